@@ -1,0 +1,176 @@
+"""Frozen values that leave or enter the channel: the bins, the antennas' places, the paths."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from jaxtyping import Complex128, Float, Float64, Int64
+from torch import Tensor
+
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+
+
+class Pattern(Protocol):
+    """What the channel asks of an antenna pattern (see ``invertwin.scene.antenna``)."""
+
+    def gain(self, direction: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point"]:
+        """Linear power gain for unit directions in the radar frame."""
+        ...
+
+    def table(self) -> Float[Tensor, "cos phi"]:
+        """The same on a grid uniform in cosθ in [-1, 1] and periodic in φ in [-π, π)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Bins of a map: range R = L/2 [m] × direction cosines u, v of the radar frame.
+
+    A count of 1 for ``u`` or ``v`` means that the axis is not resolved: every direction falls
+    into that one bin.
+    """
+
+    range_start: float
+    range_step: float
+    range_count: int
+    u_start: float = 0.0
+    u_step: float = 1.0
+    u_count: int = 1
+    v_start: float = 0.0
+    v_step: float = 1.0
+    v_count: int = 1
+
+    def __post_init__(self) -> None:
+        for axis in ("range", "u", "v"):
+            count, step = getattr(self, f"{axis}_count"), getattr(self, f"{axis}_step")
+            if count < 1 or not step > 0:
+                raise InputError(
+                    f"expected a positive {axis}_count and {axis}_step, got {count} and {step}; "
+                    "build the grid with Radar.grid(range_min, range_max)"
+                )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Bins along range, u and v."""
+        return self.range_count, self.u_count, self.v_count
+
+    @property
+    def ranges(self) -> Float64[Tensor, " range"]:
+        """Bin centres [m]."""
+        return self._axis(self.range_start, self.range_step, self.range_count)
+
+    @property
+    def u(self) -> Float64[Tensor, " u"]:
+        """Bin centres of the first direction cosine (x right)."""
+        return self._axis(self.u_start, self.u_step, self.u_count)
+
+    @property
+    def v(self) -> Float64[Tensor, " v"]:
+        """Bin centres of the second direction cosine (y up)."""
+        return self._axis(self.v_start, self.v_step, self.v_count)
+
+    @staticmethod
+    def _axis(start: float, step: float, count: int) -> Float64[Tensor, " n"]:
+        return start + step * torch.arange(count, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Link:
+    """Where the antennas are in each frame, and how they see.
+
+    Attributes:
+        tx: Phase centre of the transmitters, world coordinates [m].
+        rx: Phase centre of the receivers [m].
+        rotations: Columns are the radar's x (right), y (up), z (boresight) axes in the world.
+        tx_pattern: Power pattern of one transmitter in the radar frame.
+        rx_pattern: Power pattern of one receiver.
+        wavelength: [m].
+        shared_visibility: One visibility test from ``tx`` serves both antennas (V·V = V); the
+            boundary then has one term instead of two (derivations §3).
+    """
+
+    tx: Float64[Tensor, "frame 3"]
+    rx: Float64[Tensor, "frame 3"]
+    rotations: Float64[Tensor, "frame 3 3"]
+    tx_pattern: Pattern
+    rx_pattern: Pattern
+    wavelength: float
+    shared_visibility: bool
+
+    def __post_init__(self) -> None:
+        frames = self.tx.shape[0]
+        shapes = {"tx": (frames, 3), "rx": (frames, 3), "rotations": (frames, 3, 3)}
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if tuple(value.shape) != shape or not torch.isfinite(value).all():
+                raise InputError(
+                    f"expected finite {name} of shape {shape}, got {tuple(value.shape)}; "
+                    "give one position and rotation per frame"
+                )
+
+    @property
+    def frame_count(self) -> int:
+        """Number of radar poses."""
+        return self.tx.shape[0]
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Propagation paths, one row each.
+
+    ``coefficient`` leaves out the propagation phase: the channel response is
+    ``H(f) = Σ a exp(-j 2π f τ)`` (derivations §1 and §4).
+
+    Attributes:
+        frame: Radar pose that sees the path.
+        delay: One-way total length over c, to the phase centres [s].
+        coefficient: Field coefficient a, |a|² = received over transmitted power; zero for
+            power paths.
+        power: Expected received over transmitted power of the sample; zero for field paths.
+        first: World position of the first scattering point [m].
+        last: World position of the last one (the same for one bounce) [m].
+        kind: ``power``, ``coherent``, ``rough`` or ``field`` (a mixture of the last two).
+        boundary: Number of rows at the end that are boundary paths: zero in value, with the
+            derivative of a moving shadow edge.
+    """
+
+    frame: Int64[Tensor, " path"]
+    delay: Float64[Tensor, " path"]
+    coefficient: Complex128[Tensor, " path"]
+    power: Float64[Tensor, " path"]
+    first: Float64[Tensor, "path 3"]
+    last: Float64[Tensor, "path 3"]
+    kind: str
+    boundary: int = 0
+
+    def __len__(self) -> int:
+        return self.delay.shape[0]
+
+    @property
+    def range(self) -> Float64[Tensor, " path"]:
+        """Half the path length [m]."""
+        return 0.5 * SPEED_OF_LIGHT * self.delay
+
+    def __add__(self, other: "Paths") -> "Paths":
+        names = ("frame", "delay", "coefficient", "power", "first", "last")
+        if self.boundary:
+            return other + self if not other.boundary else _merge_boundaries(self, other)
+        joined = {n: torch.cat([getattr(self, n), getattr(other, n)]) for n in names}
+        kind = self.kind if self.kind == other.kind else "field"
+        return replace(self, **joined, kind=kind, boundary=other.boundary)
+
+
+def _merge_boundaries(a: Paths, b: Paths) -> Paths:
+    inner_a, edge_a = _split(a)
+    inner_b, edge_b = _split(b)
+    merged = inner_a + inner_b + edge_a + edge_b
+    return replace(merged, boundary=a.boundary + b.boundary)
+
+
+def _split(paths: Paths) -> tuple[Paths, Paths]:
+    cut = len(paths) - paths.boundary
+    names = ("frame", "delay", "coefficient", "power", "first", "last")
+    inner = {n: getattr(paths, n)[:cut] for n in names}
+    edge = {n: getattr(paths, n)[cut:] for n in names}
+    return replace(paths, **inner, boundary=0), replace(paths, **edge, boundary=0)
