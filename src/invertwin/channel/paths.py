@@ -1,10 +1,10 @@
 """Frozen values that leave or enter the channel: the bins, the antennas' places, the paths."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import torch
-from jaxtyping import Complex128, Float, Float64, Int64
+from jaxtyping import Bool, Complex128, Float, Float64, Int64
 from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
@@ -131,8 +131,8 @@ class Paths:
         first: World position of the first scattering point [m].
         last: World position of the last one (the same for one bounce) [m].
         kind: ``power``, ``coherent``, ``rough`` or ``field`` (a mixture of the last two).
-        boundary: Number of rows at the end that are boundary paths: zero in value, with the
-            derivative of a moving shadow edge.
+        boundary: Which rows are boundary paths: zero in value, with the derivative of a moving
+            shadow edge (derivations §3).
     """
 
     frame: Int64[Tensor, " path"]
@@ -142,7 +142,7 @@ class Paths:
     first: Float64[Tensor, "path 3"]
     last: Float64[Tensor, "path 3"]
     kind: str
-    boundary: int = 0
+    boundary: Bool[Tensor, " path"]
 
     def __len__(self) -> int:
         return self.delay.shape[0]
@@ -153,24 +153,6 @@ class Paths:
         return 0.5 * SPEED_OF_LIGHT * self.delay
 
     def __add__(self, other: "Paths") -> "Paths":
-        names = ("frame", "delay", "coefficient", "power", "first", "last")
-        if self.boundary:
-            return other + self if not other.boundary else _merge_boundaries(self, other)
+        names = [f.name for f in fields(self) if f.name != "kind"]
         joined = {n: torch.cat([getattr(self, n), getattr(other, n)]) for n in names}
-        kind = self.kind if self.kind == other.kind else "field"
-        return replace(self, **joined, kind=kind, boundary=other.boundary)
-
-
-def _merge_boundaries(a: Paths, b: Paths) -> Paths:
-    inner_a, edge_a = _split(a)
-    inner_b, edge_b = _split(b)
-    merged = inner_a + inner_b + edge_a + edge_b
-    return replace(merged, boundary=a.boundary + b.boundary)
-
-
-def _split(paths: Paths) -> tuple[Paths, Paths]:
-    cut = len(paths) - paths.boundary
-    names = ("frame", "delay", "coefficient", "power", "first", "last")
-    inner = {n: getattr(paths, n)[:cut] for n in names}
-    edge = {n: getattr(paths, n)[cut:] for n in names}
-    return replace(paths, **inner, boundary=0), replace(paths, **edge, boundary=0)
+        return Paths(**joined, kind=self.kind if self.kind == other.kind else "field")
