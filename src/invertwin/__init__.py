@@ -1,0 +1,3 @@
+"""Digital twins from radar."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,43 @@
+"""What every test shares: run-time shape checks, the data folder, the GPU marker."""
+
+import os
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+# Before torch, Dr.Jit and matplotlib are imported: few threads, no display.
+os.environ.setdefault("OMP_NUM_THREADS", str(min(2, os.cpu_count() or 1)))
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+# Shape annotations are executed in tests only; users pay nothing for them.
+install_import_hook("invertwin", "beartype.beartype")
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root of the checkout."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """Measured data: `$INVERTWIN_DATA`, by default `../shared/data` beside the checkout."""
+    default = REPOSITORY.parent / "shared" / "data"
+    folder = Path(os.environ.get("INVERTWIN_DATA", default))
+    if not folder.is_dir():
+        pytest.skip(f"no measured data in {folder}: set INVERTWIN_DATA")
+    return folder
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    marked = [item for item in items if item.get_closest_marker("gpu")]
+    if not marked:
+        return
+    from invertwin import doctor
+
+    if doctor.gpu_name() is None:
+        for item in marked:
+            item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU on this machine"))

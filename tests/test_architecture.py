@@ -1,0 +1,161 @@
+"""The one-way arrows between the rooms, read from the source with ast."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
+
+FOUNDATION = {"constants", "errors"}
+SCENE = FOUNDATION | {"scene"}
+CHANNEL = SCENE | {"doctor", "channel"}
+RADAR = CHANNEL - {"doctor"} | {"radar"}
+SIMULATION = RADAR | {"simulation"}
+CAPTURE = RADAR | {"capture"}
+INVERSION = SIMULATION | CAPTURE | {"inversion"}
+
+# Which rooms each room may import: only those before it. `__init__` is the package's own menu.
+ALLOWED = {
+    "constants": set(),
+    "errors": set(),
+    "doctor": FOUNDATION,
+    "scene": SCENE,
+    "channel": CHANNEL,
+    "radar": RADAR,
+    "simulation": SIMULATION,
+    "capture": CAPTURE,
+    "inversion": INVERSION,
+    "cli": INVERSION | {"doctor", "cli", "__init__"},
+    "__init__": INVERSION | {"doctor"},
+}
+RAY_TRACER = {"mitsuba", "drjit"}
+SHAPELESS_NAMES = {"utils", "util", "helpers", "misc", "core", "common", "base"}
+
+
+def imports(file: Path, package: Path) -> Iterator[tuple[int, str]]:
+    """Every import in a file, wherever it stands, as (line, absolute dotted name)."""
+    parent = [package.name, *file.relative_to(package).parent.parts]
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            base = parent[: len(parent) - node.level + 1] if node.level else []
+            module = ".".join([*base, *(node.module or "").split(".")]).strip(".")
+            # `from package import x` may name a module: keep x, `module_of` drops it if not.
+            for alias in node.names:
+                yield node.lineno, f"{module}.{alias.name}"
+
+
+def module_of(name: str, package: Path) -> Path | None:
+    """The file of the package that a dotted name reaches, or None for other packages."""
+    parts = name.split(".")
+    if parts[0] != package.name:
+        return None
+    path = package
+    for part in parts[1:]:
+        if (path / part).is_dir():
+            path = path / part
+        else:
+            file = path / f"{part}.py"
+            return file if file.exists() else path / "__init__.py"
+    return path / "__init__.py"
+
+
+def room_of(file: Path, package: Path) -> str:
+    first = file.relative_to(package).parts[0]
+    return first.removesuffix(".py")
+
+
+def cycles(graph: dict[Path, set[Path]]) -> list[list[Path]]:
+    found: list[list[Path]] = []
+    finished: set[Path] = set()
+
+    def visit(file: Path, trail: list[Path]) -> None:
+        if file in trail:
+            found.append([*trail[trail.index(file) :], file])
+        elif file not in finished:
+            for target in sorted(graph.get(file, ())):
+                visit(target, [*trail, file])
+            finished.add(file)
+
+    for file in sorted(graph):
+        visit(file, [])
+    return found
+
+
+def violations(package: Path) -> list[str]:
+    """One line for each broken rule in the package below this folder."""
+    problems = []
+    graph: dict[Path, set[Path]] = {}
+    for file in sorted(package.rglob("*.py")):
+        where = file.relative_to(package)
+        room = room_of(file, package)
+        if file.stem in SHAPELESS_NAMES or where.parts[0] in SHAPELESS_NAMES:
+            problems.append(f"{where}: a name that says nothing")
+        if room not in ALLOWED:
+            problems.append(f"{where}: '{room}' is no room of the house")
+            continue
+        graph[file] = set()
+        for line, name in imports(file, package):
+            if name.split(".")[0] in RAY_TRACER and room != "channel":
+                problems.append(f"{where}:{line}: {name} belongs in channel/")
+            target = module_of(name, package)
+            if target is None:
+                continue
+            to = room_of(target, package)
+            if to not in ALLOWED[room]:
+                problems.append(f"{where}:{line}: {room} must not import {to}")
+            # A folder's __init__ is its menu: importing from it inside its room is no cycle of
+            # its own, but it is one once the menu imports the importer.
+            if target != file and room != "__init__":
+                graph[file].add(target)
+    for cycle in cycles(graph):
+        problems.append("cycle: " + " → ".join(str(f.relative_to(package)) for f in cycle))
+    return problems
+
+
+def test_imports_follow_the_arrows():
+    assert violations(PACKAGE) == []
+
+
+def test_every_room_is_known():
+    assert {room_of(f, PACKAGE) for f in PACKAGE.rglob("*.py")} <= set(ALLOWED)
+
+
+@pytest.mark.parametrize(
+    ("file", "source", "complaint"),
+    [
+        ("scene/mesh.py", "from invertwin.channel import paths", "scene must not import channel"),
+        ("scene/mesh.py", "from ..radar.waveform import FMCW", "scene must not import radar"),
+        ("channel/paths.py", "import invertwin.radar", "channel must not import radar"),
+        ("channel/paths.py", "def f():\n    from invertwin import cli", "must not import cli"),
+        ("simulation.py", "from invertwin.capture import Capture", "must not import capture"),
+        ("capture/files.py", "from invertwin.simulation import simulate", "must not import sim"),
+        ("radar/waveform.py", "import mitsuba as mi", "belongs in channel/"),
+        ("radar/waveform.py", "def f():\n    from drjit.llvm import Float", "belongs in channel/"),
+        ("radar/waveform.py", "from invertwin import Scene", "radar must not import __init__"),
+        ("scene/utils.py", "", "says nothing"),
+        ("misc/thing.py", "", "says nothing"),
+        ("garage/car.py", "", "no room of the house"),
+        ("scene/mesh.py", "from invertwin.scene.scene import Scene", "cycle: "),
+    ],
+)
+def test_a_planted_violation_is_caught(tmp_path, file, source, complaint):
+    package = tmp_path / "invertwin"
+    for name in ("scene/scene.py", "channel/paths.py", "radar/waveform.py", "capture/files.py"):
+        (package / name).parent.mkdir(parents=True, exist_ok=True)
+        (package / name).write_text("")
+        (package / name).with_name("__init__.py").write_text("")
+    (package / "__init__.py").write_text("")
+    (package / "simulation.py").write_text("from invertwin.radar.waveform import FMCW\n")
+    (package / "cli").mkdir()
+    (package / "cli" / "__init__.py").write_text("")
+    (package / "scene" / "scene.py").write_text("from invertwin.scene.mesh import Mesh\n")
+    (package / "scene" / "mesh.py").write_text("")
+    assert violations(package) == []
+    (package / file).parent.mkdir(exist_ok=True)
+    (package / file).write_text(source)
+    assert any(complaint in problem for problem in violations(package)), violations(package)
