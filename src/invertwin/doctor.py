@@ -1,0 +1,508 @@
+"""Is this machine fit to trace rays? Chooses a libLLVM that works, reports, names the cure.
+
+On the CPU, Dr.Jit compiles its kernels with the system's libLLVM. Some versions are refused, and
+some load and then abort the whole process in the first kernel with a minimum or a maximum, which
+no ``except`` can catch. So every candidate is tried in a subprocess first, the newest that passes
+is named in ``DRJIT_LIBLLVM_PATH`` before Dr.Jit is imported, and the verdict is kept on disk.
+"""
+
+import contextlib
+import ctypes
+import functools
+import json
+import logging
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import zlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from invertwin.errors import InputError
+
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+BACKEND_VARIABLE = "INVERTWIN_BACKEND"
+
+# Dr.Jit must not go and find a library of its own when every one we know of fails.
+_NONE = "no-usable-libLLVM--run-invertwin-doctor"
+
+_FOLDERS = (
+    "/usr/lib",
+    "/usr/lib64",
+    "/usr/lib/*-linux-gnu*",
+    "/usr/lib/llvm*/lib",
+    "/usr/lib/llvm/*/lib*",
+    "/usr/lib64/llvm*/lib*",
+    "/usr/local/lib",
+    "/usr/local/llvm*/lib",
+    "/opt/llvm*/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    "/usr/local/opt/llvm*/lib",
+    "/home/linuxbrew/.linuxbrew/opt/llvm*/lib",
+)
+_LIBRARY = re.compile(r"libLLVM(-\d[\w.]*)?(\.\d[\d.]*)?\.(so|dylib)(\.\d[\w.]*)?$")
+_PROBE_SECONDS = 60.0
+
+_PROBE = """
+import resource
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+import drjit as dr
+from drjit.llvm.ad import Float, Float64, Int
+total = 0.0
+for kind in (Float, Float64, Int):
+    x = dr.arange(kind, 64)
+    y = dr.clip(dr.minimum(dr.maximum(x, kind(4)), kind(36)), kind(8), kind(32))
+    dr.eval(y)
+    total += float(sum(y))
+assert total == 3 * 1556, total
+print("passed")
+"""
+
+_SELF_TEST = """
+import json, sys, time
+import drjit as dr
+import mitsuba as mi
+backend = sys.argv[1]
+if backend == "auto":
+    backend = "cuda" if dr.has_backend(dr.JitBackend.CUDA) else "cpu"
+mi.set_variant({"cpu": "llvm", "cuda": "cuda"}[backend] + "_ad_mono_polarized")
+n = 100
+u, v = dr.meshgrid(dr.linspace(mi.Float, -1, 1, n), dr.linspace(mi.Float, -1, 1, n))
+mesh = mi.Mesh("relief", vertex_count=n * n, face_count=2 * (n - 1) ** 2)
+p = mi.traverse(mesh)
+p["vertex_positions"] = dr.ravel(mi.Point3f(u, v, 0.1 * dr.sin(9 * u) * dr.sin(9 * v)))
+k = dr.arange(mi.UInt32, (n - 1) ** 2)
+a = k // (n - 1) * n + k % (n - 1)
+faces = dr.zeros(mi.UInt32, 6 * (n - 1) ** 2)
+for slot, offset in enumerate((0, 1, n, 1, n + 1, n)):
+    dr.scatter(faces, a + offset, 6 * k + slot)
+p["faces"] = faces
+p.update()
+scene = mi.load_dict({"type": "scene", "relief": mesh})
+rays = 1_000_000 if backend == "cpu" else 16_000_000
+def trace(seed):
+    sampler = mi.PCG32(size=rays, initstate=seed)
+    x, y = 2 * sampler.next_float32() - 1, 2 * sampler.next_float32() - 1
+    ray = mi.Ray3f(mi.Point3f(0, 0, -2), dr.normalize(mi.Vector3f(x, y, 2)))
+    return dr.sum(scene.ray_intersect_preliminary(ray).t, axis=None).numpy()
+trace(0)
+start, done = time.perf_counter(), 0
+while time.perf_counter() - start < 1.0:
+    done += 1
+    trace(done)
+print(json.dumps({"backend": backend, "threads": dr.thread_count(),
+                  "rays_per_second": done * rays / (time.perf_counter() - start)}))
+"""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A libLLVM on this machine.
+
+    Attributes:
+        path: The file, with links resolved; or what the user wrote, if that is no file.
+        version: For example ``(19, 1)``; empty when neither file nor folder tells.
+    """
+
+    path: str
+    version: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came of running a kernel with a candidate.
+
+    Attributes:
+        usable: The kernel ran and gave the right numbers.
+        reason: One line.
+        final: Worth remembering: running it again would end the same way.
+    """
+
+    usable: bool
+    reason: str
+    final: bool = True
+
+
+@dataclass(frozen=True)
+class _Choice:
+    path: str | None
+    problem: str = ""
+    asked: str | None = None
+
+
+_choice: _Choice | None = None
+
+
+def prepare(
+    folders: Sequence[Path] | None = None,
+    probe: Callable[[str], Verdict] | None = None,
+) -> None:
+    """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM that passes, before Dr.Jit is imported.
+
+    ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require` does as
+    soon as rays are needed. A path set by the user is kept if it passes, and replaced with a
+    warning if not. Nothing is done when ``INVERTWIN_BACKEND=cuda``, nor on a second call.
+
+    Args:
+        folders: Where to look, instead of the places known to hold libLLVM.
+        probe: Judges one path, instead of :func:`probe_library`.
+    """
+    global _choice
+    if _choice is not None or os.environ.get(BACKEND_VARIABLE) == "cuda":
+        return
+    _choice = _choose(folders, probe or probe_library)
+    os.environ[VARIABLE] = _choice.path or _NONE
+
+
+def require(backend: str | None = None) -> None:
+    """Raise unless rays can be traced.
+
+    Args:
+        backend: ``cpu``, ``cuda`` or ``auto``; default: ``INVERTWIN_BACKEND``, else ``auto``. Only
+            the CPU needs libLLVM; ``auto`` is content with a GPU.
+
+    Raises:
+        InputError: No libLLVM passes. The message ends with the command that installs one.
+    """
+    backend = backend or os.environ.get(BACKEND_VARIABLE, "auto")
+    if backend == "cuda":
+        return
+    prepare()
+    if _choice is None:
+        raise InputError(
+            f"expected a checked libLLVM for the CPU backend, got none as {BACKEND_VARIABLE}=cuda "
+            f"skips the check; unset {BACKEND_VARIABLE} and start again"
+        )
+    if _choice.path is None and (backend == "cpu" or gpu_name() is None):
+        raise InputError(
+            f"expected a libLLVM that Dr.Jit can use, got {_choice.problem}; "
+            f"type: {install_command()}"
+        )
+
+
+def candidates(folders: Iterable[Path] | None = None) -> list[Candidate]:
+    """Every libLLVM in the given folders (default: system, conda, Homebrew), newest first."""
+    found = {}
+    for folder in _search_path() if folders is None else folders:
+        try:
+            names = os.listdir(folder)
+        except OSError:
+            continue
+        for name in filter(_LIBRARY.match, names):
+            path = os.path.realpath(os.path.join(folder, name))
+            if os.path.isfile(path):
+                version = _version(path) or _version(os.path.join(folder, name))
+                found[path] = max(found.get(path, ()), version)
+    return sorted(
+        (Candidate(path, version) for path, version in found.items()),
+        key=lambda candidate: (candidate.version, candidate.path),
+        reverse=True,
+    )
+
+
+def probe_library(path: str) -> Verdict:
+    """Run a Dr.Jit kernel with this libLLVM in a subprocess, where an abort harms nobody."""
+    with tempfile.TemporaryDirectory() as folder:
+        # A kernel cached by another libLLVM would hide that this one cannot compile it.
+        environment = os.environ | {VARIABLE: path, "DRJIT_CACHE_DIR": folder}
+        try:
+            ended = _run(_PROBE, environment, folder, timeout=_PROBE_SECONDS)
+        except subprocess.TimeoutExpired:
+            return Verdict(False, f"no answer within {_PROBE_SECONDS:.0f} s", final=False)
+        except OSError as error:
+            return Verdict(False, f"could not be tried: {error}", final=False)
+    if ended.returncode == 0 and "passed" in ended.stdout:
+        return Verdict(True, "works")
+    lines = [line.strip() for line in ended.stderr.splitlines() if line.strip()] or ["no message"]
+    if ended.returncode < 0:
+        # Killed from outside (memory, a time limit) says nothing about the library.
+        final = -ended.returncode in (signal.SIGABRT, signal.SIGSEGV, signal.SIGILL)
+        reason = f"aborts the process (signal {-ended.returncode}): {lines[0][:60]}"
+        return Verdict(False, reason, final)
+    if lines[0].startswith("Traceback"):
+        return Verdict(False, f"could not be tried: {lines[-1][:120]}", final=False)
+    return Verdict(False, "refused: " + lines[0].split("(): ")[-1].split(". ")[0].rstrip(".")[:120])
+
+
+def gpu_name() -> str | None:
+    """The name of the first NVIDIA GPU that the driver shows to this process, or None."""
+    # The tests and the report ask before any ray tracer is loaded, so the driver answers itself.
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return None
+    device, name = ctypes.c_int(), ctypes.create_string_buffer(128)
+    if driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0):
+        return None
+    if driver.cuDeviceGetName(name, len(name), device):
+        return None
+    return name.value.decode(errors="replace")
+
+
+def install_command() -> str:
+    """The one line that installs a libLLVM that works on this machine."""
+    if os.environ.get("CONDA_PREFIX"):
+        return "conda install -c conda-forge libllvm19"
+    if sys.platform == "darwin":
+        return "brew install llvm@19"
+    sudo = "" if getattr(os, "geteuid", lambda: 1)() == 0 else "sudo "
+    if shutil.which("apt-get"):
+        return f"{sudo}apt-get update && {sudo}apt-get install -y libllvm19"
+    if shutil.which("dnf"):
+        return f"{sudo}dnf install -y llvm-libs"
+    return "conda install -c conda-forge libllvm19"
+
+
+def report() -> dict[str, Any]:
+    """The state of this machine, for ``invertwin doctor``; takes a few seconds.
+
+    Returns:
+        ``ok``; ``versions`` by package; ``llvm`` (``chosen`` path, ``candidates`` with ``path``,
+        ``version``, ``usable``, ``verdict``); ``backend`` (``requested``, ``in_force``, ``gpu``);
+        ``threads``; ``self_test`` (``rays_per_second`` or ``error``); ``fix``: the command to type,
+        or None. Plain values that JSON can hold.
+    """
+    requested = os.environ.get(BACKEND_VARIABLE, "auto")
+    examined = []
+    prepare()
+    for candidate in _with_explicit(candidates()):
+        verdict = _remembered(candidate.path, probe_library)
+        examined.append(
+            {
+                "path": candidate.path,
+                "version": ".".join(map(str, candidate.version)),
+                "usable": verdict.usable,
+                "verdict": verdict.reason,
+            }
+        )
+    gpu, fix = gpu_name(), None
+    try:
+        require(requested)
+        measured = _self_test(requested)
+    except InputError as error:
+        measured, fix = {"error": str(error).split("; type: ")[0]}, install_command()
+    if requested == "cuda" and gpu is None:
+        fix = f"unset {BACKEND_VARIABLE}"
+    chosen = _choice.path if _choice else None
+    return {
+        "ok": "error" not in measured,
+        "versions": {
+            "invertwin": _package_version("invertwin"),
+            "python": platform.python_version(),
+            **{name: _package_version(name) for name in ("torch", "drjit", "mitsuba")},
+        },
+        "llvm": {"chosen": chosen and _resolved(chosen), "candidates": examined},
+        "backend": {
+            "requested": requested,
+            "in_force": measured.pop("backend", None),
+            "gpu": gpu,
+        },
+        "threads": measured.pop("threads", os.cpu_count()),
+        "self_test": measured,
+        "fix": fix,
+    }
+
+
+def render(report: dict[str, Any]) -> str:
+    """The report as text for a terminal."""
+    llvm, backend, test = report["llvm"], report["backend"], report["self_test"]
+    lines = [f"{name:<10} {version}" for name, version in report["versions"].items()]
+    lines += ["", "libLLVM candidates, newest first" if llvm["candidates"] else "no libLLVM found"]
+    for item in llvm["candidates"]:
+        mark = "✓" if item["usable"] else "✗"
+        chosen = "  ← chosen" if item["path"] == llvm["chosen"] else ""
+        lines.append(f"  {mark} {item['version'] or '?':<8} {item['path']}{chosen}")
+        if not item["usable"]:
+            lines.append(f"      {item['verdict']}")
+    lines += [
+        "",
+        f"backend    {backend['in_force'] or 'none'} (requested: {backend['requested']})",
+        f"GPU        {backend['gpu'] or 'none found'}",
+        f"threads    {report['threads']}",
+    ]
+    if "rays_per_second" in test:
+        lines.append(f"self-test  passed, {test['rays_per_second'] / 1e6:.1f} million rays/s")
+    else:
+        lines.append(f"self-test  failed: {test['error']}")
+    if report["fix"]:
+        lines += ["", f"To fix it, type:  {report['fix']}"]
+    return "\n".join(lines)
+
+
+def _choose(folders: Sequence[Path] | None, probe: Callable[[str], Verdict]) -> _Choice:
+    explicit = _explicit()
+    complaint = ""
+    if explicit:
+        verdict = _remembered(explicit, probe)
+        if verdict.usable:
+            return _unless_loaded(_Choice(explicit, asked=explicit))
+        complaint = f"{VARIABLE}={explicit} does not work ({verdict.reason})"
+    seen = []
+    for candidate in candidates(folders):
+        verdict = _remembered(candidate.path, probe)
+        if verdict.usable:
+            if complaint:
+                _warn(f"{complaint}; using {candidate.path}")
+            return _unless_loaded(_Choice(candidate.path, asked=explicit))
+        seen.append(f"{candidate.path} ({verdict.reason})")
+    if complaint:
+        _warn(f"{complaint}, and no other libLLVM does; 'invertwin doctor' says what to install")
+        seen.insert(0, complaint)
+    return _Choice(None, ", ".join(seen) or "none on this machine", explicit)
+
+
+def _unless_loaded(choice: _Choice) -> _Choice:
+    """The choice, unless Dr.Jit was imported earlier and has taken another libLLVM for itself."""
+    drjit = sys.modules.get("drjit")
+    if drjit is None or os.environ.get(VARIABLE) == choice.path:
+        return choice
+    loaded = tuple(drjit.detail.llvm_version())
+    if loaded[:1] == _version(choice.path or "")[:1]:
+        return choice
+    version = ".".join(map(str, loaded))
+    return _Choice(
+        None, f"libLLVM {version}, as Dr.Jit was imported first (import invertwin before it)"
+    )
+
+
+def _explicit() -> str | None:
+    """The user's own choice of libLLVM, if there is one."""
+    value = os.environ.get(VARIABLE)
+    return value if value and value != _NONE else None
+
+
+def _with_explicit(found: list[Candidate]) -> list[Candidate]:
+    asked = _choice.asked if _choice else _explicit()
+    if asked is None or _resolved(asked) in {c.path for c in found}:
+        return found
+    return [Candidate(_resolved(asked), _version(asked)), *found]
+
+
+def _resolved(path: str) -> str:
+    # A bare name such as "libLLVM-19.so" is for the system's loader to find: leave it.
+    return os.path.realpath(path) if os.path.exists(path) else path
+
+
+def _search_path() -> list[Path]:
+    roots = [os.environ.get("CONDA_PREFIX"), os.environ.get("HOMEBREW_PREFIX"), sys.prefix]
+    listed = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
+    folders = [Path(folder) for folder in listed if folder]
+    for root in filter(None, roots):
+        folders += [Path(root, "lib"), *Path(root, "opt").glob("llvm*/lib")]
+    for pattern in _FOLDERS:
+        folders += Path("/").glob(pattern.removeprefix("/"))
+    return folders
+
+
+def _version(path: str) -> tuple[int, ...]:
+    """(19, 1) of libLLVM.so.19.1, libLLVM-19.so or /usr/lib/llvm-19/lib/libLLVM.so."""
+    match = _LIBRARY.match(os.path.basename(path))
+    before, within, _, after = match.groups() if match else (None,) * 4
+    # The suffix comes last: the ".1" of libLLVM-14.so.1 counts revisions of the file, not of LLVM.
+    for text in (before, within, *re.findall(r"/llvm[-@/]?(\d[\d.]*)", path), after):
+        numbers = re.match(r"[-.]?(\d+(?:\.\d+)*)", text or "")
+        if numbers:
+            return tuple(int(part) for part in numbers.group(1).split("."))
+    return ()
+
+
+def _remembered(path: str, probe: Callable[[str], Verdict]) -> Verdict:
+    """The verdict on a path from the disk, or from the probe, which is then remembered."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return probe(path)
+    key = "|".join(
+        (
+            os.path.realpath(path),
+            str(status.st_mtime_ns),
+            str(status.st_size),
+            f"drjit {_package_version('drjit')}",
+            f"python {platform.python_version()} {platform.machine()}",
+            f"probe {zlib.crc32(_PROBE.encode())}",
+        )
+    )
+    known = _read_cache()
+    if key in known:
+        return known[key]
+    verdict = probe(path)
+    if verdict.final:
+        _write_cache(_read_cache() | {key: verdict})
+    return verdict
+
+
+def _cache_file() -> Path:
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(root, "invertwin", "llvm.json")
+
+
+def _read_cache() -> dict[str, Verdict]:
+    try:
+        entries = json.loads(_cache_file().read_text(encoding="utf-8"))
+        return {
+            key: Verdict(bool(entry["usable"]), str(entry["reason"]))
+            for key, entry in entries.items()
+        }
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return {}  # missing, or spoilt: the verdicts are simply found again
+
+
+def _write_cache(verdicts: dict[str, Verdict]) -> None:
+    file = _cache_file()
+    entries = {key: {"usable": v.usable, "reason": v.reason} for key, v in verdicts.items()}
+    # Without a place to write, the next import probes again: slower, not wrong.
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=file.name)
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            json.dump(entries, stream, indent=1)
+        os.replace(temporary, file)
+
+
+def _self_test(requested: str) -> dict[str, Any]:
+    try:
+        ended = _run(_SELF_TEST, dict(os.environ), None, requested, timeout=120.0)
+    except subprocess.TimeoutExpired:
+        return {"error": "no answer within 120 s"}
+    if ended.returncode:
+        said = ended.stderr.strip().splitlines() or ["no message"]
+        return {"error": f"exit code {ended.returncode}: {said[-1]}"}
+    return json.loads(ended.stdout.splitlines()[-1])
+
+
+def _run(
+    code: str, environment: dict[str, str], folder: str | None, *arguments: str, timeout: float
+) -> subprocess.CompletedProcess[str]:
+    # -P: a file in the current folder must not stand in for a module.
+    return subprocess.run(
+        [sys.executable, "-P", "-c", code, *arguments],
+        env=environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=timeout,
+        stdin=subprocess.DEVNULL,
+        check=False,
+    )
+
+
+@functools.cache
+def _package_version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _warn(message: str) -> None:
+    # Not `warnings`: turned into errors, it would break the import; and it takes two lines.
+    logging.getLogger("invertwin").warning("invertwin: %s", message)
