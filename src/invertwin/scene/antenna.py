@@ -1,0 +1,261 @@
+"""Antennas: gain patterns and arrays of elements, in the radar frame.
+
+The radar frame is x right, y up, z boresight. A direction is a unit vector in this frame that
+points away from the antenna; θ is its angle to z, φ = atan2(y, x).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import checked_count, checked_number, checked_tensor
+
+COSINE_COUNT = 2049
+"""Nodes of a pattern table over cosθ, at linspace(−1, 1, 2049)."""
+
+
+class Pattern(ABC):
+    """Power gain of one antenna element over direction."""
+
+    @abstractmethod
+    def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Linear power gain towards unit vectors in the radar frame."""
+
+    @abstractmethod
+    def table(self) -> Float64[Tensor, "n_cos n_phi"]:
+        """The gain on a grid: cosθ = linspace(−1, 1, n_cos), φ = −π + 2π i/n_phi, periodic.
+
+        Bilinear interpolation of it is the gain that ray kernels see. One row or column means that
+        the gain does not depend on that angle.
+        """
+
+
+@dataclass(frozen=True)
+class Isotropic(Pattern):
+    """Gain 1 in every direction."""
+
+    def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Linear power gain: 1."""
+        return torch.ones_like(direction[..., 0])
+
+    def table(self) -> Float64[Tensor, "1 1"]:
+        """One node."""
+        return torch.ones(1, 1, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Cosine(Pattern):
+    """Gain 2(n+1) cosⁿθ before the antenna and 0 behind it; its integral is 4π.
+
+    The table departs from it by at most 1.2e-7 n(n−1) of the peak gain for n ≥ 1.
+
+    Attributes:
+        exponent: n ≥ 0 of the power pattern.
+
+    Raises:
+        InputError: a negative exponent.
+    """
+
+    exponent: float
+
+    def __post_init__(self) -> None:
+        checked_number(self.exponent, "pattern exponent", 0.0)
+
+    def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Linear power gain."""
+        return self._of_cosine(direction[..., 2])
+
+    def table(self) -> Float64[Tensor, "2049 1"]:
+        """The gain over cosθ."""
+        return self._of_cosine(torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64))[:, None]
+
+    def _of_cosine(self, cosine: Tensor) -> Tensor:
+        front = cosine > 0
+        # The power of a replaced value, since the gradient of 0ⁿ is infinite for n < 1.
+        power = torch.where(front, cosine, 1.0) ** self.exponent
+        return torch.where(front, 2 * (self.exponent + 1) * power, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Table(Pattern):
+    """A measured or simulated pattern.
+
+    It is resampled once, linearly in the given angles, onto the grid of `table`; `gain`
+    interpolates that grid, so that torch and the ray kernels see one and the same pattern. The
+    grid's step in cosθ, 1/1024, is 2.5° at boresight and finer elsewhere.
+
+    Attributes:
+        theta: n ≥ 2 ascending angles to z [rad], from 0 to at most π; the gain beyond is 0.
+        phi: m ascending angles around z [rad], spanning less than 2π; m = 1 for a pattern that is
+            symmetric about z. Between the last and the first it continues periodically.
+        gains: linear power gain at these angles.
+
+    Raises:
+        InputError: wrong shapes or ranges, NaN, or a negative gain.
+    """
+
+    theta: Float64[Tensor, " n"]
+    phi: Float64[Tensor, " m"]
+    gains: Float64[Tensor, "n m"]
+    _grid: Tensor = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        do = "give theta [n], phi [m] in rad and linear gains [n, m]"
+        theta = checked_tensor(self.theta, (None,), "pattern theta", do)
+        phi = checked_tensor(self.phi, (None,), "pattern phi", do)
+        gains = checked_tensor(self.gains, (len(theta), len(phi)), "pattern gains", do)
+        _check_angles(theta, phi)
+        if bool((gains < 0).any()):
+            raise InputError(
+                f"expected linear power gains >= 0, got {float(gains.min()):g}; "
+                "convert decibels with 10**(dB/10)"
+            )
+        for name, value in (("theta", theta), ("phi", phi), ("gains", gains)):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "_grid", _resampled(theta, phi, gains))
+
+    def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Linear power gain, bilinear between the nodes of `table`."""
+        grid = self._grid.to(direction)
+        x, y, z = direction.unbind(-1)
+        row, up = _cell((z.clamp(-1, 1) + 1) / 2 * (COSINE_COUNT - 1))
+        row = row.clamp(max=COSINE_COUNT - 2)
+        up = (z.clamp(-1, 1) + 1) / 2 * (COSINE_COUNT - 1) - row
+        count = grid.shape[1]
+        # atan2 has no gradient on the axis itself; any φ serves there.
+        on_axis = (x == 0) & (y == 0)
+        azimuth = torch.atan2(y, torch.where(on_axis, 1.0, x))
+        column, across = _cell((azimuth + torch.pi) / (2 * torch.pi) * count)
+        column, neighbour = column % count, (column + 1) % count
+        low = torch.lerp(grid[row, column], grid[row, neighbour], across)
+        high = torch.lerp(grid[row + 1, column], grid[row + 1, neighbour], across)
+        return torch.lerp(low, high, up)
+
+    def table(self) -> Float64[Tensor, "2049 n_phi"]:
+        """The resampled gain."""
+        return self._grid
+
+
+@dataclass(frozen=True, eq=False)
+class AntennaArray:
+    """Elements of one pattern at fixed positions.
+
+    Attributes:
+        positions: element positions in the radar frame [m].
+        pattern: gain of every element.
+
+    Raises:
+        InputError: no elements, wrong shape, NaN, or a pattern of another type.
+    """
+
+    positions: Float64[Tensor, "n 3"]
+    pattern: Pattern = field(default_factory=Isotropic)
+
+    def __post_init__(self) -> None:
+        do = "give one position [x, y, z] in metres per element"
+        positions = checked_tensor(self.positions, (None, 3), "element positions", do)
+        if len(positions) == 0:
+            raise InputError(f"expected at least one antenna element, got none; {do}")
+        if not isinstance(self.pattern, Pattern):
+            raise InputError(
+                f"expected a Pattern, got {type(self.pattern).__name__}; "
+                "give Isotropic(), Cosine(exponent) or Table(theta, phi, gains)"
+            )
+        object.__setattr__(self, "positions", positions)
+
+
+def linear_array(
+    count: int, spacing: float, axis: Literal["x", "y"] = "x", pattern: Pattern | None = None
+) -> AntennaArray:
+    """Elements in a row, centred at the origin of the radar frame.
+
+    Args:
+        count: number of elements.
+        spacing: distance between neighbours [m].
+        axis: direction of the row.
+        pattern: gain of every element, isotropic by default.
+
+    Raises:
+        InputError: no elements, a spacing that is not positive, or another axis.
+    """
+    if axis not in ("x", "y"):
+        raise InputError(f"expected axis x or y, got {axis!r}; arrays lie in the x-y plane")
+    if axis == "x":
+        return planar_array(count, 1, spacing, spacing, pattern)
+    return planar_array(1, count, spacing, spacing, pattern)
+
+
+def planar_array(
+    nx: int, ny: int, dx: float, dy: float, pattern: Pattern | None = None
+) -> AntennaArray:
+    """Elements on a grid, centred at the origin of the radar frame; y runs fastest.
+
+    Args:
+        nx: number of columns, along x.
+        ny: number of rows, along y.
+        dx: distance between columns [m].
+        dy: distance between rows [m].
+        pattern: gain of every element, isotropic by default.
+
+    Raises:
+        InputError: no elements, or a spacing that is not positive.
+    """
+    x = _centred(nx, dx, "elements along x")
+    y = _centred(ny, dy, "elements along y")
+    plane = torch.cartesian_prod(x, y)
+    positions = torch.cat([plane, torch.zeros_like(plane[:, :1])], dim=1)
+    return AntennaArray(positions, Isotropic() if pattern is None else pattern)
+
+
+def _centred(count: int, spacing: float, what: str) -> Tensor:
+    number = checked_count(count, what, 1)
+    distance = checked_number(spacing, "element spacing [m]", 0.0, open_low=True)
+    return (torch.arange(number, dtype=torch.float64) - (number - 1) / 2) * distance
+
+
+def _cell(position: Tensor) -> tuple[Tensor, Tensor]:
+    """Integer cell and the fraction within it."""
+    cell = torch.floor(position.detach()).to(torch.int64)
+    return cell, position - cell
+
+
+def _check_angles(theta: Tensor, phi: Tensor) -> None:
+    ascending = bool((theta.diff() > 0).all()) and bool((phi.diff() > 0).all())
+    if len(theta) < 2 or len(phi) < 1 or not ascending:
+        raise InputError(
+            f"expected at least 2 ascending theta and 1 phi, got {len(theta)} and {len(phi)} "
+            f"({'' if ascending else 'not '}ascending); sort the pattern by angle"
+        )
+    if theta[0] != 0 or theta[-1] > torch.pi + 1e-9:
+        raise InputError(
+            f"expected theta from 0 to at most pi rad, got {float(theta[0]):g} to "
+            f"{float(theta[-1]):g}; convert degrees to rad and start at boresight"
+        )
+    if phi[-1] - phi[0] >= 2 * torch.pi - 1e-9:
+        raise InputError(
+            f"expected phi spanning less than 2 pi rad, got {float(phi[-1] - phi[0]):g}; "
+            "convert degrees to rad and leave out the repeated last angle"
+        )
+
+
+def _resampled(theta: Tensor, phi: Tensor, gains: Tensor) -> Tensor:
+    cosine = np.linspace(-1, 1, COSINE_COUNT)
+    given = gains.detach().numpy()
+    if len(phi) > 1:
+        # A multiple of the given number, so that evenly spaced angles stay nodes.
+        count = len(phi) * -(-360 // len(phi))
+        around = -np.pi + 2 * np.pi * np.arange(count) / count
+        rows: Sequence = [
+            np.interp(around, phi.detach().numpy(), row, period=2 * np.pi) for row in given
+        ]
+        given = np.stack(rows)
+    angle, known = np.arccos(cosine), theta.detach().numpy()
+    columns = [np.interp(angle, known, column, right=0.0) for column in given.T]
+    return torch.from_numpy(np.stack(columns, axis=1))

@@ -1,0 +1,78 @@
+"""Conversion and validation of what enters the scene: the public edge of this room."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from invertwin.errors import InputError
+
+ArrayLike = Tensor | np.ndarray | Sequence
+
+
+def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: str) -> Tensor:
+    """`value` as a finite float64 tensor of the given shape; gradients are kept.
+
+    Args:
+        value: tensor, array or nested sequence of numbers.
+        shape: expected size of every dimension, None where any size will do.
+        what: what the value is, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: not numbers, wrong shape, NaN or infinite.
+    """
+    sizes = ", ".join("any" if size is None else str(size) for size in shape)
+    expected = f"expected {what} as numbers of shape [{sizes}]"
+    try:
+        tensor = torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{expected}, got {type(value).__name__}; {do}") from None
+    fits = len(tensor.shape) == len(shape) and all(
+        size is None or size == actual for size, actual in zip(shape, tensor.shape, strict=True)
+    )
+    if not fits:
+        raise InputError(f"{expected}, got shape {list(tensor.shape)}; {do}")
+    bad = int((~torch.isfinite(tensor)).sum())
+    if bad:
+        raise InputError(
+            f"expected finite {what}, got {bad} NaN or infinite of {tensor.numel()}; {do}"
+        )
+    return tensor
+
+
+def checked_number(
+    value: object, what: str, low: float, high: float = math.inf, *, open_low: bool = False
+) -> float:
+    """The value of a finite number (or 0-d tensor) in [low, high], or (low, high] if `open_low`.
+
+    Raises:
+        InputError: not a number, NaN, infinite or out of range.
+    """
+    opening = "(" if open_low else "["
+    closing = ")" if math.isinf(high) else "]"
+    expected = f"expected {what} in {opening}{low:g}, {high:g}{closing}"
+    plain = value.detach() if isinstance(value, Tensor) else value
+    if isinstance(plain, bool) or not (
+        isinstance(plain, int | float | np.number)
+        or (isinstance(plain, Tensor) and plain.ndim == 0 and not plain.is_complex())
+    ):
+        raise InputError(f"{expected}, got {type(value).__name__}; give one real number")
+    number = float(plain)
+    inside = low < number <= high if open_low else low <= number <= high
+    if not (math.isfinite(number) and inside):
+        raise InputError(f"{expected}, got {number:g}; give a value in that range")
+    return number
+
+
+def checked_count(value: object, what: str, low: int) -> int:
+    """An integer that is at least `low`.
+
+    Raises:
+        InputError: not an integer, or too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
+        raise InputError(f"expected {what} as an integer >= {low}, got {value!r}; give a count")
+    return int(value)

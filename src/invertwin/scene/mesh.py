@@ -1,0 +1,74 @@
+"""Triangle meshes as plain tensors."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import checked_tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh; its normals are (v1 − v0) × (v2 − v0).
+
+    Open and non-manifold meshes and triangles without area are accepted: the former have edges
+    with one or many faces, the latter never reflect anything. Arrays and lists are converted.
+
+    Attributes:
+        vertices: positions in the object's frame [m]; may carry gradients.
+        faces: vertex indices of every triangle.
+
+    Raises:
+        InputError: wrong shapes, NaN, nothing in it, or an index that points to no vertex.
+    """
+
+    vertices: Float64[Tensor, "v 3"]
+    faces: Int64[Tensor, "f 3"]
+
+    def __post_init__(self) -> None:
+        vertices = checked_tensor(
+            self.vertices, (None, 3), "mesh vertices", "repair the mesh before loading it"
+        )
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", _checked_faces(self.faces, len(vertices)))
+
+    @property
+    def center(self) -> Float64[Tensor, "3"]:
+        """Middle of the bounding box [m]."""
+        return (self.vertices.amin(0) + self.vertices.amax(0)) / 2
+
+
+def _checked_faces(faces: object, vertex_count: int) -> Tensor:
+    try:
+        indices = torch.as_tensor(faces)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(
+            f"expected mesh faces as integers of shape [any, 3], got {type(faces).__name__}; "
+            "give a tensor or array of vertex indices"
+        ) from None
+    # An empty list becomes a float tensor: report it as what it is, a mesh without faces.
+    if indices.numel() == 0 or vertex_count == 0:
+        raise InputError(
+            f"expected a mesh with triangles, got {vertex_count} vertices and no usable face; "
+            "leave out empty objects"
+        )
+    if indices.is_floating_point() or indices.is_complex() or indices.dtype == torch.bool:
+        raise InputError(
+            f"expected mesh faces as integers of shape [any, 3], got {indices.dtype}; "
+            "give vertex indices"
+        )
+    if indices.ndim != 2 or indices.shape[1] != 3:
+        raise InputError(
+            f"expected mesh faces of shape [any, 3], got {list(indices.shape)}; "
+            "split polygons into triangles"
+        )
+    low, high = int(indices.min()), int(indices.max())
+    if low < 0 or high >= vertex_count:
+        raise InputError(
+            f"expected face indices in [0, {vertex_count - 1}], got [{low}, {high}]; "
+            "count vertices from 0"
+        )
+    return indices.to(torch.int64)

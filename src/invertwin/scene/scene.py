@@ -1,0 +1,189 @@
+"""Scenes: named objects, each a mesh with a material, a pose and a motion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import checked_number, checked_tensor
+from invertwin.scene.material import Material, checked_material
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.pose import compose, rigid
+
+
+@dataclass(frozen=True, eq=False)
+class Object:
+    """A mesh with a material, placed in the world.
+
+    Attributes:
+        mesh: the shape, in the object's own frame.
+        material: what its surface does to the waves.
+        pose: rigid transform from the object's frame to the world; None is the identity.
+        velocity: world velocity [m/s] of the whole object [3] or of each vertex [v, 3];
+            None is at rest.
+
+    Raises:
+        InputError: wrong types or shapes, NaN, or a pose that is not rigid.
+    """
+
+    mesh: Mesh
+    material: Material
+    pose: Float64[Tensor, "4 4"] | None = None
+    velocity: Float64[Tensor, "3"] | Float64[Tensor, "v 3"] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.mesh, Mesh):
+            raise InputError(
+                f"expected a Mesh, got {type(self.mesh).__name__}; "
+                "build one with Mesh(vertices, faces) or load_mesh(path)"
+            )
+        checked_material(self.material)
+        if self.pose is not None:
+            object.__setattr__(self, "pose", _checked_pose(self.pose))
+        if self.velocity is not None:
+            velocity = _checked_velocity(self.velocity, len(self.mesh.vertices))
+            object.__setattr__(self, "velocity", velocity)
+
+    @property
+    def transform(self) -> Float64[Tensor, "4 4"]:
+        """The pose as a matrix, also when it is None."""
+        return torch.eye(4, dtype=torch.float64) if self.pose is None else self.pose
+
+    @property
+    def vertices(self) -> Float64[Tensor, "v 3"]:
+        """Vertex positions in the world [m], differentiable in the mesh and the pose."""
+        return self._to_world(self.mesh.vertices)
+
+    @property
+    def center(self) -> Float64[Tensor, "3"]:
+        """World position [m] of the middle of the mesh's bounding box in the object's frame.
+
+        Rotations and scalings act about it. Differentiable like `vertices`.
+        """
+        return self._to_world(self.mesh.center)
+
+    def at(self, time: float) -> "Object":
+        """The object after moving with its velocity for `time` [s]."""
+        checked_number(time, "time [s]", -torch.inf)
+        if self.velocity is None:
+            return self
+        if self.velocity.ndim == 1:
+            motion = rigid(torch.eye(3, dtype=torch.float64), self.velocity * time)
+            return replace(self, pose=compose(self.transform, motion))
+        # Velocities are world vectors; row vectors times R turn them into the object's frame.
+        offsets = self.velocity * time @ self.transform[:3, :3]
+        mesh = Mesh(self.mesh.vertices + offsets, self.mesh.faces)
+        return replace(self, mesh=mesh)
+
+    def _to_world(self, points: Tensor) -> Tensor:
+        if self.pose is None:
+            return points
+        return points @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Objects by name; a frozen value.
+
+    Attributes:
+        objects: the objects in the order given (a read-only mapping).
+
+    Raises:
+        InputError: no objects, an empty name, or a value that is not an Object.
+    """
+
+    objects: Mapping[str, Object]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.objects, Mapping) or not self.objects:
+            got = "none" if isinstance(self.objects, Mapping) else type(self.objects).__name__
+            raise InputError(
+                f"expected at least one named object, got {got}; give a dict of name: Object(...)"
+            )
+        for name, value in self.objects.items():
+            if not isinstance(name, str) or not name.strip():
+                raise InputError(
+                    f"expected object names that are not empty, got {name!r}; name every object"
+                )
+            if not isinstance(value, Object):
+                raise InputError(
+                    f"expected an Object for {name!r}, got {type(value).__name__}; "
+                    "give Object(mesh, material)"
+                )
+        object.__setattr__(self, "objects", MappingProxyType(dict(self.objects)))
+
+    def __reduce__(self) -> tuple:
+        # The read-only view of the mapping can be neither copied nor pickled by itself.
+        return type(self), (dict(self.objects),)
+
+    def __getitem__(self, name: str) -> Object:
+        """The object of that name.
+
+        Raises:
+            InputError: there is none.
+        """
+        if name not in self.objects:
+            raise InputError(
+                f"expected the name of an object in the scene ({', '.join(self.names)}), "
+                f"got {name!r}; use one of these names"
+            )
+        return self.objects[name]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the objects in order."""
+        return tuple(self.objects)
+
+    def replace(self, name: str, **changes: Any) -> "Scene":
+        """A scene in which some fields of one object differ.
+
+        Args:
+            name: the object.
+            changes: new values of `mesh`, `material`, `pose` or `velocity`.
+
+        Raises:
+            InputError: no such object or field.
+        """
+        unknown = sorted(set(changes) - set(Object.__dataclass_fields__))
+        if unknown:
+            raise InputError(
+                f"expected changes of {', '.join(Object.__dataclass_fields__)}, "
+                f"got {', '.join(unknown)}; use one of these fields"
+            )
+        return Scene({**self.objects, name: replace(self[name], **changes)})
+
+    def at(self, time: float) -> "Scene":
+        """The scene after all objects moved with their velocities for `time` [s]."""
+        return Scene({name: value.at(time) for name, value in self.objects.items()})
+
+
+def _checked_pose(pose: object) -> Tensor:
+    do = "build one with rigid(rotation, translation)"
+    matrix = checked_tensor(pose, (4, 4), "pose", do)
+    fixed = matrix.detach()
+    rotation, bottom = fixed[:3, :3], fixed[3]
+    gram = rotation @ rotation.T - torch.eye(3, dtype=torch.float64)
+    is_rigid = (
+        gram.abs().max() < 1e-5
+        and torch.linalg.det(rotation) > 0
+        and bool(torch.equal(bottom, bottom.new_tensor([0.0, 0.0, 0.0, 1.0])))
+    )
+    if not is_rigid:
+        raise InputError(
+            "expected a rigid pose (rotation, translation, last row 0 0 0 1), "
+            f"got {[[round(x, 4) for x in row] for row in fixed.tolist()]}; {do}, "
+            "and scale the mesh instead"
+        )
+    return matrix
+
+
+def _checked_velocity(velocity: object, vertex_count: int) -> Tensor:
+    do = f"give one vector [3] or one per vertex [{vertex_count}, 3]"
+    tensor = torch.as_tensor(velocity)
+    shape = (3,) if tensor.ndim == 1 else (vertex_count, 3)
+    return checked_tensor(velocity, shape, "velocity [m/s]", do)

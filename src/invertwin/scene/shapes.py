@@ -1,0 +1,259 @@
+"""Built-in meshes, all centred at the origin, with outward normals."""
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import checked_count, checked_number, checked_tensor
+from invertwin.scene.mesh import Mesh
+
+
+def plate(width: float, height: float, divisions: int = 1) -> Mesh:
+    """A rectangle in the plane z = 0 that faces −z.
+
+    Args:
+        width: size along x [m].
+        height: size along y [m].
+        divisions: number of cells along each side, two triangles each.
+
+    Raises:
+        InputError: a size that is not positive, or no divisions.
+    """
+    size = [_length(width, "plate width [m]"), _length(height, "plate height [m]")]
+    n = checked_count(divisions, "divisions", 1)
+    points, faces = _lattice(n)
+    # The lattice faces +z; turning every triangle makes it face −z.
+    plane = (points / n - 0.5) * size
+    return _mesh(np.column_stack([plane, np.zeros(len(plane))]), faces[:, ::-1])
+
+
+def box(size: float | Sequence[float], divisions: int = 1) -> Mesh:
+    """A closed box.
+
+    Args:
+        size: edge length [m], one number or one for each of x, y, z.
+        divisions: number of cells along each edge, two triangles each.
+
+    Raises:
+        InputError: a size that is not positive, or no divisions.
+    """
+    sizes = [size] * 3 if isinstance(size, int | float) else list(size)
+    extent = checked_tensor(sizes, (3,), "box size", "give one number or three").numpy()
+    for length in extent:
+        _length(float(length), "box size [m]")
+    n = checked_count(divisions, "divisions", 1)
+    points, faces = _lattice(n)
+    corners, triangles = [], []
+    for axis in range(3):
+        for level, turn in ((0, -1), (n, 1)):
+            # Cyclic axes keep the lattice's orientation: +axis on the far side, turned on the near.
+            side = np.empty((len(points), 3), dtype=np.int64)
+            side[:, [(axis + 1) % 3, (axis + 2) % 3, axis]] = np.column_stack(
+                [points, np.full(len(points), level)]
+            )
+            triangles.append(faces[:, ::turn] + len(corners) * len(points))
+            corners.append(side)
+    # Integer corners are equal exactly where sides meet, so merging leaves no seam.
+    unique, index = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
+    return _mesh((unique / n - 0.5) * extent, index.ravel()[np.concatenate(triangles)])
+
+
+def sphere(radius: float, subdivisions: int = 4) -> Mesh:
+    """An icosphere with 20·4^subdivisions triangles and its vertices on the sphere.
+
+    Args:
+        radius: [m].
+        subdivisions: how often every triangle of the icosahedron is split into four.
+
+    Raises:
+        InputError: a radius that is not positive, or a negative count.
+    """
+    length = _length(radius, "sphere radius [m]")
+    count = checked_count(subdivisions, "subdivisions", 0)
+    ball = trimesh.creation.icosphere(subdivisions=count, radius=1.0)
+    unit = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
+    return _mesh(unit * length, ball.faces)
+
+
+def dihedral(edge: float) -> Mesh:
+    """Two square plates at a right angle that meet on the y axis and open to −z.
+
+    Its boresight is −z, and every wave it returns has the range of the y axis.
+
+    Args:
+        edge: edge length of the plates [m].
+
+    Raises:
+        InputError: a length that is not positive.
+    """
+    length = _length(edge, "dihedral edge [m]")
+    reach = length / math.sqrt(2)
+    vertices = [(x, y * length / 2, -abs(x)) for x in (-reach, 0.0, reach) for y in (-1, 1)]
+    return _mesh(np.array(vertices), np.array([(0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4)]))
+
+
+def trihedral(edge: float) -> Mesh:
+    """A corner reflector: three right-angled triangles with the apex at the origin, open to −z.
+
+    Its boresight is −z, one of the inner edges lies in the half plane x = 0, y > 0, and every wave
+    it returns after three bounces has the range of the apex. Peak radar cross-section: 4π edge⁴/3λ².
+
+    Args:
+        edge: length of the three inner edges [m].
+
+    Raises:
+        InputError: a length that is not positive.
+    """
+    length = _length(edge, "trihedral edge [m]")
+    angle = np.radians([90.0, 210.0, 330.0])
+    # Three perpendicular unit vectors make the same angle with their mean: cosine 1/√3.
+    tips = np.column_stack([np.cos(angle), np.sin(angle), np.full(3, -math.sqrt(0.5))])
+    vertices = np.concatenate([np.zeros((1, 3)), tips * length * math.sqrt(2 / 3)])
+    return _mesh(vertices, np.array([(0, 2, 1), (0, 3, 2), (0, 1, 3)]))
+
+
+def text(string: str, size: float = 0.6, depth: float = 0.12, max_edge: float = 0.06) -> Mesh:
+    """Extruded bold text, watertight, readable from −z with x to the right and y up.
+
+    Args:
+        string: one line of text.
+        size: height of its bounding box along y [m].
+        depth: thickness along z [m].
+        max_edge: longest edge of a triangle [m].
+
+    Raises:
+        InputError: text without visible characters, or a length that is not positive.
+    """
+    height = _length(size, "text size [m]")
+    thickness = _length(depth, "text depth [m]")
+    longest = _length(max_edge, "longest edge [m]")
+    plane, cap = _triangulated_outline(string, height, longest)
+    count = len(plane)
+    front = np.column_stack([plane, np.full(count, -thickness / 2)])
+    back = np.column_stack([plane, np.full(count, thickness / 2)])
+    start, end = _boundary(cap).T
+    walls = [(start, end, end + count), (start, end + count, start + count)]
+    faces = np.concatenate([cap[:, ::-1], cap + count, *(np.column_stack(w) for w in walls)])
+    return _mesh(*_split_long_edges(np.concatenate([front, back]), faces, longest))
+
+
+def _length(value: object, what: str) -> float:
+    return checked_number(value, what, 0.0, open_low=True)
+
+
+def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    # Copies, because reversed views have negative strides that torch does not take.
+    return Mesh(
+        torch.from_numpy(np.array(vertices, dtype=np.float64)),
+        torch.from_numpy(np.array(faces, dtype=np.int64)),
+    )
+
+
+def _lattice(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Integer points (i, j) of an n × n grid and its triangles, counter-clockwise."""
+    points = np.stack(np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij"), -1)
+    index = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    return points.reshape(-1, 2), np.concatenate(
+        [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
+    )
+
+
+def _triangulated_outline(
+    string: str, height: float, longest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points [p, 2] and counter-clockwise triangles that fill the outline of a text."""
+    # Imported here: only text needs these two, and matplotlib alone takes half a second.
+    import matplotlib
+    import shapely
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    if not isinstance(string, str) or not string.isprintable():
+        raise InputError(f"expected one line of text, got {string!r}; give printable characters")
+    font = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans-Bold.ttf"
+    # Curves are cut into chords about one unit long, so the size sets how fine they are.
+    path = TextPath((0, 0), string, size=100, prop=FontProperties(fname=font))
+    rings = [shapely.Polygon(ring) for ring in path.to_polygons() if len(ring) >= 4]
+    if not rings:
+        raise InputError(f"expected text with visible characters, got {string!r}; give a letter")
+    # A ring inside another is a hole, a ring inside a hole is filled again.
+    outline = reduce(shapely.symmetric_difference, rings)
+    left, bottom, right, top = outline.bounds
+    scale = height / (top - bottom)
+    center = np.array([left + right, bottom + top]) / 2
+    outline = shapely.transform(outline, lambda points: (points - center) * scale)
+    fine = shapely.segmentize(outline, longest)
+    # The triangulation wants one polygon at a time, and returns rings of four points.
+    triangles = np.concatenate(
+        [
+            shapely.get_coordinates(shapely.constrained_delaunay_triangles(part)).reshape(-1, 4, 2)
+            for part in shapely.get_parts(fine)
+        ]
+    )[:, :3]
+    side, other = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    clockwise = side[:, 0] * other[:, 1] < side[:, 1] * other[:, 0]
+    triangles[clockwise] = triangles[clockwise, ::-1]
+    # Corners are copies of the outline's points, hence equal to the last bit where they meet.
+    points, index = np.unique(triangles.reshape(-1, 2), axis=0, return_inverse=True)
+    return points, index.reshape(-1, 3)
+
+
+def _boundary(faces: np.ndarray) -> np.ndarray:
+    """Directed edges [b, 2] whose opposite belongs to no face."""
+    directed = {(int(a), int(b)) for face in faces for a, b in pairwise([*face, face[0]])}
+    return np.array([(a, b) for a, b in sorted(directed) if (b, a) not in directed])
+
+
+def _split_long_edges(
+    vertices: np.ndarray, faces: np.ndarray, longest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Halve all edges above a length until none is left; the mesh stays watertight.
+
+    Every triangle splits by the pattern of its own long edges, and both neighbours of an edge see
+    the same midpoint, so no crack appears.
+    """
+    while True:
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
+        unique, index = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+        index = index.reshape(-1, 3)
+        lengths = np.linalg.norm(vertices[unique[:, 0]] - vertices[unique[:, 1]], axis=1)
+        long = lengths > longest * (1 + 1e-9)
+        if not long.any():
+            return vertices, faces
+        midpoint = np.full(len(unique), -1)
+        midpoint[long] = len(vertices) + np.arange(long.sum())
+        vertices = np.concatenate([vertices, vertices[unique[long]].mean(axis=1)])
+        faces = _split(faces, midpoint[index])
+
+
+def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Split triangles at the given midpoints of their edges 01, 12, 20 (−1: not split)."""
+    count = (middle >= 0).sum(axis=1)
+    # Turn each triangle so that one split edge comes first, or the one whole edge comes last.
+    first = np.where(count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3)
+    order = (first[:, None] + np.arange(3)) % 3
+    faces = np.take_along_axis(faces, order, axis=1)
+    middle = np.take_along_axis(middle, order, axis=1)
+    a, b, c = faces.T
+    ab, bc, ca = middle.T
+    patterns = {
+        0: [(a, b, c)],
+        1: [(a, ab, c), (ab, b, c)],
+        2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
+        3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
+    }
+    return np.concatenate(
+        [
+            np.column_stack([corner[count == n] for corner in triangle])
+            for n, triangles in patterns.items()
+            for triangle in triangles
+        ]
+    )
