@@ -1,0 +1,236 @@
+"""The one crossing between torch and the ray tracer: backend choice, geometry, conversions."""
+
+import os
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from invertwin import doctor
+from invertwin.errors import InputError
+from invertwin.scene.scene import Scene
+
+_VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
+_KEPT_TOPOLOGIES = 8
+_chosen: list[str] = []
+
+
+@cache
+def _cuda_found() -> bool:
+    doctor.require()
+    import drjit as dr
+
+    return bool(dr.has_backend(dr.JitBackend.CUDA))
+
+
+def backend() -> str:
+    """The ray tracer's backend in force: ``cpu`` or ``cuda``.
+
+    The innermost :func:`use_backend` wins, then the environment variable ``INVERTWIN_BACKEND``,
+    then ``auto``: CUDA where Dr.Jit finds it, the CPU elsewhere.
+
+    Raises:
+        InputError: A name that is not known, or CUDA asked for where there is none.
+    """
+    name = _chosen[-1] if _chosen else os.environ.get("INVERTWIN_BACKEND", "auto")
+    if name not in ("cpu", "cuda", "auto"):
+        raise InputError(
+            f"expected backend 'cpu', 'cuda' or 'auto', got {name!r}; "
+            "correct the argument or INVERTWIN_BACKEND"
+        )
+    if name == "auto":
+        return "cuda" if _cuda_found() else "cpu"
+    if name == "cuda" and not _cuda_found():
+        raise InputError("expected an NVIDIA GPU for backend 'cuda', got none; use backend 'cpu'")
+    return name
+
+
+@contextmanager
+def use_backend(name: str | None) -> Iterator[None]:
+    """Choose ``cpu``, ``cuda`` or ``auto`` inside a ``with`` block; ``None`` changes nothing."""
+    if name is None:
+        yield
+        return
+    _chosen.append(name)
+    try:
+        backend()
+        yield
+    finally:
+        _chosen.pop()
+
+
+def tracer() -> Any:
+    """The ``mitsuba`` module, set to the backend in force."""
+    name = backend()
+    if name == "cpu":
+        doctor.require()
+    import mitsuba as mi
+
+    if mi.variant() != _VARIANTS[name]:
+        mi.set_variant(_VARIANTS[name])
+    return mi
+
+
+def to_float(values: Tensor) -> Any:
+    """A flat Dr.Jit float array of a torch tensor (detached, float32)."""
+    return tracer().Float(values.detach().to(torch.float32).contiguous().ravel().cpu())
+
+
+def to_index(values: Tensor) -> Any:
+    """A flat Dr.Jit index array of a torch tensor of non-negative integers."""
+    return tracer().UInt32(values.detach().to(torch.int32).contiguous().ravel().cpu().numpy())
+
+
+def to_torch(values: Any) -> Tensor:
+    """A torch tensor on the CPU of a flat Dr.Jit array."""
+    return torch.from_numpy(np.array(values))
+
+
+def opaque(value: float | int, kind: str = "UInt32") -> Any:
+    """A Dr.Jit scalar that the kernel reads from memory, so that a new value does not recompile."""
+    import drjit as dr
+
+    return dr.opaque(getattr(tracer(), kind), value)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A scene as flat tables, still torch and differentiable.
+
+    Attributes:
+        vertices: World positions of all objects, concatenated [m].
+        faces: Vertex indices of all triangles.
+        face_object: Index of the object of each triangle.
+        amplitude: Per object, square root of the Fresnel reflectance over cosθ in [0, 1].
+        diffuse, lobe, exponent: Per object, the weights of ``scene.material.Surface``.
+        coherent: Per object, whether its field paths have a deterministic phase.
+        topology: What depends on the connectivity only.
+    """
+
+    vertices: Float64[Tensor, "v 3"]
+    faces: Int64[Tensor, "f 3"]
+    face_object: Int64[Tensor, " f"]
+    amplitude: Float64[Tensor, "object cos"]
+    diffuse: Float64[Tensor, " object"]
+    lobe: Float64[Tensor, " object"]
+    exponent: Float64[Tensor, " object"]
+    coherent: tuple[bool, ...]
+    topology: "Topology"
+
+    def corners(self, faces: Int64[Tensor, " n"]) -> tuple[Tensor, Tensor, Tensor]:
+        """The three corners of the given triangles, ``[n, 3]`` each."""
+        triangles = self.faces[faces]
+        return tuple(self.vertices[triangles[:, k]] for k in range(3))  # type: ignore[return-value]
+
+
+def flatten(scene: Scene, wavelength: float) -> Geometry:
+    """All objects of a scene in one set of tables."""
+    objects = list(scene.objects.values())
+    faces, owners, offset = [], [], 0
+    for index, item in enumerate(objects):
+        faces.append(item.mesh.faces + offset)
+        owners.append(torch.full((len(item.mesh.faces),), index))
+        offset += len(item.mesh.vertices)
+    from invertwin.constants import SPEED_OF_LIGHT
+
+    surfaces = [item.material.surface(SPEED_OF_LIGHT / wavelength) for item in objects]
+    vertices = torch.cat([item.vertices for item in objects])
+    key = (_VARIANTS[backend()], *(id(item.mesh.faces) for item in objects))
+    topology = _topology(key, [item.mesh.faces for item in objects], faces, owners, vertices)
+    return Geometry(
+        vertices=vertices,
+        faces=topology.faces,
+        face_object=topology.face_object,
+        amplitude=torch.stack([s.amplitude for s in surfaces]),
+        diffuse=torch.stack([s.diffuse for s in surfaces]),
+        lobe=torch.stack([s.lobe for s in surfaces]),
+        exponent=torch.stack([s.exponent for s in surfaces]),
+        coherent=tuple(item.material.coherent for item in objects),
+        topology=topology,
+    )
+
+
+class Topology:
+    """Connectivity of a flattened scene and the ray tracer's copy of it.
+
+    The acceleration structure is rebuilt only when the vertices differ from the last upload.
+    """
+
+    def __init__(self, faces: Tensor, face_object: Tensor, vertices: Tensor) -> None:
+        mi = tracer()
+        self.faces = faces
+        self.face_object = face_object
+        self.edges, self.opposite = edges_of(faces.numpy(), vertices.detach().numpy())
+        self.device_faces = to_index(faces)
+        self.device_face_object = to_index(face_object)
+        self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
+        self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
+        mesh = mi.Mesh("scene", vertex_count=len(vertices), face_count=len(faces))
+        self._parameters = mi.traverse(mesh)
+        self._parameters["faces"] = self.device_faces
+        self._uploaded: Tensor | None = None
+        self._mesh = mesh
+        self._scene: Any = None
+
+    def ray_scene(self, vertices: Tensor) -> Any:
+        """The Mitsuba scene with these vertices (float32, world or shifted coordinates)."""
+        mi = tracer()
+        if self._uploaded is not None and torch.equal(self._uploaded, vertices):
+            return self._scene
+        if self._scene is None:
+            self._parameters["vertex_positions"] = to_float(vertices)
+            self._parameters.update()
+            self._scene = mi.load_dict({"type": "scene", "mesh": self._mesh})
+            self._parameters = mi.traverse(self._scene)
+        else:
+            self._parameters["mesh.vertex_positions"] = to_float(vertices)
+            self._parameters.update()
+        self._uploaded = vertices.clone()
+        return self._scene
+
+
+_topologies: "OrderedDict[tuple, tuple[list[Tensor], Topology]]" = OrderedDict()
+
+
+def _topology(
+    key: tuple, owners: list[Tensor], faces: list[Tensor], objects: list[Tensor], vertices: Tensor
+) -> Topology:
+    """The cached topology; the entry holds the face tensors, so that their ids stay theirs."""
+    if key not in _topologies:
+        made = Topology(torch.cat(faces), torch.cat(objects), vertices)
+        _topologies[key] = (owners, made)
+        while len(_topologies) > _KEPT_TOPOLOGIES:
+            _topologies.popitem(last=False)
+    _topologies.move_to_end(key)
+    return _topologies[key][1]
+
+
+def edges_of(
+    faces: np.ndarray, vertices: np.ndarray
+) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"]]:
+    """Edges of a triangle mesh with the opposite vertex of every triangle at the edge.
+
+    Vertices at the same position count as one, so that a mesh with split vertices has no false
+    open edges. The second table has as many columns as the edge with most triangles (2 for a
+    manifold mesh); absent ones are −1.
+    """
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    welded = first[inverse.ravel()][faces]
+    corners = [(0, 1, 2), (1, 2, 0), (2, 0, 1)]
+    ends = np.concatenate([np.sort(welded[:, [a, b]], axis=1) for a, b, _ in corners])
+    apex = np.concatenate([welded[:, c] for _, _, c in corners])
+    proper = ends[:, 0] != ends[:, 1]
+    ends, apex = ends[proper], apex[proper]
+    edges, group, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(group.ravel(), kind="stable")
+    start = np.repeat(np.cumsum(counts) - counts, counts)
+    opposite = np.full((len(edges), counts.max(initial=1)), -1, dtype=np.int64)
+    opposite[group.ravel()[order], np.arange(len(order)) - start] = apex[order]
+    return torch.from_numpy(edges.astype(np.int64)), torch.from_numpy(opposite)

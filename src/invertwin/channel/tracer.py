@@ -1,0 +1,398 @@
+"""Explicit paths in torch, float64: power paths, and the fields of coherent and rough surfaces.
+
+The slow, readable twin of ``channel/kernel.py``, and the source of every exact signal: positions
+and lengths come from float64 vertices, so that the phase is right at millimetre waves.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import zlib
+from jaxtyping import Bool, Complex128, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.bridge import Geometry, flatten, to_torch, use_backend
+from invertwin.channel.boundary import Edge, edge_points, shadow_speed
+from invertwin.channel.paths import Link, Paths
+from invertwin.channel.sampling import RaySampler, Shot, face_areas, visible
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.scene.scene import Scene
+
+_GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
+
+
+@dataclass(frozen=True)
+class View:
+    """How the two antennas see surface points, one row a point (bistatic radar equation)."""
+
+    power: Float64[Tensor, " n"]  # received over transmitted power per m², by reflectance
+    mirror: Complex128[Tensor, " n"]  # field coefficient per m² of a perfect conductor
+    length: Float64[Tensor, " n"]  # TX to point to RX [m]
+
+
+def view(
+    geometry: Geometry,
+    link: Link,
+    frame: Int64[Tensor, " n"],
+    face: Int64[Tensor, " n"],
+    position: Float64[Tensor, "n 3"],
+    normal: Float64[Tensor, "n 3"],
+) -> View:
+    """Evaluate the radar equation and physical optics at surface points.
+
+    Physical optics of a perfect conductor: ``a = (λ/4π) S / (R_t R_r)`` with
+    ``S = −(jk/2π) ∫ (n·d)₊ V dA`` (derivations §4); for separate antennas ``n·d`` is the mean of
+    both cosines, which keeps reciprocity.
+    Differs from the source: the paper gives no field of a surface.
+    """
+    to_tx, to_rx = link.tx[frame] - position, link.rx[frame] - position
+    r_tx, r_rx = to_tx.norm(dim=1), to_rx.norm(dim=1)
+    w_tx, w_rx = to_tx / r_tx[:, None], to_rx / r_rx[:, None]
+    cos_tx, cos_rx = (normal * w_tx).sum(1), (normal * w_rx).sum(1)
+    lit = (cos_tx * cos_rx > 0).to(position)
+    rotation = link.rotations[frame]
+    gain = link.tx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -w_tx))
+    gain = gain * link.rx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -w_rx))
+    owner = geometry.face_object[face]
+    reflectance = _amplitude(geometry, owner, cos_tx) * _amplitude(geometry, owner, cos_rx)
+    half = (0.5 * (1 + 2 * cos_tx * cos_rx - (w_tx * w_rx).sum(1))).clamp_min(1e-7)
+    shape = geometry.diffuse[owner] / torch.pi
+    shape = shape + geometry.lobe[owner] * half ** geometry.exponent[owner]
+    spread = lit * gain / (r_tx * r_rx) ** 2
+    power = (link.wavelength / (4 * torch.pi)) ** 2 * spread * reflectance * shape
+    facing = 0.5 * (cos_tx + cos_rx).abs()
+    mirror = -1j / (4 * torch.pi) * spread.sqrt() * facing
+    return View(power * (cos_tx * cos_rx), mirror, r_tx + r_rx)
+
+
+def _amplitude(geometry: Geometry, owner: Tensor, cosine: Tensor) -> Tensor:
+    entries = geometry.amplitude.shape[1]
+    t = cosine.abs().clamp_max(1.0) * (entries - 1)
+    low = t.detach().long().clamp_max(entries - 2)
+    first, second = geometry.amplitude[owner, low], geometry.amplitude[owner, low + 1]
+    return first + (second - first) * (t - low)
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Detached samples in torch."""
+
+    frame: Int64[Tensor, " n"]
+    face: Int64[Tensor, " n"]
+    b1: Float64[Tensor, " n"]
+    b2: Float64[Tensor, " n"]
+    weight: Float64[Tensor, " n"]
+
+    def keep(self, mask: Bool[Tensor, " n"]) -> "_Points":
+        return _Points(*(column[mask] for column in vars(self).values()))
+
+    def place(self, geometry: Geometry) -> tuple[Tensor, Tensor, Tensor]:
+        """Attached position, unit normal, and Jacobian of the area."""
+        p0, p1, p2 = geometry.corners(self.face)
+        b1, b2 = self.b1[:, None], self.b2[:, None]
+        normal = torch.linalg.cross(p1 - p0, p2 - p0)
+        double_area = normal.norm(dim=1)
+        jacobian = double_area / double_area.detach()
+        return p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2, normal / double_area[:, None], jacobian
+
+
+def trace_power(
+    scene: Scene,
+    link: Link,
+    *,
+    samples: int,
+    boundary_samples: int = 0,
+    seed: int,
+    boundary: bool = True,
+    backend: str | None = None,
+) -> Paths:
+    """Power paths by rays from the antenna, as explicit rows; for inspection and as an oracle.
+
+    The same samples, in the same sense, as :func:`invertwin.channel.deposit.deposit_power`.
+
+    Raises:
+        InputError: See ``deposit_power``.
+    """
+    with use_backend(backend):
+        geometry = flatten(scene, link.wavelength)
+        shot = Shot(geometry, link)
+        sampler = RaySampler(shot, samples, seed)
+        points = _drawn(sampler)
+        points = points.keep(points.weight > 0)
+        position, normal, jacobian = points.place(geometry)
+        seen = view(geometry, link, points.frame, points.face, position, normal)
+        power = seen.power * jacobian * points.weight
+        inner = _paths(points.frame, seen.length, position, "power", power=power)
+        if not (boundary and boundary_samples):
+            return inner
+
+        def value(edge: Edge, found: View) -> Paths:
+            amount = found.power.detach() * edge.speed
+            return _paths(
+                edge.frame,
+                found.length,
+                edge.shadow,
+                "power",
+                power=amount - amount.detach(),
+                boundary=True,
+            )
+
+        return inner + _boundary_paths(geometry, link, shot, boundary_samples, seed, value)
+
+
+@dataclass(frozen=True)
+class RoughPoints:
+    """The fixed material points of rough surfaces, with their phases.
+
+    They belong to the surfaces: never drawn again between chirps, poses, looks or iterations.
+
+    Attributes:
+        face, b1, b2: Place on the surface.
+        phase: Uniform in [0, 2π), a hash of object, triangle, number of the point and seed.
+        density: Points per m² of the scene they were drawn on.
+    """
+
+    face: Int64[Tensor, " n"]
+    b1: Float64[Tensor, " n"]
+    b2: Float64[Tensor, " n"]
+    phase: Float64[Tensor, " n"]
+    density: float
+
+
+def rough_points(scene: Scene, density: float, seed: int) -> RoughPoints:
+    """Draw the material points of all rough objects.
+
+    Args:
+        scene: Surfaces to cover.
+        density: Points per m².
+        seed: Hash key.
+
+    Raises:
+        InputError: A density that is not positive.
+    """
+    if not density > 0:
+        raise InputError(f"expected density > 0 points per m², got {density}; try 2e4")
+    columns: list[list[np.ndarray]] = [[], [], [], []]
+    offset = 0
+    for name, item in scene.objects.items():
+        triangles = item.vertices.detach()[item.mesh.faces]
+        edges = triangles[:, 1:] - triangles[:, :1]
+        area = 0.5 * torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=1).numpy()
+        if not item.material.coherent:
+            key = np.uint64(zlib.crc32(name.encode()) ^ (seed * 0x9E3779B97F4A7C15 & (2**64 - 1)))
+            face = np.arange(len(area), dtype=np.uint64)
+            expected = area * density
+            count = np.floor(expected + _hash(key, face, face * 0, 0)).astype(np.int64)
+            face = np.repeat(face, count)
+            number = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+            draws = [_hash(key, face, number.astype(np.uint64), stream) for stream in (1, 2, 3)]
+            fold = draws[0] + draws[1] > 1
+            columns[0].append(face.astype(np.int64) + offset)
+            columns[1].append(np.where(fold, 1 - draws[0], draws[0]))
+            columns[2].append(np.where(fold, 1 - draws[1], draws[1]))
+            columns[3].append(2 * np.pi * draws[2])
+        offset += len(area)
+    joined = [
+        torch.from_numpy(np.concatenate(c)) if c else torch.zeros(0, dtype=torch.float64)
+        for c in columns
+    ]
+    return RoughPoints(joined[0].long(), joined[1], joined[2], joined[3], density)
+
+
+def _hash(key: np.uint64, first: np.ndarray, second: np.ndarray, stream: int) -> np.ndarray:
+    """Uniform numbers in [0, 1): SplitMix64 over the words of the key."""
+    with np.errstate(over="ignore"):
+        state = np.full(first.shape, key, dtype=np.uint64)
+        for word in (first, second, np.full(first.shape, stream, dtype=np.uint64)):
+            state = state + np.uint64(0x9E3779B97F4A7C15) + word
+            state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            state = state ^ (state >> np.uint64(31))
+    return (state >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+def trace_field(
+    scene: Scene,
+    link: Link,
+    *,
+    samples: int = 100_000,
+    density: float = 20_000.0,
+    points: RoughPoints | None = None,
+    boundary_samples: int = 0,
+    seed: int,
+    boundary: bool = True,
+    backend: str | None = None,
+) -> Paths:
+    """Field paths: physical optics for conductors, fixed random-phase points for rough surfaces.
+
+    Args:
+        scene: What is seen.
+        link: Antennas, per frame.
+        samples: Samples per frame over all coherent objects (a converging integral).
+        density: Rough points per m² (used where ``points`` is not given).
+        points: The rough points to use, so that they stay while the scene moves.
+        boundary_samples: Silhouette samples of the coherent objects.
+        seed: Places and phases.
+        boundary: Off leaves fixed-visibility derivatives alone.
+        backend: See ``deposit_power``.
+
+    Source: derivations §4.
+    Differs from the source: rough fields have fixed points, not new phases every evaluation.
+
+    Raises:
+        InputError: A derivative of rough field paths with ``boundary`` on: single points appear
+            and vanish, so a realisation has no boundary term. Use power paths, or switch
+            ``boundary`` off to accept fixed visibility.
+    """
+    with use_backend(backend):
+        geometry = flatten(scene, link.wavelength)
+        shot = Shot(geometry, link)
+        parts = []
+        if any(geometry.coherent):
+            parts.append(_coherent(geometry, link, shot, samples, seed))
+            if boundary and boundary_samples:
+
+                def value(edge: Edge, found: View) -> Paths:
+                    amount = found.mirror.detach() * edge.speed
+                    on = torch.tensor(geometry.coherent)[geometry.face_object[edge.face]]
+                    return _paths(
+                        edge.frame,
+                        found.length,
+                        edge.shadow,
+                        "coherent",
+                        coefficient=(amount - amount.detach()) * on,
+                        boundary=True,
+                    )
+
+                parts.append(_boundary_paths(geometry, link, shot, boundary_samples, seed, value))
+        if not all(geometry.coherent):
+            if boundary and (geometry.vertices.requires_grad or link.tx.requires_grad):
+                raise InputError(
+                    "expected no geometry derivative of rough field paths, got one: single points "
+                    "appear and vanish; use power paths, or boundary=False for fixed visibility"
+                )
+            fixed = points or rough_points(scene, density, seed)
+            parts.append(_rough(geometry, link, shot, fixed))
+        joined = parts[0]
+        for part in parts[1:]:
+            joined = joined + part
+        return joined
+
+
+def _coherent(geometry: Geometry, link: Link, shot: Shot, samples: int, seed: int) -> Paths:
+    """Physical optics of the coherent objects by low-discrepancy area samples (1/N)."""
+    areas = face_areas(geometry)
+    areas = areas * torch.tensor(geometry.coherent)[geometry.face_object]
+    shift = np.random.default_rng(seed).random(3)
+    index = np.arange(samples)
+    edges = np.cumsum(areas.numpy())
+    face = np.searchsorted(edges, (index + shift[0]) / samples * edges[-1], side="right")
+    face = np.minimum(face, len(edges) - 1)
+    b1, b2 = ((0.5 + shift[1 + k] + index * _GOLDEN[k]) % 1.0 for k in range(2))
+    fold = b1 + b2 > 1
+    frames = link.frame_count
+    points = _Points(
+        frame=torch.arange(frames).repeat_interleave(samples),
+        face=torch.from_numpy(face).repeat(frames),
+        b1=torch.from_numpy(np.where(fold, 1 - b1, b1)).repeat(frames),
+        b2=torch.from_numpy(np.where(fold, 1 - b2, b2)).repeat(frames),
+        weight=torch.full((frames * samples,), float(edges[-1]) / samples, dtype=torch.float64),
+    )
+    points, position, normal, jacobian = _seen(geometry, link, shot, points)
+    found = view(geometry, link, points.frame, points.face, position, normal)
+    coefficient = found.mirror * (jacobian * points.weight)
+    return _paths(points.frame, found.length, position, "coherent", coefficient=coefficient)
+
+
+def _rough(geometry: Geometry, link: Link, shot: Shot, fixed: RoughPoints) -> Paths:
+    """Fields of the rough points: amplitude sqrt(f/ρ), phase of the material point."""
+    frames, count = link.frame_count, len(fixed.face)
+    points = _Points(
+        frame=torch.arange(frames).repeat_interleave(count),
+        face=fixed.face.repeat(frames),
+        b1=fixed.b1.repeat(frames),
+        b2=fixed.b2.repeat(frames),
+        weight=fixed.phase.repeat(frames),
+    )
+    points, position, normal, jacobian = _seen(geometry, link, shot, points)
+    found = view(geometry, link, points.frame, points.face, position, normal)
+    amplitude = (found.power * jacobian / fixed.density).sqrt()
+    coefficient = torch.polar(amplitude, points.weight)
+    return _paths(points.frame, found.length, position, "rough", coefficient=coefficient)
+
+
+def _seen(
+    geometry: Geometry, link: Link, shot: Shot, points: _Points
+) -> tuple[_Points, Tensor, Tensor, Tensor]:
+    """The points that both antennas see from the same side, and their places."""
+    with torch.no_grad():
+        position, normal, _ = points.place(geometry)
+        to_tx, to_rx = link.tx[points.frame] - position, link.rx[points.frame] - position
+        keep = (normal * to_tx).sum(1) * (normal * to_rx).sum(1) > 0
+        keep &= visible(shot, link.tx[points.frame], position)
+        if not link.shared_visibility:
+            keep &= visible(shot, link.rx[points.frame], position)
+    points = points.keep(keep)
+    return points, *points.place(geometry)
+
+
+def _boundary_paths(
+    geometry: Geometry,
+    link: Link,
+    shot: Shot,
+    samples: int,
+    seed: int,
+    value: Callable[[Edge, View], Paths],
+) -> Paths:
+    """Boundary rows of all antenna segments; ``value`` turns an edge point into a path."""
+    centres = ("tx",) if link.shared_visibility else ("tx", "rx")
+    parts = []
+    for stream, centre in enumerate(centres):
+        found = edge_points(shot, centre, samples // len(centres), seed + stream)
+        edge = shadow_speed(geometry, link, shot, found, centre)
+        seen = view(geometry, link, edge.frame, edge.face, edge.shadow, edge.normal)
+        seen = View(seen.power.detach(), seen.mirror.detach(), seen.length.detach())
+        parts.append(value(edge, seen))
+    joined = parts[0]
+    for part in parts[1:]:
+        joined = joined + part
+    return joined
+
+
+def _drawn(sampler: Any) -> _Points:
+    import drjit as dr
+
+    from invertwin.channel.bridge import tracer
+
+    drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size))
+    frame, face, b1, b2, weight = (to_torch(column) for column in vars(drawn).values())
+    return _Points(frame.long(), face.long(), b1.double(), b2.double(), weight.double())
+
+
+def _paths(
+    frame: Tensor,
+    length: Tensor,
+    position: Tensor,
+    kind: str,
+    *,
+    power: Tensor | None = None,
+    coefficient: Tensor | None = None,
+    boundary: bool = False,
+) -> Paths:
+    count = len(frame)
+    return Paths(
+        frame=frame,
+        delay=length / SPEED_OF_LIGHT,
+        coefficient=torch.zeros(count, dtype=torch.complex128)
+        if coefficient is None
+        else coefficient,
+        power=torch.zeros(count, dtype=torch.float64) if power is None else power,
+        first=position,
+        last=position,
+        kind=kind,
+        boundary=torch.full((count,), boundary),
+    )
