@@ -1,0 +1,100 @@
+# Every target sets up what it needs in .venv on first use; a second call does no set-up work.
+# Needs Python ≥ 3.11 (choose one with `make PYTHON=python3.12 ...`); the rest is fetched.
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# apt-get, where we may: as root, or with a sudo that asks for no password.
+SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo -n)
+MAY_APT := command -v apt-get >/dev/null && $(SUDO) true 2>/dev/null
+APT := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -q
+LLVM_USABLE := $(BIN)/python -c 'from invertwin import doctor; doctor.require()' 2>/dev/null
+NEW_ENOUGH := -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
+
+.PHONY: help demo test test-fast test-gpu check format bench clean
+
+help:
+	@echo 'make demo       find a hidden letter from its radar echoes (under 5 minutes)'
+	@echo 'make test       all tests but those that need a GPU'
+	@echo 'make test-fast  the quick ones'
+	@echo 'make test-gpu   those that need a GPU'
+	@echo 'make check      format, lint, types, import arrows'
+	@echo 'make format     let ruff format and sort'
+	@echo 'make bench      speed and memory, ours and peers'"'"
+	@echo 'make clean      remove .venv and caches; results in out/ stay'
+
+demo: .venv/.run .venv/.llvm
+	$(BIN)/invertwin demo
+
+test: .venv/.dev .venv/.llvm
+	$(BIN)/python -m pytest -m 'not gpu'
+
+test-fast: .venv/.dev .venv/.llvm
+	$(BIN)/python -m pytest -m 'not gpu and not slow'
+
+test-gpu: .venv/.dev .venv/.llvm
+	$(BIN)/python -m pytest -m gpu
+
+check: .venv/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/python -m pytest -q tests/test_architecture.py
+
+format: .venv/.dev
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+bench: .venv/.bench .venv/.llvm
+	@set -e; for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python "$$script"; done
+
+clean:
+	rm -rf .venv .pytest_cache .ruff_cache
+
+$(BIN)/python:
+	@set -e; \
+	python=; \
+	for name in $(PYTHON) python3 python3.14 python3.13 python3.12 python3.11; do \
+	    if $$name $(NEW_ENOUGH); then python=$$name; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	    echo 'expected Python 3.11 or newer, found none; type: sudo apt-get install python3'; exit 1; \
+	fi; \
+	if ! $$python -c 'import ensurepip' 2>/dev/null; then \
+	    package=$$($$python -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'); \
+	    if $(MAY_APT); then $(APT) update && $(APT) install -y $$package; \
+	    else echo "$$python has no venv; type: sudo apt-get install $$package"; exit 1; fi; \
+	fi; \
+	echo "set-up: .venv with $$($$python --version)"; \
+	$$python -m venv .venv || { rm -rf .venv; exit 1; }
+
+# torch first and alone: the one large package, and the one with builds for CPU or GPU to choose
+# from by pip's own settings.
+.venv/.run: pyproject.toml constraints.txt | $(BIN)/python
+	@echo 'set-up: invertwin and what it stands on (first PyTorch, some 200 MB or more)'
+	@$(PIP) install "$$(grep '^torch==' constraints.txt)"
+	@$(PIP) install --constraint constraints.txt --editable .
+	@touch $@
+
+.venv/.dev: .venv/.run
+	@echo 'set-up: tools for tests and checks'
+	@$(PIP) install --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+.venv/.bench: .venv/.run
+	@echo 'set-up: peers for the benchmarks'
+	@$(PIP) install --constraint constraints.txt --editable '.[bench]'
+	@touch $@
+
+# libllvm19 is what we test with; a system that no longer has it offers a newer one.
+.venv/.llvm: .venv/.run
+	@if ! $(LLVM_USABLE) && $(MAY_APT); then \
+	    echo 'set-up: libLLVM, which compiles the ray tracing kernels'; \
+	    $(APT) update; \
+	    for version in 19 20 21 18; do \
+	        $(APT) install -y libllvm$$version && $(LLVM_USABLE) && break; \
+	    done; \
+	fi; \
+	$(LLVM_USABLE) || { \
+	    $(BIN)/python -c 'from invertwin import doctor; print(doctor.render(doctor.report()))'; \
+	    exit 1; }
+	@touch $@
