@@ -1,0 +1,96 @@
+"""report.html: one file that opens anywhere, pictures inside."""
+
+import base64
+import html
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
+       color: #1b1f24; background: #fff; }
+h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
+p.status { font-size: 1.05rem; } img { max-width: 100%; height: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { border-bottom: 1px solid #d8dce2; padding: .25rem .8rem; text-align: right; }
+th:first-child, td:first-child { text-align: left; } thead th { border-bottom-color: #6b7280; }
+div.wide { overflow-x: auto; } pre { background: #f4f5f7; padding: 1rem; overflow-x: auto; }
+"""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report; cells are text or numbers."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the report, as PNG bytes."""
+
+    title: str
+    png: bytes
+    note: str = ""
+
+
+def report_html(
+    title: str, status: str, parts: Sequence[Table | Picture], run_file: str | Mapping[str, str]
+) -> str:
+    """The report as one HTML text that loads nothing from elsewhere.
+
+    Args:
+        title: Heading.
+        status: What came out, in a sentence.
+        parts: Tables and pictures in reading order.
+        run_file: The run file as used, or several by name.
+    """
+    body = [f"<h1>{html.escape(title)}</h1>", f'<p class="status">{html.escape(status)}</p>']
+    for part in parts:
+        body.append(f"<h2>{html.escape(part.title)}</h2>")
+        body.append(_table(part) if isinstance(part, Table) else _image(part))
+        if part.note:
+            body.append(f"<p>{html.escape(part.note)}</p>")
+    files = {"Run file": run_file} if isinstance(run_file, str) else run_file
+    for name, text in files.items():
+        body.append(f"<details><summary>{html.escape(name)}</summary>")
+        body.append(f"<pre>{html.escape(text)}</pre></details>")
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>\n<body>\n"
+        + "\n".join(body)
+        + "\n</body></html>\n"
+    )
+
+
+def shown(value: Any) -> str:
+    """A cell as people read it: four significant digits, yes and no, a dash for nothing."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}" if math.isfinite(value) else "–"
+    if isinstance(value, list | tuple):
+        return ", ".join(shown(item) for item in value)
+    return str(value)
+
+
+def _table(table: Table) -> str:
+    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
+    rows = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(shown(cell))}</td>" for cell in row) + "</tr>\n"
+        for row in table.rows
+    )
+    inner = f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
+    return f'<div class="wide"><table>{inner}</table></div>'
+
+
+def _image(picture: Picture) -> str:
+    data = base64.b64encode(picture.png).decode("ascii")
+    return f'<img alt="{html.escape(picture.title)}" src="data:image/png;base64,{data}">'

@@ -1,0 +1,728 @@
+"""The one schema of TOML run files: SI units, names as in the library, angles in `_deg` keys.
+
+Nothing here imports torch or Mitsuba: a wrong key is reported before anything heavy loads.
+"""
+
+import difflib
+import json
+import os
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from invertwin.errors import InputError
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+def _beside_run_file(name: str, info: Any) -> str:
+    """Relative paths start at the run file's folder, then at the folder INVERTWIN_DATA."""
+    folders = [(info.context or {}).get("folder", Path()), os.environ.get("INVERTWIN_DATA")]
+    paths = [Path(folder, name).absolute() for folder in folders if folder is not None]
+    return str(next((path for path in paths if path.exists()), paths[0]))
+
+
+InputPath = Annotated[str, Field(min_length=1), AfterValidator(_beside_run_file)]
+Interval = Annotated[list[NonNegative], Field(min_length=2, max_length=2)]
+
+
+# Pydantic puts the tag of a union into an error's location; the mark tells it from a key.
+_MARK = "\0"
+
+
+def _tag_by(*keys: str) -> Discriminator:
+    """A union's member by the first of `keys` that is present: its value if it is `kind` or
+    `shape`, else the key itself."""
+
+    def tag(value: Any) -> str | None:
+        if isinstance(value, list):
+            return _MARK + "points"
+        for key in keys:
+            found = value.get(key) if isinstance(value, dict) else getattr(value, key, None)
+            if found is not None:
+                return _MARK + (str(found) if key in ("kind", "shape") else key)
+        return None
+
+    tag.__name__ = ",".join(keys)  # pydantic quotes it in its errors, and `_explain` reads it
+    return Discriminator(tag)
+
+
+class Section(BaseModel):
+    """A table of the run file; keys it does not know are errors that name the nearest match."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys_only(cls, data: Any) -> Any:
+        # Pydantic's own error for an extra key does not carry the keys that are allowed.
+        if isinstance(data, dict):
+            for key in data:
+                if key not in cls.model_fields:
+                    raise PydanticCustomError(
+                        "unknown_key",
+                        "unknown key",
+                        {"key": key, "allowed": list(cls.model_fields)},
+                    )
+        return data
+
+
+# ---------------------------------------------------------------------------------- materials
+
+
+class RoughDielectric(Section):
+    """A rough surface of a dielectric."""
+
+    kind: Literal["rough_dielectric"]
+    permittivity: Annotated[float, Field(ge=1)]
+    conductivity: NonNegative = 0.0  # S/m
+    diffuse: Annotated[float, Field(ge=0, le=1)] = 1.0
+    lobe_width_deg: Positive | None = None
+
+
+class PerfectConductor(Section):
+    """A smooth perfect conductor."""
+
+    kind: Literal["perfect_conductor"]
+    lobe_width_deg: Positive | None = None
+
+
+Material = Annotated[
+    Annotated[RoughDielectric, Tag(_MARK + "rough_dielectric")]
+    | Annotated[PerfectConductor, Tag(_MARK + "perfect_conductor")],
+    _tag_by("kind"),
+]
+
+
+# -------------------------------------------------------------------------------------- scene
+
+
+class Placement(Section):
+    """Where a shape stands: scaled, then rotated about its own origin, then moved."""
+
+    position: Vector = [0.0, 0.0, 0.0]  # m
+    rotation_deg: Vector = [0.0, 0.0, 0.0]  # rotation vector
+    scale: Positive = 1.0
+
+
+class Plate(Placement):
+    shape: Literal["plate"]
+    width: Positive
+    height: Positive
+    divisions: Count = 1
+
+
+class Box(Placement):
+    shape: Literal["box"]
+    size: Annotated[list[Positive], Field(min_length=3, max_length=3)]
+    divisions: Count = 1
+
+
+class Sphere(Placement):
+    shape: Literal["sphere"]
+    radius: Positive
+    subdivisions: Annotated[int, Field(ge=0, le=8)] = 4
+
+
+class Dihedral(Placement):
+    shape: Literal["dihedral"]
+    edge: Positive
+
+
+class Trihedral(Placement):
+    shape: Literal["trihedral"]
+    edge: Positive
+
+
+class Text(Placement):
+    shape: Literal["text"]
+    text: Annotated[str, Field(min_length=1)]
+    size: Positive = 0.6
+    depth: Positive = 0.12
+    max_edge: Positive = 0.06
+
+
+class File(Placement):
+    """A mesh file: OBJ, PLY, STL or glTF."""
+
+    file: InputPath
+
+
+Part = Annotated[
+    Annotated[Plate, Tag(_MARK + "plate")]
+    | Annotated[Box, Tag(_MARK + "box")]
+    | Annotated[Sphere, Tag(_MARK + "sphere")]
+    | Annotated[Dihedral, Tag(_MARK + "dihedral")]
+    | Annotated[Trihedral, Tag(_MARK + "trihedral")]
+    | Annotated[Text, Tag(_MARK + "text")]
+    | Annotated[File, Tag(_MARK + "file")],
+    _tag_by("shape", "parts", "file"),
+]
+
+
+class Parts(Placement):
+    """Several shapes as one rigid object of one material."""
+
+    parts: Annotated[list[Part], Field(min_length=1)]
+
+
+class Body(Section):
+    """What makes a shape an object of the scene."""
+
+    material: Material
+    velocity: Vector | None = None  # m/s
+
+
+class PlateObject(Plate, Body):
+    pass
+
+
+class BoxObject(Box, Body):
+    pass
+
+
+class SphereObject(Sphere, Body):
+    pass
+
+
+class DihedralObject(Dihedral, Body):
+    pass
+
+
+class TrihedralObject(Trihedral, Body):
+    pass
+
+
+class TextObject(Text, Body):
+    pass
+
+
+class FileObject(File, Body):
+    pass
+
+
+class PartsObject(Parts, Body):
+    pass
+
+
+SceneObject = Annotated[
+    Annotated[PlateObject, Tag(_MARK + "plate")]
+    | Annotated[BoxObject, Tag(_MARK + "box")]
+    | Annotated[SphereObject, Tag(_MARK + "sphere")]
+    | Annotated[DihedralObject, Tag(_MARK + "dihedral")]
+    | Annotated[TrihedralObject, Tag(_MARK + "trihedral")]
+    | Annotated[TextObject, Tag(_MARK + "text")]
+    | Annotated[FileObject, Tag(_MARK + "file")]
+    | Annotated[PartsObject, Tag(_MARK + "parts")],
+    _tag_by("shape", "parts", "file"),
+]
+
+
+class Truth(Section):
+    """Where an object really is: replaces the placement of its scene table, key by key."""
+
+    position: Vector | None = None
+    rotation_deg: Vector | None = None
+    scale: Positive | None = None
+
+
+# -------------------------------------------------------------------------------------- radar
+
+
+class Fmcw(Section):
+    kind: Literal["fmcw"]
+    start_frequency: Positive  # Hz
+    bandwidth: Positive  # Hz
+    duration: Positive  # s
+    samples: Count
+
+
+class Impulse(Section):
+    kind: Literal["impulse"]
+    center_frequency: Positive  # Hz
+    bandwidth: Positive  # Hz
+
+
+Waveform = Annotated[
+    Annotated[Fmcw, Tag(_MARK + "fmcw")] | Annotated[Impulse, Tag(_MARK + "impulse")],
+    _tag_by("kind"),
+]
+
+
+class Isotropic(Section):
+    kind: Literal["isotropic"]
+
+
+class Cosine(Section):
+    """Power pattern cosⁿ of the angle from boresight."""
+
+    kind: Literal["cosine"]
+    exponent: NonNegative
+
+
+Pattern = Annotated[
+    Annotated[Isotropic, Tag(_MARK + "isotropic")] | Annotated[Cosine, Tag(_MARK + "cosine")],
+    _tag_by("kind"),
+]
+
+
+class ArraySection(Section):
+    """Antenna elements in the radar frame (x right, y up, z boresight)."""
+
+    center: Vector = [0.0, 0.0, 0.0]  # m
+    pattern: Pattern = Isotropic(kind="isotropic")
+
+
+class PlanarArray(ArraySection):
+    kind: Literal["planar"]
+    count: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    spacing: Annotated[list[Positive], Field(min_length=2, max_length=2)]  # m
+
+
+class LinearArray(ArraySection):
+    kind: Literal["linear"]
+    count: Count
+    spacing: Positive  # m
+    axis: Literal["x", "y"] = "x"
+
+
+class PositionArray(ArraySection):
+    kind: Literal["positions"]
+    positions: Annotated[list[Vector], Field(min_length=1)]  # m
+
+
+Array = Annotated[
+    Annotated[PlanarArray, Tag(_MARK + "planar")]
+    | Annotated[LinearArray, Tag(_MARK + "linear")]
+    | Annotated[PositionArray, Tag(_MARK + "positions")],
+    _tag_by("kind"),
+]
+
+
+class LineTrack(Section):
+    kind: Literal["line"]
+    start: Vector  # m
+    stop: Vector  # m
+    count: Count
+
+
+class ArcTrack(Section):
+    """A level arc about `center`; 0° is on its −z side, 90° on its +x side."""
+
+    kind: Literal["arc"]
+    center: Vector  # m
+    radius: Positive  # m
+    start_deg: float
+    stop_deg: float
+    count: Count
+
+
+class GridTrack(Section):
+    """An upright rectangle of positions in the x-y plane through `center`."""
+
+    kind: Literal["grid"]
+    center: Vector  # m
+    size: Annotated[list[NonNegative], Field(min_length=2, max_length=2)]  # m along x, y
+    count: Annotated[list[Count], Field(min_length=2, max_length=2)]
+
+
+Track = Annotated[
+    Annotated[Annotated[list[Vector], Field(min_length=1)], Tag(_MARK + "points")]
+    | Annotated[LineTrack, Tag(_MARK + "line")]
+    | Annotated[ArcTrack, Tag(_MARK + "arc")]
+    | Annotated[GridTrack, Tag(_MARK + "grid")],
+    _tag_by("kind"),
+]
+
+
+class LookAt(Section):
+    look_at: Vector  # m
+
+
+class Turned(Section):
+    rotation_deg: Vector  # rotation vector, the same at every position
+
+
+Orientation = Annotated[
+    Annotated[LookAt, Tag(_MARK + "look_at")] | Annotated[Turned, Tag(_MARK + "rotation_deg")],
+    _tag_by("look_at", "rotation_deg"),
+]
+
+Window = Literal["hamming", "hann", "blackman", "rectangular"]
+
+
+class Radar(Section):
+    """Arrays, waveform and poses; one frame per position."""
+
+    waveform: Waveform
+    transmitters: Array
+    receivers: Array
+    window: Window = "hamming"
+    array_window: Window = "hamming"
+    positions: Track = [[0.0, 0.0, 0.0]]  # m
+    orientation: Orientation = Turned(rotation_deg=[0.0, 0.0, 0.0])
+    shared_visibility: bool | None = None
+
+
+class Grid(Section):
+    """The map that is compared: metres of range, direction cosines."""
+
+    range_min: NonNegative
+    range_max: Positive
+    u_max: Annotated[float, Field(gt=0, le=1)] = 1.0
+    v_max: Annotated[float, Field(gt=0, le=1)] = 1.0
+    oversample: Positive = 2.0
+
+
+# --------------------------------------------------------------------------------------- data
+
+
+class SimulatedData(Section):
+    """Exact signals of the true scene, with noise."""
+
+    kind: Literal["simulated"]
+    density: Positive  # rough points per m²
+    samples: Count = 200_000  # coherent paths
+    snr_db: float | None = None
+    noise_figure_db: float | None = None
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _one_noise_level(self) -> "SimulatedData":
+        if self.snr_db is not None and self.noise_figure_db is not None:
+            raise PydanticCustomError(
+                "two_noises", "expected snr_db or noise_figure_db, got both; remove one"
+            )
+        return self
+
+
+class CaptureData(Section):
+    """A capture saved by the library (NetCDF)."""
+
+    kind: Literal["capture"]
+    file: InputPath
+
+
+class RailSarData(Section):
+    """The public recording of an ultra-wideband radar on a rail."""
+
+    kind: Literal["rail_sar"]
+    folder: InputPath
+
+
+Data = Annotated[
+    Annotated[SimulatedData, Tag(_MARK + "simulated")]
+    | Annotated[CaptureData, Tag(_MARK + "capture")]
+    | Annotated[RailSarData, Tag(_MARK + "rail_sar")],
+    _tag_by("kind"),
+]
+
+
+# ---------------------------------------------------------------------------------- inversion
+
+
+class TranslationParameter(Section):
+    kind: Literal["translation"]
+    object: str
+
+
+class PoseParameter(Section):
+    kind: Literal["pose"]
+    object: str
+
+
+class ScaleParameter(Section):
+    kind: Literal["scale"]
+    object: str
+
+
+class VerticesParameter(Section):
+    """Free vertices, held together by a Laplacian term of this weight."""
+
+    kind: Literal["vertices"]
+    object: str
+    laplacian: NonNegative = 0.0
+
+
+class MaterialParameter(Section):
+    """Material values that are sought, from the values of the scene table."""
+
+    kind: Literal["material"]
+    object: str
+    values: Annotated[list[Literal["permittivity", "conductivity", "diffuse"]], Field(min_length=1)]
+
+
+class RadarParameter(Section):
+    kind: Literal["radar_pose"]
+
+
+Parameter = Annotated[
+    Annotated[TranslationParameter, Tag(_MARK + "translation")]
+    | Annotated[PoseParameter, Tag(_MARK + "pose")]
+    | Annotated[ScaleParameter, Tag(_MARK + "scale")]
+    | Annotated[VerticesParameter, Tag(_MARK + "vertices")]
+    | Annotated[MaterialParameter, Tag(_MARK + "material")]
+    | Annotated[RadarParameter, Tag(_MARK + "radar_pose")],
+    _tag_by("kind"),
+]
+
+
+class Starts(Section):
+    """Random starting poses about the true pose of one object."""
+
+    object: str
+    count: Count = 1
+    distance: Interval  # m
+    angle_deg: Interval = [0.0, 0.0]
+    directions: Literal["any", "level", "vertical_plane"] = "any"
+    axis: Vector | None = None  # rotation axis; without it any axis
+    seed: Seed = 0
+
+
+class Surrogate(Section):
+    """Kernels of the smooth model; the extra widths anneal to zero, in cells."""
+
+    range_kernel: Literal["response", "gaussian"] = "response"
+    angle_kernel: Literal["response", "airy"] = "response"
+    range_width: NonNegative = 0.0
+    angle_width: NonNegative = 0.0
+
+
+class Loss(Section):
+    levels: Count = 3
+    gain: Literal["fitted", "one"] = "fitted"
+
+
+class Optimizer(Section):
+    kind: Literal["adam", "sgd"] = "adam"
+    rate: Positive = 0.02
+    momentum: Annotated[float, Field(ge=0, lt=1)] = 0.9
+    final_rate: NonNegative | None = None  # the rate falls to this on the last step
+
+
+class Reconstruct(Section):
+    steps: Count
+    samples: Count = 400_000
+    boundary_samples: Count = 50_000
+    annealing: Annotated[float, Field(gt=0, le=1)] = 0.7  # share of the steps with extra width
+    frames_per_step: Count | None = None
+    nuisances: list[Literal["range_bias", "clock_offset", "background"]] = []
+    boundary: bool = True
+    also_interior_only: bool = False
+    position_limit: Positive = 0.03  # m, of a success
+    rotation_limit_deg: Positive = 3.0
+
+
+class Landscape(Section):
+    """Losses along a line through the truth, exact signal beside surrogate."""
+
+    object: str
+    axis: Vector
+    span: Positive  # m on either side
+    points: Annotated[int, Field(ge=3)] = 41
+    exact_points: Annotated[int, Field(ge=3)] = 201
+
+
+class GradientParameter(Section):
+    """The scalar of a gradient check, around the scene as written."""
+
+    kind: Literal["translation", "rotation", "scale", "radar_translation"]
+    object: str | None = None
+    axis: Vector | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> "GradientParameter":
+        if (self.kind != "radar_translation") != (self.object is not None):
+            raise PydanticCustomError(
+                "object",
+                "expected `object` with translation, rotation and scale, and only there; "
+                "add or remove it",
+            )
+        if (self.kind != "scale") != (self.axis is not None):
+            raise PydanticCustomError(
+                "axis",
+                "expected `axis` with every kind but scale, and only there; add or remove it",
+            )
+        return self
+
+
+class Gradcheck(Section):
+    parameter: GradientParameter
+    steps: Annotated[list[Positive], Field(min_length=2)]  # m, rad or 1, of the differences
+    noise: Positive = 0.007  # ‖standard error‖₁/‖g_FD‖₁ at which repeating stops
+    max_pairs: Count = 64
+    samples: Count = 2_000_000
+    boundary_samples: Count = 400_000
+
+
+# ----------------------------------------------------------------------------------- run file
+
+
+class RunFile(Section):
+    """A whole run file; which sections a command needs is checked by the command."""
+
+    task: Literal["simulate", "reconstruct", "gradcheck", "demo"]
+    title: str = ""
+    seed: Seed = 0
+    scene: Annotated[dict[str, SceneObject], Field(min_length=1)]
+    truth: dict[str, Truth] = {}
+    radar: Radar | None = None
+    grid: Grid | None = None
+    data: Data | None = None
+    parameters: list[Parameter] = []
+    starts: Starts | None = None
+    surrogate: Surrogate = Surrogate()
+    loss: Loss = Loss()
+    optimizer: Optimizer = Optimizer()
+    reconstruct: Reconstruct | None = None
+    landscape: Landscape | None = None
+    gradcheck: Gradcheck | None = None
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> "RunFile":
+        used = [(f"truth.{name}", name) for name in self.truth]
+        for i, parameter in enumerate(self.parameters):
+            if not isinstance(parameter, RadarParameter):
+                used.append((f"parameters[{i}].object", parameter.object))
+        for section in ("starts", "landscape"):
+            if getattr(self, section) is not None:
+                used.append((f"{section}.object", getattr(self, section).object))
+        if self.gradcheck is not None and self.gradcheck.parameter.object is not None:
+            used.append(("gradcheck.parameter.object", self.gradcheck.parameter.object))
+        for path, name in used:
+            if name not in self.scene:
+                raise PydanticCustomError(
+                    "unknown_object", "unknown object", {"path": path, "name": name}
+                )
+        return self
+
+
+def load_run(path: Path) -> RunFile:
+    """Reads and validates a run file.
+
+    Raises:
+        InputError: The file is missing, is not TOML, or does not fit the schema; the message
+            names the key's path, what is allowed there and the nearest match, in one line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(
+            f"expected a run file, got the path {path}, which does not exist; check the path"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"expected a readable run file, got {path}: {reason}; give a TOML text file"
+        ) from None
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(
+            f"expected TOML in {path}, got an error: {error}; correct that line"
+        ) from None
+    return validate(raw, path)
+
+
+def validate(raw: dict[str, Any], source: Path) -> RunFile:
+    """The run file of parsed TOML; `source` names it in errors and anchors relative paths.
+
+    Raises:
+        InputError: It does not fit the schema.
+    """
+    try:
+        return RunFile.model_validate(raw, context={"folder": source.parent})
+    except ValidationError as error:
+        errors = error.errors(include_url=False)
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        raise InputError(f"{source}: {_explain(errors[0])}{more}") from None
+
+
+def _explain(error: ErrorDetails) -> str:
+    """One pydantic error as `path: expected ..., got ...; do ...`."""
+    path = ""
+    for item in error["loc"]:
+        if isinstance(item, int):
+            path += f"[{item}]"
+        elif not item.startswith(_MARK):
+            path += f".{item}" if path else item
+    got = _shown(error["input"])
+    context = error.get("ctx", {})
+    match error["type"]:
+        case "unknown_key":
+            key, allowed = context["key"], context["allowed"]
+            return (
+                f"{path}.{key}".lstrip(".")
+                + f": expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
+                + _nearest(key, allowed, "remove the key")
+            )
+        case "unknown_object":
+            allowed = list(error["input"]["scene"])
+            return (
+                f"{context['path']}: expected the name of an object of the scene "
+                f"({', '.join(allowed)}), got {_shown(context['name'])}; "
+                + _nearest(context["name"], allowed, "add it to the scene")
+            )
+        case "union_tag_not_found":
+            keys = context["discriminator"].removesuffix("()").split(",")
+            present = list(error["input"]) if isinstance(error["input"], dict) else []
+            guesses = [k for p in present for k in difflib.get_close_matches(p, keys, n=1)]
+            advice = f"did you mean `{guesses[0]}`?" if guesses else f"add `{keys[0]}`"
+            return f"{path}: expected a table with the key {' or '.join(keys)}, got {got}; {advice}"
+        case "union_tag_invalid":
+            key = context["discriminator"].removesuffix("()").split(",")[0]
+            tags = [
+                t.strip(" '\"").replace("\\x00", "") for t in context["expected_tags"].split(",")
+            ]
+            allowed = [t.strip(_MARK) for t in tags if t.strip(_MARK) not in ("parts", "file")]
+            tag = context["tag"].strip(_MARK)
+            return (
+                f"{path}.{key}: expected one of {', '.join(allowed)}, got {_shown(tag)}; "
+                + _nearest(tag, allowed, "choose one")
+            )
+        case "literal_error":
+            allowed = [t.strip(" '") for t in context["expected"].replace(" or ", ", ").split(",")]
+            return f"{path}: expected one of {', '.join(allowed)}, got {got}; " + _nearest(
+                str(error["input"]), allowed, "choose one"
+            )
+        case "missing":
+            return f"{path}: expected a value, got nothing; add the key `{error['loc'][-1]}`"
+        case "too_short" | "too_long":
+            least = error["type"] == "too_short"
+            size = (
+                f"at least {context['min_length']}" if least else f"at most {context['max_length']}"
+            )
+            return f"{path}: expected {size} items, got {got}; correct the list"
+        case "two_noises" | "object" | "axis":
+            return f"{path}: {error['msg']}"
+    expected = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
+    return f"{path}: expected {expected}, got {got}; correct the value"
+
+
+def _shown(value: Any) -> str:
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except TypeError:
+        text = " ".join(str(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _nearest(given: str, allowed: list[str], otherwise: str) -> str:
+    close = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
+    return f"did you mean `{close[0]}`?" if close else otherwise

@@ -1,0 +1,149 @@
+"""Run files: what is accepted, and what the errors say."""
+
+from pathlib import Path
+
+import pytest
+
+from invertwin.cli.schema import RunFile, load_run, validate
+from invertwin.errors import InputError
+
+REPOSITORY = Path(__file__).parents[2]
+ROUGH = {"kind": "rough_dielectric", "permittivity": 4.0}
+
+
+def letter(**changes):
+    return {"shape": "text", "text": "A", "material": ROUGH} | changes
+
+
+def run(**changes):
+    return {"task": "reconstruct", "scene": {"letter": letter()}} | changes
+
+
+def error_of(raw) -> str:
+    with pytest.raises(InputError) as caught:
+        validate(raw, Path("run.toml"))
+    message = str(caught.value)
+    assert "\n" not in message
+    return message.removeprefix("run.toml: ")
+
+
+def radar(**changes):
+    element = {"kind": "positions", "positions": [[0, 0, 0]]}
+    waveform = {
+        "kind": "fmcw",
+        "start_frequency": 77e9,
+        "bandwidth": 2e9,
+        "duration": 5e-5,
+        "samples": 128,
+    }
+    return {"waveform": waveform, "transmitters": element, "receivers": element} | changes
+
+
+@pytest.mark.parametrize(
+    ("raw", "parts"),
+    [
+        (run(sede=1), ["sede: ", "task, title, seed", "did you mean `seed`?"]),
+        (
+            run(scene={"letter": {"shape": "text", "text": "A", "materail": ROUGH}}),
+            ["scene.letter.materail: ", "material, velocity, position", "did you mean `material`?"],
+        ),
+        (
+            run(scene={"letter": letter(shape="txet")}),
+            ["scene.letter.shape: ", "plate, box, sphere", 'got "txet"', "did you mean `text`?"],
+        ),
+        (
+            run(scene={"letter": {"sahpe": "text", "material": ROUGH}}),
+            ["scene.letter: ", "shape or parts or file", "did you mean `shape`?"],
+        ),
+        (run(scene={"letter": letter(size="big")}), ["scene.letter.size: ", "number", '"big"']),
+        (run(scene={"letter": letter(size=True)}), ["scene.letter.size: ", "number", "true"]),
+        (run(scene={"letter": letter(size=-1.0)}), ["scene.letter.size: ", "greater than 0"]),
+        (run(scene={"letter": letter(size=float("nan"))}), ["scene.letter.size: ", "finite"]),
+        (
+            run(scene={"letter": letter(position=[0, 1])}),
+            ["scene.letter.position: ", "at least 3", "[0, 1]"],
+        ),
+        (
+            run(
+                scene={"letter": letter(material={"kind": "rough_dielectric", "permitivity": 2.0})}
+            ),
+            ["scene.letter.material.permitivity: ", "did you mean `permittivity`?"],
+        ),
+        (
+            run(scene={"letter": letter(material={"kind": "rough"})}),
+            ["scene.letter.material.kind: ", "rough_dielectric, perfect_conductor"],
+        ),
+        (
+            run(scene={"slits": {"parts": [{"shape": "plate", "width": 1}], "material": ROUGH}}),
+            ["scene.slits.parts[0].height: ", "add the key `height`"],
+        ),
+        (run(scene={}), ["scene: ", "at least 1 item"]),
+        (run(radar=radar(window="haming")), ["radar.window: ", "did you mean `hamming`?"]),
+        (run(radar=radar(positions=[[0, 0, 0], [1, 0]])), ["radar.positions[1]: ", "at least 3"]),
+        (
+            run(radar=radar(positions={"kind": "line", "start": [0, 0, 0]})),
+            ["radar.positions.stop: ", "add the key `stop`"],
+        ),
+        (
+            run(radar=radar(orientation={"look_to": [0, 0, 1]})),
+            ["radar.orientation: ", "did you mean `look_at`?"],
+        ),
+        (
+            run(parameters=[{"kind": "pose", "object": "leter"}]),
+            ["parameters[0].object: ", "(letter)", "did you mean `letter`?"],
+        ),
+        (run(truth={"wall": {"scale": 2.0}}), ["truth.wall: ", "letter", "add it to the scene"]),
+        (
+            run(data={"kind": "simulated", "density": 1e3, "snr_db": 3, "noise_figure_db": 4}),
+            ["data: ", "got both"],
+        ),
+        (
+            run(task="reconstrct"),
+            ["task: ", "simulate, reconstruct", "did you mean `reconstruct`?"],
+        ),
+    ],
+)
+def test_errors_name_path_allowed_values_and_nearest_match(raw, parts):
+    message = error_of(raw)
+    assert message.startswith(parts[0])
+    for part in parts[1:]:
+        assert part in message
+
+
+def test_number_of_further_errors_is_said():
+    message = error_of(run(radar=radar(window="x", array_window="y")))
+    assert message.endswith("(and 1 more)")
+
+
+def test_files_are_looked_for_beside_the_run_file_then_in_the_data_folder(tmp_path, monkeypatch):
+    data = tmp_path / "data"
+    (data / "recording").mkdir(parents=True)
+    monkeypatch.setenv("INVERTWIN_DATA", str(data))
+    source = tmp_path / "runs" / "run.toml"
+    raw = run(
+        scene={"mesh": {"file": "mesh.obj", "material": ROUGH}},
+        data={"kind": "rail_sar", "folder": "recording"},
+    )
+    read = validate(raw, source)
+    assert read.scene["mesh"].model_dump()["file"] == str(tmp_path / "runs" / "mesh.obj")
+    assert read.data is not None
+    assert read.data.model_dump()["folder"] == str(data / "recording")
+
+
+def test_missing_file_folder_and_broken_toml_are_input_errors(tmp_path):
+    broken = tmp_path / "broken.toml"
+    broken.write_text("task = \n")
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    for path in (tmp_path / "none.toml", tmp_path, broken, binary):
+        with pytest.raises(InputError) as caught:
+            load_run(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((REPOSITORY / "experiments").rglob("*.toml")), ids=lambda path: path.stem
+)
+def test_every_run_file_of_the_repository_is_valid(path):
+    assert isinstance(load_run(path), RunFile)
