@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from invertwin.cli.runs import PREVIOUS, open_run, plain, to_toml
-from invertwin.cli.schema import RunFile, validate
+from invertwin.cli.run_file import to_toml, validate
+from invertwin.cli.runs import PREVIOUS, open_run, plain
+from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
 

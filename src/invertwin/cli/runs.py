@@ -8,12 +8,12 @@ import hashlib
 import json
 import math
 import os
-import re
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from invertwin.cli.run_file import to_toml
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
@@ -236,40 +236,3 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return plain(value.tolist())
     return str(value)
-
-
-def to_toml(run: RunFile) -> str:
-    """The run file as used, defaults filled in; reading it back gives an equal run file."""
-    lines: list[str] = []
-    for key, value in run.model_dump(exclude_none=True).items():
-        if key in ("scene", "truth"):
-            for name, table in value.items():
-                lines += ["", f"[{key}.{_key(name)}]", *_lines(table)]
-        elif isinstance(value, dict):
-            lines += ["", f"[{key}]", *_lines(value)]
-        elif key == "parameters":
-            for table in value:
-                lines += ["", f"[[{key}]]", *_lines(table)]
-        else:
-            lines += _lines({key: value})
-    return "\n".join(lines) + "\n"
-
-
-def _lines(table: Mapping[str, Any]) -> list[str]:
-    return [f"{_key(key)} = {_inline(value)}" for key, value in table.items()]
-
-
-def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _inline(key)
-
-
-def _inline(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(k)} = {_inline(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_inline, value)) + "]"
-    return repr(value)

@@ -3,10 +3,7 @@
 Nothing here imports torch or Mitsuba: a wrong key is reported before anything heavy loads.
 """
 
-import difflib
-import json
 import os
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,12 +14,9 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    ValidationError,
     model_validator,
 )
-from pydantic_core import ErrorDetails, PydanticCustomError
-
-from invertwin.errors import InputError
+from pydantic_core import PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -43,7 +37,7 @@ Interval = Annotated[list[NonNegative], Field(min_length=2, max_length=2)]
 
 
 # Pydantic puts the tag of a union into an error's location; the mark tells it from a key.
-_MARK = "\0"
+TAG_MARK = "→"
 
 
 def _tag_by(*keys: str) -> Discriminator:
@@ -52,14 +46,14 @@ def _tag_by(*keys: str) -> Discriminator:
 
     def tag(value: Any) -> str | None:
         if isinstance(value, list):
-            return _MARK + "points"
+            return TAG_MARK + "points"
         for key in keys:
             found = value.get(key) if isinstance(value, dict) else getattr(value, key, None)
             if found is not None:
-                return _MARK + (str(found) if key in ("kind", "shape") else key)
+                return TAG_MARK + (str(found) if key in ("kind", "shape") else key)
         return None
 
-    tag.__name__ = ",".join(keys)  # pydantic quotes it in its errors, and `_explain` reads it
+    tag.__name__ = ",".join(keys)  # pydantic quotes it in its errors, and run_file reads it
     return Discriminator(tag)
 
 
@@ -104,8 +98,8 @@ class PerfectConductor(Section):
 
 
 Material = Annotated[
-    Annotated[RoughDielectric, Tag(_MARK + "rough_dielectric")]
-    | Annotated[PerfectConductor, Tag(_MARK + "perfect_conductor")],
+    Annotated[RoughDielectric, Tag(TAG_MARK + "rough_dielectric")]
+    | Annotated[PerfectConductor, Tag(TAG_MARK + "perfect_conductor")],
     _tag_by("kind"),
 ]
 
@@ -165,13 +159,13 @@ class File(Placement):
 
 
 Part = Annotated[
-    Annotated[Plate, Tag(_MARK + "plate")]
-    | Annotated[Box, Tag(_MARK + "box")]
-    | Annotated[Sphere, Tag(_MARK + "sphere")]
-    | Annotated[Dihedral, Tag(_MARK + "dihedral")]
-    | Annotated[Trihedral, Tag(_MARK + "trihedral")]
-    | Annotated[Text, Tag(_MARK + "text")]
-    | Annotated[File, Tag(_MARK + "file")],
+    Annotated[Plate, Tag(TAG_MARK + "plate")]
+    | Annotated[Box, Tag(TAG_MARK + "box")]
+    | Annotated[Sphere, Tag(TAG_MARK + "sphere")]
+    | Annotated[Dihedral, Tag(TAG_MARK + "dihedral")]
+    | Annotated[Trihedral, Tag(TAG_MARK + "trihedral")]
+    | Annotated[Text, Tag(TAG_MARK + "text")]
+    | Annotated[File, Tag(TAG_MARK + "file")],
     _tag_by("shape", "parts", "file"),
 ]
 
@@ -222,14 +216,14 @@ class PartsObject(Parts, Body):
 
 
 SceneObject = Annotated[
-    Annotated[PlateObject, Tag(_MARK + "plate")]
-    | Annotated[BoxObject, Tag(_MARK + "box")]
-    | Annotated[SphereObject, Tag(_MARK + "sphere")]
-    | Annotated[DihedralObject, Tag(_MARK + "dihedral")]
-    | Annotated[TrihedralObject, Tag(_MARK + "trihedral")]
-    | Annotated[TextObject, Tag(_MARK + "text")]
-    | Annotated[FileObject, Tag(_MARK + "file")]
-    | Annotated[PartsObject, Tag(_MARK + "parts")],
+    Annotated[PlateObject, Tag(TAG_MARK + "plate")]
+    | Annotated[BoxObject, Tag(TAG_MARK + "box")]
+    | Annotated[SphereObject, Tag(TAG_MARK + "sphere")]
+    | Annotated[DihedralObject, Tag(TAG_MARK + "dihedral")]
+    | Annotated[TrihedralObject, Tag(TAG_MARK + "trihedral")]
+    | Annotated[TextObject, Tag(TAG_MARK + "text")]
+    | Annotated[FileObject, Tag(TAG_MARK + "file")]
+    | Annotated[PartsObject, Tag(TAG_MARK + "parts")],
     _tag_by("shape", "parts", "file"),
 ]
 
@@ -260,7 +254,7 @@ class Impulse(Section):
 
 
 Waveform = Annotated[
-    Annotated[Fmcw, Tag(_MARK + "fmcw")] | Annotated[Impulse, Tag(_MARK + "impulse")],
+    Annotated[Fmcw, Tag(TAG_MARK + "fmcw")] | Annotated[Impulse, Tag(TAG_MARK + "impulse")],
     _tag_by("kind"),
 ]
 
@@ -277,7 +271,7 @@ class Cosine(Section):
 
 
 Pattern = Annotated[
-    Annotated[Isotropic, Tag(_MARK + "isotropic")] | Annotated[Cosine, Tag(_MARK + "cosine")],
+    Annotated[Isotropic, Tag(TAG_MARK + "isotropic")] | Annotated[Cosine, Tag(TAG_MARK + "cosine")],
     _tag_by("kind"),
 ]
 
@@ -308,9 +302,9 @@ class PositionArray(ArraySection):
 
 
 Array = Annotated[
-    Annotated[PlanarArray, Tag(_MARK + "planar")]
-    | Annotated[LinearArray, Tag(_MARK + "linear")]
-    | Annotated[PositionArray, Tag(_MARK + "positions")],
+    Annotated[PlanarArray, Tag(TAG_MARK + "planar")]
+    | Annotated[LinearArray, Tag(TAG_MARK + "linear")]
+    | Annotated[PositionArray, Tag(TAG_MARK + "positions")],
     _tag_by("kind"),
 ]
 
@@ -343,10 +337,10 @@ class GridTrack(Section):
 
 
 Track = Annotated[
-    Annotated[Annotated[list[Vector], Field(min_length=1)], Tag(_MARK + "points")]
-    | Annotated[LineTrack, Tag(_MARK + "line")]
-    | Annotated[ArcTrack, Tag(_MARK + "arc")]
-    | Annotated[GridTrack, Tag(_MARK + "grid")],
+    Annotated[Annotated[list[Vector], Field(min_length=1)], Tag(TAG_MARK + "points")]
+    | Annotated[LineTrack, Tag(TAG_MARK + "line")]
+    | Annotated[ArcTrack, Tag(TAG_MARK + "arc")]
+    | Annotated[GridTrack, Tag(TAG_MARK + "grid")],
     _tag_by("kind"),
 ]
 
@@ -360,7 +354,8 @@ class Turned(Section):
 
 
 Orientation = Annotated[
-    Annotated[LookAt, Tag(_MARK + "look_at")] | Annotated[Turned, Tag(_MARK + "rotation_deg")],
+    Annotated[LookAt, Tag(TAG_MARK + "look_at")]
+    | Annotated[Turned, Tag(TAG_MARK + "rotation_deg")],
     _tag_by("look_at", "rotation_deg"),
 ]
 
@@ -427,9 +422,9 @@ class RailSarData(Section):
 
 
 Data = Annotated[
-    Annotated[SimulatedData, Tag(_MARK + "simulated")]
-    | Annotated[CaptureData, Tag(_MARK + "capture")]
-    | Annotated[RailSarData, Tag(_MARK + "rail_sar")],
+    Annotated[SimulatedData, Tag(TAG_MARK + "simulated")]
+    | Annotated[CaptureData, Tag(TAG_MARK + "capture")]
+    | Annotated[RailSarData, Tag(TAG_MARK + "rail_sar")],
     _tag_by("kind"),
 ]
 
@@ -473,12 +468,12 @@ class RadarParameter(Section):
 
 
 Parameter = Annotated[
-    Annotated[TranslationParameter, Tag(_MARK + "translation")]
-    | Annotated[PoseParameter, Tag(_MARK + "pose")]
-    | Annotated[ScaleParameter, Tag(_MARK + "scale")]
-    | Annotated[VerticesParameter, Tag(_MARK + "vertices")]
-    | Annotated[MaterialParameter, Tag(_MARK + "material")]
-    | Annotated[RadarParameter, Tag(_MARK + "radar_pose")],
+    Annotated[TranslationParameter, Tag(TAG_MARK + "translation")]
+    | Annotated[PoseParameter, Tag(TAG_MARK + "pose")]
+    | Annotated[ScaleParameter, Tag(TAG_MARK + "scale")]
+    | Annotated[VerticesParameter, Tag(TAG_MARK + "vertices")]
+    | Annotated[MaterialParameter, Tag(TAG_MARK + "material")]
+    | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")],
     _tag_by("kind"),
 ]
 
@@ -611,118 +606,3 @@ class RunFile(Section):
                     "unknown_object", "unknown object", {"path": path, "name": name}
                 )
         return self
-
-
-def load_run(path: Path) -> RunFile:
-    """Reads and validates a run file.
-
-    Raises:
-        InputError: The file is missing, is not TOML, or does not fit the schema; the message
-            names the key's path, what is allowed there and the nearest match, in one line.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(
-            f"expected a run file, got the path {path}, which does not exist; check the path"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"expected a readable run file, got {path}: {reason}; give a TOML text file"
-        ) from None
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"expected TOML in {path}, got an error: {error}; correct that line"
-        ) from None
-    return validate(raw, path)
-
-
-def validate(raw: dict[str, Any], source: Path) -> RunFile:
-    """The run file of parsed TOML; `source` names it in errors and anchors relative paths.
-
-    Raises:
-        InputError: It does not fit the schema.
-    """
-    try:
-        return RunFile.model_validate(raw, context={"folder": source.parent})
-    except ValidationError as error:
-        errors = error.errors(include_url=False)
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise InputError(f"{source}: {_explain(errors[0])}{more}") from None
-
-
-def _explain(error: ErrorDetails) -> str:
-    """One pydantic error as `path: expected ..., got ...; do ...`."""
-    path = ""
-    for item in error["loc"]:
-        if isinstance(item, int):
-            path += f"[{item}]"
-        elif not item.startswith(_MARK):
-            path += f".{item}" if path else item
-    got = _shown(error["input"])
-    context = error.get("ctx", {})
-    match error["type"]:
-        case "unknown_key":
-            key, allowed = context["key"], context["allowed"]
-            return (
-                f"{path}.{key}".lstrip(".")
-                + f": expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
-                + _nearest(key, allowed, "remove the key")
-            )
-        case "unknown_object":
-            allowed = list(error["input"]["scene"])
-            return (
-                f"{context['path']}: expected the name of an object of the scene "
-                f"({', '.join(allowed)}), got {_shown(context['name'])}; "
-                + _nearest(context["name"], allowed, "add it to the scene")
-            )
-        case "union_tag_not_found":
-            keys = context["discriminator"].removesuffix("()").split(",")
-            present = list(error["input"]) if isinstance(error["input"], dict) else []
-            guesses = [k for p in present for k in difflib.get_close_matches(p, keys, n=1)]
-            advice = f"did you mean `{guesses[0]}`?" if guesses else f"add `{keys[0]}`"
-            return f"{path}: expected a table with the key {' or '.join(keys)}, got {got}; {advice}"
-        case "union_tag_invalid":
-            key = context["discriminator"].removesuffix("()").split(",")[0]
-            tags = [
-                t.strip(" '\"").replace("\\x00", "") for t in context["expected_tags"].split(",")
-            ]
-            allowed = [t.strip(_MARK) for t in tags if t.strip(_MARK) not in ("parts", "file")]
-            tag = context["tag"].strip(_MARK)
-            return (
-                f"{path}.{key}: expected one of {', '.join(allowed)}, got {_shown(tag)}; "
-                + _nearest(tag, allowed, "choose one")
-            )
-        case "literal_error":
-            allowed = [t.strip(" '") for t in context["expected"].replace(" or ", ", ").split(",")]
-            return f"{path}: expected one of {', '.join(allowed)}, got {got}; " + _nearest(
-                str(error["input"]), allowed, "choose one"
-            )
-        case "missing":
-            return f"{path}: expected a value, got nothing; add the key `{error['loc'][-1]}`"
-        case "too_short" | "too_long":
-            least = error["type"] == "too_short"
-            size = (
-                f"at least {context['min_length']}" if least else f"at most {context['max_length']}"
-            )
-            return f"{path}: expected {size} items, got {got}; correct the list"
-        case "two_noises" | "object" | "axis":
-            return f"{path}: {error['msg']}"
-    expected = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
-    return f"{path}: expected {expected}, got {got}; correct the value"
-
-
-def _shown(value: Any) -> str:
-    try:
-        text = json.dumps(value, ensure_ascii=False)
-    except TypeError:
-        text = " ".join(str(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _nearest(given: str, allowed: list[str], otherwise: str) -> str:
-    close = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
-    return f"did you mean `{close[0]}`?" if close else otherwise

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from invertwin.cli.schema import RunFile, load_run, validate
+from invertwin.cli.run_file import load_run, validate
+from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]

@@ -1,0 +1,165 @@
+"""Run files in and out: TOML to the schema with errors that help, and back to TOML."""
+
+import difflib
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from invertwin.cli.schema import TAG_MARK, RunFile
+from invertwin.errors import InputError
+
+
+def load_run(path: Path) -> RunFile:
+    """Reads and validates a run file.
+
+    Raises:
+        InputError: The file is missing, is not TOML, or does not fit the schema; the message
+            names the key's path, what is allowed there and the nearest match, in one line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(
+            f"expected a run file, got the path {path}, which does not exist; check the path"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"expected a readable run file, got {path}: {reason}; give a TOML text file"
+        ) from None
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(
+            f"expected TOML in {path}, got an error: {error}; correct that line"
+        ) from None
+    return validate(raw, path)
+
+
+def validate(raw: dict[str, Any], source: Path) -> RunFile:
+    """The run file of parsed TOML; `source` names it in errors and anchors relative paths.
+
+    Raises:
+        InputError: It does not fit the schema.
+    """
+    try:
+        return RunFile.model_validate(raw, context={"folder": source.parent})
+    except ValidationError as error:
+        errors = error.errors(include_url=False)
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        raise InputError(f"{source}: {_explain(errors[0])}{more}") from None
+
+
+def to_toml(run: RunFile) -> str:
+    """The run file as used, defaults filled in; reading it back gives an equal run file."""
+    lines: list[str] = []
+    for key, value in run.model_dump(exclude_none=True).items():
+        if key in ("scene", "truth"):
+            for name, table in value.items():
+                lines += ["", f"[{key}.{_key(name)}]", *_lines(table)]
+        elif isinstance(value, dict):
+            lines += ["", f"[{key}]", *_lines(value)]
+        elif key == "parameters":
+            for table in value:
+                lines += ["", f"[[{key}]]", *_lines(table)]
+        else:
+            lines += _lines({key: value})
+    return "\n".join(lines) + "\n"
+
+
+def _explain(error: ErrorDetails) -> str:
+    """One pydantic error as `path: expected ..., got ...; do ...`."""
+    path = ""
+    for item in error["loc"]:
+        if isinstance(item, int):
+            path += f"[{item}]"
+        elif not item.startswith(TAG_MARK):
+            path += f".{item}" if path else item
+    got = _shown(error["input"])
+    context = error.get("ctx", {})
+    match error["type"]:
+        case "unknown_key":
+            key, allowed = context["key"], context["allowed"]
+            return (
+                f"{path}.{key}".lstrip(".")
+                + f": expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
+                + _nearest(key, allowed, "remove the key")
+            )
+        case "unknown_object":
+            allowed = list(error["input"]["scene"])
+            return (
+                f"{context['path']}: expected the name of an object of the scene "
+                f"({', '.join(allowed)}), got {_shown(context['name'])}; "
+                + _nearest(context["name"], allowed, "add it to the scene")
+            )
+        case "union_tag_not_found":
+            keys = context["discriminator"].removesuffix("()").split(",")
+            present = list(error["input"]) if isinstance(error["input"], dict) else []
+            guesses = [k for p in present for k in difflib.get_close_matches(p, keys, n=1)]
+            advice = f"did you mean `{guesses[0]}`?" if guesses else f"add `{keys[0]}`"
+            return f"{path}: expected a table with the key {' or '.join(keys)}, got {got}; {advice}"
+        case "union_tag_invalid":
+            key = context["discriminator"].removesuffix("()").split(",")[0]
+            tags = [t.strip(f" '{TAG_MARK}") for t in context["expected_tags"].split(",")]
+            allowed = [tag for tag in tags if tag not in ("parts", "file")]
+            tag = context["tag"].strip(TAG_MARK)
+            return (
+                f"{path}.{key}: expected one of {', '.join(allowed)}, got {_shown(tag)}; "
+                + _nearest(tag, allowed, "choose one")
+            )
+        case "literal_error":
+            allowed = [t.strip(" '") for t in context["expected"].replace(" or ", ", ").split(",")]
+            return f"{path}: expected one of {', '.join(allowed)}, got {got}; " + _nearest(
+                str(error["input"]), allowed, "choose one"
+            )
+        case "missing":
+            return f"{path}: expected a value, got nothing; add the key `{error['loc'][-1]}`"
+        case "too_short" | "too_long":
+            least = error["type"] == "too_short"
+            size = (
+                f"at least {context['min_length']}" if least else f"at most {context['max_length']}"
+            )
+            return f"{path}: expected {size} items, got {got}; correct the list"
+        case "two_noises" | "object" | "axis":
+            return f"{path}: {error['msg']}"
+    expected = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
+    return f"{path}: expected {expected}, got {got}; correct the value"
+
+
+def _shown(value: Any) -> str:
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except TypeError:
+        text = " ".join(str(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _nearest(given: str, allowed: list[str], otherwise: str) -> str:
+    close = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
+    return f"did you mean `{close[0]}`?" if close else otherwise
+
+
+def _lines(table: Mapping[str, Any]) -> list[str]:
+    return [f"{_key(key)} = {_inline(value)}" for key, value in table.items()]
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _inline(key)
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_key(k)} = {_inline(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_inline, value)) + "]"
+    return repr(value)
