@@ -9,6 +9,7 @@ from invertwin.scene.antenna import (
     linear_array,
     planar_array,
 )
+from invertwin.scene.files import load_mesh, load_scene_xml, save_mesh
 from invertwin.scene.material import (
     Material,
     PerfectConductor,
@@ -19,6 +20,15 @@ from invertwin.scene.material import (
     fresnel_reflectance,
 )
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.parameters import (
+    Compose,
+    MaterialValues,
+    Pose,
+    RadarPose,
+    Scale,
+    Translation,
+    Vertices,
+)
 from invertwin.scene.pose import (
     compose,
     quaternion_from_vector,
@@ -26,23 +36,31 @@ from invertwin.scene.pose import (
     rotation_angle,
     rotation_from_quaternion,
     rotation_from_vector,
+    vector_from_quaternion,
 )
 from invertwin.scene.scene import Object, Scene
 from invertwin.scene.shapes import box, dihedral, plate, sphere, text, trihedral
 
 __all__ = [
     "AntennaArray",
+    "Compose",
     "Cosine",
     "Isotropic",
     "Material",
+    "MaterialValues",
     "Mesh",
     "Object",
     "Pattern",
     "PerfectConductor",
+    "Pose",
+    "RadarPose",
     "RoughDielectric",
+    "Scale",
     "Scene",
     "Surface",
     "Table",
+    "Translation",
+    "Vertices",
     "box",
     "complex_permittivity",
     "compose",
@@ -50,6 +68,8 @@ __all__ = [
     "fresnel_amplitude",
     "fresnel_reflectance",
     "linear_array",
+    "load_mesh",
+    "load_scene_xml",
     "planar_array",
     "plate",
     "quaternion_from_vector",
@@ -57,7 +77,9 @@ __all__ = [
     "rotation_angle",
     "rotation_from_quaternion",
     "rotation_from_vector",
+    "save_mesh",
     "sphere",
     "text",
     "trihedral",
+    "vector_from_quaternion",
 ]

@@ -125,15 +125,17 @@ class Table(Pattern):
         """Linear power gain, bilinear between the nodes of `table`."""
         grid = self._grid.to(direction)
         x, y, z = direction.unbind(-1)
-        row, up = _cell((z.clamp(-1, 1) + 1) / 2 * (COSINE_COUNT - 1))
-        row = row.clamp(max=COSINE_COUNT - 2)
-        up = (z.clamp(-1, 1) + 1) / 2 * (COSINE_COUNT - 1) - row
+        height = (z.clamp(-1, 1) + 1) / 2 * (COSINE_COUNT - 1)
+        row = height.detach().to(torch.int64).clamp(max=COSINE_COUNT - 2)
+        up = height - row
         count = grid.shape[1]
         # atan2 has no gradient on the axis itself; any φ serves there.
         on_axis = (x == 0) & (y == 0)
         azimuth = torch.atan2(y, torch.where(on_axis, 1.0, x))
-        column, across = _cell((azimuth + torch.pi) / (2 * torch.pi) * count)
-        column, neighbour = column % count, (column + 1) % count
+        turn = (azimuth + torch.pi) / (2 * torch.pi) * count
+        cell = turn.detach().to(torch.int64)
+        across = turn - cell
+        column, neighbour = cell % count, (cell + 1) % count
         low = torch.lerp(grid[row, column], grid[row, neighbour], across)
         high = torch.lerp(grid[row + 1, column], grid[row + 1, neighbour], across)
         return torch.lerp(low, high, up)
@@ -218,12 +220,6 @@ def _centred(count: int, spacing: float, what: str) -> Tensor:
     number = checked_count(count, what, 1)
     distance = checked_number(spacing, "element spacing [m]", 0.0, open_low=True)
     return (torch.arange(number, dtype=torch.float64) - (number - 1) / 2) * distance
-
-
-def _cell(position: Tensor) -> tuple[Tensor, Tensor]:
-    """Integer cell and the fraction within it."""
-    cell = torch.floor(position.detach()).to(torch.int64)
-    return cell, position - cell
 
 
 def _check_angles(theta: Tensor, phi: Tensor) -> None:

@@ -31,6 +31,10 @@ ANGLE_COUNT = 256
 """Nodes of the amplitude table, at cosθ = linspace(0, 1, 256)."""
 
 
+MIRROR_LOBE_WIDTH = math.radians(5.0)
+ROUGH_LOBE_WIDTH = math.radians(20.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Surface:
     """What the ray kernel needs to know of a material at one frequency (see the module text).
@@ -49,12 +53,13 @@ class Surface:
 
 
 class Material(Protocol):
-    """Anything that can describe its surface at a frequency."""
+    """Anything that can describe its surface at a frequency.
 
-    @property
-    def coherent(self) -> bool:
-        """True if field paths follow physical optics, False if the surface is rough."""
-        ...
+    Attributes:
+        coherent: True if field paths follow physical optics, False if the surface is rough.
+    """
+
+    coherent: ClassVar[bool]
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable in the material's values."""
@@ -150,7 +155,7 @@ class PerfectConductor:
         InputError: a width outside its range.
     """
 
-    lobe_width: float | Tensor = math.radians(5.0)
+    lobe_width: float | Tensor = MIRROR_LOBE_WIDTH
     coherent: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -189,7 +194,7 @@ class RoughDielectric:
     permittivity: float | Tensor
     conductivity: float | Tensor = 0.0
     diffuse: float | Tensor = 1.0
-    lobe_width: float | Tensor = math.radians(20.0)
+    lobe_width: float | Tensor = ROUGH_LOBE_WIDTH
     coherent: ClassVar[bool] = False
 
     def __post_init__(self) -> None:

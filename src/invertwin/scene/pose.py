@@ -20,6 +20,16 @@ def quaternion_from_vector(vector: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
     return torch.cat([torch.cos(angle / 2)[None], scaled])
 
 
+def vector_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
+    """Rotation vector [rad] of at most π in length of a quaternion (w, x, y, z), not zero."""
+    # A quaternion and its negative are the same rotation; w ≥ 0 is the shorter way round.
+    sign = torch.where(quaternion[0] < 0, -1.0, 1.0)
+    unit = quaternion * sign / torch.linalg.vector_norm(quaternion)
+    sine = torch.linalg.vector_norm(unit[1:])
+    # 2 atan2(s, w)/s tends to 2 at s = 0.
+    return torch.where(sine > 0, 2 * torch.atan2(sine, unit[0]) / sine, 2.0) * unit[1:]
+
+
 def rotation_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3 3"]:
     """Rotation matrix of a quaternion (w, x, y, z) of any length but zero.
 

@@ -103,7 +103,8 @@ def trihedral(edge: float) -> Mesh:
     """A corner reflector: three right-angled triangles with the apex at the origin, open to −z.
 
     Its boresight is −z, one of the inner edges lies in the half plane x = 0, y > 0, and every wave
-    it returns after three bounces has the range of the apex. Peak radar cross-section: 4π edge⁴/3λ².
+    it returns after three bounces has the range of the apex. Its peak radar cross-section is
+    4π edge⁴/3λ².
 
     Args:
         edge: length of the three inner edges [m].
@@ -160,7 +161,9 @@ def _lattice(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Integer points (i, j) of an n × n grid and its triangles, counter-clockwise."""
     points = np.stack(np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij"), -1)
     index = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    a, b, c, d = (
+        x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+    )
     return points.reshape(-1, 2), np.concatenate(
         [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
     )
@@ -181,7 +184,8 @@ def _triangulated_outline(
     font = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans-Bold.ttf"
     # Curves are cut into chords about one unit long, so the size sets how fine they are.
     path = TextPath((0, 0), string, size=100, prop=FontProperties(fname=font))
-    rings = [shapely.Polygon(ring) for ring in path.to_polygons() if len(ring) >= 4]
+    loops = [np.asarray(loop) for loop in path.to_polygons()]
+    rings = [shapely.Polygon(loop) for loop in loops if len(loop) >= 4]
     if not rings:
         raise InputError(f"expected text with visible characters, got {string!r}; give a letter")
     # A ring inside another is a hole, a ring inside a hole is filled again.
@@ -238,7 +242,9 @@ def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """Split triangles at the given midpoints of their edges 01, 12, 20 (−1: not split)."""
     count = (middle >= 0).sum(axis=1)
     # Turn each triangle so that one split edge comes first, or the one whole edge comes last.
-    first = np.where(count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3)
+    first = np.where(
+        count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3
+    )
     order = (first[:, None] + np.arange(3)) % 3
     faces = np.take_along_axis(faces, order, axis=1)
     middle = np.take_along_axis(middle, order, axis=1)

@@ -1,0 +1,302 @@
+"""Meshes and scene geometry from files, and meshes into files."""
+
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.scene import shapes
+from invertwin.scene.material import Material, RoughDielectric
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.pose import rigid, rotation_from_vector
+from invertwin.scene.scene import Object, Scene
+
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
+CONCRETE = RoughDielectric(permittivity=5.24)
+"""Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read a triangle mesh from an OBJ, PLY, STL or glTF file.
+
+    Vertices at equal positions are merged, vertices of no triangle are left out, the rest keep
+    their order. All parts of the file become one mesh; units are taken as metres and axes as they
+    are.
+
+    Args:
+        path: the file; its suffix tells the format.
+
+    Raises:
+        InputError: no such file, another format, a broken file, no triangles, or NaN.
+    """
+    file = _existing(path)
+    if file.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(
+            f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {file.name}; convert it first"
+        )
+    try:
+        loaded = trimesh.load_scene(file, process=False).to_mesh()
+        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
+    # A broken file can make the readers fail in any way; every one means the same to the user.
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(
+            f"expected a readable {file.suffix} mesh, got {file} ({reason}); export the file again"
+        ) from error
+    try:
+        # The first check sees the file as it is: merging would hide what is wrong with it.
+        Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
+        return _merged(vertices, faces)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
+    """Write a mesh, or all objects of a scene in the world, as a binary PLY file in float64.
+
+    The file appears complete or not at all: a failure leaves an existing one as it was.
+
+    Args:
+        path: the file, ending in .ply, in an existing folder.
+        shape: what to write.
+
+    Raises:
+        InputError: another suffix, or no such folder.
+        OSError: the file system refuses the write.
+    """
+    file = Path(path)
+    if file.suffix.lower() != ".ply":
+        raise InputError(f"expected a file name ending in .ply, got {file.name}; rename the output")
+    if not file.parent.is_dir():
+        raise InputError(f"expected an existing folder, got {file.parent}; create it first")
+    content = _ply(_joined(shape) if isinstance(shape, Scene) else shape)
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.part")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, file)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_scene_xml(
+    path: str | Path,
+    materials: Mapping[str, Material] | None = None,
+    default: Material = CONCRETE,
+) -> Scene:
+    """Read the geometry of a Mitsuba or Sionna scene file.
+
+    Shapes of type obj, ply, rectangle, cube and sphere become objects in world coordinates, named
+    by their id (or their type and number). Sensors, emitters and appearance are ignored.
+
+    Args:
+        path: the XML file; the mesh files it names are relative to it.
+        materials: material for each material id the shapes refer to, e.g. "mat-itu_concrete".
+        default: material of all other shapes.
+
+    Raises:
+        InputError: no such file, broken XML, something unsupported that would lose geometry, or a
+            material id that no shape refers to.
+    """
+    file = _existing(path)
+    try:
+        root = ElementTree.parse(file).getroot()
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"expected an XML scene, got {file} ({error}); export the file again"
+        ) from error
+    try:
+        return _scene_of(root, file.parent, dict(materials or {}), default)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+def _existing(path: str | Path) -> Path:
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(f"expected an existing file, got {file}; check the path")
+    return file
+
+
+def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    used = np.unique(faces)
+    # Adding zero turns −0 into 0, which is the same place.
+    _, first, group = np.unique(
+        vertices[used] + 0.0, axis=0, return_index=True, return_inverse=True
+    )
+    order = np.argsort(first)
+    rank = np.argsort(order)
+    renumbered = np.empty(len(vertices), dtype=np.int64)
+    renumbered[used] = rank[group.ravel()]
+    return _mesh(vertices[used][first[order]], renumbered[faces])
+
+
+def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    return Mesh(torch.from_numpy(vertices), torch.from_numpy(faces))
+
+
+def _joined(scene: Scene) -> Mesh:
+    vertices, faces, count = [], [], 0
+    for item in scene.objects.values():
+        vertices.append(item.vertices.detach())
+        faces.append(item.mesh.faces + count)
+        count += len(item.mesh.vertices)
+    return Mesh(torch.cat(vertices), torch.cat(faces))
+
+
+def _ply(mesh: Mesh) -> bytes:
+    vertices = mesh.vertices.detach().cpu().numpy().astype("<f8")
+    faces = np.empty(len(mesh.faces), dtype=[("count", "<u1"), ("index", "<i4", 3)])
+    faces["count"] = 3
+    faces["index"] = mesh.faces.cpu().numpy()
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+
+
+def _scene_of(
+    root: ElementTree.Element, folder: Path, materials: dict[str, Material], default: Material
+) -> Scene:
+    if root.tag != "scene" or root.find("include") is not None:
+        raise InputError(
+            f"expected one <scene> without <include>, got <{root.tag}>; merge the files into one"
+        )
+    objects: dict[str, Object] = {}
+    referred = set()
+    for number, element in enumerate(root.findall("shape")):
+        name = element.get("id") or f"{element.get('type')}_{number}"
+        if name in objects:
+            raise InputError(f"expected different shape ids, got {name!r} twice; rename one")
+        material = _material_id(element)
+        referred.add(material)
+        try:
+            mesh = _shape(element, folder)
+        except InputError as error:
+            raise InputError(f"shape {name!r}: {error}") from None
+        objects[name] = Object(mesh, materials.get(material, default))
+    unused = sorted(set(materials) - referred)
+    if unused:
+        known = ", ".join(sorted(referred - {""})) or "none"
+        raise InputError(
+            f"expected material ids that shapes refer to ({known}), got {', '.join(unused)}; "
+            "correct the names in `materials`"
+        )
+    return Scene(objects)
+
+
+def _material_id(shape: ElementTree.Element) -> str:
+    for tag in ("ref", "bsdf"):
+        element = shape.find(tag)
+        if element is not None:
+            return element.get("id", "")
+    return ""
+
+
+def _shape(element: ElementTree.Element, folder: Path) -> Mesh:
+    kind = element.get("type")
+    if kind in ("obj", "ply"):
+        mesh = load_mesh(folder / _property(element, "string", "filename", ""))
+    elif kind == "rectangle":
+        facing_back = shapes.plate(2.0, 2.0)
+        mesh = Mesh(facing_back.vertices, facing_back.faces.flip(1))
+    elif kind == "cube":
+        mesh = shapes.box(2.0)
+    elif kind == "sphere":
+        ball = shapes.sphere(_numbers(_property(element, "float", "radius", "1"), 1)[0])
+        mesh = Mesh(ball.vertices + _center(element), ball.faces)
+    else:
+        raise InputError(
+            f"expected a shape of type obj, ply, rectangle, cube or sphere, got {kind!r}; "
+            "export it as a ply mesh"
+        )
+    transform = _to_world(element)
+    mirrored = bool(torch.linalg.det(transform[:3, :3]) < 0)
+    flipped = _property(element, "boolean", "flip_normals", "false").lower() == "true"
+    vertices = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
+    return Mesh(vertices, mesh.faces.flip(1) if mirrored != flipped else mesh.faces)
+
+
+def _property(shape: ElementTree.Element, tag: str, name: str, default: str) -> str:
+    element = shape.find(f"{tag}[@name='{name}']")
+    return default if element is None else element.get("value", default)
+
+
+def _center(shape: ElementTree.Element) -> Tensor:
+    element = shape.find("point[@name='center']")
+    return torch.zeros(3, dtype=torch.float64) if element is None else _vector(element, 0.0)
+
+
+def _to_world(shape: ElementTree.Element) -> Tensor:
+    """The shape's transform: its steps act in the order written."""
+    transform = torch.eye(4, dtype=torch.float64)
+    for step in _steps(shape):
+        transform = step @ transform
+    return transform
+
+
+def _steps(shape: ElementTree.Element) -> Iterator[Tensor]:
+    identity = torch.eye(3, dtype=torch.float64)
+    for element in shape.findall("transform[@name='to_world']/*"):
+        if element.tag == "translate":
+            yield rigid(identity, _vector(element, 0.0))
+        elif element.tag == "scale":
+            yield torch.diag(torch.cat([_vector(element, 1.0), identity[0, :1]]))
+        elif element.tag == "rotate":
+            yield rigid(_rotation(element), torch.zeros(3, dtype=torch.float64))
+        elif element.tag == "matrix":
+            yield _matrix(element.get("value", ""))
+        else:
+            raise InputError(
+                "expected translate, rotate, scale or matrix in to_world, "
+                f"got {element.tag}; write it as a matrix"
+            )
+
+
+def _rotation(element: ElementTree.Element) -> Tensor:
+    axis = _vector(element, 0.0)
+    length = torch.linalg.vector_norm(axis)
+    if length == 0:
+        raise InputError("expected a rotation axis, got none; give x, y, z and angle (degrees)")
+    (angle,) = _numbers(element.get("angle", ""), 1)
+    return rotation_from_vector(axis / length * np.radians(angle))
+
+
+def _matrix(text: str) -> Tensor:
+    values = torch.tensor(_numbers(text, 9, 16), dtype=torch.float64)
+    if len(values) == 9:
+        return rigid(values.reshape(3, 3), torch.zeros(3, dtype=torch.float64))
+    return values.reshape(4, 4)
+
+
+def _vector(element: ElementTree.Element, missing: float) -> Tensor:
+    """Three numbers: from `value` (one stands for all three), or from x, y and z."""
+    if "value" in element.attrib:
+        values = _numbers(element.attrib["value"], 1, 3)
+        values = values * 3 if len(values) == 1 else values
+    else:
+        values = [_numbers(element.get(axis, str(missing)), 1)[0] for axis in "xyz"]
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _numbers(text: str, *counts: int) -> list[float]:
+    try:
+        values = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    if len(values) not in counts:
+        wanted = " or ".join(map(str, counts))
+        raise InputError(f"expected {wanted} numbers, got {text!r}; correct the scene file")
+    return values
