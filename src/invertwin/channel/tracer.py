@@ -287,12 +287,14 @@ def _coherent(geometry: Geometry, link: Link, shot: Shot, samples: int, seed: in
     """Physical optics of the coherent objects by low-discrepancy area samples (1/N)."""
     areas = face_areas(geometry)
     areas = areas * torch.tensor(geometry.coherent)[geometry.face_object]
-    shift = np.random.default_rng(seed).random(3)
+    rng = np.random.default_rng(seed)
+    shift = rng.random(2)
     index = np.arange(samples)
     edges = np.cumsum(areas.numpy())
-    face = np.searchsorted(edges, (index + shift[0]) / samples * edges[-1], side="right")
-    face = np.minimum(face, len(edges) - 1)
-    b1, b2 = ((0.5 + shift[1 + k] + index * _GOLDEN[k]) % 1.0 for k in range(2))
+    # Jittered, not evenly spaced: even steps would beat with the order of a subdivided mesh.
+    place = (index + rng.random(samples)) / samples * edges[-1]
+    face = np.minimum(np.searchsorted(edges, place, side="right"), len(edges) - 1)
+    b1, b2 = ((shift[k] + index * _GOLDEN[k]) % 1.0 for k in range(2))
     fold = b1 + b2 > 1
     frames = link.frame_count
     points = _Points(
