@@ -16,15 +16,15 @@ back R on average and R exactly where both angles agree.
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Float64, Shaped
 from torch import Tensor
 
 from invertwin.constants import VACUUM_PERMITTIVITY
-from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number
 
 ANGLE_COUNT = 256
@@ -52,8 +52,8 @@ class Surface:
     exponent: Float64[Tensor, ""]
 
 
-class Material(Protocol):
-    """Anything that can describe its surface at a frequency.
+class Material(ABC):
+    """What an object's surface does to the waves.
 
     Attributes:
         coherent: True if field paths follow physical optics, False if the surface is rough.
@@ -61,9 +61,9 @@ class Material(Protocol):
 
     coherent: ClassVar[bool]
 
+    @abstractmethod
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable in the material's values."""
-        ...
 
 
 def complex_permittivity(
@@ -142,7 +142,7 @@ def lobe_integral(exponent: Float64[Tensor, ""]) -> Float64[Tensor, ""]:
 
 
 @dataclass(frozen=True)
-class PerfectConductor:
+class PerfectConductor(Material):
     """A smooth perfect conductor: nothing is absorbed, nothing is scattered diffusely.
 
     Field paths treat it with physical optics. Power paths cannot see a mirror from a point
@@ -174,7 +174,7 @@ class PerfectConductor:
 
 
 @dataclass(frozen=True)
-class RoughDielectric:
+class RoughDielectric(Material):
     """A rough half space: Fresnel reflectance, spread diffusely and into a lobe.
 
     Attributes:
@@ -219,17 +219,3 @@ class RoughDielectric:
 
 def _float64(value: float | Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=torch.float64)
-
-
-def checked_material(value: object) -> Material:
-    """`value` if it can serve as a material.
-
-    Raises:
-        InputError: it has no `surface` or no `coherent`.
-    """
-    if not (callable(getattr(value, "surface", None)) and hasattr(value, "coherent")):
-        raise InputError(
-            f"expected a material, got {type(value).__name__}; "
-            "give a PerfectConductor, a RoughDielectric or an object with surface() and coherent"
-        )
-    return value  # pyright: ignore[reportReturnType]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number, checked_tensor
-from invertwin.scene.material import Material, checked_material
+from invertwin.scene.material import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import compose, rigid
 
@@ -42,7 +42,11 @@ class Object:
                 f"expected a Mesh, got {type(self.mesh).__name__}; "
                 "build one with Mesh(vertices, faces) or load_mesh(path)"
             )
-        checked_material(self.material)
+        if not isinstance(self.material, Material):
+            raise InputError(
+                f"expected a Material, got {type(self.material).__name__}; "
+                "give a PerfectConductor or a RoughDielectric"
+            )
         if self.pose is not None:
             object.__setattr__(self, "pose", _checked_pose(self.pose))
         if self.velocity is not None:

@@ -179,7 +179,7 @@ def _triangulated_outline(
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
-    if not isinstance(string, str) or not string.isprintable():
+    if not string.isprintable():
         raise InputError(f"expected one line of text, got {string!r}; give printable characters")
     font = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans-Bold.ttf"
     # Curves are cut into chords about one unit long, so the size sets how fine they are.
