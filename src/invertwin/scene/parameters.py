@@ -7,7 +7,7 @@ Every module starts as the identity unless initial values are given, and compose
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float64
@@ -270,6 +270,7 @@ class MaterialValues(nn.Module):
         return {name: _BOUNDED[name](raw) for name, raw in self.raw.items()}
 
 
+@runtime_checkable
 class _Movable(Protocol):
     """What `RadarPose` needs of a radar; this room knows no more of it."""
 
