@@ -41,7 +41,7 @@ def deposit_power(
     boundary_samples: int,
     seed: int,
     sampling: Literal["rays", "area"] = "rays",
-    reference: Scene | None = None,
+    reference: tuple[Scene, Link] | None = None,
     boundary: bool = True,
     memory_budget: float = 0.5e9,
     backend: str | None = None,
@@ -62,8 +62,8 @@ def deposit_power(
             only, since boundary paths are zero in value.
         seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
         sampling: ``rays`` from the antenna into the caps around the objects, or ``area``.
-        reference: For ``area``: the scene whose triangle areas fix the density, so that the
-            point set stays while θ varies.
+        reference: The scene and link that fix the density (caps around objects, enlarged by a
+            tenth, or triangle areas), so that differences in θ have common random numbers.
         boundary: Off leaves the interior term alone, for ablation.
         memory_budget: Bytes of samples alive at a time; more samples go in chunks, and the
             derivative traces them again instead of keeping them.
@@ -93,7 +93,9 @@ def deposit_power(
             boundary_samples=boundary_samples if boundary else 0,
             seed=seed,
             sampling=sampling,
-            reference=flatten(reference, link.wavelength) if reference else None,
+            reference=(flatten(reference[0], link.wavelength), reference[1])
+            if reference
+            else None,
             chunk=max(1, int(memory_budget) // _BYTES_PER_SAMPLE),
             backend=backend,
         )
@@ -110,7 +112,7 @@ class _Settings:
     boundary_samples: int
     seed: int
     sampling: str
-    reference: Geometry | None
+    reference: tuple[Geometry, Link] | None
     chunk: int
     backend: str | None
 
@@ -122,7 +124,9 @@ class _Trace:
         self.settings = settings
         self.shot = Shot(settings.geometry, settings.link)
         if settings.sampling == "rays":
-            self.sampler = RaySampler(self.shot, settings.samples, settings.seed)
+            self.sampler = RaySampler(
+                self.shot, settings.samples, settings.seed, settings.reference
+            )
         else:
             self.sampler = AreaSampler(
                 self.shot, settings.samples, settings.seed, settings.reference

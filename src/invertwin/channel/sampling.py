@@ -6,7 +6,6 @@ parameters is evaluated later, in material form (derivations §2).
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -103,30 +102,36 @@ class Shot:
             mi.Ray3f(start + (end - start) * _NEAR, end - start, 1 - 2 * _NEAR, 0.0, []), active
         )
 
-    @cached_property
-    def caps(self) -> tuple[Float64[Tensor, "frame object 3"], Float64[Tensor, "frame object"]]:
-        """Axis and height 1 − cos of the spherical cap that holds each object, seen from TX."""
-        axes, heights = [], []
-        positions = self.geometry.vertices.detach()
-        owner = self.geometry.face_object
-        for index in range(len(self.geometry.coherent)):
-            used = positions[self.geometry.faces[owner == index].unique()]
-            centre = 0.5 * (used.min(dim=0).values + used.max(dim=0).values)
-            radius = 1.001 * (used - centre).norm(dim=1).max()
-            offset = centre - self.link.tx.detach()
-            distance = offset.norm(dim=1)
-            sine = (radius / distance.clamp_min(1e-30)).clamp_max(1.0)
-            height = sine**2 / (1 + (1 - sine**2).sqrt())
-            axes.append(offset / distance.clamp_min(1e-30)[:, None])
-            heights.append(torch.where(distance > radius, height, 2.0))
-        return torch.stack(axes, dim=1), torch.stack(heights, dim=1)
+
+def _caps(
+    geometry: Geometry, link: Link, margin: float
+) -> tuple[Float64[Tensor, "frame object 3"], Float64[Tensor, "frame object"]]:
+    """Axis and height 1 − cos of the spherical cap that holds each object, seen from TX."""
+    axes, heights = [], []
+    positions, tx = geometry.vertices.detach(), link.tx.detach()
+    for index in range(len(geometry.coherent)):
+        used = positions[geometry.faces[geometry.face_object == index].unique()]
+        centre = 0.5 * (used.min(dim=0).values + used.max(dim=0).values)
+        radius = margin * (used - centre).norm(dim=1).max()
+        offset = centre - tx
+        distance = offset.norm(dim=1)
+        sine = (radius / distance.clamp_min(1e-30)).clamp_max(1.0)
+        height = sine**2 / (1 + (1 - sine**2).sqrt())
+        axes.append(offset / distance.clamp_min(1e-30)[:, None])
+        heights.append(torch.where(distance > radius, height, 2.0))
+    return torch.stack(axes, dim=1), torch.stack(heights, dim=1)
 
 
 class RaySampler:
     """Rays from TX, the same number into the cap around each object, jittered on a grid."""
 
-    def __init__(self, shot: Shot, samples: int, seed: int) -> None:
-        axes, heights = shot.caps
+    def __init__(
+        self, shot: Shot, samples: int, seed: int, reference: tuple[Geometry, Link] | None = None
+    ) -> None:
+        if reference:
+            axes, heights = _caps(*reference, margin=1.1)
+        else:
+            axes, heights = _caps(shot.geometry, shot.link, margin=1.001)
         self.shot = shot
         self.objects = axes.shape[1]
         blocks = shot.link.frame_count * self.objects
@@ -186,10 +191,10 @@ class AreaSampler:
     """
 
     def __init__(
-        self, shot: Shot, samples: int, seed: int, reference: Geometry | None = None
+        self, shot: Shot, samples: int, seed: int, reference: tuple[Geometry, Link] | None = None
     ) -> None:
         mi = tracer()
-        geometry = reference or shot.geometry
+        geometry = reference[0] if reference else shot.geometry
         if len(geometry.faces) != len(shot.geometry.faces):
             raise InputError(
                 f"expected a reference scene of {len(shot.geometry.faces)} triangles, got "
