@@ -99,6 +99,14 @@ def radar(**changes):
             ["data: ", "got both"],
         ),
         (
+            run(gradcheck={"parameter": {"kind": "translation", "object": "letter"}, "step": 1e-3}),
+            ["gradcheck.parameter: ", "`axis` with kind = translation", "add it"],
+        ),
+        (
+            run(gradcheck={"parameter": {"kind": "scale", "object": "letter"}, "step_deg": 1.0}),
+            ["gradcheck: ", "no `step_deg` with kind = scale", "remove it"],
+        ),
+        (
             run(task="reconstrct"),
             ["task: ", "simulate, reconstruct", "did you mean `reconstruct`?"],
         ),

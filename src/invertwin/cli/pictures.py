@@ -1,4 +1,4 @@
-"""Pictures of a run as PNG bytes: scene views, spectra, curves. NumPy in, Matplotlib (Agg) out."""
+"""Pictures of a run as PNG bytes: scene views, spectra, curves. Matplotlib (Agg)."""
 
 import io
 import math
@@ -10,6 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+
+from invertwin.scene import Scene
 
 PALETTE = ("#4c78a8", "#e0803c", "#54a24b", "#b279a2", "#9d755d")
 BACKGROUND = "#b9bec7"
@@ -49,6 +51,14 @@ class Axes:
     ranges: NDArray
     u: NDArray
     v: NDArray
+
+
+def meshes_of(scene: Scene) -> dict[str, tuple[NDArray, NDArray]]:
+    """Vertices and faces of every object, for a `Drawing`."""
+    return {
+        name: (item.vertices.detach().cpu().numpy(), item.mesh.faces.cpu().numpy())
+        for name, item in scene.objects.items()
+    }
 
 
 def scene_picture(drawings: Mapping[str, Drawing]) -> bytes:

@@ -126,7 +126,7 @@ def _explain(error: ErrorDetails) -> str:
                 f"at least {context['min_length']}" if least else f"at most {context['max_length']}"
             )
             return f"{path}: expected {size} items, got {got}; correct the list"
-        case "two_noises" | "object" | "axis":
+        case "presence":
             return f"{path}: {error['msg']}"
     expected = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
     return f"{path}: expected {expected}, got {got}; correct the value"

@@ -396,13 +396,13 @@ class SimulatedData(Section):
     samples: Count = 200_000  # coherent paths
     snr_db: float | None = None
     noise_figure_db: float | None = None
-    seed: Seed = 0
+    seed: Seed | None = None  # without it the run's
 
     @model_validator(mode="after")
     def _one_noise_level(self) -> "SimulatedData":
         if self.snr_db is not None and self.noise_figure_db is not None:
             raise PydanticCustomError(
-                "two_noises", "expected snr_db or noise_figure_db, got both; remove one"
+                "presence", "expected snr_db or noise_figure_db, got both; remove one"
             )
         return self
 
@@ -487,7 +487,7 @@ class Starts(Section):
     angle_deg: Interval = [0.0, 0.0]
     directions: Literal["any", "level", "vertical_plane"] = "any"
     axis: Vector | None = None  # rotation axis; without it any axis
-    seed: Seed = 0
+    seed: Seed | None = None  # without it the run's
 
 
 class Surrogate(Section):
@@ -535,35 +535,56 @@ class Landscape(Section):
 
 
 class GradientParameter(Section):
-    """The scalar of a gradient check, around the scene as written."""
+    """The scalar θ of a gradient check; θ = 0 is the scene as written."""
 
-    kind: Literal["translation", "rotation", "scale", "radar_translation"]
+    kind: Literal[
+        "translation", "rotation", "scale", "material", "radar_translation", "radar_rotation"
+    ]
     object: str | None = None
     axis: Vector | None = None
+    value: Literal["permittivity", "conductivity", "diffuse"] | None = None
 
     @model_validator(mode="after")
     def _complete(self) -> "GradientParameter":
-        if (self.kind != "radar_translation") != (self.object is not None):
-            raise PydanticCustomError(
-                "object",
-                "expected `object` with translation, rotation and scale, and only there; "
-                "add or remove it",
-            )
-        if (self.kind != "scale") != (self.axis is not None):
-            raise PydanticCustomError(
-                "axis",
-                "expected `axis` with every kind but scale, and only there; add or remove it",
-            )
+        wanted = {
+            "object": not self.kind.startswith("radar"),
+            "axis": self.kind.endswith(("translation", "rotation")),
+            "value": self.kind == "material",
+        }
+        _check_presence(self, wanted, f"with kind = {self.kind}")
         return self
 
 
 class Gradcheck(Section):
+    """Derivative of the map against central differences."""
+
     parameter: GradientParameter
-    steps: Annotated[list[Positive], Field(min_length=2)]  # m, rad or 1, of the differences
+    step: Positive | None = None  # of the differences: m, or relative for scale
+    step_deg: Positive | None = None  # the same for rotations
     noise: Positive = 0.007  # ‖standard error‖₁/‖g_FD‖₁ at which repeating stops
     max_pairs: Count = 64
-    samples: Count = 2_000_000
-    boundary_samples: Count = 400_000
+    samples: Count = 4_000_000
+    boundary_samples: Count = 1_000_000
+    repeats: Count = 4
+    difference_samples: Count = 8_000_000
+    sampling: Literal["rays", "area"] = "rays"
+
+    @model_validator(mode="after")
+    def _complete(self) -> "Gradcheck":
+        turns = self.parameter.kind.endswith("rotation")
+        wanted = {"step_deg": turns, "step": not turns}
+        _check_presence(self, wanted, f"with kind = {self.parameter.kind}")
+        return self
+
+
+def _check_presence(section: Section, wanted: dict[str, bool], when: str) -> None:
+    """Keys that one kind needs and the others must not have."""
+    for key, needed in wanted.items():
+        if needed != (getattr(section, key) is not None):
+            verb, do = ("", "add it") if needed else ("no ", "remove it")
+            raise PydanticCustomError(
+                "presence", "{text}", {"text": f"expected {verb}`{key}` {when}; {do}"}
+            )
 
 
 # ----------------------------------------------------------------------------------- run file

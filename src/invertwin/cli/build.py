@@ -1,0 +1,327 @@
+"""From the tables of a run file to the library's values: scenes, radars, grids, parameters."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from invertwin.channel.paths import Grid
+from invertwin.cli import schema
+from invertwin.errors import InputError
+from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.waveform import FMCW, Impulse, Radar
+from invertwin.scene import (
+    AntennaArray,
+    Cosine,
+    Isotropic,
+    Material,
+    Mesh,
+    Object,
+    Pattern,
+    PerfectConductor,
+    RoughDielectric,
+    Scene,
+    linear_array,
+    planar_array,
+    rigid,
+    rotation_angle,
+    rotation_from_vector,
+    shapes,
+)
+from invertwin.scene.files import load_mesh
+from invertwin.scene.parameters import (
+    MaterialValues,
+    Pose,
+    RadarPose,
+    Scale,
+    Translation,
+    Vertices,
+)
+
+
+def scene(objects: Mapping[str, schema.SceneObject]) -> Scene:
+    """The scene of the `[scene.<name>]` tables.
+
+    Raises:
+        InputError: A mesh file is missing or broken, or a shape is impossible.
+    """
+    built = {}
+    for name, table in objects.items():
+        try:
+            built[name] = _object(table)
+        except InputError as error:
+            raise InputError(f"scene.{name}: {error}") from None
+    return Scene(built)
+
+
+def true_scene(run: schema.RunFile) -> Scene:
+    """The scene with the placements of the `[truth.<name>]` tables."""
+    objects = dict(run.scene)
+    for name, truth in run.truth.items():
+        objects[name] = objects[name].model_copy(update=truth.model_dump(exclude_none=True))
+    return scene(objects)
+
+
+def _object(table: schema.SceneObject) -> Object:
+    velocity = None if table.velocity is None else _float64(table.velocity)
+    return Object(_mesh(table), _material(table.material), _pose(table), velocity)
+
+
+def _pose(table: schema.Placement) -> Tensor:
+    turn = rotation_from_vector(torch.deg2rad(_float64(table.rotation_deg)))
+    return rigid(turn, _float64(table.position))
+
+
+def _mesh(table: schema.Placement) -> Mesh:
+    """The mesh in the object's frame, scaled but not placed."""
+    match table:
+        case schema.Plate():
+            mesh = shapes.plate(table.width, table.height, table.divisions)
+        case schema.Box():
+            mesh = shapes.box(table.size, table.divisions)
+        case schema.Sphere():
+            mesh = shapes.sphere(table.radius, table.subdivisions)
+        case schema.Dihedral():
+            mesh = shapes.dihedral(table.edge)
+        case schema.Trihedral():
+            mesh = shapes.trihedral(table.edge)
+        case schema.Text():
+            mesh = shapes.text(table.text, table.size, table.depth, table.max_edge)
+        case schema.File():
+            mesh = load_mesh(table.file)
+        case schema.Parts():
+            mesh = _joined(table.parts)
+        case _:
+            raise InputError(f"expected a shape, got {type(table).__name__}; add `shape`")
+    return Mesh(mesh.vertices * table.scale, mesh.faces)
+
+
+def _joined(parts: Sequence[schema.Part]) -> Mesh:
+    vertices, faces, count = [], [], 0
+    for part in parts:
+        mesh, pose = _mesh(part), _pose(part)
+        vertices.append(mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
+        faces.append(mesh.faces + count)
+        count += len(mesh.vertices)
+    return Mesh(torch.cat(vertices), torch.cat(faces))
+
+
+def _material(table: schema.Material) -> Material:
+    values = table.model_dump(exclude={"kind", "lobe_width_deg"})
+    if table.lobe_width_deg is not None:
+        values["lobe_width"] = math.radians(table.lobe_width_deg)
+    return (RoughDielectric if table.kind == "rough_dielectric" else PerfectConductor)(**values)
+
+
+def radar(table: schema.Radar) -> Radar:
+    """The radar of the `[radar]` table, one frame per position.
+
+    Raises:
+        InputError: Values the radar refuses, or a target straight above a position.
+    """
+    wave = table.waveform
+    if isinstance(wave, schema.Fmcw):
+        waveform = FMCW(wave.start_frequency, wave.bandwidth, wave.duration, wave.samples)
+    else:
+        waveform = Impulse(wave.center_frequency, wave.bandwidth)
+    positions = _track(table.positions)
+    return Radar(
+        _array(table.transmitters),
+        _array(table.receivers),
+        waveform,
+        positions,
+        _rotations(table.orientation, positions),
+        window=table.window,
+        array_window=table.array_window,
+        shared_visibility=table.shared_visibility,
+    )
+
+
+def _array(table: schema.Array) -> AntennaArray:
+    pattern: Pattern = Isotropic()
+    if isinstance(table.pattern, schema.Cosine):
+        pattern = Cosine(table.pattern.exponent)
+    match table:
+        case schema.PlanarArray():
+            array = planar_array(*table.count, *table.spacing, pattern=pattern)
+        case schema.LinearArray():
+            array = linear_array(table.count, table.spacing, table.axis, pattern=pattern)
+        case _:
+            array = AntennaArray(_float64(table.positions), pattern)
+    return replace(array, positions=array.positions + _float64(table.center))
+
+
+def _track(table: schema.Track) -> Tensor:
+    match table:
+        case schema.LineTrack():
+            start, stop = _float64(table.start), _float64(table.stop)
+            return start + torch.linspace(0, 1, table.count, dtype=torch.float64)[:, None] * (
+                stop - start
+            )
+        case schema.ArcTrack():
+            angle = torch.deg2rad(
+                torch.linspace(table.start_deg, table.stop_deg, table.count, dtype=torch.float64)
+            )
+            around = torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
+            return _float64(table.center) + table.radius * around
+        case schema.GridTrack():
+            x, y = (
+                (torch.linspace(-0.5, 0.5, n, dtype=torch.float64) if n > 1 else torch.zeros(1))
+                * size
+                for n, size in zip(table.count, table.size, strict=True)
+            )
+            across, up = torch.meshgrid(x.double(), y.double(), indexing="ij")
+            offsets = torch.stack([across, up, torch.zeros_like(up)], dim=-1)
+            return _float64(table.center) + offsets.reshape(-1, 3)
+    return _float64(table)
+
+
+def _rotations(table: schema.Orientation, positions: Tensor) -> Tensor:
+    """Columns are the radar's right, up and boresight axes in the world."""
+    if isinstance(table, schema.Turned):
+        turn = rotation_from_vector(torch.deg2rad(_float64(table.rotation_deg)))
+        return turn.expand(len(positions), 3, 3).clone()
+    boresight = _float64(table.look_at) - positions
+    right = torch.linalg.cross(_float64([[0.0, 1.0, 0.0]]).expand_as(boresight), boresight)
+    if bool((right.norm(dim=1) < 1e-6 * (1 + boresight.norm(dim=1))).any()):
+        raise InputError(
+            "radar.orientation.look_at: expected a point that is not straight above or below a "
+            f"radar position, got {table.look_at}; move it or use rotation_deg"
+        )
+    boresight = boresight / boresight.norm(dim=1, keepdim=True)
+    right = right / right.norm(dim=1, keepdim=True)
+    return torch.stack([right, torch.linalg.cross(boresight, right), boresight], dim=-1)
+
+
+def grid(table: schema.Grid, radar: Radar) -> Grid:
+    """The bins of the `[grid]` table for a radar."""
+    return radar.grid(
+        table.range_min, table.range_max, table.u_max, table.v_max, oversample=table.oversample
+    )
+
+
+def surrogate(table: schema.Surrogate) -> Surrogate:
+    """The smooth model of the `[surrogate]` table, at its starting widths."""
+    return Surrogate(**table.model_dump())
+
+
+def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Module]:
+    """The modules of the `[[parameters]]` tables; each starts as the identity.
+
+    Raises:
+        InputError: A material value that the object's material does not have.
+    """
+    modules: list[nn.Module] = []
+    for i, table in enumerate(tables):
+        match table:
+            case schema.TranslationParameter():
+                modules.append(Translation(table.object))
+            case schema.PoseParameter():
+                modules.append(Pose(table.object))
+            case schema.ScaleParameter():
+                modules.append(Scale(table.object))
+            case schema.VerticesParameter():
+                count = len(scene[table.object].mesh.vertices)
+                modules.append(Vertices(table.object, count))
+            case schema.MaterialParameter():
+                material = scene[table.object].material
+                missing = [name for name in table.values if not hasattr(material, name)]
+                if missing:
+                    raise InputError(
+                        f"parameters[{i}].values: expected values of {type(material).__name__}, "
+                        f"got {missing[0]}; remove it"
+                    )
+                values = {name: float(getattr(material, name)) for name in table.values}
+                modules.append(MaterialValues(table.object, **values))
+            case schema.RadarParameter():
+                modules.append(RadarPose())
+    return modules
+
+
+@dataclass(frozen=True)
+class Start:
+    """A random start: the scene, and how far it is from the truth."""
+
+    scene: Scene
+    distance: float  # m
+    angle: float  # rad
+
+
+def starts(table: schema.Starts, truth: Scene, seed: int) -> list[Start]:
+    """The random starts of the `[starts]` table; the same seed gives the same ones."""
+    generator = torch.Generator().manual_seed(seed if table.seed is None else table.seed)
+
+    def uniform(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
+
+    def direction(flat: Sequence[int] = ()) -> Tensor:
+        vector = torch.randn(3, generator=generator, dtype=torch.float64)
+        vector[list(flat)] = 0
+        return vector / vector.norm()
+
+    found = []
+    for _ in range(table.count):
+        distance = uniform(*table.distance)
+        angle = math.radians(uniform(*table.angle_deg))
+        offset = distance * direction(_FLAT[table.directions])
+        axis = direction()
+        if table.axis is not None:
+            fixed = _float64(table.axis)
+            axis = fixed / fixed.norm() * (1 if uniform(0, 1) < 0.5 else -1)
+        found.append(Start(displaced(truth, table.object, offset, angle * axis), distance, angle))
+    return found
+
+
+_FLAT: Mapping[str, Sequence[int]] = {"any": (), "level": (1,), "vertical_plane": (2,)}
+
+
+def displaced(scene: Scene, name: str, offset: Tensor, rotation: Tensor) -> Scene:
+    """The scene with one object turned about its centre and moved.
+
+    Args:
+        scene: Where everything is.
+        name: The object.
+        offset: [3], m.
+        rotation: Rotation vector [3], rad.
+    """
+    item = scene[name]
+    turn = rotation_from_vector(rotation)
+    motion = rigid(turn, offset + item.center - turn @ item.center)
+    return scene.replace(name, pose=motion @ item.transform)
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How one object differs from where it really is."""
+
+    offset: Tensor  # [3], m, of its centre
+    angle: float  # rad
+    scale: float
+
+    @property
+    def distance(self) -> float:
+        """Length of the offset [m]."""
+        return float(self.offset.norm())
+
+
+def residual(found: Object, truth: Object) -> Residual:
+    """The similarity transform that remains between two copies of an object.
+
+    Least squares over the vertices (Umeyama), so it does not depend on how the pose is
+    parameterised.
+    """
+    a, b = found.vertices.detach(), truth.vertices.detach()
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    u, values, vt = torch.linalg.svd(b0.T @ a0)
+    sign = torch.ones(3, dtype=torch.float64)
+    sign[2] = torch.det(u @ vt).sign()
+    turn = u @ torch.diag(sign) @ vt
+    scale = float(b0.square().sum() / (values * sign).sum())
+    offset = found.center.detach() - truth.center.detach()
+    return Residual(offset, float(rotation_angle(turn)), 1 / scale if scale else math.nan)
+
+
+def _float64(values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)

@@ -1,0 +1,194 @@
+"""What the tables of a run file become."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from invertwin.cli import build
+from invertwin.cli.run_file import validate
+from invertwin.errors import InputError
+from invertwin.scene import RoughDielectric, rotation_angle, rotation_from_vector
+
+ROUGH = {"kind": "rough_dielectric", "permittivity": 4.0, "lobe_width_deg": 30.0}
+ELEMENT = {"kind": "positions", "positions": [[0, 0, 0]]}
+RADAR = {
+    "waveform": {
+        "kind": "fmcw",
+        "start_frequency": 76e9,
+        "bandwidth": 2e9,
+        "duration": 5e-5,
+        "samples": 64,
+    },
+    "transmitters": ELEMENT,
+    "receivers": {"kind": "linear", "count": 4, "spacing": 1.9e-3},
+}
+
+
+def read(**changes):
+    raw = {"task": "reconstruct", "scene": {"box": make_box()}} | changes
+    return validate(raw, Path("run.toml"))
+
+
+def make_box(**changes):
+    return {"shape": "box", "size": [0.2, 0.3, 0.4], "material": ROUGH} | changes
+
+
+def test_shapes_are_scaled_then_turned_then_moved():
+    run = read(scene={"box": make_box(scale=2.0, rotation_deg=[0, 90, 0], position=[1, 2, 3])})
+    box = build.scene(run.scene)["box"]
+    extent = box.vertices.amax(0) - box.vertices.amin(0)
+    torch.testing.assert_close(extent, torch.tensor([0.8, 0.6, 0.4], dtype=torch.float64))
+    torch.testing.assert_close(box.center, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    assert isinstance(box.material, RoughDielectric)
+    assert box.material.lobe_width == math.radians(30)
+
+
+def test_truth_replaces_only_what_it_names():
+    run = read(
+        scene={"box": make_box(position=[0, 0, 2], rotation_deg=[0, 10, 0])},
+        truth={"box": {"position": [0.1, 0, 2]}},
+    )
+    found = build.residual(build.scene(run.scene)["box"], build.true_scene(run)["box"])
+    torch.testing.assert_close(found.offset, torch.tensor([-0.1, 0, 0], dtype=torch.float64))
+    assert found.angle < 1e-7
+
+
+def test_every_shape_and_parts_can_be_built(tmp_path):
+    from invertwin.scene import plate
+    from invertwin.scene.files import save_mesh
+
+    save_mesh(tmp_path / "mesh.ply", plate(1.0, 1.0))
+    shapes = {
+        "plate": {"shape": "plate", "width": 1, "height": 2},
+        "sphere": {"shape": "sphere", "radius": 0.1, "subdivisions": 1},
+        "dihedral": {"shape": "dihedral", "edge": 0.1},
+        "trihedral": {"shape": "trihedral", "edge": 0.1},
+        "text": {"shape": "text", "text": "A"},
+        "file": {"file": "mesh.ply"},
+        "parts": {
+            "parts": [
+                {"shape": "plate", "width": 1, "height": 1, "position": [-1, 0, 0]},
+                {"shape": "plate", "width": 1, "height": 1, "position": [1, 0, 0], "scale": 0.5},
+            ]
+        },
+    }
+    raw = {"task": "simulate", "scene": {k: v | {"material": ROUGH} for k, v in shapes.items()}}
+    scene = build.scene(validate(raw, tmp_path / "run.toml").scene)
+    assert set(scene.names) == set(shapes)
+    slits = scene["parts"].vertices
+    assert (slits[:, 0].min(), slits[:, 0].max()) == (-1.5, 1.25)
+
+
+def test_missing_mesh_names_the_object(tmp_path):
+    raw = {"task": "simulate", "scene": {"car": {"file": "car.obj", "material": ROUGH}}}
+    with pytest.raises(InputError, match=r"scene\.car: .*car\.obj"):
+        build.scene(validate(raw, tmp_path / "run.toml").scene)
+
+
+@pytest.mark.parametrize(
+    ("positions", "count"),
+    [
+        ({"kind": "line", "start": [-1, 0, 0], "stop": [1, 0, 0], "count": 5}, 5),
+        (
+            {
+                "kind": "arc",
+                "center": [0, 0, 2.5],
+                "radius": 2.5,
+                "start_deg": -30,
+                "stop_deg": 30,
+                "count": 3,
+            },
+            3,
+        ),
+        ({"kind": "grid", "center": [0, 0, 0], "size": [1, 0.5], "count": [3, 2]}, 6),
+        ([[0, 0, 0], [0.1, 0, 0]], 2),
+    ],
+)
+def test_tracks_and_look_at(positions, count):
+    table = RADAR | {"positions": positions, "orientation": {"look_at": [0, 0.5, 2.5]}}
+    run = read(radar=table)
+    assert run.radar is not None
+    radar = build.radar(run.radar)
+    assert radar.frame_count == count
+    assert radar.rotations is not None
+    ahead = torch.tensor([0, 0.5, 2.5], dtype=torch.float64) - radar.positions
+    seen = (radar.rotations.mT @ ahead[..., None])[..., 0]
+    torch.testing.assert_close(seen[:, :2], torch.zeros(count, 2, dtype=torch.float64))
+    assert bool((torch.linalg.det(radar.rotations) > 0.999).all())
+    assert bool((radar.rotations[:, 1, 1] > 0.9).all())
+
+
+def test_look_at_straight_up_is_an_input_error():
+    run = read(radar=RADAR | {"orientation": {"look_at": [0, 1, 0]}})
+    assert run.radar is not None
+    with pytest.raises(InputError, match="look_at"):
+        build.radar(run.radar)
+
+
+def test_starts_are_as_far_off_as_asked_and_repeat():
+    table = {"object": "box", "count": 5, "distance": [0.3, 0.4], "angle_deg": [15, 25], "seed": 3}
+    run = read(starts=table)
+    assert run.starts is not None
+    truth = build.scene(run.scene)
+    found = build.starts(run.starts, truth, 0)
+    again = build.starts(run.starts, truth, 0)
+    for start, same in zip(found, again, strict=True):
+        rest = build.residual(start.scene["box"], truth["box"])
+        assert 0.3 <= start.distance <= 0.4
+        assert math.isclose(rest.distance, start.distance, rel_tol=1e-9)
+        assert math.radians(15) <= start.angle <= math.radians(25)
+        assert math.isclose(rest.angle, start.angle, rel_tol=1e-6)
+        assert math.isclose(rest.scale, 1.0, rel_tol=1e-9)
+        assert torch.equal(start.scene["box"].vertices, same.scene["box"].vertices)
+    level = read(starts=table | {"directions": "level", "axis": [0, 1, 0]})
+    assert level.starts is not None
+    for start in build.starts(level.starts, truth, 0):
+        assert abs(float(start.scene["box"].center[1])) < 1e-12
+
+
+@pytest.mark.parametrize("shape", [{"shape": "plate", "width": 1, "height": 2}, make_box()])
+def test_residual_of_a_known_similarity(shape):
+    truth = build.scene(read(scene={"x": shape | {"material": ROUGH}}).scene)
+    vector = torch.tensor([0.2, -0.7, 0.4], dtype=torch.float64)
+    offset = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    moved = build.displaced(truth, "x", offset, vector)
+    found = build.residual(moved["x"], truth["x"])
+    torch.testing.assert_close(found.offset, offset)
+    expected = float(rotation_angle(rotation_from_vector(vector)))
+    assert math.isclose(found.angle, expected, rel_tol=1e-9)
+    half = build.scene(read(scene={"x": shape | {"material": ROUGH, "scale": 0.5}}).scene)
+    assert math.isclose(build.residual(half["x"], truth["x"]).scale, 0.5)
+
+
+def test_parameters_start_as_the_identity():
+    tables = [
+        {"kind": "pose", "object": "box"},
+        {"kind": "translation", "object": "box"},
+        {"kind": "scale", "object": "box"},
+        {"kind": "vertices", "object": "box"},
+        {"kind": "material", "object": "box", "values": ["permittivity"]},
+        {"kind": "radar_pose"},
+    ]
+    run = read(parameters=tables, radar=RADAR)
+    scene = build.scene(run.scene)
+    modules = build.parameters(run.parameters, scene)
+    assert len(modules) == len(tables)
+    changed = scene
+    for module in modules[:-1]:
+        changed = module(changed)
+    torch.testing.assert_close(changed["box"].vertices, scene["box"].vertices)
+    material = changed["box"].material
+    assert isinstance(material, RoughDielectric)
+    assert isinstance(material.permittivity, torch.Tensor)
+    assert math.isclose(float(material.permittivity.detach()), 4.0, rel_tol=1e-9)
+
+
+def test_material_value_that_a_conductor_does_not_have():
+    run = read(
+        scene={"box": make_box(material={"kind": "perfect_conductor"})},
+        parameters=[{"kind": "material", "object": "box", "values": ["permittivity"]}],
+    )
+    with pytest.raises(InputError, match=r"parameters\[0\]\.values"):
+        build.parameters(run.parameters, build.scene(run.scene))
