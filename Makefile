@@ -57,12 +57,12 @@ $(BIN)/python:
 	    if $$name $(NEW_ENOUGH); then python=$$name; break; fi; \
 	done; \
 	if [ -z "$$python" ]; then \
-	    echo 'expected Python 3.11 or newer, found none; type: sudo apt-get install python3'; exit 1; \
+	    echo 'expected Python 3.11 or newer, found none; type: sudo apt-get update && sudo apt-get install python3'; exit 1; \
 	fi; \
 	if ! $$python -c 'import ensurepip' 2>/dev/null; then \
 	    package=$$($$python -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'); \
 	    if $(MAY_APT); then $(APT) update && $(APT) install -y $$package; \
-	    else echo "$$python has no venv; type: sudo apt-get install $$package"; exit 1; fi; \
+	    else echo "$$python has no venv; type: sudo apt-get update && sudo apt-get install $$package"; exit 1; fi; \
 	fi; \
 	echo "set-up: .venv with $$($$python --version)"; \
 	$$python -m venv .venv || { rm -rf .venv; exit 1; }
@@ -85,13 +85,14 @@ $(BIN)/python:
 	@$(PIP) install --constraint constraints.txt --editable '.[bench]'
 	@touch $@
 
-# libllvm19 is what we test with; a system that no longer has it offers a newer one.
+# libllvm19 is what we test with; a system that no longer has it offers a newer one. Dr.Jit also
+# needs libatomic1, which the smallest systems lack.
 .venv/.llvm: .venv/.run
 	@if ! $(LLVM_USABLE) && $(MAY_APT); then \
 	    echo 'set-up: libLLVM, which compiles the ray tracing kernels'; \
 	    $(APT) update; \
 	    for version in 19 20 21 18; do \
-	        $(APT) install -y libllvm$$version && $(LLVM_USABLE) && break; \
+	        $(APT) install -y libllvm$$version libatomic1 && $(LLVM_USABLE) && break; \
 	    done; \
 	fi; \
 	$(LLVM_USABLE) || { \

@@ -248,6 +248,21 @@ class TestRealLibraries:
         file.write_text("not a library")
         assert not doctor.probe_library(str(file)).usable
 
+    def test_what_dr_jit_itself_lacks_is_named_and_not_blamed_on_the_library(
+        self, tmp_path, monkeypatch
+    ):
+        said = (
+            "ImportError: libatomic.so.1: cannot open shared object file: No such file\nNameError"
+        )
+        ended = subprocess.CompletedProcess(
+            [], 1, "", f"Traceback (most recent call last):\n{said}"
+        )
+        monkeypatch.setattr(doctor, "_run", lambda *_, **__: ended)
+        verdict = doctor.probe_library("libLLVM-19.so")
+        assert verdict == doctor.Verdict(
+            False, "could not be tried: Dr.Jit needs libatomic.so.1", final=False
+        )
+
     @pytest.mark.parametrize("asked", [14, 15])
     def test_importing_with_a_bad_library_named_warns_and_works(self, asked):
         """The abort that LLVM 15 causes never reaches the user, even who asks for it."""
@@ -293,15 +308,21 @@ def test_report_without_any_library_names_the_cure(tmp_path):
 @pytest.mark.parametrize(
     ("conda", "platform", "tools", "root", "command"),
     [
-        (False, "linux", {"apt-get"}, True, "apt-get update && apt-get install -y libllvm19"),
+        (
+            False,
+            "linux",
+            {"apt-get"},
+            True,
+            "apt-get update && apt-get install -y libllvm19 libatomic1",
+        ),
         (
             False,
             "linux",
             {"apt-get"},
             False,
-            "sudo apt-get update && sudo apt-get install -y libllvm19",
+            "sudo apt-get update && sudo apt-get install -y libllvm19 libatomic1",
         ),
-        (False, "linux", {"dnf"}, False, "sudo dnf install -y llvm-libs"),
+        (False, "linux", {"dnf"}, False, "sudo dnf install -y llvm-libs libatomic"),
         (False, "linux", set(), False, "conda install -c conda-forge libllvm19"),
         (False, "darwin", set(), False, "brew install llvm@19"),
         (True, "linux", {"apt-get"}, True, "conda install -c conda-forge libllvm19"),

@@ -227,6 +227,9 @@ def probe_library(path: str) -> Verdict:
         final = -ended.returncode in (signal.SIGABRT, signal.SIGSEGV, signal.SIGILL)
         reason = f"aborts the process (signal {-ended.returncode}): {lines[0][:60]}"
         return Verdict(False, reason, final)
+    missing = re.search(r"ImportError: (\S+): cannot open shared object", ended.stderr)
+    if missing:
+        return Verdict(False, f"could not be tried: Dr.Jit needs {missing[1]}", final=False)
     if lines[0].startswith("Traceback"):
         return Verdict(False, f"could not be tried: {lines[-1][:120]}", final=False)
     return Verdict(False, "refused: " + lines[0].split("(): ")[-1].split(". ")[0].rstrip(".")[:120])
@@ -248,16 +251,16 @@ def gpu_name() -> str | None:
 
 
 def install_command() -> str:
-    """The one line that installs a libLLVM that works on this machine."""
+    """The one line that installs a libLLVM that works, and what else Dr.Jit needs of the system."""
     if os.environ.get("CONDA_PREFIX"):
         return "conda install -c conda-forge libllvm19"
     if sys.platform == "darwin":
         return "brew install llvm@19"
     sudo = "" if getattr(os, "geteuid", lambda: 1)() == 0 else "sudo "
     if shutil.which("apt-get"):
-        return f"{sudo}apt-get update && {sudo}apt-get install -y libllvm19"
+        return f"{sudo}apt-get update && {sudo}apt-get install -y libllvm19 libatomic1"
     if shutil.which("dnf"):
-        return f"{sudo}dnf install -y llvm-libs"
+        return f"{sudo}dnf install -y llvm-libs libatomic"
     return "conda install -c conda-forge libllvm19"
 
 
