@@ -1,0 +1,376 @@
+"""The loop: simulate, compare, step, until the twin answers as the real scene did."""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from invertwin.capture.capture import Capture
+from invertwin.channel.bridge import use_backend
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.regularization import Regularizer
+from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
+from invertwin.radar.waveform import Radar
+from invertwin.scene.scene import Scene
+
+Status = Literal["converged", "budget", "diverged"]
+
+_DIVERGED = 1e3  # times the first loss
+_WINDOW = 20  # steps over which convergence is judged
+
+
+@dataclass(frozen=True)
+class Optimizer:
+    """How a gradient becomes a step.
+
+    Attributes:
+        kind: ``adam``, or ``sgd`` with momentum.
+        rate: Learning rate at the first step; parameters are in metres and radians.
+        final_rate: At the last one (cosine in between); None = ``rate`` / 20.
+        momentum: Of SGD.
+    """
+
+    kind: Literal["adam", "sgd"] = "adam"
+    rate: float = 0.03
+    final_rate: float | None = None
+    momentum: float = 0.9
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("adam", "sgd") or not self.rate > 0:
+            raise InputError(
+                f"expected kind 'adam' or 'sgd' and rate > 0, got {self.kind!r} and {self.rate}; "
+                "Adam at 0.03 suits metres and radians"
+            )
+
+    def build(self, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
+        """The torch optimiser over these parameters."""
+        if self.kind == "adam":
+            return torch.optim.Adam(parameters, lr=self.rate)
+        return torch.optim.SGD(parameters, lr=self.rate, momentum=self.momentum)
+
+    def rate_at(self, progress: float) -> float:
+        """Learning rate after this share of the steps."""
+        last = self.rate / 20 if self.final_rate is None else self.final_rate
+        return last + 0.5 * (self.rate - last) * (1 + math.cos(math.pi * progress))
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The outcome of :func:`reconstruct`.
+
+    Attributes:
+        scene: The twin.
+        radar: The radar with the poses of the fit.
+        parameters: The fitted modules.
+        history: One row a step: ``step``, ``loss``, ``values`` (parameters by name).
+        status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
+            ``diverged`` (then the best state is kept).
+        steps: Steps done.
+        loss: Of the state returned, at the widths of its step.
+    """
+
+    scene: Scene
+    radar: Radar
+    parameters: nn.ModuleList
+    history: list[dict[str, Any]]
+    status: Status
+    steps: int
+    loss: float
+
+
+def reconstruct(
+    scene: Scene,
+    radar: Radar,
+    capture: Capture,
+    parameters: Sequence[nn.Module],
+    *,
+    grid: Grid,
+    loss: SpectrumLoss | None = None,
+    optimizer: Optimizer | None = None,
+    surrogate: Surrogate | None = None,
+    steps: int = 200,
+    annealing: float = 0.7,
+    seed: int = 0,
+    samples: int = 400_000,
+    boundary_samples: int = 50_000,
+    boundary: bool = True,
+    frames_per_step: int | None = None,
+    nuisances: Sequence[nn.Module] = (),
+    regularizers: Sequence[Regularizer] = (),
+    tolerance: float = 0.0,
+    checkpoint: str | Path | None = None,
+    checkpoint_every: int = 10,
+    resume: bool = False,
+    backend: str | None = None,
+    progress: Callable[[dict[str, Any]], None] | None = None,
+) -> Reconstruction:
+    """Find the parameters of a scene whose simulated spectrum equals a measured one.
+
+    Every step draws new samples, deposits power paths, shapes them with the surrogate, and
+    follows the gradient of the loss, silhouettes included. Surrogate and data are blurred by the
+    same extra widths, which fall to zero over the first ``annealing`` of the steps.
+
+    Args:
+        scene: Starting scene.
+        radar: The radar of the capture.
+        capture: Measured data.
+        parameters: Modules Scene → Scene or Radar → Radar, applied in order (``scene.parameters``).
+        grid: Bins that are compared.
+        loss: How maps are compared.
+        optimizer: Kind and rates.
+        surrogate: Kernels, and the extra widths at the first step.
+        steps: Budget.
+        annealing: Share of the steps with extra widths.
+        seed: Of all samples; the same seed gives the same fit.
+        samples: Interior samples a step, over the frames of the step.
+        boundary_samples: Silhouette samples a step.
+        boundary: Off for ablation.
+        frames_per_step: Random subset of frames a step (None = all).
+        nuisances: ``RangeBias``, ``ClockOffset``.
+        regularizers: Added to the loss, functions of the scene.
+        tolerance: Once the widths are zero, stop when the loss has fallen by less than this
+            share over 20 steps (0 = use the whole budget).
+        checkpoint: File that is written atomically every ``checkpoint_every`` steps.
+        checkpoint_every: [steps].
+        resume: Go on from ``checkpoint`` if it is there.
+        backend: See ``deposit_power``.
+        progress: Called with every row of the history.
+
+    Source: §4.2 of the paper.
+    Differs from the source: Adam beside SGD; annealed widths.
+
+    Raises:
+        InputError: Nothing to fit, a map of zeros, a checkpoint of another fit.
+    """
+    fit = _Fit(
+        scene=scene,
+        radar=radar,
+        modules=nn.ModuleList([*parameters, *nuisances]),
+        measured=capture.spectrum(grid).to(torch.float32),
+        grid=grid,
+        loss=loss or SpectrumLoss(),
+        surrogate=surrogate or Surrogate(range_width=3.0, angle_width=1.5),
+        annealing=annealing,
+        seed=seed,
+        samples=samples,
+        boundary_samples=boundary_samples,
+        boundary=boundary,
+        frames_per_step=frames_per_step,
+        regularizers=tuple(regularizers),
+        steps=steps,
+    )
+    sought = [p for p in fit.modules.parameters() if p.requires_grad]
+    if not sought or steps < 1:
+        raise InputError(
+            f"expected parameters to fit and steps >= 1, got {len(sought)} and {steps}; "
+            "give modules such as Pose('object')"
+        )
+    rates = optimizer or Optimizer()
+    state = _State(rates.build(sought))
+    path = Path(checkpoint) if checkpoint is not None else None
+    if resume and path is not None and path.exists():
+        state.load(path, fit)
+    with use_backend(backend):
+        status = _descend(fit, state, rates, tolerance, path, checkpoint_every, progress)
+    if path is not None:
+        state.save(path, fit)
+    with torch.no_grad():
+        moved, seen, _ = fit.applied()
+    row = state.history[-1] if state.history else {"loss": math.nan}
+    return Reconstruction(
+        moved, seen, fit.modules, state.history, status, state.step, float(row["loss"])
+    )
+
+
+@dataclass
+class _State:
+    """What a checkpoint holds besides the parameters."""
+
+    optimizer: torch.optim.Optimizer
+    step: int = 0
+    history: list[dict[str, Any]] = field(default_factory=list)
+    best: tuple[int, float, dict[str, Tensor]] | None = None
+
+    def keep_if_better(self, loss: float, fit: "_Fit") -> None:
+        """Remember the state of the lowest loss; without extra widths beats with."""
+        if self.best is not None:
+            first = fit.annealed(self.step) and not fit.annealed(self.best[0])
+            if not first and loss >= self.best[1]:
+                return
+        kept = {k: v.detach().clone() for k, v in fit.modules.state_dict().items()}
+        self.best = (self.step, loss, kept)
+
+    def save(self, path: Path, fit: "_Fit") -> None:
+        """Write atomically: a kill leaves the last whole file."""
+        part = path.with_suffix(path.suffix + ".part")
+        content = {
+            "modules": fit.modules.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "step": self.step,
+            "history": self.history,
+            "best": self.best,
+            "key": fit.key(),
+        }
+        torch.save(content, part)
+        os.replace(part, path)
+
+    def load(self, path: Path, fit: "_Fit") -> None:
+        """Restore from a file of the same fit."""
+        try:
+            content = torch.load(path, weights_only=True)
+        except Exception as error:
+            raise InputError(
+                f"expected a checkpoint in {path}, got a file that cannot be read "
+                f"({type(error).__name__}); delete it or start without resume"
+            ) from None
+        if content.get("key") != fit.key():
+            raise InputError(
+                f"expected a checkpoint of this fit in {path}, got one of another (steps, seed, "
+                "grid or parameters differ); start without resume"
+            )
+        fit.modules.load_state_dict(content["modules"])
+        self.optimizer.load_state_dict(content["optimizer"])
+        self.step, self.history = content["step"], content["history"]
+        self.best = content["best"]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The forward model and the loss of one step; pure in (parameters, step)."""
+
+    scene: Scene
+    radar: Radar
+    modules: nn.ModuleList
+    measured: Float[Tensor, "frame range u v"]
+    grid: Grid
+    loss: SpectrumLoss
+    surrogate: Surrogate
+    annealing: float
+    seed: int
+    samples: int
+    boundary_samples: int
+    boundary: bool
+    frames_per_step: int | None
+    regularizers: tuple[Regularizer, ...]
+    steps: int
+
+    def key(self) -> list[Any]:
+        """What must be equal for a checkpoint to be of this fit."""
+        shapes = [[n, list(p.shape)] for n, p in self.modules.named_parameters()]
+        settings = [self.annealing, self.samples, self.boundary_samples, self.frames_per_step]
+        return [self.steps, self.seed, list(self.grid.shape), self.boundary, settings, shapes]
+
+    def applied(self) -> tuple[Scene, Radar, Tensor | None]:
+        """Scene, radar and range offset under the present parameters."""
+        scene, radar, offset = self.scene, self.radar, None
+        for module in self.modules:
+            kind = getattr(module, "applies_to", "scene")
+            if kind in ("scene", "both"):
+                scene = module(scene)
+            if kind in ("radar", "both"):
+                radar = module(radar)
+            if kind == "range":
+                offset = module()
+        return scene, radar, offset
+
+    def widths(self, step: int) -> Surrogate:
+        """The surrogate with the extra widths of a step."""
+        left = max(0.0, 1 - step / max(1.0, self.annealing * self.steps))
+        return replace(
+            self.surrogate,
+            range_width=self.surrogate.range_width * left,
+            angle_width=self.surrogate.angle_width * left,
+        )
+
+    def annealed(self, step: int) -> bool:
+        """Whether the extra widths are zero from this step on."""
+        return step >= self.annealing * self.steps
+
+    def evaluate(self, step: int) -> Tensor:
+        """The loss of a step."""
+        scene, radar, offset = self.applied()
+        measured, kernels = self.measured, self.widths(step)
+        if self.frames_per_step is not None and self.frames_per_step < radar.frame_count:
+            rng = np.random.default_rng([self.seed, step])
+            chosen = np.sort(rng.choice(radar.frame_count, self.frames_per_step, replace=False))
+            radar, measured = radar.frames(chosen.tolist()), measured[torch.from_numpy(chosen)]
+        simulated = surrogate_spectrum(
+            scene,
+            radar,
+            self.grid,
+            kernels,
+            samples=self.samples,
+            boundary_samples=self.boundary_samples,
+            seed=self.seed * 1_000_003 + step,
+            boundary=self.boundary,
+            range_offset=offset,
+        )
+        value = self.loss(simulated, kernels.blur(measured, radar, self.grid))
+        for term in self.regularizers:
+            value = value + term(scene)
+        return value
+
+
+def _descend(
+    fit: _Fit,
+    state: _State,
+    rates: Optimizer,
+    tolerance: float,
+    checkpoint: Path | None,
+    every: int,
+    progress: Callable[[dict[str, Any]], None] | None,
+) -> Status:
+    while state.step < fit.steps:
+        for group in state.optimizer.param_groups:
+            group["lr"] = rates.rate_at(state.step / fit.steps)
+        state.optimizer.zero_grad()
+        value = fit.evaluate(state.step)
+        number = float(value.detach())
+        if _lost(number, state.history):
+            if state.best is not None:
+                fit.modules.load_state_dict(state.best[2])
+            return "diverged"
+        state.keep_if_better(number, fit)
+        value.backward()
+        state.optimizer.step()
+        state.history.append({"step": state.step, "loss": number, "values": _values(fit.modules)})
+        state.step += 1
+        if progress:
+            progress(state.history[-1])
+        if checkpoint is not None and state.step % every == 0:
+            state.save(checkpoint, fit)
+        if tolerance > 0 and _settled(fit, state, tolerance):
+            return "converged"
+    return "converged" if _settled(fit, state, max(tolerance, 1e-3)) else "budget"
+
+
+def _lost(loss: float, history: list[dict[str, Any]]) -> bool:
+    return not math.isfinite(loss) or bool(history and loss > _DIVERGED * history[0]["loss"])
+
+
+def _settled(fit: _Fit, state: _State, tolerance: float) -> bool:
+    """Whether the loss, averaged over two windows without extra widths, no longer falls."""
+    rows = [row["loss"] for row in state.history[-2 * _WINDOW :]]
+    if len(rows) < 2 * _WINDOW or not fit.annealed(state.step - 2 * _WINDOW):
+        return False
+    before, after = np.mean(rows[:_WINDOW]), np.mean(rows[_WINDOW:])
+    return bool(before - after < tolerance * before)
+
+
+def _values(modules: nn.ModuleList) -> dict[str, list[float] | float]:
+    """Parameters by name as plain numbers; long ones (vertices) are left to the checkpoint."""
+    rows: dict[str, list[float] | float] = {}
+    for module in modules:
+        for name, value in getattr(module, "values", dict)().items():
+            if value.numel() <= 16:
+                rows[name] = value.tolist()
+    return rows

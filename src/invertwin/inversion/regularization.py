@@ -1,0 +1,53 @@
+"""What is known about a shape before any signal: neighbours move alike."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Scene
+
+Regularizer = Callable[[Scene], Float64[Tensor, ""]]
+
+
+class Laplacian:
+    """Dirichlet energy of an object's displacement from its first shape.
+
+    ``(weight/2) Σ_edges w_e |d_i − d_j|²`` with cotangent weights of the first shape; d are the
+    vertices' displacements in the object's frame, over the mean edge length.
+
+    Source: §4.2 of the paper (λ L θ; its gradient is weight · L d).
+    Differs from the source: the energy is that of the displacement, so that the first shape is
+    not itself smoothed away.
+    """
+
+    def __init__(self, scene: Scene, object: str, weight: float) -> None:
+        mesh = scene[object].mesh
+        self.object, self.weight = object, weight
+        self.start = mesh.vertices.detach().clone()
+        self.edges, self.weights, self.unit = cotangent_edges(mesh)
+
+    def __call__(self, scene: Scene) -> Float64[Tensor, ""]:
+        """The energy of the scene's present shape."""
+        moved = (scene[self.object].mesh.vertices - self.start) / self.unit
+        jump = moved[self.edges[:, 0]] - moved[self.edges[:, 1]]
+        return 0.5 * self.weight * (self.weights * jump.square().sum(1)).sum()
+
+
+def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float]:
+    """Edges, their cotangent weights (at least 0.01), and the mean edge length [m]."""
+    corners = mesh.vertices.detach()[mesh.faces]
+    pairs, weights = [], []
+    for k in range(3):
+        a, b, c = corners[:, k], corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]
+        dot = ((a - c) * (b - c)).sum(1)
+        area = torch.linalg.cross(a - c, b - c).norm(dim=1).clamp_min(1e-12)
+        pairs.append(torch.stack([mesh.faces[:, k], mesh.faces[:, (k + 1) % 3]], dim=1))
+        weights.append(0.5 * dot / area)
+    ends = torch.cat(pairs).sort(dim=1).values
+    edges, group = ends.unique(dim=0, return_inverse=True)
+    total = torch.zeros(len(edges), dtype=torch.float64).index_add(0, group, torch.cat(weights))
+    lengths = (mesh.vertices.detach()[edges[:, 0]] - mesh.vertices.detach()[edges[:, 1]]).norm(dim=1)
+    return edges, total.clamp_min(0.01), float(lengths.mean())
