@@ -65,10 +65,11 @@ def _checked_faces(faces: object, vertex_count: int) -> Tensor:
             f"expected mesh faces of shape [any, 3], got {list(indices.shape)}; "
             "split polygons into triangles"
         )
+    indices = indices.to(torch.int64)
     low, high = int(indices.min()), int(indices.max())
     if low < 0 or high >= vertex_count:
         raise InputError(
             f"expected face indices in [0, {vertex_count - 1}], got [{low}, {high}]; "
             "count vertices from 0"
         )
-    return indices.to(torch.int64)
+    return indices

@@ -188,6 +188,5 @@ def _checked_pose(pose: object) -> Tensor:
 
 def _checked_velocity(velocity: object, vertex_count: int) -> Tensor:
     do = f"give one vector [3] or one per vertex [{vertex_count}, 3]"
-    tensor = torch.as_tensor(velocity)
-    shape = (3,) if tensor.ndim == 1 else (vertex_count, 3)
+    shape = (vertex_count, 3) if getattr(velocity, "ndim", 1) == 2 else (3,)
     return checked_tensor(velocity, shape, "velocity [m/s]", do)

@@ -177,17 +177,23 @@ def _triangulated_outline(
     import matplotlib
     import shapely
     from matplotlib.font_manager import FontProperties
+    from matplotlib.ft2font import FT2Font
     from matplotlib.textpath import TextPath
 
-    if not string.isprintable():
-        raise InputError(f"expected one line of text, got {string!r}; give printable characters")
+    if not string.strip() or not string.isprintable():
+        raise InputError(f"expected one line of visible text, got {string!r}; give some letters")
     font = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans-Bold.ttf"
+    glyphs = FT2Font(font)
+    unknown = [letter for letter in string if glyphs.get_char_index(ord(letter)) == 0]
+    if unknown:
+        raise InputError(
+            f"expected characters of the font DejaVu Sans, got {string!r} with "
+            f"{''.join(unknown)}; use others"
+        )
     # Curves are cut into chords about one unit long, so the size sets how fine they are.
     path = TextPath((0, 0), string, size=100, prop=FontProperties(fname=font))
     loops = [np.asarray(loop) for loop in path.to_polygons()]
     rings = [shapely.Polygon(loop) for loop in loops if len(loop) >= 4]
-    if not rings:
-        raise InputError(f"expected text with visible characters, got {string!r}; give a letter")
     # A ring inside another is a hole, a ring inside a hole is filled again.
     outline = reduce(shapely.symmetric_difference, rings)
     left, bottom, right, top = outline.bounds
