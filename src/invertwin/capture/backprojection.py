@@ -1,0 +1,120 @@
+"""Images from range profiles by coherent summation, and calibration against a known target."""
+
+import torch
+from jaxtyping import Complex128, Float64
+from scipy.optimize import minimize
+from torch import Tensor
+
+from invertwin.capture.capture import Capture
+from invertwin.errors import InputError
+
+# Half widths and steps of the first search: wide against what clocks and cables are off by after
+# alignment by hand, dense against a range cell and the time in which a radar moves one beamwidth.
+_CLOCK_SEARCH = (0.1, 0.01)
+_BIAS_SEARCH = (0.1, 0.01)
+
+
+def backproject(
+    capture: Capture, points: Float64[Tensor, "*point 3"]
+) -> Complex128[Tensor, "*point"]:
+    """Mean over the frames of each range profile at the distance of a point.
+
+    Echoes of a target at the point add in phase, since the profiles carry their carrier: the
+    matched filter of a point target without its spreading loss.
+
+    Args:
+        capture: range profiles.
+        points: world positions [m].
+
+    Raises:
+        InputError: the capture holds beat samples, or a point is beyond the measured ranges.
+    """
+    flat = points.reshape(-1, 3)
+    ranges = _distances(capture.radar().positions, flat)
+    return capture.interpolator()(ranges).mean(0).reshape(points.shape[:-1])
+
+
+def locate(
+    capture: Capture,
+    center: Float64[Tensor, "3"],
+    radius: float = 0.6,
+    step: float = 0.01,
+) -> Float64[Tensor, "3"]:
+    """The brightest point of the backprojected image in a horizontal square.
+
+    Args:
+        capture: range profiles.
+        center: of the square, at the known height of the target [m].
+        radius: half the side of the square [m].
+        step: of the image from which the search starts [m]; below half a resolution cell.
+
+    Raises:
+        InputError: as `backproject`, or a step that is not positive and below the radius.
+    """
+    if not 0 < step < radius:
+        raise InputError(
+            f"expected 0 < step < radius, got {step} and {radius}; give both in metres"
+        )
+    side = torch.arange(-radius, radius + step / 2, step, dtype=torch.float64)
+    offsets = torch.cartesian_prod(side, side)
+    interpolator, positions = capture.interpolator(), capture.radar().positions
+
+    def brightness(offset: Float64[Tensor, "point 2"]) -> Float64[Tensor, " point"]:
+        points = center + torch.nn.functional.pad(offset, (0, 1))
+        return interpolator(_distances(positions, points)).mean(0).abs()
+
+    # A column of the image at a time keeps the memory of frames × points small.
+    image = torch.cat([brightness(part) for part in offsets.split(len(side))])
+    found = _refined(brightness, offsets[image.argmax()], (step / 2, step / 2))
+    return center + torch.nn.functional.pad(found, (0, 1))
+
+
+def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
+    """The capture with the clock offset and range bias that focus a known target best.
+
+    Both are searched within 0.1 s and 0.1 m of the present ones. The power of the coherent sum is
+    the measure: over the bias it follows the envelope of the pulse, not its carrier, since a bias
+    turns all frames alike; over the clock offset it is as sharp as the image.
+
+    Args:
+        capture: range profiles with the track of the radar.
+        target: surveyed position [m].
+
+    Raises:
+        InputError: the capture has no track or holds beat samples, or the search leads outside
+            the track or the measured ranges.
+    """
+    interpolator = capture.interpolator()
+
+    def focus(trial: Float64[Tensor, "trial 2"]) -> Float64[Tensor, " trial"]:
+        """Of rows of shifts of clock [s] and bias [m]."""
+        distances = [(capture.positions(clock) - target).norm(dim=1) for clock in trial[:, 0]]
+        return interpolator(torch.stack(distances, dim=1) + trial[:, 1]).mean(0).abs()
+
+    axes = [
+        torch.arange(-reach, reach + step / 2, step, dtype=torch.float64)
+        for reach, step in (_CLOCK_SEARCH, _BIAS_SEARCH)
+    ]
+    trials = torch.cartesian_prod(*axes)
+    best = trials[focus(trials).argmax()]
+    clock, bias = _refined(focus, best, (_CLOCK_SEARCH[1] / 2, _BIAS_SEARCH[1] / 2)).tolist()
+    return capture.recalibrated(capture.clock_offset + clock, capture.range_bias + bias)
+
+
+def _distances(
+    positions: Float64[Tensor, "frame 3"], points: Float64[Tensor, "point 3"]
+) -> Float64[Tensor, "frame point"]:
+    # The matrix product that cdist takes by default cancels digits.
+    return torch.cdist(positions, points, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _refined(measure, start: Tensor, sizes: tuple[float, float]) -> Float64[Tensor, "2"]:
+    """The local maximum of a measure of rows of two numbers, from a simplex of these sizes."""
+    x, y = start.tolist()
+    simplex = [(x, y), (x + sizes[0], y), (x, y + sizes[1])]
+
+    def loss(values) -> float:
+        return -float(measure(torch.as_tensor(values, dtype=torch.float64)[None]).log())
+
+    options = {"xatol": 1e-6, "fatol": 1e-12, "initial_simplex": simplex}
+    return torch.from_numpy(minimize(loss, (x, y), method="Nelder-Mead", options=options).x)

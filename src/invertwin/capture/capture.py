@@ -1,0 +1,342 @@
+"""Measured or simulated radar data with everything needed to model it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+import xarray as xr
+from jaxtyping import Complex, Float, Float64, Int64
+from torch import Tensor
+
+from invertwin.capture.files import read_dataset, write_dataset
+from invertwin.capture.radar_fields import (
+    attribute,
+    labelled,
+    radar_fields,
+    radar_from_fields,
+    tensor,
+)
+from invertwin.capture.range_interpolation import RangeInterpolator
+from invertwin.capture.track import Track
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.radar.spectrum import exact_spectrum
+from invertwin.radar.waveform import Radar
+
+BEAT_DIMS = ("frame", "tx", "rx", "sample")
+PROFILE_DIMS = ("frame", "range")
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Radar data as labelled arrays: an `xarray.Dataset` that has been checked.
+
+    It holds either ``beat`` (frame, tx, rx, sample), the raw samples of an FMCW radar, or
+    ``range_profile`` (frame, range), analytic signals at radio frequency; beside it the radar's
+    pose in every frame, its arrays and waveform, and where known the time of each frame on the
+    radar's clock, the track its positions were read from, and surveyed positions of targets.
+    Every variable carries its unit.
+
+    Attributes:
+        dataset: the labelled arrays. Not to be changed in place.
+
+    Raises:
+        InputError: missing variables or attributes, wrong dimensions or shapes, NaN, an unknown
+            waveform, ranges that are not uniform.
+    """
+
+    dataset: xr.Dataset
+    _radar: Radar = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_radar", _checked(self.dataset))
+
+    @classmethod
+    def from_beat(
+        cls,
+        beat: Complex[Tensor, "frame tx rx sample"],
+        radar: Radar,
+        times: Float64[Tensor, " frame"] | None = None,
+    ) -> "Capture":
+        """Raw samples of an FMCW radar.
+
+        Args:
+            beat: samples of every virtual channel; dtype and bits are kept.
+            radar: what measured them.
+            times: of each frame [s].
+        """
+        variables = {"beat": labelled(BEAT_DIMS, beat, "1")}
+        return cls._assembled(variables, radar, times)
+
+    @classmethod
+    def from_range_profile(
+        cls,
+        profile: Complex[Tensor, "frame range"],
+        ranges: Float64[Tensor, " range"],
+        radar: Radar,
+        times: Float64[Tensor, " frame"] | None = None,
+        *,
+        track: Track | None = None,
+        clock_offset: float = 0.0,
+        range_bias: float = 0.0,
+        survey: Float64[Tensor, "target 3"] | None = None,
+    ) -> "Capture":
+        """Range profiles of one channel.
+
+        Args:
+            profile: analytic signal at radio frequency: an echo from R turns by 4π f/c (r − R).
+            ranges: R = L/2 of its samples, uniform, the bias already subtracted [m].
+            radar: what measured them.
+            times: of each frame on the radar's clock [s].
+            track: what the radar's positions were read from, at ``times + clock_offset``.
+            clock_offset: of the track's clock against the radar's [s].
+            range_bias: what was subtracted from the radar's own ranges [m].
+            survey: known positions of targets [m].
+        """
+        variables = {
+            "range_profile": labelled(PROFILE_DIMS, profile, "1"),
+            "range": labelled(("range",), ranges, "m"),
+        }
+        if track is not None:
+            variables["track_time"] = labelled(("track_time",), track.times, "s")
+            variables["track_position"] = labelled(("track_time", "axis"), track.positions, "m")
+        if survey is not None:
+            variables["survey"] = labelled(("target", "axis"), survey, "m")
+        capture = cls._assembled(variables, radar, times)
+        named = {"clock_offset": clock_offset, "range_bias": range_bias}
+        return cls(capture.dataset.assign_attrs(named))
+
+    @classmethod
+    def _assembled(
+        cls, variables: dict[str, xr.DataArray], radar: Radar, times: Tensor | None
+    ) -> "Capture":
+        described, attributes = radar_fields(radar)
+        variables |= described
+        if times is not None:
+            variables["time"] = labelled(("frame",), times, "s")
+        _check_sizes(variables)
+        return cls(xr.Dataset(variables, attrs=attributes))
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Capture":
+        """Reads what `save` wrote.
+
+        Raises:
+            InputError: no such file, a truncated file, or one that holds no capture.
+        """
+        return cls(read_dataset(Path(path)))
+
+    def save(self, path: str | Path) -> None:
+        """Writes NetCDF (HDF5), bit for bit; an interrupted write leaves what was there before.
+
+        Raises:
+            InputError: the folder does not exist.
+        """
+        write_dataset(self.dataset, Path(path))
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return self.dataset.sizes["frame"]
+
+    @property
+    def beat(self) -> Complex[Tensor, "frame tx rx sample"]:
+        """Raw samples.
+
+        Raises:
+            InputError: the capture holds range profiles.
+        """
+        return self._data("beat")
+
+    @property
+    def range_profile(self) -> Complex[Tensor, "frame range"]:
+        """Complex profiles.
+
+        Raises:
+            InputError: the capture holds beat samples.
+        """
+        return self._data("range_profile")
+
+    @property
+    def ranges(self) -> Float64[Tensor, " range"]:
+        """R = L/2 of the samples of the range profile [m]."""
+        self._data("range_profile")
+        return tensor(self.dataset, "range")
+
+    @property
+    def times(self) -> Float64[Tensor, " frame"]:
+        """Of each frame, on the radar's clock [s].
+
+        Raises:
+            InputError: the capture has no times.
+        """
+        return tensor(self.dataset, "time")
+
+    @property
+    def track(self) -> Track | None:
+        """What the positions were read from."""
+        if "track_time" not in self.dataset.variables:
+            return None
+        return Track(tensor(self.dataset, "track_time"), tensor(self.dataset, "track_position"))
+
+    @property
+    def clock_offset(self) -> float:
+        """Positions are those of the track at ``times`` + this [s]."""
+        return float(self.dataset.attrs.get("clock_offset", 0.0))
+
+    @property
+    def range_bias(self) -> float:
+        """What has been subtracted from the radar's own ranges [m]."""
+        return float(self.dataset.attrs.get("range_bias", 0.0))
+
+    @property
+    def survey(self) -> Float64[Tensor, "target 3"] | None:
+        """Known positions of targets [m]."""
+        return tensor(self.dataset, "survey") if "survey" in self.dataset.variables else None
+
+    def radar(self) -> Radar:
+        """The radar at the poses of the frames."""
+        return self._radar
+
+    def positions(self, clock_shift: Float64[Tensor, ""]) -> Float64[Tensor, "frame 3"]:
+        """Radar positions if the clock offset were larger by ``clock_shift`` [s].
+
+        Differentiable, so that a clock offset can be fitted.
+
+        Raises:
+            InputError: the capture has no track, or the shift leads outside it.
+        """
+        track = self.track
+        if track is None:
+            raise InputError(
+                "expected a capture with the track of the radar, got none; "
+                "a clock offset can be fitted only where the track is known"
+            )
+        return track.at(self.times + (self.clock_offset + clock_shift))
+
+    def recalibrated(self, clock_offset: float, range_bias: float) -> "Capture":
+        """The same data with another clock offset [s] and range bias [m].
+
+        Raises:
+            InputError: the capture has no track, or holds beat samples.
+        """
+        shift = torch.tensor(clock_offset - self.clock_offset, dtype=torch.float64)
+        ranges = self.ranges + (self.range_bias - range_bias)
+        dataset = self.dataset.assign(
+            position=labelled(("frame", "axis"), self.positions(shift), "m"),
+            range=labelled(("range",), ranges, "m"),
+        )
+        named = {"clock_offset": clock_offset, "range_bias": range_bias}
+        return Capture(dataset.assign_attrs(named))
+
+    def frames(self, indices: Sequence[int] | Int64[Tensor, " chosen"]) -> "Capture":
+        """Only these frames, in this order."""
+        return Capture(self.dataset.isel(frame=torch.as_tensor(indices).tolist()))
+
+    def spectrum(self, grid: Grid) -> Float[Tensor, "frame range u v"]:
+        """Measured power in the bins of a grid.
+
+        Beat samples go through the exact chain (window, range transform, beamforming); range
+        profiles are interpolated, band-limited, and squared.
+
+        Raises:
+            InputError: a grid beyond the measured ranges, or one that resolves directions which
+                range profiles do not.
+        """
+        if "beat" in self.dataset:
+            return exact_spectrum(self.beat, self._radar, grid)
+        if grid.shape[1:] != (1, 1):
+            raise InputError(
+                f"expected a grid of ranges only, got {grid.u_count} × {grid.v_count} directions; "
+                "range profiles of one channel do not resolve directions"
+            )
+        profile = self.interpolator()(grid.ranges.expand(self.frame_count, -1))
+        return profile.abs().square()[..., None, None]
+
+    def interpolator(self) -> RangeInterpolator:
+        """The range profiles as functions of range."""
+        frequency = self._radar.waveform.center_frequency
+        return RangeInterpolator(self.range_profile, self.ranges, frequency)
+
+    def _data(self, name: str) -> Tensor:
+        if name not in self.dataset:
+            held = "beat" if "beat" in self.dataset else "range_profile"
+            raise InputError(
+                f"expected a capture of {name}, got one of {held}; "
+                "captures hold raw samples or range profiles, not both"
+            )
+        return tensor(self.dataset, name)
+
+
+def _check_sizes(variables: dict[str, xr.DataArray]) -> None:
+    """xarray's own message for this does not say what to do."""
+    sizes: dict[str, tuple[str, int]] = {}
+    for name, variable in variables.items():
+        for dim, size in zip(variable.dims, variable.shape, strict=True):
+            other, expected = sizes.setdefault(str(dim), (name, size))
+            if size != expected:
+                raise InputError(
+                    f"expected {expected} along {dim} in {name} as in {other}, got {size}; "
+                    "data and radar must describe the same frames, elements and samples"
+                )
+
+
+def _checked(dataset: xr.Dataset) -> Radar:
+    """The radar of a capture, if all is as it should be."""
+    held = [name for name in ("beat", "range_profile") if name in dataset]
+    if len(held) != 1:
+        raise InputError(
+            f"expected a capture with either beat or range_profile, got {held or 'neither'}; "
+            "the file is no capture or was written by another program"
+        )
+    for name, dims in (("beat", BEAT_DIMS), ("range_profile", PROFILE_DIMS)):
+        if name in held and (dataset[name].dims != dims or dataset[name].dtype.kind != "c"):
+            raise InputError(
+                f"expected complex {name} with dimensions {dims}, got {dataset[name].dtype} with "
+                f"{dataset[name].dims}; label the data that way"
+            )
+    for name, variable in dataset.variables.items():
+        bad = int((~np.isfinite(variable.values)).sum())
+        if bad:
+            raise InputError(
+                f"expected finite {name}, got {bad} NaN or infinite of {variable.size}; "
+                "drop those frames or samples"
+            )
+    radar = radar_from_fields(dataset)
+    if "beat" in held:
+        _check_beat(dataset, radar)
+    else:
+        _check_profile(dataset)
+    return radar
+
+
+def _check_beat(dataset: xr.Dataset, radar: Radar) -> None:
+    expected = attribute(dataset.attrs, "samples") if "samples" in dataset.attrs else None
+    if expected != dataset.sizes["sample"]:
+        raise InputError(
+            f"expected {expected} samples per ramp as in the waveform "
+            f"{type(radar.waveform).__name__}, got {dataset.sizes['sample']}; "
+            "beat samples need an FMCW waveform that says how many there are"
+        )
+
+
+def _check_profile(dataset: xr.Dataset) -> None:
+    ranges = tensor(dataset, "range")
+    steps = ranges.diff()
+    if (
+        len(ranges) < 2
+        or not (steps > 0).all()
+        or (steps - steps.mean()).abs().max() > (1e-3 * steps.mean())
+    ):
+        raise InputError(
+            "expected at least 2 uniform, ascending ranges, got others; "
+            "resample the profiles onto uniform ranges in metres"
+        )
+    for end in ("tx", "rx"):
+        if dataset.sizes[end] != 1:
+            raise InputError(
+                f"expected one {end} element with range profiles, got {dataset.sizes[end]}; "
+                "range profiles are those of one channel"
+            )

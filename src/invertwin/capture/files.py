@@ -1,0 +1,76 @@
+"""Captures on disk: NetCDF in HDF5, written in one step."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from invertwin.errors import InputError
+
+
+def write_dataset(dataset: xr.Dataset, path: Path) -> None:
+    """Writes to a file beside ``path`` and renames it; complex variables as two real ones.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    real = _split(dataset)
+    # No fill values: they would mark numbers as missing.
+    encoding = {str(variable): {"_FillValue": None} for variable in real.variables}
+    try:
+        real.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def read_dataset(path: Path) -> xr.Dataset:
+    """Reads what `write_dataset` wrote.
+
+    Raises:
+        InputError: no such file, or one that is damaged or no NetCDF.
+    """
+    if not path.is_file():
+        raise InputError(f"expected a capture file, got no file {path}; check the path")
+    try:
+        # Nothing is decoded: seconds stay numbers, and every bit stays what it was.
+        dataset = xr.load_dataset(path, engine="h5netcdf", decode_cf=False)
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise InputError(
+            f"expected a whole NetCDF file, got {path}, which cannot be read "
+            f"({type(error).__name__}); it is damaged or truncated, copy or record it again"
+        ) from error
+    return _joined(dataset)
+
+
+def _split(dataset: xr.Dataset) -> xr.Dataset:
+    for name in [str(key) for key in dataset.data_vars]:
+        variable = dataset[name]
+        if variable.dtype.kind == "c":
+            parts = {f"{name}_real": variable.real, f"{name}_imag": variable.imag}
+            parts = {key: part.assign_attrs(variable.attrs) for key, part in parts.items()}
+            dataset = dataset.drop_vars(name).assign(parts)
+    return dataset
+
+
+def _joined(dataset: xr.Dataset) -> xr.Dataset:
+    for name in [str(key) for key in dataset.data_vars]:
+        if not name.endswith("_real"):
+            continue
+        real, whole = dataset[name], name.removesuffix("_real")
+        imaginary = dataset.get(f"{whole}_imag")
+        if imaginary is None or imaginary.dims != real.dims:
+            raise InputError(
+                f"expected {whole}_imag beside {name} with the same shape, got none; "
+                "the file is incomplete, copy or record it again"
+            )
+        # Part by part: real + 1j * imaginary would lose the signs of zeros.
+        values = np.empty(real.shape, dtype=f"c{2 * real.dtype.itemsize}")
+        values.real, values.imag = real.values, imaginary.values
+        dataset = dataset.drop_vars([name, f"{whole}_imag"])
+        dataset = dataset.assign({whole: (real.dims, values, real.attrs)})
+    return dataset

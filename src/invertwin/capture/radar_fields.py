@@ -1,0 +1,164 @@
+"""A radar as labelled arrays and attributes, and back."""
+
+from collections.abc import Hashable, Mapping
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+import torch
+import xarray as xr
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.radar.waveform import FMCW, Impulse, Radar
+from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, Table
+
+WAVEFORMS: dict[str, type[FMCW] | type[Impulse]] = {"FMCW": FMCW, "Impulse": Impulse}
+
+_VISIBILITY = {None: "auto", True: "shared", False: "separate"}
+
+
+def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]:
+    """Variables and attributes that describe a radar; gradients are dropped.
+
+    Raises:
+        InputError: a waveform or pattern of one's own, which a file cannot hold.
+    """
+    kind = type(radar.waveform).__name__
+    if kind not in WAVEFORMS:
+        raise InputError(f"expected a waveform of {', '.join(WAVEFORMS)}, got {kind}; use those")
+    variables = {
+        "position": labelled(("frame", "axis"), radar.positions, "m"),
+        "rotation": labelled(("frame", "axis", "radar_axis"), radar.link().rotations, "1"),
+    }
+    attributes: dict[str, Any] = {
+        "waveform": kind,
+        **asdict(radar.waveform),
+        "window": radar.window,
+        "array_window": radar.array_window,
+        "visibility": _VISIBILITY[radar.shared_visibility],
+    }
+    for end, array in (("tx", radar.transmitters), ("rx", radar.receivers)):
+        variables[f"{end}_position"] = labelled((end, "radar_axis"), array.positions, "m")
+        arrays, named = _pattern_fields(end, array.pattern)
+        variables |= arrays
+        attributes |= named
+    return variables, attributes
+
+
+def radar_from_fields(dataset: xr.Dataset) -> Radar:
+    """The radar that `radar_fields` described.
+
+    Raises:
+        InputError: a missing or unknown attribute or variable.
+    """
+    return Radar(
+        transmitters=_array_from_fields("tx", dataset),
+        receivers=_array_from_fields("rx", dataset),
+        waveform=waveform_from_attributes(dataset.attrs),
+        positions=tensor(dataset, "position"),
+        rotations=tensor(dataset, "rotation"),
+        window=str(attribute(dataset.attrs, "window")),
+        array_window=str(attribute(dataset.attrs, "array_window")),
+        shared_visibility=_named(
+            dataset.attrs, "visibility", {v: k for k, v in _VISIBILITY.items()}
+        ),
+    )
+
+
+def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> FMCW | Impulse:
+    """The waveform named by the attribute ``waveform``, with its fields.
+
+    Raises:
+        InputError: an unknown waveform or a missing field.
+    """
+    kind = _named(attributes, "waveform", WAVEFORMS)
+    # Numbers come back from a file as NumPy scalars.
+    values = {
+        field.name: (int if field.type is int else float)(attribute(attributes, field.name))
+        for field in fields(kind)
+    }
+    return kind(**values)  # pyright: ignore[reportArgumentType]
+
+
+def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
+    """A copy of a tensor with named dimensions and a unit.
+
+    Raises:
+        InputError: another number of dimensions.
+    """
+    if value.ndim != len(dims):
+        raise InputError(
+            f"expected dimensions {', '.join(dims)}, got shape {tuple(value.shape)}; "
+            "give one size for each of them"
+        )
+    return xr.DataArray(value.detach().cpu().numpy().copy(), dims=dims, attrs={"units": unit})
+
+
+def tensor(dataset: xr.Dataset, name: str) -> Tensor:
+    """A copy of a variable as a tensor.
+
+    Raises:
+        InputError: the variable is missing.
+    """
+    if name not in dataset.variables:
+        raise InputError(
+            f"expected a capture with a variable {name!r}, got none; "
+            "the file is no capture or was written by another program"
+        )
+    return torch.from_numpy(np.array(dataset[name].values))
+
+
+def attribute(attributes: Mapping[Hashable, Any], name: str) -> Any:
+    """An attribute of a capture.
+
+    Raises:
+        InputError: the attribute is missing.
+    """
+    if name not in attributes:
+        raise InputError(
+            f"expected a capture with an attribute {name!r}, got none; "
+            "the file is no capture or was written by another program"
+        )
+    return attributes[name]
+
+
+def _named(attributes: Mapping[Hashable, Any], name: str, choices: Mapping[str, Any]) -> Any:
+    value = attribute(attributes, name)
+    if value not in choices:
+        raise InputError(
+            f"expected {name} to be one of {', '.join(choices)}, got {value!r}; "
+            "the capture was written by another version or program"
+        )
+    return choices[value]
+
+
+def _pattern_fields(end: str, pattern: Pattern) -> tuple[dict[str, xr.DataArray], dict[str, Any]]:
+    name = f"{end}_pattern"
+    if isinstance(pattern, Isotropic):
+        return {}, {name: "isotropic"}
+    if isinstance(pattern, Cosine):
+        return {}, {name: "cosine", f"{name}_exponent": float(pattern.exponent)}
+    if isinstance(pattern, Table):
+        theta, phi = f"{end}_theta", f"{end}_phi"
+        return {
+            theta: labelled((theta,), pattern.theta, "rad"),
+            phi: labelled((phi,), pattern.phi, "rad"),
+            f"{end}_gain": labelled((theta, phi), pattern.gains, "1"),
+        }, {name: "table"}
+    raise InputError(
+        f"expected a pattern Isotropic, Cosine or Table, got {type(pattern).__name__}; "
+        "sample it into a Table"
+    )
+
+
+def _array_from_fields(end: str, dataset: xr.Dataset) -> AntennaArray:
+    def table() -> Pattern:
+        return Table(*(tensor(dataset, f"{end}_{part}") for part in ("theta", "phi", "gain")))
+
+    def cosine() -> Pattern:
+        return Cosine(float(attribute(dataset.attrs, f"{end}_pattern_exponent")))
+
+    patterns = {"isotropic": Isotropic, "cosine": cosine, "table": table}
+    pattern = _named(dataset.attrs, f"{end}_pattern", patterns)()
+    return AntennaArray(tensor(dataset, f"{end}_position"), pattern)

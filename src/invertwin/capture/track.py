@@ -1,0 +1,56 @@
+"""Where the radar was over time, measured by a clock of its own."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A measured path of the radar.
+
+    Attributes:
+        times: ascending, on the clock of the tracking system [s].
+        positions: world position of the radar at these times [m].
+
+    Raises:
+        InputError: wrong shapes, NaN, or times that do not ascend.
+    """
+
+    times: Float64[Tensor, " sample"]
+    positions: Float64[Tensor, "sample 3"]
+
+    def __post_init__(self) -> None:
+        count = len(self.times)
+        if self.times.ndim != 1 or tuple(self.positions.shape) != (count, 3) or count < 2:
+            raise InputError(
+                f"expected a track of at least 2 times and positions (times, 3), got "
+                f"{tuple(self.times.shape)} and {tuple(self.positions.shape)}; "
+                "give one position per time"
+            )
+        if not (torch.isfinite(self.times).all() and torch.isfinite(self.positions).all()):
+            raise InputError("expected a finite track, got NaN or infinity; drop those samples")
+        if not bool((self.times.diff() > 0).all()):
+            raise InputError("expected ascending track times, got others; sort the track by time")
+
+    def at(self, times: Float64[Tensor, " frame"]) -> Float64[Tensor, "frame 3"]:
+        """Position at these times, linear between the samples; differentiable in the times.
+
+        Raises:
+            InputError: a time before the first or after the last sample.
+        """
+        first, last = float(self.times[0]), float(self.times[-1])
+        asked = times.detach()
+        if bool((asked < first).any()) or bool((asked > last).any()):
+            raise InputError(
+                f"expected times within the track, {first:g} to {last:g} s, got "
+                f"{float(asked.min()):g} to {float(asked.max()):g} s; check the clock offset"
+            )
+        after = torch.searchsorted(self.times, asked).clamp(1, len(self.times) - 1)
+        start, end = self.times[after - 1], self.times[after]
+        part = (times - start) / (end - start)
+        return torch.lerp(self.positions[after - 1], self.positions[after], part[:, None])
