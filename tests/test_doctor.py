@@ -337,9 +337,3 @@ def test_install_command(monkeypatch, conda, platform, tools, root, command):
     monkeypatch.setattr(doctor.shutil, "which", lambda name: name if name in tools else None)
     monkeypatch.setattr(doctor.os, "geteuid", lambda: 0 if root else 1000)
     assert doctor.install_command() == command
-
-
-def test_importing_the_package_loads_no_ray_tracer():
-    code = "import sys, invertwin; print(*{'drjit', 'mitsuba', 'torch'} & set(sys.modules))"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ended.stdout.strip() == ""

@@ -11,13 +11,30 @@ from invertwin import doctor
 
 __version__ = "0.1.0"
 
-# Name → module.
-_MENU: dict[str, str] = {}
+_ROOMS = ("capture", "channel", "inversion", "radar", "scene")
 
-__all__ = ["__version__", *_MENU]  # pyright: ignore[reportUnsupportedDunderAll]
+# Name → module.
+_MENU = {
+    "Capture": "capture.capture",
+    "FMCW": "radar.waveform",
+    "Grid": "channel.paths",
+    "InputError": "errors",
+    "Object": "scene.scene",
+    "Radar": "radar.waveform",
+    "Scene": "scene.scene",
+    "SpectrumLoss": "inversion.loss",
+    "Surrogate": "radar.surrogate",
+    "gradcheck": "inversion.gradcheck",
+    "load_mesh": "scene.files",
+    "reconstruct": "inversion.reconstruction",
+}
+
+__all__ = ["__version__", *_MENU, *_ROOMS]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _ROOMS:
+        return import_module(f"invertwin.{name}")
     if name not in _MENU:
         raise AttributeError(f"module 'invertwin' has no attribute {name!r}")
     value = getattr(import_module(f"invertwin.{_MENU[name]}"), name)
@@ -26,7 +43,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MENU})
+    return sorted({*globals(), *__all__})
 
 
 # Dr.Jit picks its libLLVM while it is being imported: before any module can do that.
