@@ -10,8 +10,11 @@ from jaxtyping import install_import_hook
 os.environ.setdefault("OMP_NUM_THREADS", str(min(2, os.cpu_count() or 1)))
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-# Shape annotations are executed in tests only; users pay nothing for them.
-install_import_hook("invertwin", "beartype.beartype")
+# Shape annotations are executed in tests only; users pay nothing for them. The numeric tower of
+# PEP 484: an int is welcome where a float is asked for.
+install_import_hook(
+    "invertwin", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+)
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
