@@ -129,23 +129,48 @@ def test_look_at_straight_up_is_an_input_error():
 
 def test_starts_are_as_far_off_as_asked_and_repeat():
     table = {"object": "box", "count": 5, "distance": [0.3, 0.4], "angle_deg": [15, 25], "seed": 3}
+    run = read(truth={"box": {"position": [1, 2, 3]}}, starts=table)
+    assert run.starts is not None
+    scene, truth = build.scene(run.scene), build.true_scene(run)
+    found = build.starts(run.starts, scene, truth, 0)
+    again = build.starts(run.starts, scene, truth, 0)
+    for start, same in zip(found, again, strict=True):
+        rest = build.residual(start["box"], truth["box"])
+        assert 0.3 <= rest.distance <= 0.4
+        assert math.radians(15) <= rest.angle <= math.radians(25)
+        assert math.isclose(rest.scale, 1.0, rel_tol=1e-9)
+        assert torch.equal(start["box"].vertices, same["box"].vertices)
+
+
+def test_starts_in_a_plane_about_one_axis():
+    table = {
+        "object": "box",
+        "count": 5,
+        "distance": [0.3, 0.4],
+        "angle_deg": [15, 25],
+        "axes": ["x", "z"],
+        "rotation_axis": [0, 2, 0],
+    }
     run = read(starts=table)
     assert run.starts is not None
-    truth = build.scene(run.scene)
-    found = build.starts(run.starts, truth, 0)
-    again = build.starts(run.starts, truth, 0)
-    for start, same in zip(found, again, strict=True):
-        rest = build.residual(start.scene["box"], truth["box"])
-        assert 0.3 <= start.distance <= 0.4
-        assert math.isclose(rest.distance, start.distance, rel_tol=1e-9)
-        assert math.radians(15) <= start.angle <= math.radians(25)
-        assert math.isclose(rest.angle, start.angle, rel_tol=1e-6)
-        assert math.isclose(rest.scale, 1.0, rel_tol=1e-9)
-        assert torch.equal(start.scene["box"].vertices, same.scene["box"].vertices)
-    level = read(starts=table | {"directions": "level", "axis": [0, 1, 0]})
-    assert level.starts is not None
-    for start in build.starts(level.starts, truth, 0):
-        assert abs(float(start.scene["box"].center[1])) < 1e-12
+    scene = build.scene(run.scene)
+    for start in build.starts(run.starts, scene, scene, 7):
+        assert abs(float(start["box"].center[1])) < 1e-12
+        torch.testing.assert_close(start["box"].transform[1, :3], scene["box"].transform[1, :3])
+
+
+def test_axes_that_are_not_sought_stay():
+    table = {"kind": "pose", "object": "box", "axes": ["x"], "rotation_axes": ["y"]}
+    run = read(parameters=[table])
+    scene = build.scene(run.scene)
+    (pose,) = build.parameters(run.parameters, scene)
+    weights = torch.arange(24, dtype=torch.float64).reshape(8, 3)
+    (pose(scene)["box"].vertices * weights).square().sum().backward()
+    gradients = {name: p.grad for name, p in pose.named_parameters()}
+    assert gradients["translation"] is not None
+    assert gradients["rotation"] is not None
+    assert (gradients["translation"] != 0).tolist() == [True, False, False]
+    assert (gradients["rotation"][1:] != 0).tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize("shape", [{"shape": "plate", "width": 1, "height": 2}, make_box()])

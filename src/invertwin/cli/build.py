@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from invertwin.channel.paths import Grid
 from invertwin.cli import schema
 from invertwin.errors import InputError
+from invertwin.inversion.regularization import Laplacian
 from invertwin.radar.surrogate import Surrogate
 from invertwin.radar.waveform import FMCW, Impulse, Radar
 from invertwin.scene import (
@@ -217,9 +218,14 @@ def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Modu
     for i, table in enumerate(tables):
         match table:
             case schema.TranslationParameter():
-                modules.append(Translation(table.object))
+                moved = Translation(table.object)
+                _only(moved.translation, table.axes)
+                modules.append(moved)
             case schema.PoseParameter():
-                modules.append(Pose(table.object))
+                posed = Pose(table.object)
+                _only(posed.translation, table.axes)
+                _only(posed.rotation, table.rotation_axes)
+                modules.append(posed)
             case schema.ScaleParameter():
                 modules.append(Scale(table.object))
             case schema.VerticesParameter():
@@ -240,41 +246,56 @@ def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Modu
     return modules
 
 
-@dataclass(frozen=True)
-class Start:
-    """A random start: the scene, and how far it is from the truth."""
+def _only(parameter: nn.Parameter, axes: Sequence[str]) -> None:
+    """Keeps a parameter still along the world axes that are not sought."""
+    mask = torch.ones_like(parameter)
+    mask[-3:] = _float64([axis in axes for axis in "xyz"])
+    if not bool(mask.all()):
+        parameter.register_hook(lambda gradient: gradient * mask)
 
-    scene: Scene
-    distance: float  # m
-    angle: float  # rad
+
+def regularizers(tables: Sequence[schema.Parameter], scene: Scene) -> list[Laplacian]:
+    """The Laplacian terms of the vertex parameters."""
+    return [
+        Laplacian(scene, table.object, table.laplacian)
+        for table in tables
+        if isinstance(table, schema.VerticesParameter) and table.laplacian > 0
+    ]
 
 
-def starts(table: schema.Starts, truth: Scene, seed: int) -> list[Start]:
-    """The random starts of the `[starts]` table; the same seed gives the same ones."""
+def starts(table: schema.Starts, scene: Scene, truth: Scene, seed: int) -> list[Scene]:
+    """The scenes from which the fits of the `[starts]` table start.
+
+    Args:
+        table: How many, how far from the truth.
+        scene: The scene as known; only the pose of the object is replaced.
+        truth: The true scene.
+        seed: Used where the table has none; the same seed gives the same starts.
+    """
     generator = torch.Generator().manual_seed(seed if table.seed is None else table.seed)
 
     def uniform(low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 
-    def direction(flat: Sequence[int] = ()) -> Tensor:
+    def direction(axes: Sequence[str]) -> Tensor:
         vector = torch.randn(3, generator=generator, dtype=torch.float64)
-        vector[list(flat)] = 0
+        vector = vector * _float64([axis in axes for axis in "xyz"])
         return vector / vector.norm()
 
     found = []
     for _ in range(table.count):
-        distance = uniform(*table.distance)
-        angle = math.radians(uniform(*table.angle_deg))
-        offset = distance * direction(_FLAT[table.directions])
-        axis = direction()
-        if table.axis is not None:
-            fixed = _float64(table.axis)
+        offset = uniform(*table.distance) * direction(table.axes)
+        axis = direction("xyz")
+        if table.rotation_axis is not None:
+            fixed = _float64(table.rotation_axis)
             axis = fixed / fixed.norm() * (1 if uniform(0, 1) < 0.5 else -1)
-        found.append(Start(displaced(truth, table.object, offset, angle * axis), distance, angle))
+        rotation = math.radians(uniform(*table.angle_deg)) * axis
+        moved = displaced(truth, table.object, offset, rotation)[table.object]
+        turn = moved.transform[:3, :3]
+        # The object as known may have another size: it is its centre that is placed.
+        place = moved.center - turn @ scene[table.object].mesh.center
+        found.append(scene.replace(table.object, pose=rigid(turn, place)))
     return found
-
-
-_FLAT: Mapping[str, Sequence[int]] = {"any": (), "level": (1,), "vertical_plane": (2,)}
 
 
 def displaced(scene: Scene, name: str, offset: Tensor, rotation: Tensor) -> Scene:

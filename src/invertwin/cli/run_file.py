@@ -42,6 +42,20 @@ def load_run(path: Path) -> RunFile:
     return validate(raw, path)
 
 
+def need(run: RunFile, section: str, command: str) -> Any:
+    """A section that a command cannot do without.
+
+    Raises:
+        InputError: The run file does not have it.
+    """
+    found = getattr(run, section)
+    if found in (None, []):
+        raise InputError(
+            f"expected a section [{section}] for {command}, got a run file without it; add it"
+        )
+    return found
+
+
 def validate(raw: dict[str, Any], source: Path) -> RunFile:
     """The run file of parsed TOML; `source` names it in errors and anchors relative paths.
 

@@ -20,6 +20,7 @@ from invertwin.errors import InputError
 MANIFEST = ".invertwin.json"
 PREVIOUS = ".previous"
 CHECKPOINT = "checkpoint.pt"
+PARTS = "parts"  # finished and unfinished parts of a run, until it ends
 RESULTS = ("metrics.json", "run.toml", "report.html", "twin.ply", CHECKPOINT)
 
 
@@ -54,11 +55,16 @@ class RunFolder:
 
     @property
     def resumable(self) -> bool:
-        """Whether this run left a checkpoint to go on from."""
+        """Whether this run left something to go on from."""
         return any(
-            Path(name).suffix == ".pt" and (self.path / name).exists()
+            (name == CHECKPOINT or name.startswith(PARTS)) and (self.path / name).exists()
             for name in self._manifest["files"]
         )
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run had ended before it was opened again."""
+        return self._manifest["complete"]
 
     def file(self, name: str) -> Path:
         """The path of a result file, owned by this run from now on."""
@@ -169,7 +175,7 @@ def _to_resume(path: Path, manifest: dict[str, Any] | None, digest: str) -> dict
             f"expected the run file and options that {path} was made with (its run.toml), got "
             "others; use those, or --overwrite"
         )
-    return {**manifest, "complete": False}
+    return manifest
 
 
 def _read_manifest(path: Path) -> dict[str, Any] | None:

@@ -57,6 +57,9 @@ def _tag_by(*keys: str) -> Discriminator:
     return Discriminator(tag)
 
 
+WorldAxes = Annotated[list[Literal["x", "y", "z"]], Field(min_length=1)]
+
+
 class Section(BaseModel):
     """A table of the run file; keys it does not know are errors that name the nearest match."""
 
@@ -433,13 +436,20 @@ Data = Annotated[
 
 
 class TranslationParameter(Section):
+    """Moves an object along the given world axes."""
+
     kind: Literal["translation"]
     object: str
+    axes: WorldAxes = ["x", "y", "z"]
 
 
 class PoseParameter(Section):
+    """Moves an object and turns it about its centre, along and about the given world axes."""
+
     kind: Literal["pose"]
     object: str
+    axes: WorldAxes = ["x", "y", "z"]
+    rotation_axes: WorldAxes = ["x", "y", "z"]
 
 
 class ScaleParameter(Section):
@@ -485,8 +495,8 @@ class Starts(Section):
     count: Count = 1
     distance: Interval  # m
     angle_deg: Interval = [0.0, 0.0]
-    directions: Literal["any", "level", "vertical_plane"] = "any"
-    axis: Vector | None = None  # rotation axis; without it any axis
+    axes: WorldAxes = ["x", "y", "z"]  # of the offset
+    rotation_axis: Vector | None = None  # without it any axis
     seed: Seed | None = None  # without it the run's
 
 
@@ -502,13 +512,14 @@ class Surrogate(Section):
 class Loss(Section):
     levels: Count = 3
     gain: Literal["fitted", "one"] = "fitted"
+    background: Literal["none", "level", "static"] = "none"
 
 
 class Optimizer(Section):
     kind: Literal["adam", "sgd"] = "adam"
-    rate: Positive = 0.02
+    rate: Positive = 0.03  # m and rad
+    final_rate: NonNegative | None = None  # on the last step; without it rate / 20
     momentum: Annotated[float, Field(ge=0, lt=1)] = 0.9
-    final_rate: NonNegative | None = None  # the rate falls to this on the last step
 
 
 class Reconstruct(Section):
@@ -517,20 +528,36 @@ class Reconstruct(Section):
     boundary_samples: Count = 50_000
     annealing: Annotated[float, Field(gt=0, le=1)] = 0.7  # share of the steps with extra width
     frames_per_step: Count | None = None
-    nuisances: list[Literal["range_bias", "clock_offset", "background"]] = []
+    tolerance: NonNegative = 0.0  # 0 = use all steps
+    checkpoint_every: Count = 10
+    nuisances: list[Literal["range_bias", "clock_offset"]] = []
     boundary: bool = True
     also_interior_only: bool = False
     position_limit: Positive = 0.03  # m, of a success
     rotation_limit_deg: Positive = 3.0
 
 
+class Calibration(Section):
+    """Range bias and clock offset from one object whose place is known, before the fit.
+
+    With `method = "fit"` by a reconstruction of these two numbers, all else as in the main fit;
+    with `"backprojection"` by what focuses the object best.
+    """
+
+    object: str
+    method: Literal["fit", "backprojection"] = "fit"
+    steps: Count | None = None  # without it those of the main fit
+    rate: Positive | None = None
+
+
 class Landscape(Section):
-    """Losses along a line through the truth, exact signal beside surrogate."""
+    """Losses along a line through the truth: exact signal beside surrogate."""
 
     object: str
     axis: Vector
-    span: Positive  # m on either side
+    span: Positive = 0.4  # m on either side, surrogate
     points: Annotated[int, Field(ge=3)] = 41
+    exact_span: Positive = 0.01  # m on either side, exact signal
     exact_points: Annotated[int, Field(ge=3)] = 201
 
 
@@ -607,6 +634,7 @@ class RunFile(Section):
     loss: Loss = Loss()
     optimizer: Optimizer = Optimizer()
     reconstruct: Reconstruct | None = None
+    calibration: Calibration | None = None
     landscape: Landscape | None = None
     gradcheck: Gradcheck | None = None
 
@@ -616,7 +644,7 @@ class RunFile(Section):
         for i, parameter in enumerate(self.parameters):
             if not isinstance(parameter, RadarParameter):
                 used.append((f"parameters[{i}].object", parameter.object))
-        for section in ("starts", "landscape"):
+        for section in ("starts", "landscape", "calibration"):
             if getattr(self, section) is not None:
                 used.append((f"{section}.object", getattr(self, section).object))
         if self.gradcheck is not None and self.gradcheck.parameter.object is not None:

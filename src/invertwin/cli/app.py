@@ -1,0 +1,220 @@
+"""The command line `invertwin`: simulate, reconstruct, gradcheck, demo, doctor."""
+
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from invertwin.cli.report import Table, shown
+from invertwin.cli.run_file import load_run
+from invertwin.cli.runs import RunFolder, open_run
+from invertwin.cli.schema import RunFile
+from invertwin.errors import InputError
+
+app = typer.Typer(
+    name="invertwin",
+    help="Digital twins from radar: find a scene from its echoes by differentiating ray tracing.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+console = Console(highlight=False)
+
+
+class Backend(StrEnum):
+    """Where rays are traced."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+def _use_backend(value: Backend | None) -> Backend | None:
+    if value is not None:
+        os.environ["INVERTWIN_BACKEND"] = value.value
+    return value
+
+
+BackendOption = Annotated[
+    Backend | None,
+    typer.Option(
+        "--backend",
+        callback=_use_backend,
+        help="Where rays are traced; default: INVERTWIN_BACKEND, else auto.",
+        show_default=False,
+    ),
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option("-o", "--out", help="Folder for the results; default: out/<file stem>."),
+]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the results that are in the folder.")
+]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")
+]
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", min=0, max=2**31 - 1, help="Replaces the run file's seed.")
+]
+FileArgument = Annotated[Path, typer.Argument(help="Run file (TOML).", show_default=False)]
+FilesArgument = Annotated[list[Path], typer.Argument(help="Run files (TOML).", show_default=False)]
+
+
+@app.command()
+def simulate(
+    file: FileArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    seed: SeedOption = None,
+    backend: BackendOption = None,
+) -> None:
+    """Simulate exact radar signals of a scene, and their spectra."""
+    runs = _load([file], seed)
+    with _folder(out or _default(file), runs, overwrite, False) as folder:
+        from invertwin.cli.run_simulate import run_simulate
+
+        _print(run_simulate(runs[file.stem], folder))
+
+
+@app.command()
+def reconstruct(
+    file: FileArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    resume: ResumeOption = False,
+    seed: SeedOption = None,
+    backend: BackendOption = None,
+) -> None:
+    """Fit the parameters of a scene to radar data."""
+    _reconstruct(file, out or _default(file), overwrite, resume, seed)
+
+
+@app.command()
+def demo(
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    resume: ResumeOption = False,
+    seed: SeedOption = None,
+    backend: BackendOption = None,
+) -> None:
+    """Find a hidden letter from its radar echoes."""
+    _reconstruct(_demo_file(), out or Path("out/demo"), overwrite, resume, seed)
+
+
+@app.command()
+def gradcheck(
+    files: FilesArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    resume: ResumeOption = False,
+    seed: SeedOption = None,
+    backend: BackendOption = None,
+) -> None:
+    """Compare automatic derivatives with central differences."""
+    runs = _load(files, seed)
+    default = _default(files[0]) if len(files) == 1 else Path("out/gradcheck")
+    with _folder(out or default, runs, overwrite, resume) as folder:
+        if folder.complete:
+            return
+        from invertwin.cli.run_gradcheck import run_gradcheck
+
+        with console.status("tracing") as status:
+            table = run_gradcheck(runs, folder, status.update)
+        _print([table])
+
+
+@app.command()
+def doctor(backend: BackendOption = None) -> None:
+    """Check that this machine can trace rays, and say how to fix it if not."""
+    from invertwin import doctor as machine
+
+    report = machine.report()
+    console.print(machine.render(report), markup=False, soft_wrap=True)
+    if not report["ok"]:
+        raise typer.Exit(1)
+
+
+def main() -> None:
+    """Entry point: bad input is one line and exit code 2, an interruption 130."""
+    warnings.showwarning = _show_warning
+    try:
+        app(standalone_mode=True)
+    except InputError as error:
+        print(f"invertwin: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _reconstruct(file: Path, out: Path, overwrite: bool, resume: bool, seed: int | None) -> None:
+    runs = _load([file], seed)
+    with _folder(out, runs, overwrite, resume) as folder:
+        if folder.complete:
+            return
+        from invertwin.cli.run_reconstruct import run_reconstruct
+
+        _print(run_reconstruct(runs[file.stem], folder, console))
+
+
+@contextmanager
+def _folder(
+    path: Path, runs: dict[str, RunFile], overwrite: bool, resume: bool
+) -> Iterator[RunFolder]:
+    """The run's folder; says where the results are, or how to resume."""
+    folder = open_run(path, runs, overwrite=overwrite, resume=resume)
+    try:
+        with folder:
+            yield folder
+    except KeyboardInterrupt:
+        line = "invertwin: interrupted"
+        if folder.resumable:
+            line += f"; the same command with --resume goes on (results so far in {path})"
+        print(line, file=sys.stderr)
+        sys.exit(130)
+    done = "was complete already" if folder.complete and folder.resumed else "complete"
+    console.print(f"{done}: {path / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def _load(files: list[Path], seed: int | None) -> dict[str, RunFile]:
+    runs: dict[str, RunFile] = {}
+    for file in files:
+        if file.stem in runs:
+            raise InputError(
+                f"expected run files of different names, got {file.stem} twice; rename one"
+            )
+        run = load_run(file)
+        runs[file.stem] = run if seed is None else run.model_copy(update={"seed": seed})
+    return runs
+
+
+def _default(file: Path) -> Path:
+    return Path("out") / file.stem
+
+
+def _demo_file() -> Path:
+    """In a wheel the run file lies beside this module, in a checkout in experiments."""
+    beside = Path(__file__).with_name("demo.toml")
+    return beside if beside.exists() else Path(__file__).parents[3] / "experiments" / "demo.toml"
+
+
+def _print(tables: list[Table]) -> None:
+    for table in tables:
+        grid = RichTable(title=table.title, title_justify="left")
+        for i, column in enumerate(table.columns):
+            grid.add_column(column, justify="left" if i == 0 else "right")
+        for row in table.rows:
+            grid.add_row(*map(shown, row))
+        console.print(grid)
+        if table.note:
+            console.print(table.note, markup=False)
+
+
+def _show_warning(message: Warning | str, *_: Any) -> None:
+    print(f"invertwin: warning: {message}", file=sys.stderr)

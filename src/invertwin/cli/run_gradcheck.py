@@ -1,0 +1,152 @@
+"""`invertwin gradcheck`: the derivative of a map against central differences, scene by scene."""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from invertwin.channel.paths import Grid
+from invertwin.cli import build, pictures
+from invertwin.cli.report import Picture, Table, report_html
+from invertwin.cli.run_file import need, to_toml
+from invertwin.cli.runs import PARTS, RunFolder
+from invertwin.cli.schema import Gradcheck, RunFile
+from invertwin.inversion.gradcheck import Direction, GradientReport, gradcheck
+from invertwin.radar.waveform import Radar
+from invertwin.scene import Scene
+
+COLUMNS = (
+    "scene",
+    "full L1",
+    "full L2",
+    "full corr.",
+    "interior L1",
+    "interior / full",
+    "noise",
+    "steps differ",
+    "order",
+    "pairs",
+)
+
+
+def run_gradcheck(
+    runs: Mapping[str, RunFile], folder: RunFolder, say: Callable[[str], None]
+) -> Table:
+    """Checks every run file, writes the folder, and returns the table to print.
+
+    Scenes that an interrupted run has finished are not computed again.
+    """
+    begin = time.perf_counter()
+    scenes: dict[str, Any] = {}
+    parts = []
+    for name, run in runs.items():
+        part = f"{PARTS}/{name}.json"
+        found = folder.read_json(part)
+        if found is None:
+            found = _check(name, run, folder, lambda line, name=name: say(f"{name}: {line}"))
+            folder.write_json(part, found)
+        scenes[name] = found
+        png = (folder.path / f"{name}.png").read_bytes()
+        parts.append(Picture(run.title or name, png, note=_note(run, found)))
+    seconds = time.perf_counter() - begin
+    table = Table("Agreement with central differences", COLUMNS, [_row(*s) for s in scenes.items()])
+    folder.write_json(
+        "metrics.json", {"task": "gradcheck", "scenes": scenes, "wall_seconds": seconds}
+    )
+    files = {f"{name}.toml": to_toml(run) for name, run in runs.items()}
+    folder.write_text(
+        "report.html",
+        report_html("Gradient check", f"{len(scenes)} scenes checked.", [table, *parts], files),
+    )
+    folder.remove([f"{PARTS}/{name}.json" for name in runs])
+    return table
+
+
+def _check(
+    name: str, run: RunFile, folder: RunFolder, say: Callable[[str], None]
+) -> dict[str, Any]:
+    begin = time.perf_counter()
+    settings = need(run, "gradcheck", "gradcheck")
+    scene = build.scene(run.scene)
+    radar = build.radar(need(run, "radar", "gradcheck"))
+    grid = build.grid(need(run, "grid", "gradcheck"), radar)
+    report = gradcheck(
+        scene,
+        radar,
+        grid,
+        _direction(settings),
+        surrogate=build.surrogate(run.surrogate),
+        samples=settings.samples,
+        boundary_samples=settings.boundary_samples,
+        repeats=settings.repeats,
+        step=math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0,
+        difference_samples=settings.difference_samples,
+        noise=settings.noise,
+        max_pairs=settings.max_pairs,
+        sampling=settings.sampling,
+        seed=run.seed,
+        progress=say,
+    )
+    folder.write_bytes(f"{name}.png", _maps(report, grid))
+    folder.write_bytes(f"{name}_scene.png", _picture(scene, radar, settings.parameter.object))
+    return {
+        "full": asdict(report.full),
+        "interior": asdict(report.interior),
+        "difference_noise": report.difference_noise,
+        "step_agreement": report.step_agreement,
+        "pairs": report.pairs,
+        "seconds": time.perf_counter() - begin,
+    }
+
+
+def _direction(settings: Gradcheck) -> Direction:
+    table = settings.parameter
+    values = table.model_dump(exclude_none=True)
+    if table.axis is not None:
+        values["axis"] = tuple(table.axis)
+    return Direction(**values)
+
+
+def _maps(report: GradientReport, grid: Grid) -> bytes:
+    maps = {
+        "differences": report.difference,
+        "full": report.gradient,
+        "interior only": report.interior_gradient,
+        "full − differences": report.gradient - report.difference,
+    }
+    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
+    return pictures.gradient_picture({k: np.asarray(v) for k, v in maps.items()}, axes)
+
+
+def _picture(scene: Scene, radar: Radar, sought: str | None) -> bytes:
+    drawing = pictures.Drawing(
+        pictures.meshes_of(scene),
+        sought=[] if sought is None else [sought],
+        radar=radar.positions.numpy(),
+    )
+    return pictures.scene_picture({"scene": drawing})
+
+
+def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
+    full, interior = found["full"], found["interior"]
+    return [
+        name,
+        full["relative_l1"],
+        full["relative_l2"],
+        full["correlation"],
+        interior["relative_l1"],
+        interior["relative_l1"] / full["relative_l1"] if full["relative_l1"] else None,
+        found["difference_noise"],
+        found["step_agreement"],
+        full["order"],
+        found["pairs"],
+    ]
+
+
+def _note(run: RunFile, found: Mapping[str, Any]) -> str:
+    parameter = need(run, "gradcheck", "gradcheck").parameter
+    what = f"{parameter.kind} of {parameter.object or 'the radar'}"
+    return f"Derivative with respect to the {what}; {found['seconds']:.0f} s."
