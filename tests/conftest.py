@@ -1,10 +1,11 @@
 """What every test shares: run-time shape checks, the data folder, the GPU marker."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
+from jaxtyping import config, install_import_hook
 
 # Before torch, Dr.Jit and matplotlib are imported: few threads, no display.
 os.environ.setdefault("OMP_NUM_THREADS", str(min(2, os.cpu_count() or 1)))
@@ -33,6 +34,14 @@ def data_folder() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no measured data in {folder}: set INVERTWIN_DATA")
     return folder
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Bad input as users meet it: the shape checks of the tests would catch it first."""
+    config.update("jaxtyping_disable", True)
+    yield
+    config.update("jaxtyping_disable", False)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
