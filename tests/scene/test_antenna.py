@@ -177,7 +177,7 @@ def one(*numbers: float) -> Tensor:
         (lambda: AntennaArray(torch.zeros(0, 3)), "at least one antenna element"),
         (lambda: AntennaArray(torch.zeros(4, 2)), r"element positions as numbers of shape"),
         (lambda: AntennaArray(one(0, 0, 0)[None] / 0), "finite element positions"),
-        (lambda: AntennaArray(torch.zeros(1, 3), "isotropic"), "expected a Pattern, got str"),  # pyright: ignore
+        (lambda: AntennaArray(torch.zeros(1, 3), "isotropic"), "expected a Pattern, got str"),  # pyright: ignore[reportArgumentType]
         (lambda: linear_array(0, 0.1), "elements along x"),
         (lambda: linear_array(2, 0.0), "element spacing"),
         (lambda: planar_array(2, 2, 0.1, -0.1), "element spacing"),

@@ -181,18 +181,15 @@ def test_surface_tables():
     assert not RoughDielectric.coherent
 
 
-def test_gradients_of_the_tables():
+@pytest.mark.parametrize("values", [(3.0, 0.5, 0.4, 0.3), (1.01, 1e-3, 0.9, 1.0)])
+def test_gradients_of_the_tables(values):
     def tables(permittivity, conductivity, diffuse, lobe_width):
         material = RoughDielectric(permittivity, conductivity, diffuse, lobe_width)
         surface = material.surface(FREQUENCY)
         return surface.amplitude, surface.diffuse, surface.lobe, surface.exponent
 
-    for values in ((3.0, 0.5, 0.4, 0.3), (1.01, 1e-3, 0.0, 1.0), (80.0, 20.0, 1.0, 0.1)):
-        inputs = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in values]
-        # Permittivity and conductivity only need steps within their range.
-        assert torch.autograd.gradcheck(tables, inputs[:1] + [i.detach() for i in inputs[1:]])
-        if 0 < values[2] < 1:
-            assert torch.autograd.gradcheck(tables, inputs)
+    inputs = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in values]
+    assert torch.autograd.gradcheck(tables, inputs)
 
 
 def test_gradient_of_the_conductor_lobe():

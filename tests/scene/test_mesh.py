@@ -14,7 +14,7 @@ FACE = torch.tensor([[0, 1, 2]])
 @pytest.mark.usefixtures("unchecked")
 def test_converts_arrays_and_keeps_gradients():
     vertices = TRIANGLE.to(torch.float32).requires_grad_()
-    mesh = Mesh(vertices, np.array([[0, 1, 2]], dtype=np.uint32))  # pyright: ignore
+    mesh = Mesh(vertices, np.array([[0, 1, 2]], dtype=np.uint32))  # pyright: ignore[reportArgumentType]
     assert mesh.vertices.dtype == torch.float64
     assert mesh.faces.dtype == torch.int64
     mesh.vertices.sum().backward()

@@ -141,8 +141,8 @@ def test_scene_can_be_copied_and_pickled():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Object("plate.obj", METAL), "expected a Mesh, got str"),
-        (lambda: Object(PLATE, "metal"), "expected a Material, got str"),
+        (lambda: Object("plate.obj", METAL), "expected a Mesh, got str"),  # pyright: ignore[reportArgumentType]
+        (lambda: Object(PLATE, "metal"), "expected a Material, got str"),  # pyright: ignore[reportArgumentType]
         (lambda: Object(PLATE, METAL, pose=torch.eye(3)), r"pose as numbers of shape \[4, 4\]"),
         (lambda: Object(PLATE, METAL, pose=2 * torch.eye(4)), "expected a rigid pose"),
         (lambda: Object(PLATE, METAL, pose=torch.diag(vector(-1, 1, 1, 1))), "a rigid pose"),
@@ -150,13 +150,13 @@ def test_scene_can_be_copied_and_pickled():
         (lambda: Object(PLATE, METAL, pose=placed().T), "expected a rigid pose"),
         (lambda: Object(PLATE, METAL, velocity=vector(1, 2)), r"velocity \[m/s\] as numbers"),
         (lambda: Object(PLATE, METAL, velocity=torch.zeros(3, 3)), r"shape \[4, 3\], got shape"),
-        (lambda: Object(PLATE, METAL, velocity="fast"), "velocity"),
+        (lambda: Object(PLATE, METAL, velocity="fast"), "velocity"),  # pyright: ignore[reportArgumentType]
         (lambda: Object(PLATE, METAL).at(math.nan), "time"),
         (lambda: Scene({}), "at least one named object, got none"),
-        (lambda: Scene([Object(PLATE, METAL)]), "at least one named object, got list"),
+        (lambda: Scene([Object(PLATE, METAL)]), "at least one named object, got list"),  # pyright: ignore[reportArgumentType]
         (lambda: Scene({"": Object(PLATE, METAL)}), "names that are not empty, got ''"),
-        (lambda: Scene({3: Object(PLATE, METAL)}), "names that are not empty, got 3"),
-        (lambda: Scene({"wall": PLATE}), "an Object for 'wall', got Mesh"),
+        (lambda: Scene({3: Object(PLATE, METAL)}), "names that are not empty, got 3"),  # pyright: ignore[reportArgumentType]
+        (lambda: Scene({"wall": PLATE}), "an Object for 'wall', got Mesh"),  # pyright: ignore[reportArgumentType]
         (lambda: scene()["floor"], r"\(wall, door\), got 'floor'"),
         (lambda: scene().replace("floor", pose=None), r"\(wall, door\), got 'floor'"),
         (lambda: scene().replace("wall", color=1), "changes of mesh, material, .* got color"),

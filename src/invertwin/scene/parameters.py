@@ -386,11 +386,13 @@ def _vector(value: ArrayLike, what: str) -> Tensor:
 
 def _rotation_numbers(value: ArrayLike) -> Tensor:
     do = "give a rotation vector [3] in rad or q = (w, rx, ry, rz)"
-    length = len(value)
-    numbers = checked_tensor(value, (3 if length == 3 else 4,), "initial rotation", do)
-    if length == 3:
+    numbers = checked_tensor(value, (None,), "initial rotation", do)
+    if len(numbers) == 3:
         quaternion = quaternion_from_vector(numbers.detach())
         return quaternion * quaternion.new_tensor([1.0, 2.0, 2.0, 2.0])
-    if not bool(numbers.any()):
-        raise InputError(f"expected q that is not zero, got {numbers.tolist()}; {do}")
+    if len(numbers) != 4 or not bool(numbers.any()):
+        raise InputError(
+            "expected an initial rotation of 3 numbers, or 4 that are not all zero, "
+            f"got {numbers.tolist()}; {do}"
+        )
     return numbers.detach().clone()

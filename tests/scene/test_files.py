@@ -1,0 +1,346 @@
+"""Files: round trips, scene geometry as Mitsuba reads it, one-line errors, safe writes."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from invertwin.errors import InputError
+from invertwin.scene import (
+    Mesh,
+    Object,
+    PerfectConductor,
+    RoughDielectric,
+    Scene,
+    box,
+    load_mesh,
+    load_scene_xml,
+    plate,
+    rigid,
+    rotation_from_vector,
+    save_mesh,
+    sphere,
+    text,
+)
+
+
+def triangles(mesh: Mesh) -> np.ndarray:
+    return mesh.vertices[mesh.faces].numpy()
+
+
+def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "gltf", "glb"])
+def test_other_programs_meshes_are_read(tmp_path, suffix):
+    mesh = box([0.3, 0.4, 0.5], divisions=2)
+    path = tmp_path / f"box.{suffix}"
+    exported = as_trimesh(mesh).export(file_type=suffix)
+    # glTF comes as several files.
+    parts = exported if isinstance(exported, dict) else {path.name: exported}
+    for name, content in parts.items():
+        target = path if name == "model.gltf" else tmp_path / name
+        target.write_bytes(content.encode() if isinstance(content, str) else content)
+    loaded = load_mesh(path)
+    # STL repeats every corner: merging finds the same 26 vertices and no seam.
+    assert loaded.vertices.shape == mesh.vertices.shape
+    assert np.allclose(triangles(loaded), triangles(mesh), atol=1e-7)
+    assert as_trimesh(loaded).is_watertight
+
+
+def test_own_files_keep_every_bit(tmp_path):
+    mesh = text("A")
+    save_mesh(tmp_path / "letter.ply", mesh)
+    loaded = load_mesh(tmp_path / "letter.ply")
+    assert torch.equal(loaded.vertices, mesh.vertices)
+    assert torch.equal(loaded.faces, mesh.faces)
+
+
+def test_text_obj_with_normals_and_quads(tmp_path):
+    path = tmp_path / "quad.obj"
+    path.write_text(
+        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 9 9 9\nvn 0 0 1\nf 1//1 2//1 3//1 4//1\n"
+    )
+    mesh = load_mesh(path)
+    # The vertex of no face is gone: it would spoil the centre.
+    assert mesh.vertices.shape == (4, 3)
+    assert len(mesh.faces) == 2
+    assert mesh.center.tolist() == [0.5, 0.5, 0.0]
+
+
+def test_open_and_degenerate_meshes_are_read(tmp_path):
+    path = tmp_path / "odd.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 1 3\nf 1 1 2\n")
+    assert load_mesh(path).faces.shape == (4, 3)
+
+
+def test_scene_is_saved_in_the_world(tmp_path):
+    pose = rigid(
+        rotation_from_vector(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)),
+        torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64),
+    )
+    scene = Scene(
+        {
+            "plate": Object(plate(1.0, 1.0), PerfectConductor(), pose),
+            "ball": Object(sphere(0.1, 1), RoughDielectric(3.0)),
+        }
+    )
+    save_mesh(tmp_path / "twin.ply", scene)
+    loaded = load_mesh(tmp_path / "twin.ply")
+    expected = torch.cat([scene[name].vertices[scene[name].mesh.faces] for name in scene.names])
+    assert np.array_equal(triangles(loaded), expected.numpy())
+
+
+def test_meshes_with_gradients_can_be_saved(tmp_path):
+    mesh = plate(1.0, 1.0)
+    save_mesh(tmp_path / "plate.ply", Mesh(mesh.vertices.clone().requires_grad_(), mesh.faces))
+    assert len(load_mesh(tmp_path / "plate.ply").faces) == 2
+
+
+@pytest.mark.parametrize("broken", ["write_bytes", "replace"])
+def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch, broken):
+    path = tmp_path / "twin.ply"
+    save_mesh(path, plate(1.0, 1.0))
+    before = path.read_bytes()
+
+    def fail(*args):
+        if broken == "write_bytes":
+            # A disk that is full half way through.
+            with open(args[0], "wb") as file:
+                file.write(args[1][:50])
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Path if broken == "write_bytes" else os, broken, fail)
+    with pytest.raises(OSError, match="no space left"):
+        save_mesh(path, box(2.0))
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["twin.ply"]
+
+
+def ply(vertex: str) -> str:
+    """An ASCII file of one triangle with the given first vertex."""
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    return (
+        f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}element face 1\n"
+        f"property list uchar int vertex_indices\nend_header\n{vertex}\n1 0 0\n0 1 0\n3 0 1 2\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("missing.ply", None, "an existing file, got .*missing.ply"),
+        ("mesh.step", b"", r"mesh file \(.obj, .ply, .stl, .gltf, .glb\), got mesh.step"),
+        ("empty.obj", b"", "empty.obj"),
+        ("empty.stl", b"", "empty.stl"),
+        ("empty.ply", b"", "empty.ply"),
+        ("empty.glb", b"", "empty.glb"),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "points.obj"),
+        ("nan.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "got 1 NaN or infinite of 9"),
+        ("nan.ply", ply("0 nan 0").encode(), "got 1 NaN or infinite of 9"),
+        ("index.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
+        ("index.ply", ply("0 0 0").replace("3 0 1 2", "3 0 1 7").encode(), "index.ply"),
+        ("cut.ply", ply("0 0 0")[:150].encode(), "cut.ply"),
+        ("random.ply", bytes(range(256)), "random.ply"),
+        ("random.stl", bytes(range(256)), "random.stl"),
+        ("random.gltf", b"{ not json", "random.gltf"),
+        (
+            "lost.gltf",
+            b'{"asset": {"version": "2.0"}, "buffers": [{"uri": "no.bin"}]}',
+            "lost.gltf",
+        ),
+    ],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path, name, content, message):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        load_mesh(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_truncated_binary_file_is_refused(tmp_path):
+    path = tmp_path / "letter.ply"
+    save_mesh(path, text("A"))
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(InputError, match=r"letter.ply"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize("name", ["twin.obj", "no/folder/twin.ply"])
+def test_bad_output_is_refused(tmp_path, name):
+    with pytest.raises(InputError):
+        save_mesh(tmp_path / name, plate(1.0, 1.0))
+
+
+SCENE = """<scene version="3.0.0">
+  <default name="spp" value="16"/>
+  <integrator type="path"/>
+  <emitter type="constant"/>
+  <bsdf type="diffuse" id="mat-itu_concrete"/>
+  <bsdf type="diffuse" id="mat-itu_metal"/>
+  <shape type="ply" id="mesh-letter">
+    <string name="filename" value="meshes/letter.ply"/>
+    <boolean name="face_normals" value="true"/>
+    <ref id="mat-itu_metal" name="bsdf"/>
+    <transform name="to_world">
+      <scale value="2"/>
+      <rotate x="0" y="1" z="0" angle="30"/>
+      <translate x="1" y="-2" z="3"/>
+    </transform>
+  </shape>
+  <shape type="obj" id="mesh-box">
+    <string name="filename" value="meshes/box.obj"/>
+    <ref id="mat-itu_concrete"/>
+    <transform name="to_world">
+      <translate value="0.5, 0.25, -1"/>
+      <rotate value="0.6 0 0.8" angle="-70"/>
+      <scale x="1.5" z="0.5"/>
+    </transform>
+  </shape>
+  <shape type="rectangle" id="floor">
+    <transform name="to_world"><rotate x="1" angle="-90"/><scale x="4" y="1" z="5"/></transform>
+  </shape>
+  <shape type="cube">
+    <transform name="to_world">
+      <matrix value="0.5 0 0 1  0 -0.25 0.1 2  0 0 2 3  0 0 0 1"/>
+    </transform>
+    <ref id="mat-itu_concrete"/>
+  </shape>
+  <shape type="sphere" id="ball">
+    <point name="center" x="1" y="0" z="-1"/>
+    <float name="radius" value="0.7"/>
+    <boolean name="flip_normals" value="true"/>
+    <transform name="to_world"><translate y="2"/><scale value="2"/></transform>
+  </shape>
+</scene>
+"""
+
+
+def write_scene(folder: Path, content: str = SCENE) -> Path:
+    (folder / "meshes").mkdir()
+    save_mesh(folder / "meshes" / "letter.ply", text("A"))
+    as_trimesh(box([1.0, 2.0, 3.0])).export(folder / "meshes" / "box.obj")
+    path = folder / "scene.xml"
+    path.write_text(content)
+    return path
+
+
+def signed_volume(item: Object) -> float:
+    a, b, c = item.vertices[item.mesh.faces].unbind(1)
+    return float((a * torch.linalg.cross(b, c)).sum() / 6)
+
+
+def test_scene_file_gives_named_objects_with_materials(tmp_path):
+    metal = PerfectConductor()
+    scene = load_scene_xml(write_scene(tmp_path), {"mat-itu_metal": metal})
+    assert scene.names == ("mesh-letter", "mesh-box", "floor", "cube_3", "ball")
+    assert scene["mesh-letter"].material is metal
+    assert scene["floor"].material == RoughDielectric(5.24)
+    other = load_scene_xml(tmp_path / "scene.xml", default=metal)
+    assert all(item.material is metal for item in other.objects.values())
+
+
+def test_scene_file_keeps_normals_outward(tmp_path):
+    scene = load_scene_xml(write_scene(tmp_path))
+    # The matrix of the cube mirrors it; the ball asks for inward normals.
+    assert signed_volume(scene["cube_3"]) == pytest.approx(8 * 0.25)
+    assert signed_volume(scene["mesh-letter"]) > 0
+    assert signed_volume(scene["ball"]) < 0
+    a, b, c = scene["floor"].vertices[scene["floor"].mesh.faces[0]]
+    assert torch.linalg.cross(b - a, c - a)[1] > 0
+
+
+READ_WITH_MITSUBA = """
+import json, sys
+import mitsuba
+mitsuba.set_variant("scalar_rgb")
+scene = mitsuba.load_file(sys.argv[1])
+boxes = {}
+for shape in scene.shapes():
+    box = shape.bbox()
+    boxes[shape.id()] = [list(map(float, box.min)), list(map(float, box.max))]
+print(json.dumps(boxes))
+"""
+
+
+def test_scene_file_means_what_mitsuba_reads(tmp_path):
+    path = write_scene(tmp_path)
+    # In a process of its own: a variant set here would hold for all other tests.
+    answer = subprocess.run(
+        [sys.executable, "-c", READ_WITH_MITSUBA, str(path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    boxes = json.loads(answer.stdout.splitlines()[-1])
+    scene = load_scene_xml(path)
+    for name in ("mesh-letter", "mesh-box", "floor", "ball"):
+        low, high = (torch.tensor(corner, dtype=torch.float64) for corner in boxes[name])
+        # The sphere of triangles touches its bounding box at vertices only.
+        tolerance = 0.002 if name == "ball" else 1e-5
+        vertices = scene[name].vertices
+        assert torch.allclose(vertices.amin(0), low, atol=tolerance), name
+        assert torch.allclose(vertices.amax(0), high, atol=tolerance), name
+
+
+def shape(kind: str, content: str = "", name: str = "thing") -> str:
+    return f'<scene version="3.0.0"><shape type="{kind}" id="{name}">{content}</shape></scene>'
+
+
+def to_world(content: str) -> str:
+    return shape("cube", f'<transform name="to_world">{content}</transform>')
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("<scene", "expected an XML scene"),
+        ("", "expected an XML scene"),
+        ("<scene version='3.0.0'/>", "at least one named object"),
+        ("<mesh/>", "expected one <scene> without <include>, got <mesh>"),
+        ("<scene><include filename='a.xml'/></scene>", "without <include>"),
+        (shape("disk"), "shape 'thing': .*got 'disk'; export it as a ply mesh"),
+        (shape("ply", '<string name="filename" value="no.ply"/>'), "got .*no.ply; check the path"),
+        (shape("ply"), "expected an existing file"),
+        (shape("sphere", '<float name="radius" value="big"/>'), "1 numbers, got 'big'"),
+        (shape("sphere", '<float name="radius" value="-1"/>'), "sphere radius"),
+        (to_world("<lookat/>"), "translate, rotate, scale or matrix in to_world, got lookat"),
+        (to_world('<matrix value="1 2 3"/>'), "9 or 16 numbers, got '1 2 3'"),
+        (to_world('<rotate angle="3"/>'), "expected a rotation axis"),
+        (to_world('<rotate x="1"/>'), "1 numbers, got ''"),
+        (to_world('<translate value="1 2"/>'), "1 or 3 numbers, got '1 2'"),
+        (to_world('<translate x="nan"/>'), "finite mesh vertices"),
+        (
+            "<scene><shape type='cube' id='a'/><shape type='cube' id='a'/></scene>",
+            "different shape ids, got 'a' twice",
+        ),
+    ],
+)
+def test_bad_scene_files_are_refused_in_one_line(tmp_path, content, message):
+    path = tmp_path / "scene.xml"
+    path.write_text(content)
+    with pytest.raises(InputError, match=message) as caught:
+        load_scene_xml(path)
+    assert "\n" not in str(caught.value)
+    assert "scene.xml" in str(caught.value)
+
+
+def test_misspelled_material_is_refused(tmp_path):
+    path = write_scene(tmp_path)
+    with pytest.raises(InputError, match=r"\(mat-itu_concrete, mat-itu_metal\), got itu_metal"):
+        load_scene_xml(path, {"itu_metal": PerfectConductor()})
+
+
+def test_missing_scene_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="expected an existing file"):
+        load_scene_xml(tmp_path / "none.xml")
