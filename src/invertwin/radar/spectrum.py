@@ -1,0 +1,195 @@
+"""Beamforming: range profiles of the virtual channels to power over range × direction."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Complex, Float, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.radar.range_profile import range_profile
+from invertwin.radar.waveform import Radar, taper
+
+# Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
+_FLATNESS = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Aperture:
+    """The virtual array on the grid of its distinct x and y positions.
+
+    Attributes:
+        x: Distinct x positions [m].
+        y: Distinct y positions [m].
+        column: Index into ``x`` of each virtual element, TX-major.
+        row: Index into ``y`` of each virtual element.
+        x_taper: Window along x.
+        y_taper: Window along y.
+        counts: Number of virtual elements at each place of the grid.
+        wavelength: [m].
+    """
+
+    x: Float64[Tensor, " x"]
+    y: Float64[Tensor, " y"]
+    column: Int64[Tensor, " virtual"]
+    row: Int64[Tensor, " virtual"]
+    x_taper: Float64[Tensor, " x"]
+    y_taper: Float64[Tensor, " y"]
+    counts: Float64[Tensor, "x y"]
+    wavelength: float
+
+    @property
+    def separable(self) -> bool:
+        """Whether the array is the product of a row and a column, so its response is too."""
+        counts = self.counts
+        return torch.equal(counts * counts.sum(), counts.sum(1)[:, None] * counts.sum(0)[None])
+
+    @property
+    def x_weight(self) -> Float64[Tensor, " x"]:
+        """Weight of each x position of a separable array."""
+        return self.x_taper * self.counts.sum(1)
+
+    @property
+    def y_weight(self) -> Float64[Tensor, " y"]:
+        """Weight of each y position of a separable array."""
+        return self.y_taper * self.counts.sum(0)
+
+    def check_resolved(self, grid: Grid) -> None:
+        """Raise where one axis alone of a non-separable array is asked for."""
+        if not self.separable and (grid.u_count == 1 or grid.v_count == 1):
+            raise InputError(
+                f"expected a grid that resolves u and v, got {grid.u_count} × {grid.v_count} bins; "
+                "this array is not the product of a row and a column, so resolve both axes"
+            )
+
+    def steering(
+        self, cosines: Float64[Tensor, " node"], places: Float64[Tensor, " place"]
+    ) -> Complex[Tensor, "node place"]:
+        """exp(+jk u x): undoes the beat phase of an element at x for a source at u."""
+        phase = 2 * math.pi / self.wavelength * cosines[:, None] * places[None]
+        return torch.polar(torch.ones_like(phase), phase)
+
+
+def aperture(radar: Radar) -> Aperture:
+    """The radar's virtual array, sorted onto its distinct positions.
+
+    Raises:
+        InputError: The array is not flat in the radar's x-y plane, so that u and v alone do not
+            describe its response.
+    """
+    places = radar.virtual_positions.detach().cpu()
+    key = tuple(tuple(place) for place in places.tolist())
+    return _aperture(key, radar.waveform.wavelength, radar.array_window)
+
+
+def beamform(
+    profile: Complex[Tensor, "frame tx rx range"], radar: Radar, grid: Grid
+) -> Float[Tensor, "frame range u v"]:
+    """Bartlett power spectrum at the grid's directions.
+
+    Steering is exp(+jk(u x + v y)) on the beat signal, whose phase falls as the element moves
+    towards the target. Normalised by the sum of the weights: a point target of |a|² peaks at
+    |a|². Along an axis that the grid does not resolve, the power of the elements is averaged.
+
+    Raises:
+        InputError: The profile does not fit radar and grid, the array is not flat, or the grid
+            resolves only one axis of an array that is not the product of a row and a column.
+    """
+    expected = (
+        radar.frame_count,
+        len(radar.transmitters.positions),
+        len(radar.receivers.positions),
+        grid.range_count,
+    )
+    if tuple(profile.shape) != expected:
+        raise InputError(
+            f"expected a profile of shape {expected} (frame, tx, rx, range), got "
+            f"{tuple(profile.shape)}; use the radar and grid of range_profile"
+        )
+    channels = profile.flatten(1, 2)
+    if grid.u_count == grid.v_count == 1:
+        return channels.abs().square().mean(1)[..., None, None]
+    array = aperture(radar)
+    array.check_resolved(grid)
+    if array.separable:
+        return _separable_power(channels, array, grid)
+    weight = array.x_taper[array.column] * array.y_taper[array.row]
+    u = array.steering(grid.u, array.x)[:, array.column] * (weight / weight.sum())
+    v = array.steering(grid.v, array.y)[:, array.row]
+    both = (u[:, None] * v[None]).flatten(0, 1).to(channels)
+    power = (both @ channels).abs().square().unflatten(1, (grid.u_count, grid.v_count))
+    return power.movedim(-1, 1)
+
+
+def exact_spectrum(
+    beat: Complex[Tensor, "frame tx rx sample"], radar: Radar, grid: Grid
+) -> Float[Tensor, "frame range u v"]:
+    """Power spectrum as a real radar forms it: ``range_profile``, then ``beamform``."""
+    return beamform(range_profile(beat, radar, grid), radar, grid)
+
+
+def _separable_power(
+    channels: Complex[Tensor, "frame virtual range"], array: Aperture, grid: Grid
+) -> Float[Tensor, "frame range u v"]:
+    frames, _, ranges = channels.shape
+    nx, ny = array.counts.shape
+    # Elements at the same place are averaged.
+    plane = channels.new_zeros(frames, nx * ny, ranges)
+    index = (array.column * ny + array.row).to(channels.device)
+    plane = plane.index_add(1, index, channels).unflatten(1, (nx, ny))
+    plane = plane / array.counts[..., None].to(plane.device, plane.real.dtype)
+
+    def steered(cosines: Tensor, places: Tensor, weight: Tensor) -> Tensor:
+        return (array.steering(cosines, places) * (weight / weight.sum())).to(channels)
+
+    if grid.v_count > 1:
+        v = steered(grid.v, array.y, array.y_weight)
+        plane = torch.einsum("vy,fxyr->fxvr", v, plane)
+    if grid.u_count > 1:
+        u = steered(grid.u, array.x, array.x_weight)
+        plane = torch.einsum("ux,fxvr->fruv", u, plane)
+    else:
+        plane = plane.permute(0, 3, 1, 2)
+    power = plane.abs().square()
+    if grid.u_count == 1:
+        power = power.mean(2, keepdim=True)
+    if grid.v_count == 1:
+        power = power.mean(3, keepdim=True)
+    return power
+
+
+@lru_cache(maxsize=8)
+def _aperture(key: tuple[tuple[float, ...], ...], wavelength: float, window: str) -> Aperture:
+    places = torch.tensor(key, dtype=torch.float64)
+    depth = float(places[:, 2].max() - places[:, 2].min()) / wavelength
+    if depth > _FLATNESS:
+        raise InputError(
+            f"expected a virtual array in the radar's x-y plane, got one {depth:.2g} wavelengths "
+            "deep along z; turn the radar's rotation instead of its elements"
+        )
+    x, column = _distinct(places[:, 0], wavelength)
+    y, row = _distinct(places[:, 1], wavelength)
+    counts = torch.zeros(len(x), len(y), dtype=torch.float64)
+    counts.index_put_((column, row), torch.ones(len(places), dtype=torch.float64), accumulate=True)
+    return Aperture(x, y, column, row, _taper(window, x), _taper(window, y), counts, wavelength)
+
+
+def _distinct(
+    places: Float64[Tensor, " virtual"], wavelength: float
+) -> tuple[Float64[Tensor, " place"], Int64[Tensor, " virtual"]]:
+    """Distinct positions to a thousandth of a wavelength, and which one each element has."""
+    ordered, order = places.sort()
+    groups = torch.cat([torch.zeros(1), (ordered.diff() > 1e-3 * wavelength)]).cumsum(0).long()
+    index = torch.empty_like(groups)
+    index[order] = groups
+    sums = torch.zeros(int(groups[-1]) + 1, dtype=torch.float64).index_add_(0, index, places)
+    return sums / torch.bincount(index), index
+
+
+def _taper(window: str, places: Float64[Tensor, " place"]) -> Float64[Tensor, " place"]:
+    extent = places[-1] - places[0]
+    position = (places - places[0]) / extent if len(places) > 1 else torch.zeros_like(places)
+    return taper(window, position, len(places))

@@ -1,0 +1,396 @@
+"""The smooth twin of the exact chain: deposited power, shaped by the radar's point spread."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from invertwin.channel.deposit import deposit_power
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.radar.spectrum import Aperture, aperture
+from invertwin.radar.waveform import FMCW, Impulse, Radar, sample_window
+from invertwin.scene.scene import Scene
+
+_SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
+# Kernels are tabulated at least this far out, so that short grids do not truncate them.
+_MIN_EXTENT = 64
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """How the power of one path spreads over the bins of a spectrum.
+
+    "response" kernels are what the exact chain does to a point target: the power response of
+    its sample window in range, of its weighted virtual array in direction. For random phases
+    the mean of the exact spectrum is therefore the surrogate's. The extra widths blur both the
+    simulated and the measured map; annealing them to zero widens the basin of attraction.
+
+    Source: §3.4 of the paper; derivations §5.
+    Differs from the source: power is spread, not a field with random phases, whose boundary
+    gradient has mean zero; the Airy argument is k r |Δ(u, v)|, which is shift invariant, not
+    k r sin ψ; the Gaussian has peak 1 (``normalized_gaussian`` is the printed one).
+
+    Attributes:
+        range_kernel: "response", or "gaussian" with a full width at half maximum of one range
+            cell c/2B. For an ``Impulse`` radar both are the Gaussian.
+        angle_kernel: "response", or "airy" (an evenly lit ellipse that fills the aperture).
+        range_width: Standard deviation of the extra Gaussian [range cells].
+        angle_width: The same in u and v [beamwidths λ/D].
+        aperture_radius: Radius for "airy" [m]; None = half the virtual aperture along x and y.
+
+    Raises:
+        InputError: An unknown kernel, a negative width or radius.
+    """
+
+    range_kernel: str = "response"
+    angle_kernel: str = "response"
+    range_width: float = 0.0
+    angle_width: float = 0.0
+    aperture_radius: float | None = None
+
+    def __post_init__(self) -> None:
+        choices = {"range_kernel": ("response", "gaussian"), "angle_kernel": ("response", "airy")}
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise InputError(
+                    f"expected {name} to be one of {', '.join(allowed)}, "
+                    f"got {getattr(self, name)!r}; choose one of them"
+                )
+        radius = 1.0 if self.aperture_radius is None else self.aperture_radius
+        if not (self.range_width >= 0 and self.angle_width >= 0 and radius > 0):
+            raise InputError(
+                "expected widths >= 0 and a positive aperture_radius, got "
+                f"{self.range_width}, {self.angle_width} and {self.aperture_radius}; "
+                "widths are in range cells and beamwidths, the radius in metres"
+            )
+
+    def shape(
+        self,
+        deposit: Float[Tensor, "frame range u v"],
+        radar: Radar,
+        grid: Grid,
+        range_offset: Float[Tensor, ""] | None = None,
+    ) -> Float[Tensor, "frame range u v"]:
+        """Deposited power as the radar would show it on average over random phases.
+
+        A convolution with the power point spread (peak 1), divided in the Fourier domain by the
+        transform sinc³ of the deposit's quadratic B-spline, so that the deposit adds no blur.
+        Nothing wraps around: what leaves the grid is lost.
+
+        Args:
+            deposit: From ``deposit_power`` on the same grid.
+            radar: Its window, arrays and waveform.
+            grid: Bins.
+            range_offset: Moves everything to larger ranges [m]; differentiable.
+
+        Raises:
+            InputError: The map does not have the grid's shape.
+        """
+        _check_map(deposit, grid)
+        for kernel in self._kernels(radar, grid):
+            offset = None
+            if kernel.dims == (1,) and range_offset is not None:
+                offset = range_offset / grid.range_step
+            deposit = kernel.apply(deposit, self._extra(kernel.dims, radar, grid), offset)
+        return deposit
+
+    def blur(
+        self, power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
+    ) -> Float[Tensor, "frame range u v"]:
+        """Only the extra Gaussian widths, for measured spectra; no widths, no change.
+
+        Raises:
+            InputError: The map does not have the grid's shape.
+        """
+        _check_map(power, grid)
+        for dim, count in enumerate(grid.shape, start=1):
+            extra = self._extra((dim,), radar, grid)
+            if count > 1 and extra[0] > 0:
+                power = _flat(dim, count).apply(power, extra)
+        return power
+
+    def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_Kernel, ...]":
+        resolved = grid.u_count > 1 or grid.v_count > 1
+        return _kernels(
+            self.range_kernel,
+            self.angle_kernel,
+            self._radii(radar),
+            radar.waveform,
+            radar.window,
+            aperture(radar) if resolved else None,
+            grid,
+        )
+
+    def _radii(self, radar: Radar) -> tuple[float, float]:
+        if self.aperture_radius is not None:
+            return self.aperture_radius, self.aperture_radius
+        return 0.5 * radar.aperture[0], 0.5 * radar.aperture[1]
+
+    def _extra(self, dims: tuple[int, ...], radar: Radar, grid: Grid) -> list[float]:
+        """Standard deviations of the extra Gaussian along map dimensions, in bins."""
+        u, v = radar.beamwidth
+        sigmas = {
+            1: self.range_width * radar.waveform.range_resolution / grid.range_step,
+            2: self.angle_width * u / grid.u_step,
+            3: self.angle_width * v / grid.v_step,
+        }
+        return [sigmas[dim] for dim in dims]
+
+
+def surrogate_spectrum(
+    scene: Scene,
+    radar: Radar,
+    grid: Grid,
+    surrogate: Surrogate,
+    *,
+    samples: int,
+    boundary_samples: int,
+    seed: int,
+    boundary: bool = True,
+    range_offset: Float[Tensor, ""] | None = None,
+) -> Float[Tensor, "frame range u v"]:
+    """Expected power spectrum of a scene, differentiable in it: deposit, then shape.
+
+    Args:
+        scene: What is seen.
+        radar: Arrays, waveform and poses.
+        grid: Bins, see ``Radar.grid``.
+        surrogate: Kernels and their extra widths.
+        samples: Interior samples over all frames.
+        boundary_samples: Silhouette samples over all frames.
+        seed: Same seed, same spectrum.
+        boundary: Off leaves the visibility terms out of the gradient, for ablation.
+        range_offset: Moves everything to larger ranges [m]; differentiable.
+    """
+    deposit = deposit_power(
+        scene,
+        radar.link(),
+        grid,
+        samples=samples,
+        boundary_samples=boundary_samples,
+        seed=seed,
+        boundary=boundary,
+    )
+    return surrogate.shape(deposit, radar, grid, range_offset)
+
+
+def range_point_spread(
+    waveform: FMCW | Impulse,
+    distance: Float64[Tensor, " point"],
+    window: str = "hamming",
+    kernel: str = "response",
+) -> Float64[Tensor, " point"]:
+    """Power of a point target at a distance from its range, peak 1.
+
+    Args:
+        waveform: Of the radar.
+        distance: [m].
+        window: Taper of the samples.
+        kernel: As ``Surrogate.range_kernel``.
+    """
+    if kernel == "response" and isinstance(waveform, FMCW):
+        weight = sample_window(waveform, window)
+        cycles = distance[:, None] / waveform.max_range * torch.arange(waveform.samples)
+        return (torch.exp(2j * math.pi * cycles) @ (weight / weight.sum() + 0j)).abs().square()
+    sigma = _SIGMA_PER_FWHM * waveform.range_resolution
+    return torch.exp(-0.5 * (distance / sigma).square())
+
+
+def array_point_spread(
+    array: Aperture, du: Float64[Tensor, " u"], dv: Float64[Tensor, " v"]
+) -> Float64[Tensor, "u v"]:
+    """Power of a point target at offsets in u and v from its direction, peak 1."""
+    weight = array.counts * array.x_taper[:, None] * array.y_taper[None]
+    weight = (weight / weight.sum()).to(torch.complex128)
+    response = array.steering(du, array.x) @ weight @ array.steering(dv, array.y).T
+    return response.abs().square()
+
+
+def airy(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
+    """Power pattern of an evenly lit disc, (2 J1(z)/z)² with z = k r |Δ(u, v)|; differentiable.
+
+    Source: the spatial spectrum surrogate of the paper (§3.4.2); derivations §5.
+    """
+    near = z.abs() < 1e-3
+    away = torch.where(near, torch.ones_like(z), z)
+    lobe = (2 * bessel_j1(away) / away).square()
+    return torch.where(near, 1 - z.square() / 4 + 5 * z**4 / 192, lobe)
+
+
+def bessel_j1(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
+    """Bessel function of the first kind and order one, with the gradient J0 − J1/z.
+
+    ``torch.special.bessel_j1`` has none and says nothing.
+    """
+    return _BesselJ1.apply(z)  # type: ignore[no-any-return]
+
+
+def normalized_gaussian(
+    ranges: Float[Tensor, " path"], bins: Float[Tensor, " bin"], sigma: float
+) -> Float[Tensor, "path bin"]:
+    """The paper's range kernel: a Gaussian around each path, normalised over the bins.
+
+        G_f(R) = exp(−(R − D_f)²/2σ²) / Σ_j exp(−(R − D_j)²/2σ²)
+
+    Its derivative, which automatic differentiation gives, is
+    ``∂G_f/∂R = G_f [(D_f − R)/σ² − Σ_j G_j (D_j − R)/σ²]``.
+
+    Source: §3.4.1 of the paper; derivations §5.
+    Differs from the source: the printed derivative ``G (D − τ)/σ² (1 − G)`` belongs to another
+    normalisation (4–28 % off here), and the delay there stands for the range R.
+
+    Args:
+        ranges: R of each path [m].
+        bins: D_f, centres of the bins [m].
+        sigma: σ [m].
+    """
+    return torch.softmax(-0.5 * ((ranges[:, None] - bins[None]) / sigma).square(), dim=1)
+
+
+class _BesselJ1(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, z: Tensor) -> Tensor:
+        value = torch.special.bessel_j1(z)
+        ctx.save_for_backward(z, value)
+        return value
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        z, value = ctx.saved_tensors
+        ratio = torch.where(z == 0, 0.5 * torch.ones_like(z), value / z)
+        return grads[0] * (torch.special.bessel_j0(z) - ratio)
+
+
+@dataclass(frozen=True, eq=False)
+class _Kernel:
+    """A convolution along one map dimension, or two at once, as its transfer function.
+
+    Attributes:
+        dims: Dimensions of the map [frame, range, u, v].
+        counts: Bins along them.
+        transfer: Over the frequencies of a real FFT (the last dimension halved); real, since
+            every point spread is symmetric.
+    """
+
+    dims: tuple[int, ...]
+    counts: tuple[int, ...]
+    transfer: Float64[Tensor, "..."]
+
+    def apply(self, power: Tensor, sigmas: list[float], offset: Tensor | None = None) -> Tensor:
+        """The map convolved, with extra Gaussian widths and a shift, both in bins."""
+        transfer = self.transfer
+        for frequency, sigma in zip(_frequencies(self.counts), sigmas, strict=True):
+            if sigma > 0:
+                transfer = transfer * torch.exp(-2 * (math.pi * sigma * frequency).square())
+        if len(self.dims) > 1:
+            return self._by_fft(power, transfer)
+        if offset is not None:
+            ramp = _frequencies(self.counts)[0] * (-2 * math.pi * offset.cpu().double())
+            transfer = transfer * torch.polar(torch.ones_like(ramp), ramp)
+        return self._by_matrix(power, transfer)
+
+    def _by_fft(self, power: Tensor, transfer: Tensor) -> Tensor:
+        size = [_padded(count) for count in self.counts]
+        spectrum = torch.fft.rfftn(power, size, self.dims)
+        full = torch.fft.irfftn(spectrum * transfer.to(spectrum.real), size, self.dims)
+        return full[..., : self.counts[0], : self.counts[1]]
+
+    def _by_matrix(self, power: Tensor, transfer: Tensor) -> Tensor:
+        # At these sizes a Toeplitz matrix per axis is some 30 times faster than a padded FFT.
+        (dim,), (count,) = self.dims, self.counts
+        taps = torch.fft.irfft(transfer, _padded(count))
+        place = torch.arange(count)
+        matrix = taps[(place[:, None] - place[None]) % len(taps)].to(power)
+        rows = power.movedim(dim, 0)
+        return (matrix @ rows.reshape(count, -1)).reshape(rows.shape).movedim(0, dim)
+
+
+@lru_cache(maxsize=16)
+def _kernels(
+    range_kernel: str,
+    angle_kernel: str,
+    radii: tuple[float, float],
+    waveform: FMCW | Impulse,
+    window: str,
+    array: Aperture | None,
+    grid: Grid,
+) -> tuple[_Kernel, ...]:
+    """The kernels without extra widths; cached, since an optimisation asks again each step."""
+    spread = range_point_spread(
+        waveform, _lags(grid.range_count) * grid.range_step, window, range_kernel
+    )
+    kernels = [_compensated((1,), (grid.range_count,), spread)]
+    if array is None:
+        return tuple(kernels)
+    array.check_resolved(grid)
+    du, dv = _lags(grid.u_count) * grid.u_step, _lags(grid.v_count) * grid.v_step
+    zero = torch.zeros(1, dtype=torch.float64)
+    counts = grid.u_count, grid.v_count
+    if grid.u_count > 1 and grid.v_count > 1 and (angle_kernel == "airy" or not array.separable):
+        spread = _angle_spread(angle_kernel, radii, array, du, dv)
+        return (*kernels, _compensated((2, 3), counts, spread))
+    if grid.u_count > 1:
+        spread = _angle_spread(angle_kernel, radii, array, du, zero)[:, 0]
+        kernels.append(_compensated((2,), counts[:1], spread))
+    if grid.v_count > 1:
+        spread = _angle_spread(angle_kernel, radii, array, zero, dv)[0]
+        kernels.append(_compensated((3,), counts[1:], spread))
+    return tuple(kernels)
+
+
+def _angle_spread(
+    kernel: str, radii: tuple[float, float], array: Aperture, du: Tensor, dv: Tensor
+) -> Tensor:
+    if kernel == "response":
+        return array_point_spread(array, du, dv)
+    wavenumber = 2 * math.pi / array.wavelength
+    return airy(wavenumber * torch.hypot(radii[0] * du[:, None], radii[1] * dv[None]))
+
+
+def _compensated(dims: tuple[int, ...], counts: tuple[int, ...], spread: Tensor) -> _Kernel:
+    """Kernel of a point spread tabulated at lags, less the blur of the quadratic B-spline.
+
+    At the highest frequency the B-spline's transform is sinc³(1/2) = 0.26, so the division is
+    bounded.
+    """
+    transfer = torch.fft.rfftn(spread).real
+    for frequency in _frequencies(counts):
+        transfer = transfer / torch.sinc(frequency) ** 3
+    return _Kernel(dims, counts, transfer)
+
+
+def _flat(dim: int, count: int) -> _Kernel:
+    return _Kernel((dim,), (count,), torch.ones_like(_frequencies((count,))[0]))
+
+
+def _padded(count: int) -> int:
+    """A fast FFT length that holds all lags between ``count`` bins, so that nothing wraps."""
+    need = 2 * max(count, _MIN_EXTENT)
+    octave = 1 << (need - 1).bit_length() - 4
+    return next(m * octave for m in (9, 10, 12, 16) if m * octave >= need)
+
+
+def _lags(count: int) -> Float64[Tensor, " lag"]:
+    """Offsets in bins, in the order of an FFT."""
+    return torch.fft.fftfreq(_padded(count), d=1 / _padded(count), dtype=torch.float64)
+
+
+def _frequencies(counts: tuple[int, ...]) -> list[Tensor]:
+    """Cycles per bin of a real FFT, shaped to broadcast along each dimension."""
+    *full, half = (_padded(count) for count in counts)
+    axes = [torch.fft.fftfreq(size, dtype=torch.float64)[:, None] for size in full]
+    return [*axes, torch.fft.rfftfreq(half, dtype=torch.float64)]
+
+
+def _check_map(power: Tensor, grid: Grid) -> None:
+    if tuple(power.shape[1:]) != grid.shape:
+        raise InputError(
+            f"expected a map of shape (frames, {', '.join(map(str, grid.shape))}), got "
+            f"{tuple(power.shape)}; use the grid that it was made on"
+        )

@@ -1,0 +1,300 @@
+"""Beat signals against the plain sum, exact arithmetic and the radar equation."""
+
+import math
+from dataclasses import replace
+
+import mpmath
+import pytest
+import torch
+
+from invertwin.channel.paths import Grid, Paths
+from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.radar import (
+    FMCW,
+    Impulse,
+    PhysicsWarning,
+    Radar,
+    add_noise,
+    beat_signal,
+    exact_spectrum,
+    range_profile,
+)
+from invertwin.scene.antenna import linear_array
+from invertwin.scene.pose import rotation_from_vector
+from oracles.beat import beat as direct_beat
+
+
+def cloud(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    points = points * torch.tensor([2.0, 1.0, 3.0]) + torch.tensor([-1.0, -0.5, 1.5])
+    return points, torch.randn(count, generator=generator, dtype=torch.complex128)
+
+
+def two_bounces(radar: Radar, count: int) -> Paths:
+    """Chains over two points, spread over the radar's frames."""
+    first, coefficient = cloud(count, 1)
+    last, _ = cloud(count, 2)
+    frame = torch.arange(count) % radar.frame_count
+    link = radar.link()
+    length = (first - link.tx[frame]).norm(dim=-1) + (last - link.rx[frame]).norm(dim=-1)
+    length = length + (first - last).norm(dim=-1)
+    zero = torch.zeros(count, dtype=torch.float64)
+    return Paths(
+        frame, length / SPEED_OF_LIGHT, coefficient, zero, first, last, "field", zero.bool()
+    )
+
+
+@pytest.fixture
+def track(waveform: FMCW) -> Radar:
+    """Two turned poses of a 2 × 3 MIMO radar, TX and RX beside each other."""
+    half = 0.5 * waveform.wavelength
+    rotations = torch.stack(
+        [rotation_from_vector(torch.tensor(r).double()) for r in ([0.1, 0.2, 0.3], [0, -0.4, 0.1])]
+    )
+    receivers = linear_array(3, half)
+    receivers = replace(receivers, positions=receivers.positions + torch.tensor([0.05, 0.02, 0]))
+    positions = torch.tensor([[0, 0, 0], [0.3, 0.1, -0.2]], dtype=torch.float64)
+    return Radar(linear_array(2, half, "y"), receivers, waveform, positions, rotations)
+
+
+def test_equals_the_plain_sum(track):
+    paths = two_bounces(track, 200)
+    expected = direct_beat(paths, track)
+    found = beat_signal(paths, track)
+    assert found.shape == (2, 2, 3, 64)
+    assert (found - expected).norm() < 1e-8 * expected.norm()
+
+
+@pytest.mark.parametrize("samples", [63, 64])
+def test_odd_and_even_sample_counts(point_paths, samples):
+    half = SPEED_OF_LIGHT / 154e9
+    radar = Radar(
+        linear_array(1, half),
+        linear_array(2, half),
+        FMCW(77e9, 1e9, 4e-5, samples),
+        torch.zeros(1, 3),
+    )
+    paths = point_paths(radar, *cloud(50))
+    expected = direct_beat(paths, radar)
+    assert (beat_signal(paths, radar) - expected).norm() < 1e-8 * expected.norm()
+
+
+def test_threads_do_not_change_the_signal(track, point_paths):
+    paths = point_paths(track, *cloud(100))
+    before = torch.get_num_threads()
+    signals = []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            signals.append(beat_signal(paths, track))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*signals)
+
+
+def test_phase_at_200_m_in_exact_arithmetic(point_paths):
+    """Two-way phase of 6e5 rad, to each element, against 40 digits."""
+    waveform = FMCW(77e9, 0.3e9, 40e-6, 1024)
+    half = 0.5 * waveform.wavelength
+    radar = Radar(
+        linear_array(2, half, "y"), linear_array(8, half), waveform, torch.tensor([[0.1, 0.2, 0.3]])
+    )
+    point = torch.tensor([[31.7, -12.3, 197.1]], dtype=torch.float64)
+    paths = point_paths(radar, point, torch.tensor([1.0]))
+    found = beat_signal(paths, radar)[0]
+    tx, rx = radar.elements()
+    mpmath.mp.dps = 40
+    c = mpmath.mpf(SPEED_OF_LIGHT)
+    slope = mpmath.mpf(waveform.bandwidth) / mpmath.mpf(waveform.duration)
+
+    def distance(a, b):
+        return mpmath.sqrt(sum((mpmath.mpf(a[i]) - mpmath.mpf(b[i])) ** 2 for i in range(3)))
+
+    for t, r, n in ((0, 0, 0), (1, 7, 513), (0, 5, 1023)):
+        target = point[0].tolist()
+        length = distance(tx[0, t].tolist(), target) + distance(rx[0, r].tolist(), target)
+        delay, time = length / c, mpmath.mpf(n) * mpmath.mpf(waveform.duration) / 1024
+        cycles = waveform.start_frequency * delay + slope * delay * time - slope * delay**2 / 2
+        angle = 2 * mpmath.pi * (cycles - mpmath.nint(cycles))
+        expected = complex(mpmath.cos(angle), mpmath.sin(angle))
+        assert abs(found[t, r, n].item() - expected) < 1e-5
+
+
+def test_gradients(track):
+    paths = two_bounces(track, 4)
+    waveform = FMCW(1e9, 0.2e9, 1e-6, 12)
+    # A low carrier, so that differences of the phase are accurate; the same code.
+    radar = replace(track, waveform=waveform)
+
+    def signal(coefficient, delay, first, last, positions):
+        moved = replace(paths, coefficient=coefficient, delay=delay, first=first, last=last)
+        return beat_signal(moved, replace(radar, positions=positions), tolerance=1e-13)
+
+    # The delay in nanoseconds keeps all derivatives of one order.
+    inputs = [paths.coefficient, paths.delay * 1e9, paths.first, paths.last, radar.positions]
+    inputs = [value.clone().requires_grad_() for value in inputs]
+    assert torch.autograd.gradcheck(
+        lambda a, d, *rest: signal(a, d * 1e-9, *rest), inputs, eps=1e-6, atol=1e-4, rtol=1e-5
+    )
+
+
+def test_gradient_at_77_ghz_equals_autodiff_of_the_plain_sum(track):
+    paths = two_bounces(track, 60)
+    grads = []
+    for forward in (beat_signal, direct_beat):
+        leaves = [
+            value.clone().requires_grad_()
+            for value in (paths.coefficient, paths.delay, paths.first, paths.last)
+        ]
+        named = dict(zip(("coefficient", "delay", "first", "last"), leaves, strict=True))
+        signal = forward(replace(paths, **named), track)
+        target = torch.linspace(0, 1, 64) * (1 + 0.5j)
+        (signal - target).abs().square().sum().backward()
+        grads.append([leaf.grad for leaf in leaves])
+    for found, expected in zip(*grads, strict=True):
+        assert (found - expected).norm() < 1e-7 * expected.norm()
+
+
+def test_no_paths_and_empty_frames(track, point_paths):
+    empty = point_paths(track, torch.zeros(0, 3), torch.zeros(0))
+    assert torch.equal(beat_signal(empty, track), torch.zeros(2, 2, 3, 64).to(torch.complex128))
+    points, coefficient = cloud(5)
+    frame = torch.ones(5, dtype=torch.int64)
+    coefficient = coefficient.clone().requires_grad_()
+    signal = beat_signal(point_paths(track, points, coefficient, frame), track)
+    assert signal[0].abs().max() == 0
+    assert signal[1].abs().min() > 0
+    signal.abs().sum().backward()
+    assert coefficient.grad is not None
+    assert torch.isfinite(coefficient.grad).all()
+
+
+def test_zero_amplitude_boundary_paths_carry_gradient(track, point_paths):
+    points, coefficient = cloud(6)
+    extra = torch.zeros(1, dtype=torch.complex128, requires_grad=True)
+    all_points = torch.cat([points, points[:1] + 0.01])
+    paths = point_paths(track, all_points, torch.cat([coefficient, extra]))
+    beat_signal(paths, track).abs().square().sum().backward()
+    assert extra.grad is not None
+    assert extra.grad.abs() > 0
+
+
+@pytest.mark.parametrize("fractional", [False, True])
+def test_radar_equation(point_paths, linear, fractional):
+    """Point target of 1 m² at 4 m: peak within 0.1 bin and 0.2 dB of P_t G² λ² σ/((4π)³R⁴)."""
+    waveform = linear.waveform
+    distance = 4.0 + (0.37 * waveform.range_resolution if fractional else 0.0)
+    gain, area = 10.0, 1.0
+    expected = gain**2 * waveform.wavelength**2 * area / ((4 * math.pi) ** 3 * distance**4)
+    direction = torch.tensor([0.3, 0.0, math.sqrt(1 - 0.09)], dtype=torch.float64)
+    coefficient = torch.tensor([math.sqrt(expected) * complex(math.cos(1), math.sin(1))])
+    paths = point_paths(linear, direction * distance, coefficient)
+    grid = linear.grid(3, 5, oversample=16)
+    power = exact_spectrum(beat_signal(paths, linear), linear, grid)[0, :, :, 0]
+    peak = int(power.argmax())
+    row, column = divmod(peak, grid.u_count)
+    assert abs(grid.ranges[row] - distance) < 0.1 * waveform.range_resolution
+    assert abs(grid.u[column] - 0.3) < 0.1 * linear.beamwidth[0]
+    assert abs(10 * math.log10(power.max() / expected)) < 0.2
+
+
+def test_near_field_lengths_are_exact(point_paths, waveform):
+    """At half the aperture's length from the array, phases follow spheres, not planes."""
+    radar = Radar(
+        linear_array(1, 1.0), linear_array(64, waveform.wavelength / 2), waveform, torch.zeros(1, 3)
+    )
+    point = torch.tensor([0.02, 0.01, 0.06], dtype=torch.float64)
+    signal = beat_signal(point_paths(radar, point, torch.tensor([1.0])), radar)
+    tx, rx = radar.elements()
+    length = (point - tx[0, 0]).norm() + (point - rx[0]).norm(dim=-1)
+    delay = length / SPEED_OF_LIGHT
+    cycles = waveform.start_frequency * delay - 0.5 * waveform.slope * delay.square()
+    expected = torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)
+    assert (signal[0, 0, :, 0] - expected).abs().max() < 1e-8
+    plane = length.mean() - radar.virtual_positions[:, 0] * point[0] / point.norm()
+    assert (plane - length).abs().max() > waveform.wavelength
+
+
+def test_phase_falls_as_the_element_moves_towards_the_target(point_paths, linear):
+    """Beat coefficient conj(a), phase +2π f0 τ: shorter delay, lower phase."""
+    signal = beat_signal(
+        point_paths(linear, torch.tensor([3.0, 0, 3.0]), torch.tensor([1j])), linear
+    )
+    step = (signal[0, 0, 1:, 0] * signal[0, 0, :-1, 0].conj()).angle().mean()
+    assert step == pytest.approx(-math.pi * math.sqrt(0.5), rel=0.05)
+    one = linear.frames([0])
+    plain = beat_signal(point_paths(one, torch.tensor([3.0, 0, 3.0]), torch.tensor([1.0])), one)
+    assert torch.allclose(signal, -1j * plain)
+
+
+def test_fft_equals_matrix(point_paths, linear):
+    signal = beat_signal(point_paths(linear, *cloud(30)), linear)
+    grid = linear.grid(1, 4)
+    nudged = replace(grid, range_start=grid.range_start + 1e-6)
+    by_fft, by_matrix = (range_profile(signal, linear, g) for g in (grid, nudged))
+    assert by_fft.shape == (1, 1, 16, grid.range_count)
+    assert (by_fft - by_matrix).norm() < 1e-3 * by_fft.norm()
+    assert not torch.equal(by_fft, by_matrix)
+
+
+def test_profile_of_a_target_on_a_bin_is_its_coefficient(point_paths, linear):
+    radar = replace(linear, receivers=linear_array(1, 1.0))
+    grid = radar.grid(1, 4)
+    distance = float(grid.ranges[11])
+    paths = point_paths(radar, torch.tensor([0, 0, distance]), torch.tensor([2.5e-3]))
+    profile = range_profile(beat_signal(paths, radar), radar, grid)[0, 0, 0].abs()
+    assert profile.argmax() == 11
+    assert profile[11] == pytest.approx(2.5e-3, rel=1e-6)
+
+
+def test_single_precision_profile(point_paths, linear):
+    signal = beat_signal(point_paths(linear, *cloud(30)), linear)
+    grid = linear.grid(1, 4)
+    double, single = (exact_spectrum(s, linear, grid) for s in (signal, signal.to(torch.complex64)))
+    assert single.dtype == torch.float32
+    assert (single - double).abs().max() < 1e-5 * double.max()
+
+
+def test_noise_levels(linear):
+    ones = torch.full((1, 1, 16, 64), 3.0, dtype=torch.complex128).expand(40, -1, -1, -1)
+    noise = add_noise(ones, snr_db=10, seed=3) - ones
+    assert noise.abs().square().mean() == pytest.approx(0.9, rel=0.03)
+    assert noise.real.square().mean() == pytest.approx(0.45, rel=0.03)
+    assert noise.mean().abs() < 0.02
+    assert torch.equal(add_noise(ones, snr_db=10, seed=3) - ones, noise)
+    assert not torch.equal(add_noise(ones, snr_db=10, seed=4) - ones, noise)
+    zeros = 0 * ones
+    thermal = add_noise(zeros, linear, noise_figure_db=12, transmit_power=0.02, seed=3)
+    rate = 64 / 40e-6
+    expected = BOLTZMANN * 290 * 10**1.2 * rate / 0.02
+    assert thermal.abs().square().mean() == pytest.approx(expected, rel=0.03)
+    assert torch.equal(add_noise(zeros, snr_db=10, seed=3), zeros)
+
+
+def test_noise_needs_one_level(linear):
+    beat = torch.zeros(1, 1, 16, 64, dtype=torch.complex128)
+    for levels in ({}, {"snr_db": 3.0, "noise_figure_db": 3.0}):
+        with pytest.raises(InputError, match="exactly one"):
+            add_noise(beat, linear, seed=0, **levels)
+    with pytest.raises(InputError, match="expected a radar"):
+        add_noise(beat, noise_figure_db=3.0, seed=0)
+
+
+def test_beyond_the_unambiguous_range_warns(point_paths, linear):
+    paths = point_paths(linear, torch.tensor([0, 0, 10.0]), torch.tensor([1.0]))
+    with pytest.warns(PhysicsWarning, match=r"1 of 1 paths .* 9\.59 m"):
+        beat_signal(paths, linear)
+
+
+def test_wrong_input(point_paths, linear):
+    paths = point_paths(linear, *cloud(3))
+    with pytest.raises(InputError, match="field paths"):
+        beat_signal(replace(paths, kind="power"), linear)
+    with pytest.raises(InputError, match=r"path frames in 0\.\.0"):
+        beat_signal(replace(paths, frame=paths.frame + 1), linear)
+    with pytest.raises(InputError, match="no beat signal"):
+        beat_signal(paths, replace(linear, waveform=Impulse(77e9, 1e9)))
+    with pytest.raises(InputError, match="beat signal of shape"):
+        range_profile(torch.zeros(1, 1, 16, 65, dtype=torch.complex128), linear, Grid(1, 0.1, 9))

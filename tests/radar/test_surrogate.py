@@ -1,0 +1,311 @@
+"""The surrogate against the exact chain, and the shape of each kernel."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.radar import (
+    Impulse,
+    Radar,
+    Surrogate,
+    airy,
+    beat_signal,
+    exact_spectrum,
+    normalized_gaussian,
+    surrogate_spectrum,
+)
+from invertwin.radar.spectrum import aperture
+from invertwin.radar.surrogate import array_point_spread, bessel_j1, range_point_spread
+from invertwin.scene import Object, PerfectConductor, Scene, plate
+from invertwin.scene.antenna import AntennaArray, linear_array
+from oracles.bspline import deposit
+
+
+def cloud(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points 4–5 m away within 0.3 in u and v, and their powers."""
+    generator = torch.Generator().manual_seed(seed)
+    u, v, r = torch.rand(3, count, generator=generator, dtype=torch.float64)
+    u, v, r = 0.6 * u - 0.3, 0.6 * v - 0.3, 4 + r
+    points = r[:, None] * torch.stack([u, v, (1 - u**2 - v**2).sqrt()], 1)
+    return points, 0.2 + torch.rand(count, generator=generator, dtype=torch.float64)
+
+
+def deposited(points: torch.Tensor, power: torch.Tensor, grid: Grid) -> torch.Tensor:
+    r = points.norm(dim=-1)
+    return deposit(power, r, points[:, 0] / r, points[:, 1] / r, grid)[None]
+
+
+def expected_exact(radar: Radar, points, power, grid, point_paths) -> torch.Tensor:
+    """E|spectrum|² over independent uniform phases is the sum over the points, one by one."""
+    count = len(points)
+    copies = replace(radar, positions=radar.positions.expand(count, 3))
+    paths = point_paths(copies, points, power.sqrt(), torch.arange(count))
+    return exact_spectrum(beat_signal(paths, copies), copies, grid).sum(0, keepdim=True)
+
+
+def hexagon(radar: Radar) -> Radar:
+    places = radar.receivers.positions
+    inside = (places / places.amax(0).clamp(min=1e-9))[:, :2].norm(dim=-1) < 1.1
+    return replace(radar, receivers=AntennaArray(places[inside]))
+
+
+@pytest.mark.parametrize("array", ["planar", "mimo", "hexagon", "linear"])
+def test_mean_exact_spectrum_is_the_surrogate(array, planar, mimo, linear, point_paths):
+    radar = {"planar": planar, "mimo": mimo, "hexagon": hexagon(planar), "linear": linear}[array]
+    points, power = cloud(60)
+    grid = radar.grid(3.5, 5.5, 0.7, 0.7)
+    exact = expected_exact(radar, points, power, grid, point_paths)
+    twin = Surrogate().shape(deposited(points, power, grid), radar, grid)
+    assert (exact - twin).norm() < 0.02 * exact.norm()
+    assert (exact - twin).abs().max() < 0.02 * exact.max()
+    assert twin.sum() == pytest.approx(float(exact.sum()), rel=0.005)
+
+
+def test_mean_over_phase_seeds(linear, point_paths):
+    """The same by brute force: 400 draws of the phases of one cloud, one per frame."""
+    seeds = 400
+    points, power = cloud(300, 1)
+    copies = replace(linear, positions=linear.positions.expand(seeds, 3))
+    generator = torch.Generator().manual_seed(5)
+    angle = 2 * math.pi * torch.rand(seeds * 300, generator=generator, dtype=torch.float64)
+    coefficient = torch.polar(power.sqrt().repeat(seeds), angle)
+    frame = torch.arange(seeds).repeat_interleave(300)
+    paths = point_paths(copies, points.repeat(seeds, 1), coefficient, frame)
+    grid = linear.grid(3.5, 5.5, 0.7)
+    mean = exact_spectrum(beat_signal(paths, copies), copies, grid).mean(0)
+    twin = Surrogate().shape(deposited(points, power, grid), linear, grid)[0]
+    assert mean.sum() == pytest.approx(float(twin.sum()), rel=0.02)
+    assert (mean - twin).mean().abs() < 0.02 * twin.max()
+    # What is left is speckle: 1/√seeds per bin.
+    assert (mean - twin).norm() < 1.3 / math.sqrt(seeds) * twin.norm()
+
+
+def test_the_windows_are_part_of_the_kernel(planar, point_paths):
+    radar = replace(planar, window="hann", array_window="rectangular")
+    points, power = cloud(30)
+    grid = radar.grid(3.5, 5.5, 0.7, 0.7)
+    exact = expected_exact(radar, points, power, grid, point_paths)
+    for used, limit in ((radar, 0.02), (planar, None)):
+        twin = Surrogate().shape(deposited(points, power, grid), used, grid)
+        error = (exact - twin).norm() / exact.norm()
+        assert error < limit if limit else error > 0.1
+
+
+def half_width(profile: torch.Tensor, step: float) -> float:
+    """Full width at half maximum by linear interpolation."""
+    peak = int(profile.argmax())
+    right = peak + int((profile[peak:] < profile[peak] / 2).nonzero()[0])
+    fraction = (profile[right - 1] - profile[peak] / 2) / (profile[right - 1] - profile[right])
+    return 2 * step * (right - 1 + float(fraction) - peak)
+
+
+@pytest.mark.parametrize("kernel", ["gaussian", "response"])
+def test_range_kernel_width_and_peak(kernel, linear):
+    radar = replace(linear, receivers=linear_array(1, 1.0))
+    grid = radar.grid(3, 6, oversample=16)
+    power = torch.zeros(1, *grid.shape, dtype=torch.float64)
+    power[0, 170] = 2.0
+    profile = Surrogate(range_kernel=kernel).shape(power, radar, grid)[0, :, 0, 0]
+    cell = radar.waveform.range_resolution
+    # −3 dB width of the Hamming window: 1.30 cells of its transform.
+    width = {"gaussian": 1.0, "response": 1.30}[kernel]
+    assert profile.argmax() == 170
+    assert profile.max() == pytest.approx(2, rel=0.01)
+    assert half_width(profile, grid.range_step) == pytest.approx(width * cell, rel=0.02)
+
+
+def test_bspline_adds_no_blur(linear):
+    """Wherever the point falls between the bins, the shaped deposit is the point spread."""
+    radar = replace(linear, receivers=linear_array(1, 1.0))
+    grid = radar.grid(3, 6)
+    zero = torch.zeros(1, dtype=torch.float64)
+    for distance in (4.5, 4.5 + 0.3 * grid.range_step, 4.5 + 0.5 * grid.range_step):
+        place = torch.tensor([distance], dtype=torch.float64)
+        spread = deposit(torch.ones(1, dtype=torch.float64), place, zero, zero, grid)
+        shaped = Surrogate().shape(spread[None], radar, grid)[0, :, 0, 0]
+        expected = range_point_spread(radar.waveform, grid.ranges - distance)
+        assert (shaped - expected).abs().max() < 0.02
+
+
+def test_airy_kernel(planar):
+    """A point between the bins comes out as (2 J1(z)/z)² of an ellipse that fills the array."""
+    grid = planar.grid(3.8, 4.2, 0.9, 0.9)
+    distance = grid.ranges[2:3]
+    u, v = torch.tensor([0.111], dtype=torch.float64), torch.tensor([-0.2], dtype=torch.float64)
+    spread = deposit(torch.ones(1, dtype=torch.float64), distance, u, v, grid)[None]
+    k = 2 * math.pi / planar.waveform.wavelength
+    for radius in (None, 0.008):
+        surrogate = Surrogate(angle_kernel="airy", aperture_radius=radius)
+        shaped = surrogate.shape(spread, planar, grid)[0, 2]
+        along, across = (0.5 * size if radius is None else radius for size in planar.aperture)
+        z = k * torch.hypot(along * (grid.u - u)[:, None], across * (grid.v - v)[None])
+        assert (shaped / shaped.max() - airy(z) / airy(z).max()).abs().max() < 0.02
+
+
+def test_airy_along_one_axis(linear):
+    grid = linear.grid(4, 4.2, 0.9, oversample=8)
+    power = torch.zeros(1, *grid.shape, dtype=torch.float64)
+    power[0, 4, grid.u_count // 2, 0] = 1
+    shaped = Surrogate(angle_kernel="airy").shape(power, linear, grid)[0, 4, :, 0]
+    # Half-power width of (2 J1(z)/z)²: z = ±1.6163, with r half the aperture D.
+    width = 2 * 1.6163 / math.pi * linear.beamwidth[0]
+    assert half_width(shaped, grid.u_step) == pytest.approx(width, rel=0.01)
+
+
+@pytest.mark.parametrize("angle_kernel", ["response", "airy"])
+def test_nothing_wraps(angle_kernel, planar):
+    grid = planar.grid(4, 5, 0.6, 0.6)
+    for corner in ((0, 0, 0), (-1, -1, -1)):
+        power = torch.zeros(1, *grid.shape)
+        power[(0, *corner)] = 1
+        shaped = Surrogate(angle_kernel=angle_kernel, range_width=1.0, angle_width=0.5).shape(
+            power, planar, grid
+        )[0]
+        opposite = shaped.flip(0, 1, 2)[corner]
+        assert opposite.abs() < 1e-3 * shaped.max()
+        assert shaped.argmax() == power[0].argmax()
+
+
+def test_extra_widths(linear):
+    """Blurring the exact map equals shaping with the wider kernel; variances add."""
+    grid = linear.grid(2, 8, oversample=4)
+    power = torch.zeros(1, *grid.shape, dtype=torch.float64)
+    power[0, 80, grid.u_count // 2, 0] = 1
+    wide = Surrogate(range_width=3.0, angle_width=1.5)
+    sharp = Surrogate().shape(power, linear, grid)
+    found = wide.shape(power, linear, grid)
+    # The window's sidelobes at the rim lose power only once they are cut off.
+    assert (wide.blur(sharp, linear, grid) - found).abs().max() < 0.01 * found.max()
+    assert torch.equal(Surrogate().blur(sharp, linear, grid), sharp)
+    pure = wide.blur(power, linear, grid)[0, :, :, 0]
+    for profile, centers, sigma in (
+        (pure.sum(1), grid.ranges, 3 * linear.waveform.range_resolution),
+        (pure.sum(0), grid.u, 1.5 * linear.beamwidth[0]),
+    ):
+        assert profile.sum() == pytest.approx(1, rel=1e-3)
+        mean = (profile * centers).sum()
+        spread = (profile * (centers - mean).square()).sum().sqrt()
+        assert spread == pytest.approx(sigma, rel=0.01)
+
+
+def test_range_offset_moves_and_differentiates(linear):
+    grid = linear.grid(3, 6)
+    points, power = cloud(20)
+    spread = deposited(points, power, grid)
+    offset = torch.tensor(3 * grid.range_step, dtype=torch.float64)
+    moved = Surrogate().shape(spread, linear, grid, offset)
+    assert torch.allclose(moved[:, 3:], Surrogate().shape(spread, linear, grid)[:, :-3], atol=1e-9)
+    small = replace(grid, u_count=3)
+    spread = spread[:, :, 20:23].contiguous().requires_grad_()
+    offset = torch.tensor(0.021, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda p, d: Surrogate(range_width=0.5).shape(p, linear, small, d),
+        (spread, offset),
+        fast_mode=True,
+    )
+
+
+@pytest.mark.parametrize("angle_kernel", ["response", "airy"])
+def test_gradient_of_the_map(angle_kernel, planar):
+    grid = planar.grid(4, 4.4, 0.3, 0.3)
+    power = torch.rand(
+        2, *grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    surrogate = Surrogate("gaussian", angle_kernel, range_width=0.3, angle_width=0.2)
+    assert torch.autograd.gradcheck(
+        lambda p: surrogate.shape(p, planar, grid), power.requires_grad_(), fast_mode=True
+    )
+
+
+def test_frames_and_precision(planar):
+    grid = planar.grid(4, 5, 0.5, 0.5)
+    power = torch.rand(3, *grid.shape, generator=torch.Generator().manual_seed(0))
+    found = Surrogate().shape(power, planar, grid)
+    assert found.dtype == torch.float32
+    assert torch.allclose(found[1:2], Surrogate().shape(power[1:2], planar, grid), rtol=1e-5)
+    double = Surrogate().shape(power.double(), planar, grid)
+    assert (found - double).abs().max() < 1e-5 * double.max()
+
+
+def test_impulse_is_a_gaussian_pulse():
+    one = linear_array(1, 1.0)
+    radar = Radar(one, one, Impulse(3.95e9, 1.7e9), torch.zeros(1, 3))
+    grid = radar.grid(0, 5, oversample=8)
+    power = torch.zeros(1, *grid.shape, dtype=torch.float64)
+    power[0, 200] = 1
+    maps = [Surrogate(range_kernel=k).shape(power, radar, grid) for k in ("response", "gaussian")]
+    assert torch.equal(*maps)
+    cell = radar.waveform.range_resolution
+    assert half_width(maps[0][0, :, 0, 0], grid.range_step) == pytest.approx(cell, rel=0.02)
+
+
+def test_point_spreads_peak_at_one(planar):
+    zero = torch.zeros(1, dtype=torch.float64)
+    assert range_point_spread(planar.waveform, zero).item() == pytest.approx(1)
+    assert array_point_spread(aperture(planar), zero, zero).item() == pytest.approx(1)
+
+
+def test_bessel_and_airy_gradients():
+    z = torch.tensor([-3.0, 0.0, 1e-4, 9.9e-4, 1.1e-3, 0.5, 3.8, 40.0], dtype=torch.float64)
+    z.requires_grad_()
+    assert torch.autograd.gradcheck(bessel_j1, z)
+    assert torch.autograd.gradcheck(airy, z)
+    values = airy(z).detach()
+    assert values[1] == 1
+    assert values[3] == pytest.approx(1 - 0.25 * 9.9e-4**2, abs=1e-12)
+    # First dark ring.
+    assert airy(torch.tensor([3.8317059702], dtype=torch.float64)).item() < 1e-18
+
+
+def test_normalized_gaussian_has_the_derivative_stated_and_not_the_printed_one():
+    bins = torch.linspace(0, 2, 21, dtype=torch.float64)
+    ranges = torch.tensor([0.93, 1.31], dtype=torch.float64, requires_grad=True)
+    sigma = 0.12
+    kernel = normalized_gaussian(ranges, bins, sigma)
+    assert torch.allclose(kernel.sum(1), torch.ones(2, dtype=torch.float64))
+    assert torch.autograd.gradcheck(lambda r: normalized_gaussian(r, bins, sigma), ranges)
+    pull = (bins[None] - ranges[:, None]) / sigma**2
+    stated = kernel * (pull - (kernel * pull).sum(1, keepdim=True))
+    printed = kernel * pull * (1 - kernel)
+    for path in range(2):
+        row = torch.stack(
+            [
+                torch.autograd.grad(kernel[path, f], ranges, retain_graph=True)[0][path]
+                for f in range(21)
+            ]
+        )
+        assert torch.allclose(row, stated[path])
+        assert (row - printed[path]).norm() > 0.04 * row.norm()
+
+
+def test_scene_to_spectrum(planar):
+    """The whole surrogate chain on a plate: bright where it stands, dark elsewhere."""
+    scene = Scene({"plate": Object(plate(0.3, 0.3), PerfectConductor())})
+    radar = replace(planar, positions=torch.tensor([[0.0, 0, -4.0]]))
+    grid = radar.grid(3, 5, 0.5, 0.5)
+    power = surrogate_spectrum(
+        scene, radar, grid, Surrogate(), samples=20_000, boundary_samples=0, seed=1
+    )
+    r, u, v = torch.unravel_index(power[0].argmax(), power[0].shape)
+    assert grid.ranges[r] == pytest.approx(4, abs=grid.range_step)
+    assert grid.u[u].abs() < 2 * grid.u_step
+    assert grid.v[v].abs() < 2 * grid.v_step
+    assert power[0, 0].max() < 0.01 * power.max()
+
+
+def test_wrong_input(planar):
+    grid = planar.grid(4, 5)
+    with pytest.raises(InputError, match="expected a map of shape"):
+        Surrogate().shape(torch.zeros(1, 2, 3, 4), planar, grid)
+    with pytest.raises(InputError, match="range_kernel"):
+        Surrogate(range_kernel="sinc")
+    with pytest.raises(InputError, match="angle_kernel"):
+        Surrogate(angle_kernel="gaussian")
+    with pytest.raises(InputError, match="widths >= 0"):
+        Surrogate(range_width=-1.0)
+    with pytest.raises(InputError, match="positive aperture_radius"):
+        Surrogate(aperture_radius=0.0)

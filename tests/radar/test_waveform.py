@@ -1,0 +1,178 @@
+"""Waveforms, radar geometry, grids, and the errors and warnings at their edge."""
+
+import math
+
+import pytest
+import torch
+
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.radar import FMCW, Impulse, PhysicsWarning, Radar
+from invertwin.radar.waveform import taper
+from invertwin.scene.antenna import AntennaArray, Isotropic, linear_array
+from invertwin.scene.pose import rotation_from_vector
+
+LAMBDA = SPEED_OF_LIGHT / 77e9
+
+
+def test_fmcw_numbers():
+    waveform = FMCW(77e9, 2e9, 40e-6, 128)
+    assert waveform.center_frequency == 78e9
+    assert waveform.slope == pytest.approx(5e13)
+    assert waveform.range_resolution == pytest.approx(0.0749481, rel=1e-5)
+    assert waveform.max_range == pytest.approx(128 * 0.0749481, rel=1e-5)
+    assert waveform.sample_times[-1] == pytest.approx(40e-6 * 127 / 128)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: FMCW(77, 2e9, 40e-6, 128), "did you mean 77e9"),
+        (lambda: FMCW(77e3, 2e9, 40e-6, 128), "did you mean 77000e6"),
+        (lambda: FMCW(77e9, 2, 40e-6, 128), "did you mean 2e9"),
+        (lambda: FMCW(77e9, 2e9, 40, 128), "did you mean 40e-6"),
+        (lambda: FMCW(77e9, -2e9, 40e-6, 128), "positive bandwidth"),
+        (lambda: FMCW(77e9, 2e9, 40e-6, 1), "at least 2 samples"),
+        (lambda: FMCW(math.nan, 2e9, 40e-6, 128), "positive start_frequency"),
+        (lambda: Impulse(3.95, 1.7e9), "did you mean 3.95e9"),
+    ],
+)
+def test_wrong_units(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def small(**changes) -> Radar:
+    one = linear_array(1, LAMBDA / 2)
+    arguments = {
+        "transmitters": one,
+        "receivers": one,
+        "waveform": FMCW(77e9, 1e9, 40e-6, 64),
+        "positions": torch.zeros(2, 3, dtype=torch.float64),
+    }
+    return Radar(**(arguments | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"positions": torch.zeros(3)}, "radar positions"),
+        ({"positions": torch.zeros(0, 3)}, "at least one radar pose"),
+        ({"positions": torch.full((2, 3), math.nan)}, "finite radar positions"),
+        ({"rotations": torch.eye(3).expand(3, 3, 3)}, "radar rotations"),
+        ({"rotations": 2 * torch.eye(3).expand(2, 3, 3)}, "orthonormal"),
+        ({"rotations": torch.diag(torch.tensor([1.0, 1, -1])).expand(2, 3, 3)}, "orthonormal"),
+        ({"window": "kaiser"}, "expected window"),
+        ({"array_window": "none"}, "expected array_window"),
+        (
+            {"transmitters": linear_array(2, LAMBDA / 2), "shared_visibility": False},
+            "one transmitter",
+        ),
+    ],
+)
+def test_wrong_radar(changes, message):
+    with pytest.raises(InputError, match=message):
+        small(**changes)
+
+
+def test_positions_from_lists_are_float64():
+    radar = small(positions=[[0, 0, 1], [0, 0, 2]])
+    assert radar.positions.dtype == torch.float64
+
+
+def test_shared_visibility_follows_the_distance():
+    def at(x: float) -> AntennaArray:
+        return AntennaArray(torch.tensor([[x, 0.0, 0.0]]), Isotropic())
+
+    assert small(receivers=at(0.09)).link().shared_visibility
+    assert not small(receivers=at(0.2)).link().shared_visibility
+    assert small(receivers=at(0.2), shared_visibility=True).link().shared_visibility
+
+
+def test_world_geometry():
+    """The second pose looks along world +x: radar z → x, radar x → −z, radar y stays."""
+    turn = rotation_from_vector(torch.tensor([0, math.pi / 2, 0], dtype=torch.float64))
+    rotations = torch.stack([torch.eye(3, dtype=torch.float64), turn])
+    receivers = AntennaArray(torch.tensor([[0.0, 0, 0], [0.001, 0, 0], [0.0, 0.0015, 0]]))
+    radar = small(receivers=receivers, positions=[[1, 2, 3], [1, 2, 3]], rotations=rotations)
+    tx, rx = radar.elements()
+    offsets = rx - torch.tensor([1.0, 2, 3], dtype=torch.float64)
+    assert torch.allclose(tx[1, 0], torch.tensor([1.0, 2, 3], dtype=torch.float64))
+    assert offsets[0, 1].tolist() == pytest.approx([0.001, 0, 0], abs=1e-9)
+    assert offsets[1, 1].tolist() == pytest.approx([0, 0, -0.001], abs=1e-9)
+    assert offsets[1, 2].tolist() == pytest.approx([0, 0.0015, 0], abs=1e-9)
+    assert torch.allclose(radar.link().rx, rx.mean(1))
+    boresight = radar.link().rotations[1] @ torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    assert torch.allclose(boresight, torch.tensor([1.0, 0, 0], dtype=torch.float64))
+
+
+def test_virtual_positions_are_tx_major():
+    tx, rx = linear_array(2, 0.4 * LAMBDA, "y"), linear_array(3, 0.5 * LAMBDA)
+    virtual = small(transmitters=tx, receivers=rx).virtual_positions / LAMBDA
+    assert torch.allclose(virtual[:, 0], torch.tensor([-0.5, 0, 0.5] * 2).double())
+    assert torch.allclose(virtual[:, 1], torch.tensor([-0.2] * 3 + [0.2] * 3).double())
+
+
+def test_moved_turns_about_the_mean_position():
+    radar = small(positions=[[0, 0, 0], [2, 0, 0]])
+    turn = rotation_from_vector(torch.tensor([0, 0, math.pi / 2], dtype=torch.float64))
+    shift = torch.tensor([0.0, 0, 5], dtype=torch.float64, requires_grad=True)
+    moved = radar.moved(turn, shift)
+    expected = torch.tensor([[1.0, -1, 5], [1, 1, 5]], dtype=torch.float64)
+    assert torch.allclose(moved.positions, expected)
+    assert torch.allclose(moved.link().rotations, turn.expand(2, 3, 3))
+    moved.link().tx.sum().backward()
+    assert shift.grad is not None
+    assert torch.equal(shift.grad, torch.full((3,), 2.0, dtype=torch.float64))
+
+
+def test_frames_choose_poses():
+    radar = small(positions=[[0, 0, 0], [1, 0, 0], [2, 0, 0]]).frames([2, 0])
+    assert radar.positions[:, 0].tolist() == [2, 0]
+    assert radar.frame_count == 2
+
+
+def test_grid_spacing():
+    radar = small(receivers=linear_array(16, LAMBDA / 2))
+    grid = radar.grid(2.03, 3.01, u_max=0.5)
+    cell = radar.waveform.range_resolution
+    assert grid.range_step == pytest.approx(cell / 2)
+    assert grid.range_start / grid.range_step == pytest.approx(round(2.03 // (cell / 2)))
+    assert grid.ranges[0] <= 2.03
+    assert grid.ranges[-1] >= 3.01
+    assert grid.u_step == pytest.approx(1 / 32, rel=0.01)
+    assert grid.u_count % 2 == 1
+    assert grid.u[0] == pytest.approx(-grid.u[-1])
+    assert grid.u[-1] >= 0.5
+    assert grid.v_count == 1
+    assert radar.grid(2, 3, oversample=4).range_step == pytest.approx(cell / 4)
+
+
+def test_impulse_grid():
+    radar = small(waveform=Impulse(3.95e9, 1.7e9))
+    assert radar.grid(0, 5).shape[1:] == (1, 1)
+
+
+@pytest.mark.parametrize("limits", [(3, 2), (-1, 2), (0, 2, 1.5), (0, 2, 1, 0), (0, 2, 1, 1, 0.5)])
+def test_wrong_grid(limits):
+    with pytest.raises(InputError):
+        small().grid(*limits)
+
+
+def test_wide_spacing_warns():
+    with pytest.warns(PhysicsWarning, match="grating lobes"):
+        small(receivers=linear_array(4, LAMBDA))
+
+
+@pytest.mark.parametrize("name", ["hamming", "hann", "blackman", "rectangular"])
+def test_tapers(name):
+    position = torch.linspace(0, 1, 9, dtype=torch.float64)
+    weight = taper(name, position, 9)
+    assert torch.allclose(weight, weight.flip(0))
+    assert weight[4] == pytest.approx(1)
+    assert (weight > 0).all()
+    if name == "hamming":
+        assert torch.allclose(weight, torch.hamming_window(9, periodic=False).double(), atol=1e-6)
+    if name == "hann":
+        inner = torch.hann_window(11, periodic=False, dtype=torch.float64)[1:-1]
+        assert torch.allclose(weight, inner)
