@@ -183,7 +183,7 @@ def _triangulated_outline(
     if not string.strip() or not string.isprintable():
         raise InputError(f"expected one line of visible text, got {string!r}; give some letters")
     font = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans-Bold.ttf"
-    glyphs = FT2Font(font)
+    glyphs = FT2Font(str(font))
     unknown = [letter for letter in string if glyphs.get_char_index(ord(letter)) == 0]
     if unknown:
         raise InputError(
