@@ -300,6 +300,12 @@ def test_initial_values_are_copied():
     assert start.tolist() == [1.0, 2.0, 3.0]
 
 
+class Elsewhere(nn.Module):
+    """Maps neither scenes nor radars."""
+
+    applies_to = "range"
+
+
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("make", "message"),
@@ -313,6 +319,7 @@ def test_initial_values_are_copied():
         (lambda: Scale("block", 0.0), "initial scale"),
         (lambda: Vertices("block", 0), "number of vertices"),
         (lambda: Vertices("block", 7)(scene()), "expected 7 vertices in 'block', got 8"),
+        (lambda: Compose(Elsewhere()), "map scenes or radars, got Elsewhere for range"),
         (lambda: MaterialValues("block"), "at least one of permittivity"),
         (lambda: MaterialValues("block", permittivity=1.0), r"inside \(1, inf\), got 1"),
         (lambda: MaterialValues("block", permittivity=0.5), r"\[1, inf\), got 0.5"),

@@ -319,8 +319,18 @@ class Compose(nn.Module):
     """
 
     def __init__(self, *modules: nn.Module) -> None:
-        """Compose the given modules."""
+        """Compose the given modules.
+
+        Raises:
+            InputError: a module that maps neither scenes nor radars, which would never be applied.
+        """
         super().__init__()
+        for module in modules:
+            if _applies_to(module) not in ("scene", "radar", "both"):
+                raise InputError(
+                    "expected modules that map scenes or radars, "
+                    f"got {type(module).__name__} for {_applies_to(module)}; pass it separately"
+                )
         self.parts = nn.ModuleList(modules)
 
     @property
