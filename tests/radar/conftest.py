@@ -1,11 +1,12 @@
 """Hand-built paths: the radar is tested without a ray tracer."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from jaxtyping import config
 from torch import Tensor
 
 from invertwin.channel.paths import Paths
@@ -14,6 +15,14 @@ from invertwin.radar import FMCW, Radar
 from invertwin.scene.antenna import linear_array, planar_array
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Without the run-time shape checks of the tests, which would catch bad input first."""
+    config.update("jaxtyping_disable", True)
+    yield
+    config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")
@@ -52,7 +61,10 @@ def planar(waveform: FMCW) -> Radar:
     """One transmitter, 12 × 8 receivers."""
     half = 0.5 * waveform.wavelength
     return Radar(
-        linear_array(1, half), planar_array(12, 8, half, half), waveform, torch.zeros(1, 3)
+        linear_array(1, half),
+        planar_array(12, 8, half, half),
+        waveform,
+        torch.zeros(1, 3, dtype=torch.float64),
     )
 
 
@@ -60,11 +72,21 @@ def planar(waveform: FMCW) -> Radar:
 def mimo(waveform: FMCW) -> Radar:
     """A column of 8 transmitters and a row of 12 receivers: the same virtual array."""
     half = 0.5 * waveform.wavelength
-    return Radar(linear_array(8, half, "y"), linear_array(12, half), waveform, torch.zeros(1, 3))
+    return Radar(
+        linear_array(8, half, "y"),
+        linear_array(12, half),
+        waveform,
+        torch.zeros(1, 3, dtype=torch.float64),
+    )
 
 
 @pytest.fixture(scope="session")
 def linear(waveform: FMCW) -> Radar:
     """One transmitter, 16 receivers in a row."""
     half = 0.5 * waveform.wavelength
-    return Radar(linear_array(1, half), linear_array(16, half), waveform, torch.zeros(1, 3))
+    return Radar(
+        linear_array(1, half),
+        linear_array(16, half),
+        waveform,
+        torch.zeros(1, 3, dtype=torch.float64),
+    )

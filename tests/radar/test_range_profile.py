@@ -74,7 +74,7 @@ def test_odd_and_even_sample_counts(point_paths, samples):
         linear_array(1, half),
         linear_array(2, half),
         FMCW(77e9, 1e9, 4e-5, samples),
-        torch.zeros(1, 3),
+        torch.zeros(1, 3, dtype=torch.float64),
     )
     paths = point_paths(radar, *cloud(50))
     expected = direct_beat(paths, radar)
@@ -99,7 +99,10 @@ def test_phase_at_200_m_in_exact_arithmetic(point_paths):
     waveform = FMCW(77e9, 0.3e9, 40e-6, 1024)
     half = 0.5 * waveform.wavelength
     radar = Radar(
-        linear_array(2, half, "y"), linear_array(8, half), waveform, torch.tensor([[0.1, 0.2, 0.3]])
+        linear_array(2, half, "y"),
+        linear_array(8, half),
+        waveform,
+        torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64),
     )
     point = torch.tensor([[31.7, -12.3, 197.1]], dtype=torch.float64)
     paths = point_paths(radar, point, torch.tensor([1.0]))
@@ -158,7 +161,7 @@ def test_gradient_at_77_ghz_equals_autodiff_of_the_plain_sum(track):
 
 
 def test_no_paths_and_empty_frames(track, point_paths):
-    empty = point_paths(track, torch.zeros(0, 3), torch.zeros(0))
+    empty = point_paths(track, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0))
     assert torch.equal(beat_signal(empty, track), torch.zeros(2, 2, 3, 64).to(torch.complex128))
     points, coefficient = cloud(5)
     frame = torch.ones(5, dtype=torch.int64)
@@ -203,7 +206,10 @@ def test_radar_equation(point_paths, linear, fractional):
 def test_near_field_lengths_are_exact(point_paths, waveform):
     """At half the aperture's length from the array, phases follow spheres, not planes."""
     radar = Radar(
-        linear_array(1, 1.0), linear_array(64, waveform.wavelength / 2), waveform, torch.zeros(1, 3)
+        linear_array(1, 1.0),
+        linear_array(64, waveform.wavelength / 2),
+        waveform,
+        torch.zeros(1, 3, dtype=torch.float64),
     )
     point = torch.tensor([0.02, 0.01, 0.06], dtype=torch.float64)
     signal = beat_signal(point_paths(radar, point, torch.tensor([1.0])), radar)

@@ -93,7 +93,12 @@ def test_unresolved_axes_average_the_elements(planar, point_paths):
 def test_overlapping_virtual_elements(waveform, point_paths):
     """2 × 4 elements with three shared places, against explicit sums."""
     half = 0.5 * waveform.wavelength
-    radar = Radar(linear_array(2, half), linear_array(4, half), waveform, torch.zeros(1, 3))
+    radar = Radar(
+        linear_array(2, half),
+        linear_array(4, half),
+        waveform,
+        torch.zeros(1, 3, dtype=torch.float64),
+    )
     array = aperture(radar)
     assert array.counts[:, 0].tolist() == [1, 2, 2, 2, 1]
     target = DISTANCE * torch.tensor([U, 0, math.sqrt(1 - U**2)], dtype=torch.float64)
@@ -106,7 +111,7 @@ def test_overlapping_virtual_elements(waveform, point_paths):
 
 
 def test_frames_are_independent(planar, point_paths):
-    both = replace(planar, positions=torch.zeros(2, 3))
+    both = replace(planar, positions=torch.zeros(2, 3, dtype=torch.float64))
     frame = torch.tensor([1])
     paths = point_paths(both, TARGET, torch.tensor([1.0]), frame)
     grid = both.grid(4.8, 5.2)

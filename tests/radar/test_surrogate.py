@@ -233,7 +233,7 @@ def test_frames_and_precision(planar):
 
 def test_impulse_is_a_gaussian_pulse():
     one = linear_array(1, 1.0)
-    radar = Radar(one, one, Impulse(3.95e9, 1.7e9), torch.zeros(1, 3))
+    radar = Radar(one, one, Impulse(3.95e9, 1.7e9), torch.zeros(1, 3, dtype=torch.float64))
     grid = radar.grid(0, 5, oversample=8)
     power = torch.zeros(1, *grid.shape, dtype=torch.float64)
     power[0, 200] = 1
@@ -285,7 +285,7 @@ def test_normalized_gaussian_has_the_derivative_stated_and_not_the_printed_one()
 def test_scene_to_spectrum(planar):
     """The whole surrogate chain on a plate: bright where it stands, dark elsewhere."""
     scene = Scene({"plate": Object(plate(0.3, 0.3), PerfectConductor())})
-    radar = replace(planar, positions=torch.tensor([[0.0, 0, -4.0]]))
+    radar = replace(planar, positions=torch.tensor([[0.0, 0, -4.0]], dtype=torch.float64))
     grid = radar.grid(3, 5, 0.5, 0.5)
     power = surrogate_spectrum(
         scene, radar, grid, Surrogate(), samples=20_000, boundary_samples=0, seed=1

@@ -57,7 +57,7 @@ def small(**changes) -> Radar:
     ("changes", "message"),
     [
         ({"positions": torch.zeros(3)}, "radar positions"),
-        ({"positions": torch.zeros(0, 3)}, "at least one radar pose"),
+        ({"positions": torch.zeros(0, 3, dtype=torch.float64)}, "at least one radar pose"),
         ({"positions": torch.full((2, 3), math.nan)}, "finite radar positions"),
         ({"rotations": torch.eye(3).expand(3, 3, 3)}, "radar rotations"),
         ({"rotations": 2 * torch.eye(3).expand(2, 3, 3)}, "orthonormal"),
@@ -70,19 +70,19 @@ def small(**changes) -> Radar:
         ),
     ],
 )
-def test_wrong_radar(changes, message):
+def test_wrong_radar(unchecked, changes, message):
     with pytest.raises(InputError, match=message):
         small(**changes)
 
 
-def test_positions_from_lists_are_float64():
+def test_positions_from_lists_are_float64(unchecked):
     radar = small(positions=[[0, 0, 1], [0, 0, 2]])
     assert radar.positions.dtype == torch.float64
 
 
 def test_shared_visibility_follows_the_distance():
     def at(x: float) -> AntennaArray:
-        return AntennaArray(torch.tensor([[x, 0.0, 0.0]]), Isotropic())
+        return AntennaArray(torch.tensor([[x, 0.0, 0.0]], dtype=torch.float64), Isotropic())
 
     assert small(receivers=at(0.09)).link().shared_visibility
     assert not small(receivers=at(0.2)).link().shared_visibility
@@ -93,8 +93,14 @@ def test_world_geometry():
     """The second pose looks along world +x: radar z → x, radar x → −z, radar y stays."""
     turn = rotation_from_vector(torch.tensor([0, math.pi / 2, 0], dtype=torch.float64))
     rotations = torch.stack([torch.eye(3, dtype=torch.float64), turn])
-    receivers = AntennaArray(torch.tensor([[0.0, 0, 0], [0.001, 0, 0], [0.0, 0.0015, 0]]))
-    radar = small(receivers=receivers, positions=[[1, 2, 3], [1, 2, 3]], rotations=rotations)
+    receivers = AntennaArray(
+        torch.tensor([[0, 0, 0], [0.001, 0, 0], [0, 0.0015, 0]], dtype=torch.float64)
+    )
+    radar = small(
+        receivers=receivers,
+        positions=torch.tensor([[1, 2, 3], [1, 2, 3]], dtype=torch.float64),
+        rotations=rotations,
+    )
     tx, rx = radar.elements()
     offsets = rx - torch.tensor([1.0, 2, 3], dtype=torch.float64)
     assert torch.allclose(tx[1, 0], torch.tensor([1.0, 2, 3], dtype=torch.float64))
@@ -114,7 +120,7 @@ def test_virtual_positions_are_tx_major():
 
 
 def test_moved_turns_about_the_mean_position():
-    radar = small(positions=[[0, 0, 0], [2, 0, 0]])
+    radar = small(positions=torch.tensor([[0, 0, 0], [2, 0, 0]], dtype=torch.float64))
     turn = rotation_from_vector(torch.tensor([0, 0, math.pi / 2], dtype=torch.float64))
     shift = torch.tensor([0.0, 0, 5], dtype=torch.float64, requires_grad=True)
     moved = radar.moved(turn, shift)
@@ -127,7 +133,9 @@ def test_moved_turns_about_the_mean_position():
 
 
 def test_frames_choose_poses():
-    radar = small(positions=[[0, 0, 0], [1, 0, 0], [2, 0, 0]]).frames([2, 0])
+    radar = small(
+        positions=torch.tensor([[0, 0, 0], [1, 0, 0], [2, 0, 0]], dtype=torch.float64)
+    ).frames([2, 0])
     assert radar.positions[:, 0].tolist() == [2, 0]
     assert radar.frame_count == 2
 

@@ -211,14 +211,11 @@ class _Signal:
         """Phase per sample and delay [rad/s]."""
         return 2 * math.pi * self.waveform.bandwidth / self.waveform.samples
 
-    def channels(self) -> list[np.ndarray]:
-        """(tx, rx) pairs, split into one contiguous share per thread."""
-        pairs = np.stack(np.unravel_index(np.arange(len(self.tx) * len(self.rx)), self.shape), 1)
-        return np.array_split(pairs, min(torch.get_num_threads(), len(pairs)))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return len(self.tx), len(self.rx)
+    def shares(self) -> list[list[tuple[int, int]]]:
+        """All (tx, rx) pairs, dealt out to the threads."""
+        pairs = [(t, r) for t in range(len(self.tx)) for r in range(len(self.rx))]
+        threads = min(torch.get_num_threads(), len(pairs))
+        return [pairs[thread::threads] for thread in range(threads)]
 
     def delay(self, tx: int, rx: int) -> np.ndarray:
         """Delay of every path between two elements [s]."""
@@ -281,9 +278,9 @@ class _BeatSum(torch.autograd.Function):
             tolerance,
         )
         ctx.signal = signal
-        result = np.zeros((*signal.shape, waveform.samples), dtype=np.complex128)
+        result = np.zeros((len(tx), len(rx), waveform.samples), dtype=np.complex128)
 
-        def share(pairs: np.ndarray) -> None:
+        def share(pairs: list[tuple[int, int]]) -> None:
             plan = signal.plan(1, 1)
             for t, r in pairs:
                 delay = signal.delay(t, r)
@@ -294,7 +291,7 @@ class _BeatSum(torch.autograd.Function):
                 result[t, r] = plan.execute(strengths)
 
         if len(inner):
-            _in_threads(share, signal.channels())
+            _in_threads(share, signal.shares())
         return torch.from_numpy(result)
 
     @staticmethod
@@ -307,16 +304,16 @@ class _BeatSum(torch.autograd.Function):
             zeros = [np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))]
             parts = [*zeros, np.zeros_like(signal.tx), np.zeros_like(signal.rx)]
         else:
-            shares = _in_threads(
-                lambda pairs: _adjoint_share(signal, grad, pairs), signal.channels()
-            )
+            shares = _in_threads(lambda pairs: _adjoint_share(signal, grad, pairs), signal.shares())
             parts = [reduce(np.add, terms) for terms in zip(*shares, strict=True)]
         coefficient, inner, first, last, tx, rx = parts
         gradients = (np.conj(coefficient), inner, first.T, last.T, tx, rx)
         return *(torch.from_numpy(np.ascontiguousarray(g)) for g in gradients), None, None
 
 
-def _adjoint_share(signal: _Signal, grad: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
+def _adjoint_share(
+    signal: _Signal, grad: np.ndarray, pairs: list[tuple[int, int]]
+) -> list[np.ndarray]:
     """Gradients of the loss from some channels: dL = Re Σ conj(grad_n) ds_n.
 
     With s_n = Σ b E_n: Σ grad_n conj(E_n) for b, and 2π Im(conj(b) Σ grad_n conj(E_n) f_n) with
@@ -357,7 +354,7 @@ def _distance(points: np.ndarray, place: np.ndarray) -> np.ndarray:
     return np.sqrt(square, out=square)
 
 
-def _in_threads(share: Callable[[np.ndarray], Any], shares: list[np.ndarray]) -> list[Any]:
+def _in_threads(share: Callable[[list], Any], shares: list[list]) -> list[Any]:
     if len(shares) == 1:
         return [share(shares[0])]
     with ThreadPoolExecutor(len(shares)) as pool:
