@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from invertwin.cli.report import Table, shown
 from invertwin.cli.run_file import load_run
@@ -206,11 +207,11 @@ def _demo_file() -> Path:
 
 def _print(tables: list[Table]) -> None:
     for table in tables:
-        grid = RichTable(title=table.title, title_justify="left")
+        grid = RichTable(title=Text(table.title), title_justify="left")
         for i, column in enumerate(table.columns):
-            grid.add_column(column, justify="left" if i == 0 else "right")
+            grid.add_column(Text(column), justify="left" if i == 0 else "right")
         for row in table.rows:
-            grid.add_row(*map(shown, row))
+            grid.add_row(*(Text(shown(cell)) for cell in row))
         console.print(grid)
         if table.note:
             console.print(table.note, markup=False)

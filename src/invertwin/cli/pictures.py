@@ -27,6 +27,10 @@ VIEWS: Mapping[str, NDArray] = {
 }
 
 
+Curve = tuple[NDArray, NDArray]
+"""Places and values."""
+
+
 @dataclass(frozen=True)
 class Drawing:
     """One scene as triangles, with an optional outline of where objects should be.
@@ -105,7 +109,8 @@ def _draw_scene(axes, drawing: Drawing, frame: NDArray) -> None:
     for vertices, faces in drawing.outline.values():
         segments = vertices[_sharp_edges(vertices, faces)] @ frame[:2].T
         axes.add_collection(LineCollection(list(segments), colors=OUTLINE, linewidths=0.8))
-    if drawing.radar is not None:
+    # Seen from the radar, its own marks would only hide the scene.
+    if drawing.radar is not None and frame[2, 2] == 0:
         x, y = (drawing.radar @ frame[:2].T).T
         axes.plot(x, y, "v", color="black", markersize=4)
     axes.set_aspect("equal")
@@ -206,29 +211,34 @@ def loss_picture(losses: Mapping[str, Sequence[float]]) -> bytes:
     return _png(figure)
 
 
-def landscape_picture(
-    exact: tuple[NDArray, NDArray], surrogates: Mapping[str, tuple[NDArray, NDArray]]
-) -> bytes:
+def landscape_picture(exact: Curve, surrogates: Mapping[str, Curve]) -> bytes:
     """The exact signal's loss beside the surrogate's, over the offset from the truth.
 
     Args:
         exact: Offsets (m) and losses of the exact signal.
-        surrogates: Offsets (m) and losses of the surrogate, per width.
+        surrogates: Offsets (m) and losses of the surrogate, by name.
     """
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.plot(exact[0], exact[1], color=PALETTE[0], linewidth=0.8)
-    left.set_title("exact signal: local minima every half wavelength", fontsize=9)
+    left.plot(exact[0] * 1e3, exact[1], color=PALETTE[0], linewidth=0.8)
+    left.set_title(f"exact signal: {count_minima(exact[1])} local minima", fontsize=9)
+    left.set_xlabel("offset from the truth [mm]")
     for i, (name, (offsets, losses)) in enumerate(surrogates.items()):
-        right.plot(offsets, losses, color=PALETTE[(i + 1) % len(PALETTE)], label=name)
-    right.set_title("surrogate: one basin", fontsize=9)
+        color = PALETTE[(i + 1) % len(PALETTE)]
+        right.plot(offsets, losses, color=color, label=f"{name} ({count_minima(losses)})")
+    right.set_title("surrogate, and its number of local minima", fontsize=9)
+    right.set_xlabel("offset from the truth [m]")
     right.legend(fontsize=8)
     for axes in (left, right):
         axes.axvline(0, color="black", linewidth=0.6, linestyle=":")
-        axes.set_xlabel("offset from the truth [m]")
         axes.set_ylabel("loss")
         axes.grid(alpha=0.3)
     return _png(figure)
+
+
+def count_minima(values: NDArray) -> int:
+    """Points inside a curve that are lower than both neighbours."""
+    return int(np.sum((values[1:-1] < values[:-2]) & (values[1:-1] < values[2:])))
 
 
 def gradient_picture(gradients: Mapping[str, NDArray], axes: Axes) -> bytes:

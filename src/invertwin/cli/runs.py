@@ -66,6 +66,11 @@ class RunFolder:
         """Whether the run had ended before it was opened again."""
         return self._manifest["complete"]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The result files of this run."""
+        return tuple(self._manifest["files"])
+
     def file(self, name: str) -> Path:
         """The path of a result file, owned by this run from now on."""
         if name not in self._manifest["files"]:

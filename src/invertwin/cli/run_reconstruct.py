@@ -1,0 +1,512 @@
+"""`invertwin reconstruct` and `demo`: fits from one or many starts, scored against the truth."""
+
+import math
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import nn
+
+from invertwin.capture import Capture, calibrate, locate, rail_sar
+from invertwin.channel.paths import Grid
+from invertwin.cli import build, pictures
+from invertwin.cli.landscape import landscape
+from invertwin.cli.report import Picture, Table, report_html
+from invertwin.cli.run_file import need, to_toml
+from invertwin.cli.run_simulate import exact
+from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
+from invertwin.cli.schema import CaptureData, RadarParameter, RunFile, SimulatedData
+from invertwin.errors import InputError
+from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.nuisances import ClockOffset, RangeBias
+from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
+from invertwin.radar.surrogate import surrogate_spectrum
+from invertwin.radar.waveform import Radar
+from invertwin.scene import Scene
+from invertwin.scene.files import save_mesh
+
+FULL, INTERIOR = "full", "interior_only"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything a fit needs, built from the run file.
+
+    Attributes:
+        run: The run file.
+        scene: The scene as known.
+        truth: The true scene, where the run file knows it.
+        known: Names of the objects whose true pose is known.
+        capture: The data.
+        radar: What measured them.
+        grid: Bins that are compared.
+        target: The object that is scored, if any moves.
+    """
+
+    run: RunFile
+    scene: Scene
+    truth: Scene
+    known: frozenset[str]
+    capture: Capture
+    radar: Radar
+    grid: Grid
+    target: str | None
+
+
+def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> list[Table]:
+    """Fits from every start, writes the folder, and returns the tables to print.
+
+    Starts that an interrupted run has finished are not fitted again.
+    """
+    begin = time.perf_counter()
+    settings = need(run, "reconstruct", "reconstruct")
+    problem, calibration = _calibrated(_problem(run, console), folder, console)
+    scenes = [problem.scene]
+    if run.starts is not None:
+        scenes = build.starts(run.starts, problem.scene, problem.truth, run.seed)
+    modes = [FULL] if settings.boundary else [INTERIOR]
+    if settings.also_interior_only and settings.boundary:
+        modes.append(INTERIOR)
+    single = len(scenes) * len(modes) == 1
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for mode in modes:
+        rows[mode] = [
+            _fit(problem, scene, i, mode, folder, console, CHECKPOINT if single else None)
+            for i, scene in enumerate(scenes)
+        ]
+    best = min(rows[modes[0]], key=lambda row: _finite(row["loss"]))
+    start = scenes[best["start"]]
+    twin, radar, offset = _restored(problem, start, folder, best["checkpoint"])
+    metrics = {
+        "task": run.task,
+        **_summary(problem, rows, modes),
+        **{key: best[key] for key in _SCORES if key in best},
+        "status": best["status"],
+        "loss": best["loss"],
+        "steps": best["steps"],
+        "parameters": best["values"],
+        **({"calibration": calibration} if calibration else {}),
+        **_heldout(problem, rows[modes[0]], best),
+        "starts": _without_history(rows[modes[0]]),
+    }
+    if len(modes) > 1:
+        metrics["starts_interior_only"] = _without_history(rows[INTERIOR])
+    if run.landscape is not None and isinstance(run.data, SimulatedData):
+        console.print("computing the loss landscape")
+        png, found = landscape(run, problem.truth, problem.radar, problem.grid, problem.capture)
+        folder.write_bytes("landscape.png", png)
+        metrics["landscape"] = found
+    metrics["wall_seconds"] = time.perf_counter() - begin
+    tables = _tables(problem, metrics, start, twin, rows)
+    _draw(problem, folder, rows, start, twin, radar, offset)
+    save_mesh(folder.file("twin.ply"), twin)
+    if not single:
+        shutil.copyfile(folder.path / best["checkpoint"], folder.file(CHECKPOINT))
+    folder.write_json("metrics.json", metrics)
+    _write_report(run, folder, metrics, tables)
+    folder.remove([name for name in folder.names if name.startswith(PARTS)])
+    return tables
+
+
+def _finite(loss: float | None) -> float:
+    """The loss as a rank: one that is not a number comes last."""
+    return loss if loss is not None and math.isfinite(loss) else math.inf
+
+
+def _problem(run: RunFile, console: Console) -> Problem:
+    need(run, "parameters", "reconstruct")
+    table = need(run, "grid", "reconstruct")
+    scene, truth = build.scene(run.scene), build.true_scene(run)
+    data = need(run, "data", "reconstruct")
+    if isinstance(data, SimulatedData):
+        radar = build.radar(need(run, "radar", "simulated data"))
+        grid = build.grid(table, radar)
+        console.print("simulating the exact signals of the true scene")
+        beat = exact(run, truth, radar, grid).beat
+        assert beat is not None
+        capture = Capture.from_beat(beat, radar)
+        known = frozenset(truth.names)
+    else:
+        if run.radar is not None:
+            raise InputError(
+                f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
+                "remove it: a capture brings its radar along"
+            )
+        is_file = isinstance(data, CaptureData)
+        capture = Capture.load(data.file) if is_file else rail_sar.read(data.folder)
+        radar = capture.radar()
+        grid = build.grid(table, radar)
+        known = frozenset(run.truth)
+    target = run.starts.object if run.starts else next(iter(_sought(run)), None)
+    return Problem(run, scene, truth, known, capture, radar, grid, target)
+
+
+def _calibrated(
+    problem: Problem, folder: RunFolder, console: Console
+) -> tuple[Problem, dict[str, Any]]:
+    """The problem with range bias and clock offset found on an object whose place is known."""
+    table = problem.run.calibration
+    if table is None:
+        return problem, {}
+    center = problem.truth[table.object].center
+    if table.method == "backprojection":
+        capture, row = calibrate(problem.capture, center), {}
+    else:
+        alone = Scene({table.object: problem.truth[table.object]})
+        nuisances = [RangeBias(), ClockOffset(problem.capture)]
+        checkpoint = f"{PARTS}/calibration.pt"
+        rate = table.rate or problem.run.optimizer.rate
+        steps = table.steps or _steps(problem)
+        found = _reconstruct(
+            problem,
+            alone,
+            nuisances,
+            _Bar(console, "calibration", steps),
+            folder.file(checkpoint),
+            steps=steps,
+            optimizer=replace(_optimizer(problem.run), rate=rate),
+        )
+        capture = problem.capture.recalibrated(
+            problem.capture.clock_offset + float(nuisances[1].shift.detach()),
+            problem.capture.range_bias + float(nuisances[0].bias.detach()),
+        )
+        row = {"loss": found.loss, "status": found.status}
+    row |= {"clock_offset_s": capture.clock_offset, "range_bias_m": capture.range_bias}
+    return replace(problem, capture=capture, radar=capture.radar()), row
+
+
+def _fit(
+    problem: Problem,
+    scene: Scene,
+    index: int,
+    mode: str,
+    folder: RunFolder,
+    console: Console,
+    checkpoint: str | None,
+) -> dict[str, Any]:
+    """One fit, or what an interrupted run has kept of it."""
+    part = f"{PARTS}/{mode}_{index:02d}"
+    done = folder.read_json(f"{part}.json")
+    if done is not None:
+        return done
+    begin = time.perf_counter()
+    name = f"start {index + 1}" + (", interior only" if mode == INTERIOR else "")
+    checkpoint = checkpoint or f"{part}.pt"
+    found = _reconstruct(
+        problem,
+        scene,
+        [*build.parameters(problem.run.parameters, scene), *_nuisances(problem)],
+        _Bar(console, name, _steps(problem)),
+        folder.file(checkpoint),
+        steps=_steps(problem),
+        boundary=mode == FULL,
+        seed=problem.run.seed + index,
+        regularizers=build.regularizers(problem.run.parameters, scene),
+    )
+    row = {
+        "start": index,
+        **_scores(problem, scene, found.scene),
+        "loss": found.loss,
+        "status": found.status,
+        "steps": found.steps,
+        "seconds": time.perf_counter() - begin,
+        "values": found.history[-1]["values"] if found.history else {},
+        "checkpoint": checkpoint,
+        "losses": [step["loss"] for step in found.history],
+    }
+    folder.write_json(f"{part}.json", row)
+    return row
+
+
+def _reconstruct(
+    problem: Problem,
+    scene: Scene,
+    modules: Sequence[nn.Module],
+    bar: "_Bar",
+    checkpoint: Any,
+    **changes: Any,
+) -> Reconstruction:
+    settings = need(problem.run, "reconstruct", "reconstruct")
+    options = {
+        "grid": problem.grid,
+        "loss": SpectrumLoss(**problem.run.loss.model_dump()),
+        "optimizer": _optimizer(problem.run),
+        "surrogate": build.surrogate(problem.run.surrogate),
+        "annealing": settings.annealing,
+        "seed": problem.run.seed,
+        "samples": settings.samples,
+        "boundary_samples": settings.boundary_samples,
+        "boundary": settings.boundary,
+        "frames_per_step": settings.frames_per_step,
+        "tolerance": settings.tolerance,
+        "checkpoint": checkpoint,
+        "checkpoint_every": settings.checkpoint_every,
+        "resume": True,  # from its own unfinished part; open_run has settled what may be there
+    }
+    with bar:
+        return reconstruct(
+            scene,
+            problem.radar,
+            problem.capture,
+            modules,
+            progress=bar.advance,
+            **(options | changes),
+        )
+
+
+class _Bar:
+    """A progress bar with the loss and the first parameters."""
+
+    def __init__(self, console: Console, name: str, steps: int):
+        self._bar = Progress(
+            TextColumn(name),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
+            console=console,
+        )
+        self._task = self._bar.add_task("", total=steps)
+
+    def __enter__(self) -> "_Bar":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def advance(self, row: dict[str, Any]) -> None:
+        """Shows a row of the history."""
+        values = " ".join(
+            np.array2string(np.atleast_1d(value), precision=3, suppress_small=True)
+            for value in list(row["values"].values())[:2]
+            if np.size(value) <= 3
+        )
+        text = f"loss {row['loss']:.4f} {values}"
+        self._bar.update(self._task, completed=row["step"] + 1, description=text)
+
+
+def _sought(run: RunFile) -> list[str]:
+    """Objects that have parameters."""
+    return [p.object for p in run.parameters if not isinstance(p, RadarParameter)]
+
+
+def _steps(problem: Problem) -> int:
+    return need(problem.run, "reconstruct", "reconstruct").steps
+
+
+def _optimizer(run: RunFile) -> Optimizer:
+    return Optimizer(**run.optimizer.model_dump())
+
+
+def _nuisances(problem: Problem) -> list[nn.Module]:
+    made = {"range_bias": RangeBias, "clock_offset": lambda: ClockOffset(problem.capture)}
+    names = need(problem.run, "reconstruct", "reconstruct").nuisances
+    return [made[name]() for name in names]
+
+
+def _restored(
+    problem: Problem, scene: Scene, folder: RunFolder, checkpoint: str
+) -> tuple[Scene, Radar, torch.Tensor | None]:
+    """Twin, radar and range offset of a finished fit, from its checkpoint."""
+    modules = nn.ModuleList(
+        [*build.parameters(problem.run.parameters, scene), *_nuisances(problem)]
+    )
+    saved = torch.load(folder.path / checkpoint, weights_only=True)
+    modules.load_state_dict(saved["modules"])
+    radar, offset = problem.radar, None
+    with torch.no_grad():
+        for module in modules:
+            match getattr(module, "applies_to", "scene"):
+                case "scene":
+                    scene = module(scene)
+                case "radar":
+                    radar = module(radar)
+                case "range":
+                    offset = module()
+    return scene, radar, offset
+
+
+_SCORES = ("start_distance_m", "start_angle_deg", "position_error_m", "rotation_error_deg", "scale")
+
+
+def _scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
+    """How far start and twin are from the truth, where it is known."""
+    name = problem.target
+    if name is None:
+        return {}
+    place = twin[name].center.detach().tolist()
+    if name not in problem.known:
+        return {"position": place}
+    settings = need(problem.run, "reconstruct", "reconstruct")
+    before = build.residual(start[name], problem.truth[name])
+    after = build.residual(twin[name], problem.truth[name])
+    angle = math.degrees(after.angle)
+    turned = any(p.kind == "pose" for p in problem.run.parameters)
+    near = after.distance <= settings.position_limit
+    return {
+        "start_distance_m": before.distance,
+        "start_angle_deg": math.degrees(before.angle),
+        "position_error_m": after.distance,
+        "rotation_error_deg": angle,
+        "scale": after.scale,
+        "success": near and (not turned or angle <= settings.rotation_limit_deg),
+        "position": place,
+    }
+
+
+def _summary(
+    problem: Problem, rows: dict[str, list[dict[str, Any]]], modes: Sequence[str]
+) -> dict[str, Any]:
+    """Successes with and, where asked for, without boundary terms."""
+    if problem.target not in problem.known:
+        return {}
+    counts = {mode: sum(row["success"] for row in rows[mode]) for mode in modes}
+    found = {"successes": counts[modes[0]], "starts_count": len(rows[modes[0]])}
+    if INTERIOR in counts:
+        found["successes_interior_only"] = counts[INTERIOR]
+    return found
+
+
+def _heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) -> dict[str, Any]:
+    """For calibrated captures: the error on an object that took no part in the calibration."""
+    table = problem.run.calibration
+    name = problem.target
+    if table is None or name is None or name not in problem.known or name == table.object:
+        return {}
+    truth = problem.truth[name].center
+    focused = calibrate(problem.capture, problem.truth[table.object].center)
+    classical = locate(focused, truth) - truth
+    places = torch.tensor([row["position"] for row in rows], dtype=torch.float64)
+    spread = (places - places.mean(0)).norm(dim=1).max()
+    return {
+        "heldout_error_m": best["position_error_m"],
+        "heldout_error_worst_m": max(row["position_error_m"] for row in rows),
+        "backprojection_error_m": float(classical.norm()),
+        "spread_m": float(spread),
+    }
+
+
+def _without_history(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{k: v for k, v in row.items() if k not in ("losses", "checkpoint")} for row in rows]
+
+
+def _tables(
+    problem: Problem,
+    metrics: dict[str, Any],
+    start: Scene,
+    twin: Scene,
+    rows: dict[str, list[dict[str, Any]]],
+) -> list[Table]:
+    plain = [(k, v) for k, v in metrics.items() if not isinstance(v, dict | list)]
+    plain += metrics.get("calibration", {}).items()
+    tables = [Table("Result", ["quantity", "value"], [list(item) for item in plain])]
+    columns = ["start", *_SCORES, "success", "loss", "status", "steps", "seconds"]
+    for mode, fits in rows.items():
+        if len(fits) > 1:
+            cells = [[row["start"] + 1, *(row.get(c) for c in columns[1:])] for row in fits]
+            tables.append(Table(f"Starts, {mode.replace('_', ' ')}", columns, cells))
+    cells = []
+    for name in dict.fromkeys(_sought(problem.run)):
+        scenes = [start, twin, *([problem.truth] if name in problem.known else [])]
+        centers = [scene[name].center.detach().tolist() for scene in scenes]
+        for i, axis in enumerate("xyz"):
+            cells.append([f"{name}.{axis} [m]", *(center[i] for center in centers)])
+        if name in problem.known:
+            angles = [
+                math.degrees(build.residual(scene[name], problem.truth[name]).angle)
+                for scene in scenes
+            ]
+            cells.append([f"{name}, angle to the truth [°]", *angles])
+    for row in cells:
+        row += [None] * (4 - len(row))
+    tables.append(Table("Parameters", ["parameter", "start", "result", "truth"], cells))
+    moves = [[k, v] for k, v in metrics["parameters"].items()]
+    tables.append(Table("Moves from the start", ["parameter", "value"], moves))
+    return tables
+
+
+def _draw(
+    problem: Problem,
+    folder: RunFolder,
+    rows: dict[str, list[dict[str, Any]]],
+    start: Scene,
+    twin: Scene,
+    radar: Radar,
+    offset: torch.Tensor | None,
+) -> None:
+    """Writes the pictures of the best fit."""
+    sought = _sought(problem.run)
+    places = radar.positions.detach().numpy()
+    truth = pictures.meshes_of(problem.truth)
+    outline = {k: v for k, v in truth.items() if k in problem.known and k in sought}
+    scenes = {"truth": problem.truth} if outline else {}
+    scenes |= {"start": start, "twin": twin}
+    folder.write_bytes(
+        "scene.png",
+        pictures.scene_picture(
+            {
+                name: pictures.Drawing(pictures.meshes_of(scene), sought, outline, places)
+                for name, scene in scenes.items()
+            }
+        ),
+    )
+    settings = need(problem.run, "reconstruct", "reconstruct")
+    sharp = replace(build.surrogate(problem.run.surrogate), range_width=0.0, angle_width=0.0)
+
+    def spectrum(scene: Scene) -> np.ndarray:
+        with torch.no_grad():
+            return surrogate_spectrum(
+                scene,
+                radar,
+                problem.grid,
+                sharp,
+                samples=4 * settings.samples,
+                boundary_samples=0,
+                seed=problem.run.seed,
+                range_offset=offset,
+            ).numpy()
+
+    grid = problem.grid
+    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
+    maps = {
+        "measured": problem.capture.spectrum(grid).numpy(),
+        "simulated, start": spectrum(start),
+        "simulated, twin": spectrum(twin),
+    }
+    folder.write_bytes("spectra.png", pictures.spectra_picture(maps, axes))
+    losses = {
+        f"{mode.replace('_', ' ')} {row['start'] + 1}": row["losses"]
+        for mode, fits in rows.items()
+        for row in fits
+    }
+    folder.write_bytes("loss.png", pictures.loss_picture(losses))
+
+
+def _write_report(
+    run: RunFile, folder: RunFolder, metrics: dict[str, Any], tables: Sequence[Table]
+) -> None:
+    notes = {
+        "scene": "Outlined in red: where the sought objects really are.",
+        "spectra": "Summed over frames; each map in dB below its own peak.",
+        "landscape": "Both losses along the same line through the truth.",
+    }
+    shown = [
+        Picture(name.capitalize(), (folder.path / f"{name}.png").read_bytes(), notes.get(name, ""))
+        for name in ("scene", "spectra", "loss", "landscape")
+        if f"{name}.png" in folder.names
+    ]
+    status = f"{metrics['status']} after {metrics['steps']} steps."
+    if "position_error_m" in metrics:
+        status = (
+            f"{metrics['position_error_m']:.3f} m and {metrics['rotation_error_deg']:.1f}° from "
+            f"the truth; {status}"
+        )
+    title = run.title or "Reconstruction"
+    folder.write_text("report.html", report_html(title, status, [*tables, *shown], to_toml(run)))
