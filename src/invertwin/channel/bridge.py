@@ -69,8 +69,7 @@ def use_backend(name: str | None) -> Iterator[None]:
 def tracer() -> Any:
     """The ``mitsuba`` module, set to the backend in force."""
     name = backend()
-    if name == "cpu":
-        doctor.require()
+    doctor.require(name)
     import mitsuba as mi
 
     if mi.variant() != _VARIANTS[name]:

@@ -1,7 +1,7 @@
 """Frozen values that leave or enter the channel: the bins, the antennas' places, the paths."""
 
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Complex128, Float, Float64, Int64
@@ -11,6 +11,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 
 
+@runtime_checkable
 class Pattern(Protocol):
     """What the channel asks of an antenna pattern (see ``invertwin.scene.antenna``)."""
 
