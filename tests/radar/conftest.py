@@ -1,8 +1,6 @@
 """Hand-built paths: the radar is tested without a ray tracer."""
 
-import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,8 +11,6 @@ from invertwin.channel.paths import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar import FMCW, Radar
 from invertwin.scene.antenna import linear_array, planar_array
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 
 @pytest.fixture
