@@ -3,7 +3,7 @@
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -15,7 +15,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from invertwin.cli.report import Table, shown
-from invertwin.cli.run_file import load_run
+from invertwin.cli.run_file import load_run, need
 from invertwin.cli.runs import RunFolder, open_run
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
@@ -79,7 +79,7 @@ def simulate(
     backend: BackendOption = None,
 ) -> None:
     """Simulate exact radar signals of a scene, and their spectra."""
-    runs = _load([file], seed)
+    runs = _load([file], seed, "simulate", ("radar", "grid", "data"))
     with _folder(out or _default(file), runs, overwrite, False) as folder:
         from invertwin.cli.run_simulate import run_simulate
 
@@ -121,7 +121,7 @@ def gradcheck(
     backend: BackendOption = None,
 ) -> None:
     """Compare automatic derivatives with central differences."""
-    runs = _load(files, seed)
+    runs = _load(files, seed, "gradcheck", ("gradcheck", "radar", "grid"))
     default = _default(files[0]) if len(files) == 1 else Path("out/gradcheck")
     with _folder(out or default, runs, overwrite, resume) as folder:
         if folder.complete:
@@ -155,7 +155,7 @@ def main() -> None:
 
 
 def _reconstruct(file: Path, out: Path, overwrite: bool, resume: bool, seed: int | None) -> None:
-    runs = _load([file], seed)
+    runs = _load([file], seed, "reconstruct", ("reconstruct", "data", "grid", "parameters"))
     with _folder(out, runs, overwrite, resume) as folder:
         if folder.complete:
             return
@@ -183,7 +183,10 @@ def _folder(
     console.print(f"{done}: {path / 'report.html'}", markup=False, soft_wrap=True)
 
 
-def _load(files: list[Path], seed: int | None) -> dict[str, RunFile]:
+def _load(
+    files: list[Path], seed: int | None, command: str, sections: Sequence[str]
+) -> dict[str, RunFile]:
+    """Run files by stem, with the sections that the command cannot do without."""
     runs: dict[str, RunFile] = {}
     for file in files:
         if file.stem in runs:
@@ -191,6 +194,8 @@ def _load(files: list[Path], seed: int | None) -> dict[str, RunFile]:
                 f"expected run files of different names, got {file.stem} twice; rename one"
             )
         run = load_run(file)
+        for section in sections:
+            need(run, section, command)
         runs[file.stem] = run if seed is None else run.model_copy(update={"seed": seed})
     return runs
 

@@ -51,7 +51,7 @@ def need(run: RunFile, section: str, command: str) -> Any:
     found = getattr(run, section)
     if found in (None, []):
         raise InputError(
-            f"expected a section [{section}] for {command}, got a run file without it; add it"
+            f"expected a section [{section}] for {command}, got a run file without one; add it"
         )
     return found
 

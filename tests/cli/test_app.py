@@ -1,0 +1,314 @@
+"""The commands end to end, on scenes small enough for seconds."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from invertwin.cli import app
+from invertwin.cli.run_file import load_run
+
+RUN = """
+task = "reconstruct"
+seed = 3
+
+[scene.plate]
+shape = "plate"
+width = 0.4
+height = 0.3
+divisions = 3
+position = [0.0, 0.0, 1.2]
+material = { kind = "rough_dielectric", permittivity = 4.0 }
+
+[scene.wall]
+shape = "plate"
+width = 2.0
+height = 2.0
+position = [0.0, 0.0, 1.6]
+material = { kind = "rough_dielectric", permittivity = 4.0 }
+
+[truth.plate]
+position = [0.02, 0.01, 1.2]
+
+[radar]
+waveform = { kind = "fmcw", start_frequency = 76e9, bandwidth = 2e9, duration = 5e-5, samples = 64 }
+receivers = { kind = "planar", count = [6, 4], spacing = [1.9e-3, 1.9e-3] }
+positions = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]
+
+[radar.transmitters]
+kind = "positions"
+positions = [[0.0, 0.0, 0.0]]
+pattern = { kind = "cosine", exponent = 1.0 }
+
+[grid]
+range_min = 0.8
+range_max = 1.8
+u_max = 0.6
+v_max = 0.6
+
+[data]
+kind = "simulated"
+density = 2e3
+snr_db = 20.0
+
+[[parameters]]
+kind = "translation"
+object = "plate"
+
+[surrogate]
+range_width = 2.0
+angle_width = 1.0
+
+[reconstruct]
+steps = 8
+samples = 20_000
+boundary_samples = 4_000
+checkpoint_every = 1
+"""
+STARTS = """
+[starts]
+object = "plate"
+count = 2
+distance = [0.05, 0.08]
+"""
+GRADCHECK = """
+[gradcheck]
+parameter = { kind = "translation", object = "plate", axis = [1.0, 0.0, 0.0] }
+step = 1e-2
+samples = 50_000
+boundary_samples = 20_000
+repeats = 1
+difference_samples = 50_000
+max_pairs = 4
+"""
+
+BEHIND = RUN.replace("1.2]", "-1.2]").replace("1.6]", "-1.6]").replace("snr_db = 20.0", "")
+MATERIAL = 'material = { kind = "perfect_conductor" }\n'
+
+
+@pytest.fixture
+def run_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "small.toml"
+    file.write_text(RUN)
+    return file
+
+
+def call(monkeypatch, *arguments) -> int:
+    monkeypatch.setattr(sys, "argv", ["invertwin", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        app.main()
+    return ended.value.code if isinstance(ended.value.code, int) else 0
+
+
+def read_metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_help_names_the_commands(monkeypatch, capsys):
+    assert call(monkeypatch, "--help") == 0
+    said = capsys.readouterr().out
+    for command in ("simulate", "reconstruct", "gradcheck", "demo", "doctor"):
+        assert command in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["reconstruct", "none.toml"], "none.toml"),
+        (["simulate", "unknown.toml"], "did you mean `position`?"),
+        (["gradcheck", "small.toml"], "[gradcheck]"),
+        (["gradcheck", "check.toml", "check.toml"], "check twice"),
+        (["reconstruct", "mesh.toml"], "car.obj"),
+        (["reconstruct", "behind.toml"], "map with power"),
+        (["reconstruct", "small.toml", "-o", "full"], "metrics.json"),
+        (["reconstruct", "small.toml", "--resume"], "interrupted run"),
+        (["reconstruct", "small.toml", "--resume", "--overwrite"], "both"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(run_file, monkeypatch, capfd, arguments, said):
+    folder = run_file.parent
+    (folder / "unknown.toml").write_text(RUN.replace("position = [0.0, 0.0, 1.2]", "positoin = 1"))
+    (folder / "mesh.toml").write_text(RUN + '[scene.car]\nfile = "car.obj"\n' + MATERIAL)
+    (folder / "check.toml").write_text(RUN + GRADCHECK)
+    (folder / "behind.toml").write_text(BEHIND)
+    (folder / "full").mkdir()
+    (folder / "full" / "metrics.json").write_text("{}")
+    assert call(monkeypatch, *arguments) == 2
+    error = capfd.readouterr().err
+    assert said in error
+    assert error.startswith("invertwin: expected") or ": expected" in error
+    assert error.count("\n") == 1
+    assert not (folder / "out").exists() or not any((folder / "out").iterdir())
+    assert (folder / "full" / "metrics.json").read_text() == "{}"
+
+
+def test_simulate_then_reconstruct_from_the_saved_capture(run_file, monkeypatch, capsys):
+    assert call(monkeypatch, "simulate", run_file) == 0
+    out = run_file.parent / "out" / "small"
+    metrics = read_metrics(out)
+    assert metrics["frames"] == 2
+    assert metrics["channels"] == 24
+    assert 1.1 < metrics["peak_range_m"] < 1.8
+    assert {p.name for p in out.iterdir()} >= {"capture.nc", "scene.png", "spectra.png"}
+    assert "peak_range_m" in capsys.readouterr().out
+
+    text = RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]
+    text = text.replace('kind = "simulated"', 'kind = "capture"\nfile = "out/small/capture.nc"')
+    text = text.replace("density = 2e3\nsnr_db = 20.0\n", "")
+    measured = run_file.with_name("measured.toml")
+    measured.write_text(text)
+    assert call(monkeypatch, "reconstruct", measured, "-o", "fit") == 0
+    metrics = read_metrics(run_file.parent / "fit")
+    # The truth is an input here only because the run file says it.
+    assert metrics["start_distance_m"] == pytest.approx(0.0224, abs=1e-3)
+
+
+def test_simulate_of_nothing_visible_is_silence(run_file, monkeypatch):
+    run_file.write_text(BEHIND)
+    assert call(monkeypatch, "simulate", run_file) == 0
+    assert read_metrics(run_file.parent / "out" / "small")["peak_power_db"] is None
+
+
+def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
+    landscape = '[landscape]\nobject = "plate"\naxis = [0.0, 0.0, 1.0]\npoints = 3\n'
+    run_file.write_text(RUN + landscape + "exact_points = 21\n")
+    assert call(monkeypatch, "reconstruct", run_file, "--seed", "5", "-o", "fit") == 0
+    out = run_file.parent / "fit"
+    names = {p.name for p in out.iterdir()}
+    assert names == {
+        *(".invertwin.json", "metrics.json", "run.toml", "report.html", "twin.ply"),
+        *("checkpoint.pt", "scene.png", "spectra.png", "loss.png", "landscape.png"),
+    }
+    metrics = read_metrics(out)
+    assert metrics["status"] in ("budget", "converged")
+    assert metrics["starts_count"] == len(metrics["starts"]) == 1
+    assert metrics["position_error_m"] >= 0
+    assert metrics["landscape"]["local_minima"]["exact"] >= 3
+    assert load_run(out / "run.toml").seed == 5
+    report = (out / "report.html").read_text()
+    assert report.count("data:image/png;base64,") == 4
+    assert "plate.x [m]" in report
+    assert "plate.x [m]" in capsys.readouterr().out
+
+    assert call(monkeypatch, "reconstruct", run_file, "--seed", "5", "-o", "fit") == 2
+    assert call(monkeypatch, "reconstruct", run_file, "--seed", "5", "-o", "fit", "--resume") == 0
+    assert "complete already" in capsys.readouterr().out
+
+
+def test_many_starts_with_and_without_boundary_terms(run_file, monkeypatch):
+    run_file.write_text(RUN + "also_interior_only = true\n" + STARTS)
+    assert call(monkeypatch, "reconstruct", run_file) == 0
+    out = run_file.parent / "out" / "small"
+    metrics = read_metrics(out)
+    assert len(metrics["starts"]) == len(metrics["starts_interior_only"]) == 2
+    assert metrics["successes"] == sum(row["success"] for row in metrics["starts"])
+    assert "successes_interior_only" in metrics
+    best = min(metrics["starts"], key=lambda row: row["loss"])
+    assert metrics["position_error_m"] == best["position_error_m"]
+    for row in metrics["starts"]:
+        assert 0.05 <= row["start_distance_m"] <= 0.08
+    assert (out / "checkpoint.pt").exists()
+    assert not (out / "parts").exists()
+
+
+# torch's forward mode loads its own deprecated scripts.
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
+    files = []
+    for name in ("first", "second"):
+        files.append(run_file.with_name(f"{name}.toml"))
+        files[-1].write_text(RUN.replace("[0.02, 0.01, 1.2]", "[0.0, 0.0, 1.2]") + GRADCHECK)
+    assert call(monkeypatch, "gradcheck", *files) == 0
+    out = run_file.parent / "out" / "gradcheck"
+    scenes = read_metrics(out)["scenes"]
+    assert set(scenes) == {"first", "second"}
+    for scene in scenes.values():
+        for kind in ("full", "interior"):
+            assert set(scene[kind]) >= {"relative_l1", "relative_l2", "correlation"}
+        assert scene["full"]["relative_l1"] < scene["interior"]["relative_l1"]
+        assert scene["difference_noise"] > 0
+    assert {p.name for p in out.iterdir()} >= {"first.png", "runs", "report.html"}
+    assert "second" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypatch):
+    run_file.write_text(RUN.replace("steps = 8", "steps = 40") + STARTS)
+    assert call(monkeypatch, "reconstruct", run_file, "-o", "whole") == 0
+    whole = read_metrics(run_file.parent / "whole")
+
+    command = [sys.executable, "-c", "from invertwin.cli.app import main; main()"]
+    command += ["reconstruct", str(run_file), "-o", "cut"]
+    checkpoint = run_file.parent / "cut" / "parts" / "full_01.pt"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert checkpoint.exists()
+    assert not (run_file.parent / "cut" / "metrics.json").exists()
+
+    assert call(monkeypatch, "reconstruct", run_file, "-o", "cut", "--resume") == 0
+    resumed = read_metrics(run_file.parent / "cut")
+    for a, b in zip(resumed["starts"], whole["starts"], strict=True):
+        assert a["values"]["plate.translation"] == pytest.approx(
+            b["values"]["plate.translation"], rel=1e-4
+        )
+
+
+def test_interruption_says_how_to_go_on(run_file, monkeypatch, capsys):
+    from invertwin.cli import run_reconstruct
+
+    def interrupted(run, folder, console):
+        folder.write_text("checkpoint.pt", "state")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_reconstruct, "run_reconstruct", interrupted)
+    assert call(monkeypatch, "reconstruct", run_file) == 130
+    error = capsys.readouterr().err
+    assert "--resume" in error
+    assert error.count("\n") == 1
+    assert (run_file.parent / "out" / "small" / "checkpoint.pt").exists()
+
+
+def test_demo_reconstructs_the_run_file_that_comes_along(tmp_path, monkeypatch):
+    from invertwin.cli import run_reconstruct
+
+    monkeypatch.chdir(tmp_path)
+    seen = []
+
+    def noted(run, folder, console):
+        seen.append((run, folder.path))
+        return []
+
+    monkeypatch.setattr(run_reconstruct, "run_reconstruct", noted)
+    assert call(monkeypatch, "demo", "--seed", "9") == 0
+    ((run, path),) = seen
+    assert run.task == "demo"
+    assert run.seed == 9
+    assert path == Path("out/demo")
+
+
+@pytest.mark.parametrize("ok", [True, False])
+def test_doctor_prints_and_returns_the_verdict(monkeypatch, capsys, ok):
+    from invertwin import doctor
+
+    monkeypatch.setattr(doctor, "report", lambda: {"ok": ok})
+    monkeypatch.setattr(doctor, "render", lambda report: "[not markup] " + "x" * 100)
+    assert call(monkeypatch, "doctor") == (0 if ok else 1)
+    assert "[not markup] " + "x" * 100 in capsys.readouterr().out
+
+
+def test_backend_option_is_in_force(monkeypatch, run_file):
+    monkeypatch.setenv("INVERTWIN_BACKEND", "auto")
+    assert call(monkeypatch, "reconstruct", "none.toml", "--backend", "cpu") == 2
+    assert os.environ["INVERTWIN_BACKEND"] == "cpu"
+    assert call(monkeypatch, "reconstruct", "none.toml", "--backend", "tpu") == 2
