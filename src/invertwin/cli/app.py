@@ -27,7 +27,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-console = Console(highlight=False)
+# Tables in a log file or a pipe keep the width that holds their columns.
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 
 
 class Backend(StrEnum):
@@ -214,7 +215,7 @@ def _print(tables: list[Table]) -> None:
     for table in tables:
         grid = RichTable(title=Text(table.title), title_justify="left")
         for i, column in enumerate(table.columns):
-            grid.add_column(Text(column), justify="left" if i == 0 else "right")
+            grid.add_column(Text(column), justify="right" if i else "left", no_wrap=i == 0)
         for row in table.rows:
             grid.add_row(*(Text(shown(cell)) for cell in row))
         console.print(grid)

@@ -335,6 +335,18 @@ def _restored(
 
 _SCORES = ("start_distance_m", "start_angle_deg", "position_error_m", "rotation_error_deg", "scale")
 
+_COLUMNS = {
+    "start_distance_m": "from [m]",
+    "start_angle_deg": "from [°]",
+    "position_error_m": "error [m]",
+    "rotation_error_deg": "error [°]",
+    "success": "success",
+    "loss": "loss",
+    "status": "status",
+    "steps": "steps",
+    "seconds": "time [s]",
+}
+
 
 def _scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     """How far start and twin are from the truth, where it is known."""
@@ -407,11 +419,11 @@ def _tables(
     plain = [(k, v) for k, v in metrics.items() if not isinstance(v, dict | list)]
     plain += metrics.get("calibration", {}).items()
     tables = [Table("Result", ["quantity", "value"], [list(item) for item in plain])]
-    columns = ["start", *_SCORES, "success", "loss", "status", "steps", "seconds"]
     for mode, fits in rows.items():
         if len(fits) > 1:
-            cells = [[row["start"] + 1, *(row.get(c) for c in columns[1:])] for row in fits]
-            tables.append(Table(f"Starts, {mode.replace('_', ' ')}", columns, cells))
+            cells = [[row["start"] + 1, *(row.get(key) for key in _COLUMNS)] for row in fits]
+            title = f"Starts, {mode.replace('_', ' ')}"
+            tables.append(Table(title, ["start", *_COLUMNS.values()], cells))
     cells = []
     for name in dict.fromkeys(_sought(problem.run)):
         scenes = [start, twin, *([problem.truth] if name in problem.known else [])]
