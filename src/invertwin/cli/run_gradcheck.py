@@ -149,4 +149,4 @@ def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
 def _note(run: RunFile, found: Mapping[str, Any]) -> str:
     parameter = need(run, "gradcheck", "gradcheck").parameter
     what = f"{parameter.kind} of {parameter.object or 'the radar'}"
-    return f"Derivative with respect to the {what}; {found['seconds']:.0f} s."
+    return f"Derivative with respect to the {what}; {found['seconds']:.0f} s. {run.note}"

@@ -86,10 +86,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> list[T
     metrics = {
         "task": run.task,
         **_summary(problem, rows, modes),
-        **{key: best[key] for key in _SCORES if key in best},
-        "status": best["status"],
-        "loss": best["loss"],
-        "steps": best["steps"],
+        **{key: best[key] for key in _COLUMNS if key in best and key != "seconds"},
         "parameters": best["values"],
         **({"calibration": calibration} if calibration else {}),
         **_heldout(problem, rows[modes[0]], best),
@@ -333,13 +330,12 @@ def _restored(
     return scene, radar, offset
 
 
-_SCORES = ("start_distance_m", "start_angle_deg", "position_error_m", "rotation_error_deg", "scale")
-
 _COLUMNS = {
     "start_distance_m": "from [m]",
     "start_angle_deg": "from [°]",
     "position_error_m": "error [m]",
     "rotation_error_deg": "error [°]",
+    "scale_error": "size error",
     "success": "success",
     "loss": "loss",
     "status": "status",
@@ -359,18 +355,20 @@ def _scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     settings = need(problem.run, "reconstruct", "reconstruct")
     before = build.residual(start[name], problem.truth[name])
     after = build.residual(twin[name], problem.truth[name])
-    angle = math.degrees(after.angle)
-    turned = any(p.kind == "pose" for p in problem.run.parameters)
-    near = after.distance <= settings.position_limit
-    return {
+    rows: dict[str, Any] = {
         "start_distance_m": before.distance,
-        "start_angle_deg": math.degrees(before.angle),
         "position_error_m": after.distance,
-        "rotation_error_deg": angle,
-        "scale": after.scale,
-        "success": near and (not turned or angle <= settings.rotation_limit_deg),
+        "success": after.distance <= settings.position_limit,
         "position": place,
     }
+    kinds = {p.kind for p in problem.run.parameters}
+    if "pose" in kinds:
+        angle = math.degrees(after.angle)
+        rows |= {"start_angle_deg": math.degrees(before.angle), "rotation_error_deg": angle}
+        rows["success"] &= angle <= settings.rotation_limit_deg
+    if "scale" in kinds:
+        rows |= {"scale_error": abs(after.scale - 1)}
+    return rows
 
 
 def _summary(
@@ -417,20 +415,21 @@ def _tables(
     rows: dict[str, list[dict[str, Any]]],
 ) -> list[Table]:
     plain = [(k, v) for k, v in metrics.items() if not isinstance(v, dict | list)]
-    plain += metrics.get("calibration", {}).items()
+    plain += [(f"calibration: {k}", v) for k, v in metrics.get("calibration", {}).items()]
     tables = [Table("Result", ["quantity", "value"], [list(item) for item in plain])]
     for mode, fits in rows.items():
         if len(fits) > 1:
-            cells = [[row["start"] + 1, *(row.get(key) for key in _COLUMNS)] for row in fits]
+            keys = [key for key in _COLUMNS if key in fits[0]]
+            cells = [[row["start"] + 1, *(row[key] for key in keys)] for row in fits]
             title = f"Starts, {mode.replace('_', ' ')}"
-            tables.append(Table(title, ["start", *_COLUMNS.values()], cells))
+            tables.append(Table(title, ["start", *(_COLUMNS[key] for key in keys)], cells))
     cells = []
     for name in dict.fromkeys(_sought(problem.run)):
         scenes = [start, twin, *([problem.truth] if name in problem.known else [])]
         centers = [scene[name].center.detach().tolist() for scene in scenes]
         for i, axis in enumerate("xyz"):
             cells.append([f"{name}.{axis} [m]", *(center[i] for center in centers)])
-        if name in problem.known:
+        if name in problem.known and "rotation_error_deg" in metrics:
             angles = [
                 math.degrees(build.residual(scene[name], problem.truth[name]).angle)
                 for scene in scenes
@@ -514,11 +513,11 @@ def _write_report(
         for name in ("scene", "spectra", "loss", "landscape")
         if f"{name}.png" in folder.names
     ]
-    status = f"{metrics['status']} after {metrics['steps']} steps."
+    status = f"{metrics['status']} after {metrics['steps']} steps. {run.note}"
     if "position_error_m" in metrics:
-        status = (
-            f"{metrics['position_error_m']:.3f} m and {metrics['rotation_error_deg']:.1f}° from "
-            f"the truth; {status}"
+        turned = (
+            f" and {metrics['rotation_error_deg']:.1f}°" if "rotation_error_deg" in metrics else ""
         )
+        status = f"{metrics['position_error_m']:.3f} m{turned} from the truth; {status}"
     title = run.title or "Reconstruction"
     folder.write_text("report.html", report_html(title, status, [*tables, *shown], to_toml(run)))

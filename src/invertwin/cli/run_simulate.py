@@ -92,7 +92,7 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
         ),
     ]
     title = run.title or "Simulation"
-    status = f"{len(found.paths)} paths, {radar.frame_count} frames."
+    status = f"{len(found.paths)} paths, {radar.frame_count} frames. {run.note}"
     folder.write_text("report.html", report_html(title, status, [table, *shown], to_toml(run)))
     return [table]
 

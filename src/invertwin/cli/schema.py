@@ -622,6 +622,7 @@ class RunFile(Section):
 
     task: Literal["simulate", "reconstruct", "gradcheck", "demo"]
     title: str = ""
+    note: str = ""  # shown in the report
     seed: Seed = 0
     scene: Annotated[dict[str, SceneObject], Field(min_length=1)]
     truth: dict[str, Truth] = {}
