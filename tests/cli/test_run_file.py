@@ -43,7 +43,7 @@ def radar(**changes):
 @pytest.mark.parametrize(
     ("raw", "parts"),
     [
-        (run(sede=1), ["sede: ", "task, title, seed", "did you mean `seed`?"]),
+        (run(sede=1), ["sede: ", "task, title, note, seed", "did you mean `seed`?"]),
         (
             run(scene={"letter": {"shape": "text", "text": "A", "materail": ROUGH}}),
             ["scene.letter.materail: ", "material, velocity, position", "did you mean `material`?"],
