@@ -49,8 +49,10 @@ def run_gradcheck(
             found = _check(name, run, folder, lambda line, name=name: say(f"{name}: {line}"))
             folder.write_json(part, found)
         scenes[name] = found
-        png = (folder.path / f"{name}.png").read_bytes()
-        parts.append(Picture(run.title or name, png, note=_note(run, found)))
+        parts += [
+            Picture(run.title or name, (folder.path / f"{name}_scene.png").read_bytes()),
+            Picture(name, (folder.path / f"{name}.png").read_bytes(), note=_note(run, found)),
+        ]
     seconds = time.perf_counter() - begin
     table = Table("Agreement with central differences", COLUMNS, [_row(*s) for s in scenes.items()])
     folder.write_json(
