@@ -27,6 +27,7 @@ _MENU = {
     "gradcheck": "inversion.gradcheck",
     "load_mesh": "scene.files",
     "reconstruct": "inversion.reconstruction",
+    "simulate": "simulation",
 }
 
 __all__ = ["__version__", *_MENU, *_ROOMS]  # pyright: ignore[reportUnsupportedDunderAll]

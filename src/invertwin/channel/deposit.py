@@ -344,7 +344,7 @@ def _scatter(out: Any, trace: _Trace, found: Contribution) -> None:
         dr.scatter_add(out, weight, tracer().UInt32(index), ok)
 
 
-def _scatter_derivative(out: Any, trace: _Trace, found: Contribution, dots: list) -> None:
+def _scatter_derivative(out: Any, trace: _Trace, found: Contribution, dots: tuple) -> None:
     """Add the derivative of the paths' deposit, given those of power, range, u and v."""
     import drjit as dr
 

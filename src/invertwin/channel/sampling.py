@@ -21,6 +21,7 @@ from invertwin.errors import InputError
 # Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and small
 # enough that the dark side of a 0.3 m ball stays dark from a kilometre away.
 _NEAR = 3e-6
+_GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
 _FEW_EDGES = 2000  # up to here float32 can place a sample along the edge by its rest in the CDF
 
 
@@ -180,7 +181,8 @@ class RaySampler:
             valid &= shot.clear(position, shot.point(shot.rx, frame), valid)
         weight = dr.select(valid, dr.square(hit.t) / (cosine * density), 0.0)
         face = dr.select(valid, hit.prim_index, shot.sound_face)
-        return Samples(frame, face, hit.prim_uv.x, hit.prim_uv.y, weight)
+        b = dr.select(valid, hit.prim_uv, 0.25)
+        return Samples(frame, face, b.x, b.y, weight)
 
 
 class AreaSampler:
@@ -291,6 +293,10 @@ class EdgeSampler:
             mi.Ray3f(y + away * _NEAR, away), coherent=True, active=valid
         )
         valid &= hit.is_valid()
+        # A ray in the plane of the triangle it meets has no shadow point there: lose it.
+        p0, p1, p2 = shot.corners(hit.prim_index, valid)
+        normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+        valid &= dr.abs(dr.dot(normal, away)) > _GRAZING * dr.norm(away)
         opposite = mi.UInt32(dr.gather(mi.Int32, topology.device_opposite[0], edge))
         weight = 1 / (pmf * self.size)
         found = EdgeSamples(frame, first, second, opposite, along, hit.prim_index, weight)
