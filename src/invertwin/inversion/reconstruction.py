@@ -35,12 +35,15 @@ class Optimizer:
     Attributes:
         kind: ``adam``, or ``sgd`` with momentum.
         rate: Learning rate at the first step; parameters are in metres and radians.
-        final_rate: At the last one (cosine in between); None = ``rate`` / 20.
+        rotation_rate: The same for parameters named ``rotation``; None = ``rate``.
+        final_rate: At the last step (cosine in between), of ``rate``; None = ``rate`` / 20.
+            The rates of all parameters fall alike.
         momentum: Of SGD.
     """
 
     kind: Literal["adam", "sgd"] = "adam"
     rate: float = 0.03
+    rotation_rate: float | None = None
     final_rate: float | None = None
     momentum: float = 0.9
 
@@ -51,16 +54,25 @@ class Optimizer:
                 "Adam at 0.03 suits metres and radians"
             )
 
-    def build(self, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
-        """The torch optimiser over these parameters."""
+    def build(self, modules: nn.Module) -> torch.optim.Optimizer:
+        """The torch optimiser over the modules' parameters."""
+        groups: dict[float, list[nn.Parameter]] = {}
+        for name, parameter in modules.named_parameters():
+            if parameter.requires_grad:
+                turns = name.endswith("rotation") and self.rotation_rate is not None
+                ratio = self.rotation_rate / self.rate if turns else 1.0  # type: ignore[operator]
+                groups.setdefault(ratio, []).append(parameter)
+        listed = [{"params": group, "ratio": ratio} for ratio, group in groups.items()]
         if self.kind == "adam":
-            return torch.optim.Adam(parameters, lr=self.rate)
-        return torch.optim.SGD(parameters, lr=self.rate, momentum=self.momentum)
+            return torch.optim.Adam(listed, lr=self.rate)
+        return torch.optim.SGD(listed, lr=self.rate, momentum=self.momentum)
 
-    def rate_at(self, progress: float) -> float:
-        """Learning rate after this share of the steps."""
+    def apply(self, optimizer: torch.optim.Optimizer, progress: float) -> None:
+        """Set the learning rates after this share of the steps."""
         last = self.rate / 20 if self.final_rate is None else self.final_rate
-        return last + 0.5 * (self.rate - last) * (1 + math.cos(math.pi * progress))
+        rate = last + 0.5 * (self.rate - last) * (1 + math.cos(math.pi * progress))
+        for group in optimizer.param_groups:
+            group["lr"] = rate * group["ratio"]
 
 
 @dataclass(frozen=True)
@@ -175,7 +187,7 @@ def reconstruct(
             "give modules such as Pose('object')"
         )
     rates = optimizer or Optimizer()
-    state = _State(rates.build(sought))
+    state = _State(rates.build(fit.modules))
     path = Path(checkpoint) if checkpoint is not None else None
     if resume and path is not None and path.exists():
         state.load(path, fit)
@@ -330,8 +342,7 @@ def _descend(
     progress: Callable[[dict[str, Any]], None] | None,
 ) -> Status:
     while state.step < fit.steps:
-        for group in state.optimizer.param_groups:
-            group["lr"] = rates.rate_at(state.step / fit.steps)
+        rates.apply(state.optimizer, state.step / fit.steps)
         state.optimizer.zero_grad()
         value = fit.evaluate(state.step)
         number = float(value.detach())
