@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor
 
@@ -103,7 +102,5 @@ def simulate(
         )
     beat = beat_signal(paths, radar)
     if snr_db is not None or noise_figure_db is not None:
-        beat = add_noise(
-            beat, radar, snr_db=snr_db, noise_figure_db=noise_figure_db, seed=seed
-        )
+        beat = add_noise(beat, radar, snr_db=snr_db, noise_figure_db=noise_figure_db, seed=seed)
     return Simulation(exact_spectrum(beat, radar, grid), paths, beat)

@@ -93,14 +93,11 @@ def deposit_power(
             boundary_samples=boundary_samples if boundary else 0,
             seed=seed,
             sampling=sampling,
-            reference=(flatten(reference[0], link.wavelength), reference[1])
-            if reference
-            else None,
+            reference=(flatten(reference[0], link.wavelength), reference[1]) if reference else None,
             chunk=max(1, int(memory_budget) // _BYTES_PER_SAMPLE),
             backend=backend,
         )
-        tables = [getattr(geometry if hasattr(geometry, n) else link, n) for n in DIFFERENTIABLE]
-        return _Deposit.apply(settings, *tables)  # type: ignore[no-any-return]
+        return _Deposit.apply(settings, *settings.tables)  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -115,6 +112,15 @@ class _Settings:
     reference: tuple[Geometry, Link] | None
     chunk: int
     backend: str | None
+
+    @property
+    def tables(self) -> list[Tensor]:
+        """What the map can be differentiated by, in the kernel's order."""
+        owners = (self.geometry, self.link)
+        return [
+            next(getattr(owner, name) for owner in owners if hasattr(owner, name))
+            for name in DIFFERENTIABLE
+        ]
 
 
 class _Trace:
@@ -234,11 +240,7 @@ class _Deposit(torch.autograd.Function):
 
             _over_paths(trace, inputs, pull)
             results: list[Tensor | None] = [None]
-            for name in DIFFERENTIABLE:
-                source = getattr(
-                    trace.settings.geometry if hasattr(trace.settings.geometry, name) else
-                    trace.settings.link, name
-                )  # fmt: skip
+            for name, source in zip(DIFFERENTIABLE, trace.settings.tables, strict=True):
                 results.append(
                     to_torch(dr.grad(tables[name])).reshape(source.shape).to(source)
                     if name in tables
@@ -254,12 +256,13 @@ class _Deposit(torch.autograd.Function):
         trace: _Trace = ctx.trace
         with use_backend(trace.settings.backend):
             plain = trace.inputs()
-            tables = {}
-            for name, tangent in zip(DIFFERENTIABLE, tangents, strict=True):
-                if tangent is not None:
-                    tables[name] = type(plain.tx)(getattr(plain, name))
-                    dr.enable_grad(tables[name])
-            given = dict(zip(DIFFERENTIABLE, tangents, strict=True))
+            given = {
+                name: tangent
+                for name, tangent in zip(DIFFERENTIABLE, tangents, strict=True)
+                if tangent is not None
+            }
+            tables = {name: type(plain.tx)(getattr(plain, name)) for name in given}
+            dr.enable_grad(list(tables.values()))
             out = dr.zeros(mi.Float, trace.bins)
 
             def push(found: Contribution) -> None:

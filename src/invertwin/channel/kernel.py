@@ -96,9 +96,7 @@ class PatternTable:
         row = dr.minimum(mi.UInt32(dr.detach(t)), rows - 2)
         along = t - mi.Float(row)
         if columns == 1:
-            low, high = dr.gather(mi.Float, self.values, row), dr.gather(
-                mi.Float, self.values, row + 1
-            )
+            low, high = (dr.gather(mi.Float, self.values, line) for line in (row, row + 1))
             return low + (high - low) * along
         s = (dr.atan2(direction.y, direction.x) / (2 * dr.pi) + 0.5) * columns
         column = dr.minimum(mi.UInt32(dr.detach(s)), columns - 1)
@@ -147,9 +145,7 @@ def _to_radar(inputs: Inputs, frame: Any, direction: Any) -> Any:
 
     mi = tracer()
     rows = [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k) for k in range(3)]
-    return mi.Vector3f(
-        *(sum(rows[k][axis] * direction[k] for k in range(3)) for axis in range(3))
-    )
+    return mi.Vector3f(*(sum(rows[k][axis] * direction[k] for k in range(3)) for axis in range(3)))
 
 
 def _amplitude(inputs: Inputs, owner: Any, cosine: Any) -> Any:

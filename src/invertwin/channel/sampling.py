@@ -261,7 +261,7 @@ class EdgeSampler:
             side = dr.dot(plane, offset)
             left |= here & (side > 0)
             right |= here & (side < 0)
-        self.index = dr.compress(left ^ right)
+        self.index: Any = dr.compress(left ^ right)
         self.size = samples if dr.width(self.index) else 0
         if self.size:
             length = dr.norm(y1 - y0) / dr.norm(0.5 * (y0 + y1) - origin)
@@ -301,7 +301,7 @@ class EdgeSampler:
         weight = 1 / (pmf * self.size)
         found = EdgeSamples(frame, first, second, opposite, along, hit.prim_index, weight)
         dr.eval(found, valid)
-        kept = dr.compress(valid)
+        kept: Any = dr.compress(valid)
         return EdgeSamples(
             *(dr.gather(type(column), column, kept) for column in vars(found).values())
         )
@@ -316,9 +316,7 @@ def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
     return areas
 
 
-def visible(
-    shot: Shot, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
-) -> Tensor:
+def visible(shot: Shot, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]) -> Tensor:
     """Whether nothing lies between pairs of world points (torch in, torch out)."""
     mi = tracer()
     points = []

@@ -4,18 +4,18 @@ The slow, readable twin of ``channel/kernel.py``, and the source of every exact 
 and lengths come from float64 vertices, so that the phase is right at millimetre waves.
 """
 
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-import zlib
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.bridge import Geometry, flatten, to_torch, use_backend
 from invertwin.channel.boundary import Edge, edge_points, shadow_speed
+from invertwin.channel.bridge import Geometry, flatten, to_torch, use_backend
 from invertwin.channel.paths import Link, Paths
 from invertwin.channel.sampling import RaySampler, Shot, face_areas, visible
 from invertwin.constants import SPEED_OF_LIGHT

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -58,7 +58,7 @@ class Direction:
             return scene, radar.moved(rotation_from_vector(axis * theta), axis * 0)
         item = scene[self.object]
         if self.kind == "material":
-            material = item.material
+            material: Any = item.material
             if self.value not in vars(material):
                 raise InputError(
                     f"expected a value of {self.object}'s material ({', '.join(vars(material))}), "

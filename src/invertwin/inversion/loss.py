@@ -54,9 +54,7 @@ class SpectrumLoss:
 
     def __post_init__(self) -> None:
         if self.kind not in ("mse", "likelihood"):
-            raise InputError(
-                f"expected kind 'mse' or 'likelihood', got {self.kind!r}; choose one"
-            )
+            raise InputError(f"expected kind 'mse' or 'likelihood', got {self.kind!r}; choose one")
         if self.levels < 1 or self.gain not in ("fitted", "one"):
             raise InputError(
                 f"expected levels >= 1 and gain 'fitted' or 'one', got {self.levels} and "

@@ -38,7 +38,8 @@ class Laplacian:
 
 def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float]:
     """Edges, their cotangent weights (at least 0.01), and the mean edge length [m]."""
-    corners = mesh.vertices.detach()[mesh.faces]
+    positions = mesh.vertices.detach()
+    corners = positions[mesh.faces]
     pairs, weights = [], []
     for k in range(3):
         a, b, c = corners[:, k], corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]
@@ -49,5 +50,5 @@ def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float
     ends = torch.cat(pairs).sort(dim=1).values
     edges, group = ends.unique(dim=0, return_inverse=True)
     total = torch.zeros(len(edges), dtype=torch.float64).index_add(0, group, torch.cat(weights))
-    lengths = (mesh.vertices.detach()[edges[:, 0]] - mesh.vertices.detach()[edges[:, 1]]).norm(dim=1)
+    lengths = (positions[edges[:, 0]] - positions[edges[:, 1]]).norm(dim=1)
     return edges, total.clamp_min(0.01), float(lengths.mean())
