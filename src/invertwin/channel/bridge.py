@@ -166,6 +166,9 @@ class Topology:
         mi = tracer()
         self.faces = faces
         self.face_object = face_object
+        owners = range(int(face_object.max()) + 1)
+        self.object_vertices = [faces[face_object == owner].unique() for owner in owners]
+        self.sound_face: int | None = None  # a triangle that was no sliver when last looked at
         self.edges, self.opposite = edges_of(faces.numpy(), vertices.detach().numpy())
         self.device_faces = to_index(faces)
         self.device_face_object = to_index(face_object)

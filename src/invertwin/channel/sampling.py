@@ -22,6 +22,7 @@ from invertwin.errors import InputError
 # enough that the dark side of a 0.3 m ball stays dark from a kilometre away.
 _NEAR = 3e-6
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
+_SLIVER = 1e-3  # a triangle's area over its squared sides, below which it is one
 _FEW_EDGES = 2000  # up to here float32 can place a sample along the edge by its rest in the CDF
 
 
@@ -80,7 +81,7 @@ class Shot:
         self.tx = to_float(link.tx.detach() - self.origin)
         self.rx = to_float(link.rx.detach() - self.origin)
         # Lanes without a hit are evaluated on a sound triangle, then masked: no NaN can leak.
-        self.sound_face = int(face_areas(geometry).argmax())
+        self.sound_face = opaque(_sound_face(geometry))
 
     def point(self, table: Any, index: Any) -> Any:
         """Rows of a flat table of points."""
@@ -111,7 +112,7 @@ def _caps(
     axes, heights = [], []
     positions, tx = geometry.vertices.detach(), link.tx.detach()
     for index in range(len(geometry.coherent)):
-        used = positions[geometry.faces[geometry.face_object == index].unique()]
+        used = positions[geometry.topology.object_vertices[index]]
         centre = 0.5 * (used.min(dim=0).values + used.max(dim=0).values)
         radius = margin * (used - centre).norm(dim=1).max()
         offset = centre - tx
@@ -305,6 +306,19 @@ class EdgeSampler:
         return EdgeSamples(
             *(dr.gather(type(column), column, kept) for column in vars(found).values())
         )
+
+
+def _sound_face(geometry: Geometry) -> int:
+    """A triangle that is no sliver; the last answer while it stays one, which is quicker."""
+    topology = geometry.topology
+    if topology.sound_face is not None:
+        p0, p1, p2 = geometry.vertices.detach()[geometry.faces[topology.sound_face]]
+        sides = torch.stack([p1 - p0, p2 - p0])
+        area = torch.linalg.cross(sides[0], sides[1]).norm()
+        if area > _SLIVER * sides.square().sum():
+            return topology.sound_face
+    topology.sound_face = int(face_areas(geometry).argmax())
+    return topology.sound_face
 
 
 def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
