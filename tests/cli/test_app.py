@@ -218,7 +218,6 @@ def test_many_starts_with_and_without_boundary_terms(run_file, monkeypatch):
 
 
 # torch's forward mode loads its own deprecated scripts.
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
     files = []
     for name in ("first", "second"):

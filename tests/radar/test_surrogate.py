@@ -211,7 +211,6 @@ def test_range_offset_moves_and_differentiates(linear):
 
 
 # Torch's forward mode compiles its own helpers in a way that it has deprecated.
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("angle_kernel", ["response", "airy"])
 def test_gradient_of_the_map(angle_kernel, planar):
     grid = planar.grid(4, 4.4, 0.3, 0.3)

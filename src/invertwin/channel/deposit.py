@@ -6,7 +6,7 @@ map has continuous derivatives in range and direction. No path is ever stored fo
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -145,11 +145,14 @@ class _Trace:
         shape = self.settings.grid.shape
         return self.shot.link.frame_count * shape[0] * shape[1] * shape[2]
 
-    def inputs(self, tables: dict[str, Any] | None = None) -> Inputs:
-        """The kernel's inputs, with some arrays replaced by ones that carry derivatives."""
-        from dataclasses import replace
+    def inputs(self, tables: dict[str, Any] | None = None, *, together: bool = True) -> Inputs:
+        """The kernel's inputs, with some arrays replaced by ones that carry derivatives.
 
-        made = Inputs.of(self.settings.geometry, self.settings.link, self.shot)
+        ``together`` says that antennas at one place also move as one.
+        """
+        link = self.settings.link
+        monostatic = together and bool((link.tx == link.rx).all())
+        made = Inputs.of(self.settings.geometry, link, self.shot, monostatic)
         return replace(made, **(tables or {}))
 
     def interior(self, keep: bool) -> Iterator[Samples]:
@@ -226,7 +229,7 @@ class _Deposit(torch.autograd.Function):
             plain = trace.inputs()
             tables = {name: type(plain.tx)(getattr(plain, name)) for name in wanted}
             dr.enable_grad(list(tables.values()))
-            inputs = trace.inputs(tables)
+            inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
             seed = to_float(grad)
 
             def pull(found: Contribution) -> None:
@@ -263,19 +266,28 @@ class _Deposit(torch.autograd.Function):
             }
             tables = {name: type(plain.tx)(getattr(plain, name)) for name in given}
             dr.enable_grad(list(tables.values()))
+            inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
             out = dr.zeros(mi.Float, trace.bins)
 
             def push(found: Contribution) -> None:
                 for name, table in tables.items():
                     dr.set_grad(table, to_float(given[name]))
-                dots = dr.forward_to(*found.attached)
+                # u and v also feed the pattern, so that by default their derivatives would be
+                # cleared once passed on.
+                dots = dr.forward_to(*found.attached, flags=dr.ADFlag.ClearEdges)
                 _scatter_derivative(out, trace, found, dots)
                 dr.eval(out)
 
-            _over_paths(trace, trace.inputs(tables), push)
+            _over_paths(trace, inputs, push)
             return to_torch(out).reshape(
                 trace.settings.link.frame_count, *trace.settings.grid.shape
             )
+
+
+def _equal(first: Tensor | None, second: Tensor | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    return torch.equal(first, second)
 
 
 def _over_paths(trace: _Trace, inputs: Inputs, act: Callable[[Contribution], None]) -> None:

@@ -40,8 +40,12 @@ class Inputs:
     scale: float
 
     @staticmethod
-    def of(geometry: Geometry, link: Link, shot: Shot) -> "Inputs":
-        """Upload a geometry and a link; positions are taken about the shot's local origin."""
+    def of(geometry: Geometry, link: Link, shot: Shot, monostatic: bool) -> "Inputs":
+        """Upload a geometry and a link; positions are taken about the shot's local origin.
+
+        ``monostatic`` spares one leg where both antennas are one, derivatives included: what is
+        due to ``rx`` is then due to ``tx``.
+        """
         topology = geometry.topology
         return Inputs(
             vertices=shot.vertices,
@@ -56,7 +60,7 @@ class Inputs:
             face_object=topology.device_face_object,
             cosines=geometry.amplitude.shape[1],
             has_lobe=bool((geometry.lobe != 0).any()) or geometry.lobe.requires_grad,
-            monostatic=bool((link.tx == link.rx).all()),
+            monostatic=monostatic,
             tx_pattern=PatternTable.of(link.tx_pattern),
             rx_pattern=PatternTable.of(link.rx_pattern),
             scale=(link.wavelength / (4 * np.pi)) ** 2,

@@ -82,7 +82,8 @@ class Link:
 
     Attributes:
         tx: Phase centre of the transmitters, world coordinates [m].
-        rx: Phase centre of the receivers [m].
+        rx: Phase centre of the receivers [m]. Where it equals ``tx`` in every frame and both carry
+            gradients, they count as one antenna, and ``tx`` gets the whole gradient.
         rotations: Columns are the radar's x (right), y (up), z (boresight) axes in the world.
         tx_pattern: Power pattern of one transmitter in the radar frame.
         rx_pattern: Power pattern of one receiver.

@@ -1,0 +1,96 @@
+"""Small scenes that several rooms are tested on."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from invertwin.channel.paths import Grid, Link
+from invertwin.radar import FMCW, Radar
+from invertwin.scene import (
+    AntennaArray,
+    Isotropic,
+    Material,
+    Mesh,
+    Object,
+    Pattern,
+    RoughDielectric,
+    Scene,
+    linear_array,
+    plate,
+    rigid,
+    rotation_from_vector,
+)
+
+WAVELENGTH = 3.893e-3
+GRID = Grid(0.4, 0.075, 34, u_start=-0.6, u_step=0.1, u_count=13)
+
+
+def float64(values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def thing(
+    mesh: Mesh,
+    at: Sequence[float] = (0.0, 0.0, 0.0),
+    turn: Sequence[float] = (0.0, 0.0, 0.0),
+    material: Material | None = None,
+) -> Object:
+    """An object at a place, turned by a rotation vector [rad]; rough unless said otherwise."""
+    pose = rigid(rotation_from_vector(float64(turn)), float64(at))
+    return Object(mesh, material or RoughDielectric(4.0), pose)
+
+
+def occluder(**materials: Material) -> Scene:
+    """A plate 1 m away, turned a little, before a wall 2 m away: visibility changes with both."""
+    return Scene(
+        {
+            "wall": thing(plate(2.0, 2.0, divisions=2), (0, 0, 2), material=materials.get("wall")),
+            "occluder": thing(
+                plate(0.4, 0.3), (0.1, 0.05, 1), (0.1, 0.2, 0), materials.get("occluder")
+            ),
+        }
+    )
+
+
+def link(
+    tx: object = ((0.0, 0.0, 0.0),),
+    rx: object = None,
+    rotations: Tensor | None = None,
+    pattern: Pattern | None = None,
+    *,
+    wavelength: float = WAVELENGTH,
+    shared: bool | None = None,
+) -> Link:
+    """Antennas at the given places, looking along z; visibility is shared if they coincide."""
+    places = tx if isinstance(tx, Tensor) else float64(tx)
+    others = places if rx is None else rx if isinstance(rx, Tensor) else float64(rx)
+    if rotations is None:
+        rotations = torch.eye(3, dtype=torch.float64).expand(len(places), 3, 3)
+    gain = pattern or Isotropic()
+    return Link(
+        places,
+        others,
+        rotations,
+        gain,
+        gain,
+        wavelength,
+        (rx is None) if shared is None else shared,
+    )
+
+
+def radar(positions: object = ((0.0, 0.0, 0.0),), receivers: int = 16) -> Radar:
+    """77 GHz, 2 GHz of bandwidth, one transmitter, a row of receivers."""
+    return Radar(
+        AntennaArray(torch.zeros(1, 3, dtype=torch.float64)),
+        linear_array(receivers, 1.9467e-3),
+        FMCW(76e9, 2e9, 50e-6, 64),
+        positions if isinstance(positions, Tensor) else float64(positions),
+        array_window="rectangular",
+    )
+
+
+def relative(found: Tensor, truth: Tensor) -> float:
+    """‖found − truth‖₁ / ‖truth‖₁."""
+    found, truth = found.detach(), truth.detach()
+    return float((found - truth).abs().sum() / truth.abs().sum())
