@@ -1,1 +1,19 @@
 """Scene to paths to channel impulse response: the only room that knows the ray tracer."""
+
+from invertwin.channel.bridge import backend, use_backend
+from invertwin.channel.deposit import deposit_power
+from invertwin.channel.paths import Grid, Link, Paths
+from invertwin.channel.tracer import RoughPoints, rough_points, trace_field, trace_power
+
+__all__ = [
+    "Grid",
+    "Link",
+    "Paths",
+    "RoughPoints",
+    "backend",
+    "deposit_power",
+    "rough_points",
+    "trace_field",
+    "trace_power",
+    "use_backend",
+]

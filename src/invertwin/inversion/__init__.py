@@ -1,0 +1,21 @@
+"""Spectrum to loss to scene: reconstruction, and the check that its gradients are right."""
+
+from invertwin.inversion.gradcheck import Agreement, Direction, GradientReport
+from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.nuisances import ClockOffset, RangeBias
+from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
+from invertwin.inversion.regularization import Laplacian, Regularizer
+
+__all__ = [
+    "Agreement",
+    "ClockOffset",
+    "Direction",
+    "GradientReport",
+    "Laplacian",
+    "Optimizer",
+    "RangeBias",
+    "Reconstruction",
+    "Regularizer",
+    "SpectrumLoss",
+    "reconstruct",
+]
