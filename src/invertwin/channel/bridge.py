@@ -189,13 +189,24 @@ class Topology:
         if self._scene is None:
             self._parameters["vertex_positions"] = to_float(vertices)
             self._parameters.update()
-            self._scene = mi.load_dict({"type": "scene", "mesh": self._mesh})
+            self._scene = mi.load_dict({"type": "scene", **self._shapes()})
             self._parameters = mi.traverse(self._scene)
         else:
-            self._parameters["mesh.vertex_positions"] = to_float(vertices)
+            key = next(k for k, _ in self._parameters.items() if k.endswith("vertex_positions"))
+            self._parameters[key] = to_float(vertices)
             self._parameters.update()
         self._uploaded = vertices.clone()
         return self._scene
+
+    def _shapes(self) -> dict[str, Any]:
+        """The mesh; on the CPU in a group, for which Embree builds its tree three times faster."""
+        if backend() == "cuda":
+            return {"mesh": self._mesh}
+        reference = {"type": "ref", "id": "group"}
+        return {
+            "group": {"type": "shapegroup", "mesh": self._mesh},
+            "instance": {"type": "instance", "group": reference},
+        }
 
 
 _topologies: "OrderedDict[tuple, tuple[list[Tensor], Topology]]" = OrderedDict()
