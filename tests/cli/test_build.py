@@ -37,7 +37,7 @@ def make_box(**changes):
 
 def test_shapes_are_scaled_then_turned_then_moved():
     run = read(scene={"box": make_box(scale=2.0, rotation_deg=[0, 90, 0], position=[1, 2, 3])})
-    box = build.scene(run.scene)["box"]
+    box = build.scene(run)["box"]
     extent = box.vertices.amax(0) - box.vertices.amin(0)
     torch.testing.assert_close(extent, torch.tensor([0.8, 0.6, 0.4], dtype=torch.float64))
     torch.testing.assert_close(box.center, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
@@ -50,7 +50,7 @@ def test_truth_replaces_only_what_it_names():
         scene={"box": make_box(position=[0, 0, 2], rotation_deg=[0, 10, 0])},
         truth={"box": {"position": [0.1, 0, 2]}},
     )
-    found = build.residual(build.scene(run.scene)["box"], build.true_scene(run)["box"])
+    found = build.residual(build.scene(run)["box"], build.true_scene(run)["box"])
     torch.testing.assert_close(found.offset, torch.tensor([-0.1, 0, 0], dtype=torch.float64))
     assert found.angle < 1e-7
 
@@ -75,7 +75,7 @@ def test_every_shape_and_parts_can_be_built(tmp_path):
         },
     }
     raw = {"task": "simulate", "scene": {k: v | {"material": ROUGH} for k, v in shapes.items()}}
-    scene = build.scene(validate(raw, tmp_path / "run.toml").scene)
+    scene = build.scene(validate(raw, tmp_path / "run.toml"))
     assert set(scene.names) == set(shapes)
     slits = scene["parts"].vertices
     assert (slits[:, 0].min(), slits[:, 0].max()) == (-1.5, 1.25)
@@ -84,7 +84,7 @@ def test_every_shape_and_parts_can_be_built(tmp_path):
 def test_missing_mesh_names_the_object(tmp_path):
     raw = {"task": "simulate", "scene": {"car": {"file": "car.obj", "material": ROUGH}}}
     with pytest.raises(InputError, match=r"scene\.car: .*car\.obj"):
-        build.scene(validate(raw, tmp_path / "run.toml").scene)
+        build.scene(validate(raw, tmp_path / "run.toml"))
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_starts_are_as_far_off_as_asked_and_repeat():
     table = {"object": "box", "count": 5, "distance": [0.3, 0.4], "angle_deg": [15, 25], "seed": 3}
     run = read(truth={"box": {"position": [1, 2, 3]}}, starts=table)
     assert run.starts is not None
-    scene, truth = build.scene(run.scene), build.true_scene(run)
+    scene, truth = build.scene(run), build.true_scene(run)
     found = build.starts(run.starts, scene, truth, 0)
     again = build.starts(run.starts, scene, truth, 0)
     for start, same in zip(found, again, strict=True):
@@ -153,7 +153,7 @@ def test_starts_in_a_plane_about_one_axis():
     }
     run = read(starts=table)
     assert run.starts is not None
-    scene = build.scene(run.scene)
+    scene = build.scene(run)
     for start in build.starts(run.starts, scene, scene, 7):
         assert abs(float(start["box"].center[1])) < 1e-12
         torch.testing.assert_close(start["box"].transform[1, :3], scene["box"].transform[1, :3])
@@ -162,7 +162,7 @@ def test_starts_in_a_plane_about_one_axis():
 def test_axes_that_are_not_sought_stay():
     table = {"kind": "pose", "object": "box", "axes": ["x"], "rotation_axes": ["y"]}
     run = read(parameters=[table])
-    scene = build.scene(run.scene)
+    scene = build.scene(run)
     (pose,) = build.parameters(run.parameters, scene)
     weights = torch.arange(24, dtype=torch.float64).reshape(8, 3)
     (pose(scene)["box"].vertices * weights).square().sum().backward()
@@ -175,7 +175,7 @@ def test_axes_that_are_not_sought_stay():
 
 @pytest.mark.parametrize("shape", [{"shape": "plate", "width": 1, "height": 2}, make_box()])
 def test_residual_of_a_known_similarity(shape):
-    truth = build.scene(read(scene={"x": shape | {"material": ROUGH}}).scene)
+    truth = build.scene(read(scene={"x": shape | {"material": ROUGH}}))
     vector = torch.tensor([0.2, -0.7, 0.4], dtype=torch.float64)
     offset = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     moved = build.displaced(truth, "x", offset, vector)
@@ -183,7 +183,7 @@ def test_residual_of_a_known_similarity(shape):
     torch.testing.assert_close(found.offset, offset)
     expected = float(rotation_angle(rotation_from_vector(vector)))
     assert math.isclose(found.angle, expected, rel_tol=1e-9)
-    half = build.scene(read(scene={"x": shape | {"material": ROUGH, "scale": 0.5}}).scene)
+    half = build.scene(read(scene={"x": shape | {"material": ROUGH, "scale": 0.5}}))
     assert math.isclose(build.residual(half["x"], truth["x"]).scale, 0.5)
 
 
@@ -197,7 +197,7 @@ def test_parameters_start_as_the_identity():
         {"kind": "radar_pose"},
     ]
     run = read(parameters=tables, radar=RADAR)
-    scene = build.scene(run.scene)
+    scene = build.scene(run)
     modules = build.parameters(run.parameters, scene)
     assert len(modules) == len(tables)
     changed = scene
@@ -216,4 +216,4 @@ def test_material_value_that_a_conductor_does_not_have():
         parameters=[{"kind": "material", "object": "box", "values": ["permittivity"]}],
     )
     with pytest.raises(InputError, match=r"parameters\[0\]\.values"):
-        build.parameters(run.parameters, build.scene(run.scene))
+        build.parameters(run.parameters, build.scene(run))

@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from invertwin.cli import pictures
-from invertwin.cli.report import Picture, Table, report_html
+from invertwin.cli.report import Again, Picture, Table, report_html
 
 PNG = b"\x89PNG\r\n\x1a\n"
 BOX = (
@@ -23,13 +23,14 @@ def test_report_is_self_contained_and_escaped():
     text = report_html(
         "A < B",
         "converged",
+        "first\n\nsecond",
         [
             Table(
                 "Poses", ["name", "x", "ok"], [["<letter>", 0.123456, True], ["wall", None, False]]
             ),
             Picture("Loss & steps", PNG + b"data", note="one & two"),
         ],
-        'task = "demo"',
+        Again("reconstruct run.toml", {"run.toml": 'task = "demo"'}),
     )
     assert "A &lt; B" in text
     assert "&lt;letter&gt;" in text
@@ -37,6 +38,8 @@ def test_report_is_self_contained_and_escaped():
     assert re.findall(r'(?:src|href)="(?!data:)', text) == []
     assert "data:image/png;base64,iVBOR" in text
     assert "<script" not in text
+    assert "<p>first</p>\n<p>second</p>" in text
+    assert "invertwin reconstruct run.toml -o again" in text
 
 
 def test_scene_picture_draws_open_closed_and_empty_scenes():
@@ -77,10 +80,11 @@ def test_spectra_of_every_layout_and_of_silence():
 
 def test_curves():
     x = np.linspace(-1, 1, 9)
-    assert pictures.loss_picture({"start 0": [1.0, 0.5], "start 1": [0.0, 0.0]})[:8] == PNG
+    losses = {"full": [[1.0, 0.5], [0.0, 0.0]], "interior": [[1.0, 0.01]]}
+    assert pictures.loss_picture(losses, annealed=1.0)[:8] == PNG
     assert pictures.loss_picture({})[:8] == PNG
     assert pictures.landscape_picture((x, x**2), {"wide": (x, x**2)})[:8] == PNG
 
 
 def test_pictures_repeat_byte_for_byte():
-    assert pictures.loss_picture({"a": [1.0, 0.5]}) == pictures.loss_picture({"a": [1.0, 0.5]})
+    assert pictures.loss_picture({"a": [[1.0]]}) == pictures.loss_picture({"a": [[1.0]]})

@@ -78,7 +78,7 @@ def radar(**changes):
             run(scene={"slits": {"parts": [{"shape": "plate", "width": 1}], "material": ROUGH}}),
             ["scene.slits.parts[0].height: ", "add the key `height`"],
         ),
-        (run(scene={}), ["scene: ", "at least 1 item"]),
+        (run(scene={}), ["scene: ", "at least 1 object"]),
         (run(radar=radar(window="haming")), ["radar.window: ", "did you mean `hamming`?"]),
         (run(radar=radar(positions=[[0, 0, 0], [1, 0]])), ["radar.positions[1]: ", "at least 3"]),
         (

@@ -109,7 +109,9 @@ def demo(
     backend: BackendOption = None,
 ) -> None:
     """Find a hidden letter from its radar echoes."""
-    _reconstruct(_demo_file(), out or Path("out/demo"), overwrite, resume, seed)
+    # In its own folder the demo replaces what it left there before.
+    again = out is None and not resume
+    _reconstruct(_demo_file(), out or Path("out/demo"), overwrite or again, resume, seed)
 
 
 @app.command()

@@ -1,7 +1,8 @@
 """From the tables of a run file to the library's values: scenes, radars, grids, parameters."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,7 +10,10 @@ from torch import Tensor, nn
 
 from invertwin.channel.paths import Grid
 from invertwin.cli import schema
+from invertwin.cli.run_file import unknown_object
 from invertwin.errors import InputError
+from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.reconstruction import Optimizer
 from invertwin.inversion.regularization import Laplacian
 from invertwin.radar.surrogate import Surrogate
 from invertwin.radar.waveform import FMCW, Impulse, Radar
@@ -24,6 +28,7 @@ from invertwin.scene import (
     PerfectConductor,
     RoughDielectric,
     Scene,
+    Table,
     linear_array,
     planar_array,
     rigid,
@@ -31,7 +36,7 @@ from invertwin.scene import (
     rotation_from_vector,
     shapes,
 )
-from invertwin.scene.files import load_mesh
+from invertwin.scene.files import CONCRETE, load_mesh, load_scene_xml
 from invertwin.scene.parameters import (
     MaterialValues,
     Pose,
@@ -42,27 +47,60 @@ from invertwin.scene.parameters import (
 )
 
 
-def scene(objects: Mapping[str, schema.SceneObject]) -> Scene:
-    """The scene of the `[scene.<name>]` tables.
+def scene(run: schema.RunFile) -> Scene:
+    """The scene of the `[scene.<name>]` tables and of the `[scene_file]`.
 
     Raises:
-        InputError: A mesh file is missing or broken, or a shape is impossible.
+        InputError: A file is missing or broken, a shape is impossible, or the run file names an
+            object that is not there.
     """
-    built = {}
-    for name, table in objects.items():
-        try:
+    built: dict[str, Object] = {}
+    if run.scene_file is not None:
+        with about("scene_file"):
+            built.update(_from_file(run.scene_file).objects)
+    for name, table in run.scene.items():
+        with about(f"scene.{name}"):
+            if name in built:
+                raise InputError(
+                    "expected a name that the scene file does not use, got one of its objects; "
+                    "choose another"
+                )
             built[name] = _object(table)
-        except InputError as error:
-            raise InputError(f"scene.{name}: {error}") from None
+    for path, name in run.references():
+        if name not in built:
+            raise InputError(unknown_object(path, name, list(built)))
     return Scene(built)
 
 
 def true_scene(run: schema.RunFile) -> Scene:
     """The scene with the placements of the `[truth.<name>]` tables."""
-    objects = dict(run.scene)
+    found = scene(run)
     for name, truth in run.truth.items():
-        objects[name] = objects[name].model_copy(update=truth.model_dump(exclude_none=True))
-    return scene(objects)
+        changes = truth.model_dump(exclude_none=True)
+        if name in run.scene:
+            item = _object(run.scene[name].model_copy(update=changes))
+        else:
+            # Objects of a file stand where it puts them: they are scaled and placed from there.
+            item, place = found[name], schema.Placement(**changes)
+            mesh = Mesh(item.mesh.vertices * place.scale, item.mesh.faces)
+            item = replace(item, mesh=mesh, pose=_pose(place))
+        found = Scene({**found.objects, name: item})
+    return found
+
+
+@contextmanager
+def about(path: str) -> Iterator[None]:
+    """Errors of the library with the key of the run file that they are about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _from_file(table: schema.SceneFile) -> Scene:
+    materials = {name: _material(material) for name, material in table.materials.items()}
+    others = CONCRETE if table.material is None else _material(table.material)
+    return load_scene_xml(table.file, materials, others)
 
 
 def _object(table: schema.SceneObject) -> Object:
@@ -123,27 +161,32 @@ def radar(table: schema.Radar) -> Radar:
         InputError: Values the radar refuses, or a target straight above a position.
     """
     wave = table.waveform
-    if isinstance(wave, schema.Fmcw):
-        waveform = FMCW(wave.start_frequency, wave.bandwidth, wave.duration, wave.samples)
-    else:
-        waveform = Impulse(wave.center_frequency, wave.bandwidth)
+    with about("radar.waveform"):
+        if isinstance(wave, schema.Fmcw):
+            waveform = FMCW(wave.start_frequency, wave.bandwidth, wave.duration, wave.samples)
+        else:
+            waveform = Impulse(wave.center_frequency, wave.bandwidth)
+    with about("radar.transmitters"):
+        transmitters = _array(table.transmitters)
+    with about("radar.receivers"):
+        receivers = _array(table.receivers)
     positions = _track(table.positions)
-    return Radar(
-        _array(table.transmitters),
-        _array(table.receivers),
-        waveform,
-        positions,
-        _rotations(table.orientation, positions),
-        window=table.window,
-        array_window=table.array_window,
-        shared_visibility=table.shared_visibility,
-    )
+    rotations = _rotations(table.orientation, positions)
+    with about("radar"):
+        return Radar(
+            transmitters,
+            receivers,
+            waveform,
+            positions,
+            rotations,
+            window=table.window,
+            array_window=table.array_window,
+            shared_visibility=table.shared_visibility,
+        )
 
 
 def _array(table: schema.Array) -> AntennaArray:
-    pattern: Pattern = Isotropic()
-    if isinstance(table.pattern, schema.Cosine):
-        pattern = Cosine(table.pattern.exponent)
+    pattern = _pattern(table.pattern)
     match table:
         case schema.PlanarArray():
             array = planar_array(*table.count, *table.spacing, pattern=pattern)
@@ -152,6 +195,16 @@ def _array(table: schema.Array) -> AntennaArray:
         case _:
             array = AntennaArray(_float64(table.positions), pattern)
     return replace(array, positions=array.positions + _float64(table.center))
+
+
+def _pattern(table: schema.Pattern) -> Pattern:
+    match table:
+        case schema.Cosine():
+            return Cosine(table.exponent)
+        case schema.TablePattern():
+            theta, phi = torch.deg2rad(_float64(table.theta_deg)), _float64(table.phi_deg)
+            return Table(theta, torch.deg2rad(phi), 10 ** (_float64(table.gain_db) / 10))
+    return Isotropic()
 
 
 def _track(table: schema.Track) -> Tensor:
@@ -198,9 +251,10 @@ def _rotations(table: schema.Orientation, positions: Tensor) -> Tensor:
 
 def grid(table: schema.Grid, radar: Radar) -> Grid:
     """The bins of the `[grid]` table for a radar."""
-    return radar.grid(
-        table.range_min, table.range_max, table.u_max, table.v_max, oversample=table.oversample
-    )
+    with about("grid"):
+        return radar.grid(
+            table.range_min, table.range_max, table.u_max, table.v_max, oversample=table.oversample
+        )
 
 
 def surrogate(table: schema.Surrogate) -> Surrogate:
@@ -208,11 +262,22 @@ def surrogate(table: schema.Surrogate) -> Surrogate:
     return Surrogate(**table.model_dump())
 
 
+def loss(table: schema.Loss) -> SpectrumLoss:
+    """How maps are compared, from the `[loss]` table."""
+    return SpectrumLoss(**table.model_dump(exclude_none=True))
+
+
+def optimizer(table: schema.Optimizer) -> Optimizer:
+    """The rates of the `[optimizer]` table."""
+    return Optimizer(**table.model_dump(exclude_none=True))
+
+
 def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Module]:
     """The modules of the `[[parameters]]` tables; each starts as the identity.
 
     Raises:
-        InputError: A material value that the object's material does not have.
+        InputError: A material value that the object's material does not have, or that starts at
+            the end of its range.
     """
     modules: list[nn.Module] = []
     for i, table in enumerate(tables):
@@ -240,7 +305,8 @@ def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Modu
                         f"got {missing[0]}; remove it"
                     )
                 values = {name: float(getattr(material, name)) for name in table.values}
-                modules.append(MaterialValues(table.object, **values))
+                with about(f"parameters[{i}].values, material of {table.object}"):
+                    modules.append(MaterialValues(table.object, **values))
             case schema.RadarParameter():
                 modules.append(RadarPose())
     return modules

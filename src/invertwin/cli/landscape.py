@@ -13,7 +13,6 @@ from invertwin.cli import build, pictures
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.inversion.loss import SpectrumLoss
 from invertwin.radar.range_profile import beat_signal
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
 from invertwin.radar.waveform import Radar
@@ -25,7 +24,7 @@ def landscape(
 ) -> tuple[bytes, dict[str, Any]]:
     """The picture and the numbers of the `[landscape]` table.
 
-    One frame and, for the exact signal, one channel of it are enough to show the shape.
+    For the exact signal one channel of one frame is enough to show the shape.
 
     Returns:
         PNG bytes; and the number of local minima of every curve.
@@ -105,14 +104,13 @@ def _smooth(
     kernel: Surrogate,
 ) -> np.ndarray:
     settings = need(run, "reconstruct", "the loss landscape")
-    first = radar.frames([0])
-    measured = kernel.blur(capture.frames([0]).spectrum(grid).float(), first, grid)
-    loss = SpectrumLoss(**run.loss.model_dump())
+    measured = kernel.blur(capture.spectrum(grid).float(), radar, grid)
+    loss = build.loss(run.loss)
 
     def at(scene: Scene) -> float:
         simulated = surrogate_spectrum(
             scene,
-            first,
+            radar,
             grid,
             kernel,
             samples=settings.samples,

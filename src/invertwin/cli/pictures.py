@@ -2,29 +2,36 @@
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from invertwin.radar.waveform import Radar
 from invertwin.scene import Scene
 
 PALETTE = ("#4c78a8", "#e0803c", "#54a24b", "#b279a2", "#9d755d")
 BACKGROUND = "#b9bec7"
 OUTLINE = "#c0143c"
 DYNAMIC_RANGE_DB = 40.0
+U_LABEL, V_LABEL = "direction cosine u (to the right)", "direction cosine v (up)"
 MAX_TRIANGLES = 40_000
 
-# Rows are the right, up and towards-the-viewer directions of a picture, in world coordinates.
-VIEWS: Mapping[str, NDArray] = {
-    "from the radar": np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
-    "from above": np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]),
-    "from the side": np.array([[0, 0, 1.0], [0, 1, 0], [1, 0, 0]]),
+MARKED_SHARE = 0.015  # of a view: objects that look smaller get a mark
+TRACK_COUNT = 24  # radar positions: more of them are drawn as a line
+
+VIEWS: Mapping[str, tuple[int, int, int]] = {
+    "from the radar": (0, 1, 2),
+    "from above": (0, 2, 1),
+    "from the side": (2, 1, 0),
 }
+"""What runs across, up, and in depth: 0, 1, 2 = the radar's right, up, boresight."""
 
 
 Curve = tuple[NDArray, NDArray]
@@ -47,6 +54,14 @@ class Drawing:
     outline: Mapping[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
     radar: NDArray | None = None
 
+    @property
+    def colors(self) -> dict[str, str]:
+        """A colour for every object."""
+        return {
+            name: PALETTE[i % len(PALETTE)] if name in self.sought else BACKGROUND
+            for i, name in enumerate(self.meshes)
+        }
+
 
 @dataclass(frozen=True)
 class Axes:
@@ -65,57 +80,157 @@ def meshes_of(scene: Scene) -> dict[str, tuple[NDArray, NDArray]]:
     }
 
 
-def scene_picture(drawings: Mapping[str, Drawing]) -> bytes:
-    """Rows of views, one row per drawing."""
-    figure = Figure(figsize=(11, 3.4 * len(drawings)), layout="constrained")
-    grid = figure.subplots(len(drawings), len(VIEWS), squeeze=False)
-    for row, (title, drawing) in zip(grid, drawings.items(), strict=True):
-        for axes, (view, frame) in zip(row, VIEWS.items(), strict=True):
-            _draw_scene(axes, drawing, frame)
-            axes.set_title(f"{title}, {view}", fontsize=9)
-            across = {"from the side": "z [m]"}.get(view, "x [m]")
-            axes.set_xlabel(across, fontsize=8)
-            axes.set_ylabel({"from above": "z [m]"}.get(view, "y [m]"), fontsize=8)
+def frame_of(radar: Radar) -> NDArray:
+    """Mean right, up and boresight of a radar over its frames, as columns [3, 3]."""
+    if radar.rotations is None:
+        return np.eye(3)
+    return radar.rotations.detach().mean(0).numpy()
+
+
+def scene_picture(drawings: Mapping[str, Drawing], frame: NDArray | None = None) -> bytes:
+    """Three views of every drawing: one drawing a column, or a single one in a row.
+
+    Args:
+        drawings: What is drawn, by title.
+        frame: Right, up and boresight of the radar as columns [3, 3]; each view looks along the
+            world axis nearest to one of them. None = the axes of the world.
+    """
+    nearest = _nearest_axes(np.eye(3) if frame is None else frame)
+    windows = {view: _window(drawings.values(), nearest, view) for view in VIEWS}
+    heights = {view: min(max(h / w, 0.3), 1.3) for view, (_, _, w, h) in windows.items()}
+    cells = [[(view, title) for title in drawings] for view in VIEWS]
+    ratios = list(heights.values())
+    if len(drawings) == 1:
+        cells = [[(view, title) for view in VIEWS for title in drawings]]
+        ratios = [max(ratios)]
+    width = 11.0
+    height = 0.5 + sum(ratio * width / len(cells[0]) + 0.35 for ratio in ratios)
+    figure = Figure(figsize=(width, height), layout="constrained")
+    grid = figure.subplots(
+        len(cells), len(cells[0]), squeeze=False, gridspec_kw={"height_ratios": ratios}
+    )
+    for axes, (view, title) in zip(grid.flat, (c for row in cells for c in row), strict=True):
+        _draw_scene(axes, drawings[title], nearest, view, windows[view])
+        axes.set_title(f"{title}, {view}", fontsize=9)
+    _legend(figure, drawings)
     return _png(figure)
 
 
-def _draw_scene(axes, drawing: Drawing, frame: NDArray) -> None:
+@dataclass(frozen=True)
+class _NearestAxes:
+    """The world axes nearest to the radar's right, up and boresight, and their signs."""
+
+    index: tuple[int, int, int]
+    sign: tuple[int, int, int]
+
+
+def _nearest_axes(frame: NDArray) -> _NearestAxes:
+    size = np.abs(frame)
+    orders = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
+    index = max(orders, key=lambda order: sum(size[k, c] for c, k in enumerate(order)))
+    a, b, c = (-1 if frame[k, c] < 0 else 1 for c, k in enumerate(index))
+    return _NearestAxes(index, (a, b, c))
+
+
+def _window(drawings: Iterable[Drawing], nearest: _NearestAxes, view: str) -> tuple[float, ...]:
+    """Centre and size of what a view shows, the same for all drawings."""
+    across, up, depth = VIEWS[view]
+    points = [np.zeros((0, 3))]
+    for drawing in drawings:
+        points += [v for v, _ in (*drawing.meshes.values(), *drawing.outline.values())]
+        # Seen from the radar, its own marks would only hide the scene.
+        if drawing.radar is not None and depth != 2:
+            points.append(drawing.radar)
+    flat = np.concatenate(points)[:, [nearest.index[across], nearest.index[up]]]
+    if not len(flat):
+        return 0.0, 0.0, 1.0, 1.0
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    sides = (high - low) * 1.12
+    sides = np.maximum(sides, max(0.3 * sides.max(), 1e-3))
+    return (*(low + high) / 2, *sides)
+
+
+def _draw_scene(
+    axes, drawing: Drawing, nearest: _NearestAxes, view: str, window: tuple[float, ...]
+) -> None:
+    across, up, depth = VIEWS[view]
+    plane = [nearest.index[across], nearest.index[up]]
+    # The eye is before the radar's boresight, above, or on the right.
+    behind = nearest.sign[depth] * (-1 if depth == 2 else 1)
+    _paint(axes, drawing, plane, nearest.index[depth], behind)
+    for vertices, faces in drawing.outline.values():
+        segments = vertices[_sharp_edges(vertices, faces)][:, :, plane]
+        axes.add_collection(LineCollection(list(segments), colors=OUTLINE, linewidths=0.8))
+    smallest = MARKED_SHARE * max(window[2:])
+    for name, (vertices, _) in drawing.meshes.items():
+        if np.ptp(vertices[:, plane], axis=0).max() < smallest:
+            axes.plot(*vertices[:, plane].mean(axis=0), "o", color=drawing.colors[name], ms=6)
+    for vertices, _ in drawing.outline.values():
+        if np.ptp(vertices[:, plane], axis=0).max() < smallest:
+            axes.plot(*vertices[:, plane].mean(axis=0), "+", color=OUTLINE, ms=11, mew=1.2)
+    if drawing.radar is not None and depth != 2:
+        line = len(drawing.radar) > TRACK_COUNT
+        style = {"linewidth": 2} if line else {"marker": "v", "linestyle": "", "markersize": 4}
+        axes.plot(*drawing.radar[:, plane].T, color="black", **style)
+    for set_limits, k, c in ((axes.set_xlim, across, 0), (axes.set_ylim, up, 1)):
+        ends = window[c] + window[c + 2] / 2 * np.array([-1, 1])
+        set_limits(*ends[:: nearest.sign[k]])
+    axes.set_aspect("equal")
+    axes.set_xlabel(f"{'xyz'[plane[0]]} [m]", fontsize=8)
+    axes.set_ylabel(f"{'xyz'[plane[1]]} [m]", fontsize=8)
+    axes.tick_params(labelsize=7)
+
+
+def _paint(axes, drawing: Drawing, plane: list[int], depth: int, behind: int) -> None:
+    """Shaded triangles, the far ones first."""
     polygons, colors = [], []
     corners = [v for v, _ in drawing.meshes.values()]
     extent = np.ptp(np.concatenate(corners), axis=0).max() if corners else 1.0
-    for i, (name, (vertices, faces)) in enumerate(drawing.meshes.items()):
+    for name, (vertices, faces) in drawing.meshes.items():
         triangles = _small_triangles(vertices[faces], extent / 6)
         triangles = triangles[:: math.ceil(len(triangles) / MAX_TRIANGLES)]
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         lengths = np.linalg.norm(normals, axis=1)
         light = np.array([0.35, 0.6, -0.72])
         shade = np.abs(normals @ light) / np.where(lengths > 0, lengths, 1)
-        color = PALETTE[i % len(PALETTE)] if name in drawing.sought else BACKGROUND
+        color = drawing.colors[name]
         rgb = np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)]) / 255
         polygons.append(triangles)
         colors.append(np.clip(rgb * (0.55 + 0.5 * shade[:, None]), 0, 1))
     if polygons:
         triangles, color = np.concatenate(polygons), np.concatenate(colors)
-        order = np.argsort(triangles.mean(axis=1) @ frame[2])
+        order = np.argsort(behind * triangles[:, :, depth].mean(axis=1))
         # Edges in the face's own colour close the hairlines between neighbouring triangles.
         axes.add_collection(
             PolyCollection(
-                list((triangles @ frame[:2].T)[order]),
+                list(triangles[order][:, :, plane]),
                 facecolors=color[order],
                 edgecolors=color[order],
                 linewidths=0.3,
             )
         )
-    for vertices, faces in drawing.outline.values():
-        segments = vertices[_sharp_edges(vertices, faces)] @ frame[:2].T
-        axes.add_collection(LineCollection(list(segments), colors=OUTLINE, linewidths=0.8))
-    # Seen from the radar, its own marks would only hide the scene.
-    if drawing.radar is not None and frame[2, 2] == 0:
-        x, y = (drawing.radar @ frame[:2].T).T
-        axes.plot(x, y, "v", color="black", markersize=4)
-    axes.set_aspect("equal")
-    axes.autoscale_view()
-    axes.tick_params(labelsize=7)
+
+
+def _legend(figure: Figure, drawings: Mapping[str, Drawing]) -> None:
+    """Which colour is what, over all drawings."""
+    handles: dict[str, Patch | Line2D] = {}
+    for drawing in drawings.values():
+        for name, color in drawing.colors.items():
+            label = name if name in drawing.sought else "not sought"
+            handles[label] = Patch(color=color, label=label)
+        if drawing.outline:
+            handles["truth"] = Line2D([], [], color=OUTLINE, linewidth=1, label="truth")
+        if drawing.radar is not None:
+            handles["radar"] = Line2D(
+                [], [], color="black", marker="v", linestyle="", markersize=4, label="radar"
+            )
+    figure.legend(
+        handles=list(handles.values()),
+        loc="outside lower center",
+        ncols=6,
+        fontsize=8,
+        frameon=False,
+    )
 
 
 def _small_triangles(triangles: NDArray, longest: float) -> NDArray:
@@ -159,9 +274,9 @@ def spectra_picture(spectra: Mapping[str, NDArray], axes: Axes) -> bytes:
     """
     rows: list[tuple[str, NDArray | None]] = []
     if len(axes.u) > 1:
-        rows.append(("u (azimuth)", axes.u))
+        rows.append((U_LABEL, axes.u))
     if len(axes.v) > 1:
-        rows.append(("v (elevation)", axes.v))
+        rows.append((V_LABEL, axes.v))
     if not rows:
         rows.append(("frame", None))
     figure = Figure(figsize=(3.7 * len(spectra), 3.3 * len(rows)), layout="constrained")
@@ -195,19 +310,31 @@ def spectra_picture(spectra: Mapping[str, NDArray], axes: Axes) -> bytes:
     return _png(figure)
 
 
-def loss_picture(losses: Mapping[str, Sequence[float]]) -> bytes:
-    """Loss over steps, one line per run."""
-    figure = Figure(figsize=(6, 3.2), layout="constrained")
+def loss_picture(
+    losses: Mapping[str, Sequence[Sequence[float]]], annealed: float | None = None
+) -> bytes:
+    """Loss over steps, one colour per group and one line per fit.
+
+    Args:
+        losses: Losses of every fit, by group.
+        annealed: Step from which the surrogate has no extra width.
+    """
+    figure = Figure(figsize=(7, 3.2), layout="constrained")
     axes = figure.subplots()
-    for i, (name, values) in enumerate(losses.items()):
-        axes.plot(values, color=PALETTE[i % len(PALETTE)], linewidth=1.2, label=name)
-    if any(value > 0 for values in losses.values() for value in values):
+    for i, (name, fits) in enumerate(losses.items()):
+        for k, values in enumerate(fits):
+            style = {"color": PALETTE[i % len(PALETTE)], "linewidth": 1.1, "alpha": 0.7}
+            axes.plot(values, label="_" if k else f"{name} ({len(fits)})", **style)
+    values = [value for fits in losses.values() for row in fits for value in row if value > 0]
+    if values and max(values) > 5 * min(values):
         axes.set_yscale("log")
+    if annealed is not None:
+        axes.axvline(annealed, color="black", linewidth=0.8, linestyle=":", label="no extra width")
     axes.set_xlabel("step")
     axes.set_ylabel("loss")
     axes.grid(alpha=0.3)
-    if 1 < len(losses) <= 12:
-        axes.legend(fontsize=7, ncols=2)
+    if losses:
+        axes.legend(fontsize=8)
     return _png(figure)
 
 
@@ -263,7 +390,7 @@ def gradient_picture(gradients: Mapping[str, NDArray], axes: Axes) -> bytes:
             cmap="RdBu_r",
         )
         cell.set_title(name, fontsize=9)
-        cell.set_xlabel("u (azimuth)" if len(axes.u) > 1 else "frame", fontsize=8)
+        cell.set_xlabel(U_LABEL if len(axes.u) > 1 else "frame", fontsize=8)
         cell.tick_params(labelsize=7)
     grid[0].set_ylabel("range [m]", fontsize=8)
     if image is not None:

@@ -4,7 +4,7 @@ import difflib
 import json
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +87,14 @@ def to_toml(run: RunFile) -> str:
     return "\n".join(lines) + "\n"
 
 
+def unknown_object(path: str, name: str, known: Sequence[str]) -> str:
+    """What is wrong with a key that names an object which the scene does not have."""
+    return (
+        f"{path}: expected the name of an object of the scene ({', '.join(known)}), "
+        f"got {_shown(name)}; " + _nearest(name, known, "add it to the scene")
+    )
+
+
 def _explain(error: ErrorDetails) -> str:
     """One pydantic error as `path: expected ..., got ...; do ...`."""
     path = ""
@@ -106,12 +114,7 @@ def _explain(error: ErrorDetails) -> str:
                 + _nearest(key, allowed, "remove the key")
             )
         case "unknown_object":
-            allowed = list(error["input"]["scene"])
-            return (
-                f"{context['path']}: expected the name of an object of the scene "
-                f"({', '.join(allowed)}), got {_shown(context['name'])}; "
-                + _nearest(context["name"], allowed, "add it to the scene")
-            )
+            return unknown_object(context["path"], context["name"], list(error["input"]["scene"]))
         case "union_tag_not_found":
             keys = context["discriminator"].removesuffix("()").split(",")
             present = list(error["input"]) if isinstance(error["input"], dict) else []
@@ -140,8 +143,8 @@ def _explain(error: ErrorDetails) -> str:
                 f"at least {context['min_length']}" if least else f"at most {context['max_length']}"
             )
             return f"{path}: expected {size} items, got {got}; correct the list"
-        case "presence":
-            return f"{path}: {error['msg']}"
+        case "section":
+            return f"{context['path'] or path}: {error['msg']}"
     expected = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
     return f"{path}: expected {expected}, got {got}; correct the value"
 
@@ -154,7 +157,7 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _nearest(given: str, allowed: list[str], otherwise: str) -> str:
+def _nearest(given: str, allowed: Sequence[str], otherwise: str) -> str:
     close = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
     return f"did you mean `{close[0]}`?" if close else otherwise
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from invertwin.channel.paths import Grid
 from invertwin.cli import build, pictures
-from invertwin.cli.report import Picture, Table, report_html
+from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import Gradcheck, RunFile
@@ -58,13 +58,22 @@ def run_gradcheck(
     folder.write_json(
         "metrics.json", {"task": "gradcheck", "scenes": scenes, "wall_seconds": seconds}
     )
-    files = {f"{name}.toml": to_toml(run) for name, run in runs.items()}
     folder.write_text(
         "report.html",
-        report_html("Gradient check", f"{len(scenes)} scenes checked.", [table, *parts], files),
+        report_html(
+            "Gradient check", f"{len(scenes)} scenes checked.", "", [table, *parts], _again(runs)
+        ),
     )
     folder.remove([f"{PARTS}/{name}.json" for name in runs])
     return table
+
+
+def _again(runs: Mapping[str, RunFile]) -> Again:
+    if len(runs) == 1:
+        (run,) = runs.values()
+        return Again("gradcheck run.toml", {"run.toml": to_toml(run)})
+    files = {f"runs/{name}.toml": to_toml(run) for name, run in runs.items()}
+    return Again("gradcheck runs/*.toml", files)
 
 
 def _check(
@@ -72,7 +81,7 @@ def _check(
 ) -> dict[str, Any]:
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
-    scene = build.scene(run.scene)
+    scene = build.scene(run)
     radar = build.radar(need(run, "radar", "gradcheck"))
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
     report = gradcheck(
@@ -129,7 +138,7 @@ def _picture(scene: Scene, radar: Radar, sought: str | None) -> bytes:
         sought=[] if sought is None else [sought],
         radar=radar.positions.numpy(),
     )
-    return pictures.scene_picture({"scene": drawing})
+    return pictures.scene_picture({"scene": drawing}, pictures.frame_of(radar))
 
 
 def _row(name: str, found: Mapping[str, Any]) -> list[Any]:

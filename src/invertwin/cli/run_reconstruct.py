@@ -5,6 +5,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,21 +18,27 @@ from invertwin.capture import Capture, calibrate, locate, rail_sar
 from invertwin.channel.paths import Grid
 from invertwin.cli import build, pictures
 from invertwin.cli.landscape import landscape
-from invertwin.cli.report import Picture, Table, report_html
+from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
-from invertwin.cli.schema import CaptureData, RadarParameter, RunFile, SimulatedData
+from invertwin.cli.schema import CaptureData, RadarParameter, RailSarData, RunFile, SimulatedData
 from invertwin.errors import InputError
-from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
-from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
+from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.radar.surrogate import surrogate_spectrum
 from invertwin.radar.waveform import Radar
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 
 FULL, INTERIOR = "full", "interior_only"
+_RAIL_SAR_ORIGINAL = "github.com/jjimmykang/bwsi-backprojection, trial 6"
+_ENDS = {
+    "converged": "the loss no longer falls",
+    "budget": "all steps used",
+    "diverged": "diverged, best state kept",
+}
+_MODES = {FULL: "with boundary terms", INTERIOR: "interior only"}
 
 
 @dataclass(frozen=True)
@@ -119,7 +126,8 @@ def _finite(loss: float | None) -> float:
 def _problem(run: RunFile, console: Console) -> Problem:
     need(run, "parameters", "reconstruct")
     table = need(run, "grid", "reconstruct")
-    scene, truth = build.scene(run.scene), build.true_scene(run)
+    scene, truth = build.scene(run), build.true_scene(run)
+    build.parameters(run.parameters, scene)  # their errors come before any work
     data = need(run, "data", "reconstruct")
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
@@ -135,13 +143,26 @@ def _problem(run: RunFile, console: Console) -> Problem:
                 f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
                 "remove it: a capture brings its radar along"
             )
-        is_file = isinstance(data, CaptureData)
-        capture = Capture.load(data.file) if is_file else rail_sar.read(data.folder)
+        capture = _measured(data)
         radar = capture.radar()
         grid = build.grid(table, radar)
         known = frozenset(run.truth)
     target = run.starts.object if run.starts else next(iter(_sought(run)), None)
     return Problem(run, scene, truth, known, capture, radar, grid, target)
+
+
+def _measured(data: CaptureData | RailSarData) -> Capture:
+    if isinstance(data, CaptureData):
+        with build.about("data.file"):
+            return Capture.load(data.file)
+    with build.about("data.folder"):
+        if not (Path(data.folder) / rail_sar.FILE).is_file():
+            raise InputError(
+                f"expected {rail_sar.FILE} in {data.folder}, got no such file; it is made from the "
+                f"public recording {_RAIL_SAR_ORIGINAL}: set INVERTWIN_DATA to the folder that "
+                f"holds {Path(data.folder).name}/"
+            )
+        return rail_sar.read(data.folder)
 
 
 def _calibrated(
@@ -167,7 +188,7 @@ def _calibrated(
             _Bar(console, "calibration", steps),
             folder.file(checkpoint),
             steps=steps,
-            optimizer=replace(_optimizer(problem.run), rate=rate),
+            optimizer=replace(build.optimizer(problem.run.optimizer), rate=rate),
         )
         capture = problem.capture.recalibrated(
             problem.capture.clock_offset + float(nuisances[1].shift.detach()),
@@ -232,8 +253,8 @@ def _reconstruct(
     settings = need(problem.run, "reconstruct", "reconstruct")
     options = {
         "grid": problem.grid,
-        "loss": SpectrumLoss(**problem.run.loss.model_dump()),
-        "optimizer": _optimizer(problem.run),
+        "loss": build.loss(problem.run.loss),
+        "optimizer": build.optimizer(problem.run.optimizer),
         "surrogate": build.surrogate(problem.run.surrogate),
         "annealing": settings.annealing,
         "seed": problem.run.seed,
@@ -298,8 +319,9 @@ def _steps(problem: Problem) -> int:
     return need(problem.run, "reconstruct", "reconstruct").steps
 
 
-def _optimizer(run: RunFile) -> Optimizer:
-    return Optimizer(**run.optimizer.model_dump())
+def _widths(run: RunFile) -> bool:
+    """Whether the surrogate starts with extra widths."""
+    return run.surrogate.range_width > 0 or run.surrogate.angle_width > 0
 
 
 def _nuisances(problem: Problem) -> list[nn.Module]:
@@ -390,16 +412,19 @@ def _heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any])
     name = problem.target
     if table is None or name is None or name not in problem.known or name == table.object:
         return {}
-    truth = problem.truth[name].center
-    focused = calibrate(problem.capture, problem.truth[table.object].center)
-    classical = locate(focused, truth) - truth
+    truth, known = problem.truth[name].center, problem.truth[table.object].center
+    focused = calibrate(problem.capture, known)
+    peak = locate(focused, truth)
     places = torch.tensor([row["position"] for row in rows], dtype=torch.float64)
     spread = (places - places.mean(0)).norm(dim=1).max()
     return {
         "heldout_error_m": best["position_error_m"],
         "heldout_error_worst_m": max(row["position_error_m"] for row in rows),
-        "backprojection_error_m": float(classical.norm()),
+        "backprojection_error_m": float((peak - truth).norm()),
         "spread_m": float(spread),
+        # Between the two objects. That these differ is no matter of the fit.
+        "backprojection_distance_m": float((peak - locate(focused, known)).norm()),
+        "surveyed_distance_m": float((truth - known).norm()),
     }
 
 
@@ -414,14 +439,14 @@ def _tables(
     twin: Scene,
     rows: dict[str, list[dict[str, Any]]],
 ) -> list[Table]:
-    plain = [(k, v) for k, v in metrics.items() if not isinstance(v, dict | list)]
+    plain = [(k, v) for k, v in metrics.items() if not isinstance(v, dict | list) and k != "task"]
     plain += [(f"calibration: {k}", v) for k, v in metrics.get("calibration", {}).items()]
     tables = [Table("Result", ["quantity", "value"], [list(item) for item in plain])]
     for mode, fits in rows.items():
         if len(fits) > 1:
             keys = [key for key in _COLUMNS if key in fits[0]]
             cells = [[row["start"] + 1, *(row[key] for key in keys)] for row in fits]
-            title = f"Starts, {mode.replace('_', ' ')}"
+            title = f"Starts, {_MODES[mode]}"
             tables.append(Table(title, ["start", *(_COLUMNS[key] for key in keys)], cells))
     cells = []
     for name in dict.fromkeys(_sought(problem.run)):
@@ -465,7 +490,8 @@ def _draw(
             {
                 name: pictures.Drawing(pictures.meshes_of(scene), sought, outline, places)
                 for name, scene in scenes.items()
-            }
+            },
+            pictures.frame_of(radar),
         ),
     )
     settings = need(problem.run, "reconstruct", "reconstruct")
@@ -492,32 +518,37 @@ def _draw(
         "simulated, twin": spectrum(twin),
     }
     folder.write_bytes("spectra.png", pictures.spectra_picture(maps, axes))
-    losses = {
-        f"{mode.replace('_', ' ')} {row['start'] + 1}": row["losses"]
-        for mode, fits in rows.items()
-        for row in fits
-    }
-    folder.write_bytes("loss.png", pictures.loss_picture(losses))
+    losses = {_MODES[mode]: [row["losses"] for row in fits] for mode, fits in rows.items()}
+    annealed = settings.annealing * settings.steps if _widths(problem.run) else None
+    folder.write_bytes("loss.png", pictures.loss_picture(losses, annealed))
 
 
 def _write_report(
     run: RunFile, folder: RunFolder, metrics: dict[str, Any], tables: Sequence[Table]
 ) -> None:
     notes = {
-        "scene": "Outlined in red: where the sought objects really are.",
-        "spectra": "Summed over frames; each map in dB below its own peak.",
-        "landscape": "Both losses along the same line through the truth.",
+        "scene": "In red: where the sought objects really are." if "success" in metrics else "",
+        "spectra": "Each map in dB below its own peak; maps over direction are summed over frames.",
+        "landscape": "Left: one channel's exact signal. Right: the power maps of the fit.",
     }
     shown = [
         Picture(name.capitalize(), (folder.path / f"{name}.png").read_bytes(), notes.get(name, ""))
         for name in ("scene", "spectra", "loss", "landscape")
         if f"{name}.png" in folder.names
     ]
-    status = f"{metrics['status']} after {metrics['steps']} steps. {run.note}"
-    if "position_error_m" in metrics:
-        turned = (
-            f" and {metrics['rotation_error_deg']:.1f}°" if "rotation_error_deg" in metrics else ""
-        )
-        status = f"{metrics['position_error_m']:.3f} m{turned} from the truth; {status}"
     title = run.title or "Reconstruction"
-    folder.write_text("report.html", report_html(title, status, [*tables, *shown], to_toml(run)))
+    again = Again("reconstruct run.toml", {"run.toml": to_toml(run)})
+    parts = [*tables[:1], *shown, *tables[1:]]
+    folder.write_text("report.html", report_html(title, _status(metrics), run.note, parts, again))
+
+
+def _status(metrics: dict[str, Any]) -> str:
+    """What came out, in a sentence or two."""
+    count = metrics.get("starts_count", 1)
+    which = f"Best of {count} starts: " if count > 1 else ""
+    ended = f"{_ENDS[metrics['status']]} after {metrics['steps']} steps"
+    if "position_error_m" not in metrics:
+        return f"{which}{ended}."
+    turned = f" and {metrics['rotation_error_deg']:.2f}°" if "rotation_error_deg" in metrics else ""
+    score = f"{which}{metrics['position_error_m']:.3f} m{turned} from the truth; {ended}."
+    return score + (f" {metrics['successes']} of {count} starts succeed." if count > 1 else "")

@@ -9,7 +9,7 @@ import torch
 from invertwin.capture import Capture
 from invertwin.channel.paths import Grid
 from invertwin.cli import build, pictures
-from invertwin.cli.report import Picture, Table, report_html
+from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
@@ -81,7 +81,9 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
     )
     axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
     maps = {"exact signal": found.spectrum.numpy(), "surrogate": smooth.numpy()}
-    folder.write_bytes("scene.png", pictures.scene_picture({"scene": drawing}))
+    folder.write_bytes(
+        "scene.png", pictures.scene_picture({"scene": drawing}, pictures.frame_of(radar))
+    )
     folder.write_bytes("spectra.png", pictures.spectra_picture(maps, axes))
     shown = [
         Picture("Scene", (folder.path / "scene.png").read_bytes()),
@@ -92,8 +94,9 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
         ),
     ]
     title = run.title or "Simulation"
-    status = f"{len(found.paths)} paths, {radar.frame_count} frames. {run.note}"
-    folder.write_text("report.html", report_html(title, status, [table, *shown], to_toml(run)))
+    status = f"{len(found.paths)} paths, {radar.frame_count} frames."
+    again = Again("simulate run.toml", {"run.toml": to_toml(run)})
+    folder.write_text("report.html", report_html(title, status, run.note, [table, *shown], again))
     return [table]
 
 

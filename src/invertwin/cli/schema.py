@@ -5,7 +5,7 @@ Nothing here imports torch or Mitsuba: a wrong key is reported before anything h
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 from pydantic import (
     AfterValidator,
@@ -25,10 +25,17 @@ Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
+# Beside the checkout; for an installed package this is a folder that does not exist.
+_DATA_BESIDE_CHECKOUT = Path(__file__).resolve().parents[4] / "shared" / "data"
+
+
 def _beside_run_file(name: str, info: Any) -> str:
-    """Relative paths start at the run file's folder, then at the folder INVERTWIN_DATA."""
-    folders = [(info.context or {}).get("folder", Path()), os.environ.get("INVERTWIN_DATA")]
-    paths = [Path(folder, name).absolute() for folder in folders if folder is not None]
+    """Relative paths start at the run file's folder, then at the data folder."""
+    folders = [
+        (info.context or {}).get("folder", Path()),
+        os.environ.get("INVERTWIN_DATA", _DATA_BESIDE_CHECKOUT),
+    ]
+    paths = [Path(folder, name).absolute() for folder in folders]
     return str(next((path for path in paths if path.exists()), paths[0]))
 
 
@@ -231,6 +238,14 @@ SceneObject = Annotated[
 ]
 
 
+class SceneFile(Section):
+    """Objects from the geometry of a Mitsuba or Sionna scene file (XML), named as in the file."""
+
+    file: InputPath
+    materials: dict[str, Material] = {}  # by the file's material ids
+    material: Material | None = None  # of all other objects; without it concrete
+
+
 class Truth(Section):
     """Where an object really is: replaces the placement of its scene table, key by key."""
 
@@ -273,8 +288,30 @@ class Cosine(Section):
     exponent: NonNegative
 
 
+class TablePattern(Section):
+    """A measured power pattern: one row per theta, from 0 at boresight, one column per phi."""
+
+    kind: Literal["table"]
+    theta_deg: Annotated[list[float], Field(min_length=2)]
+    phi_deg: Annotated[list[float], Field(min_length=1)] = [0.0]  # one: symmetric about boresight
+    gain_db: list[list[float]]
+
+    @model_validator(mode="after")
+    def _rectangular(self) -> "TablePattern":
+        rows, columns = len(self.theta_deg), len(self.phi_deg)
+        if len(self.gain_db) != rows or any(len(row) != columns for row in self.gain_db):
+            lengths = sorted({len(row) for row in self.gain_db})
+            _fail(
+                f"expected gain_db with {rows} rows of {columns}, got {len(self.gain_db)} rows of "
+                f"{' or '.join(map(str, lengths))}; give one row per theta and one column per phi"
+            )
+        return self
+
+
 Pattern = Annotated[
-    Annotated[Isotropic, Tag(TAG_MARK + "isotropic")] | Annotated[Cosine, Tag(TAG_MARK + "cosine")],
+    Annotated[Isotropic, Tag(TAG_MARK + "isotropic")]
+    | Annotated[Cosine, Tag(TAG_MARK + "cosine")]
+    | Annotated[TablePattern, Tag(TAG_MARK + "table")],
     _tag_by("kind"),
 ]
 
@@ -404,9 +441,7 @@ class SimulatedData(Section):
     @model_validator(mode="after")
     def _one_noise_level(self) -> "SimulatedData":
         if self.snr_db is not None and self.noise_figure_db is not None:
-            raise PydanticCustomError(
-                "presence", "expected snr_db or noise_figure_db, got both; remove one"
-            )
+            _fail("expected snr_db or noise_figure_db, got both; remove one")
         return self
 
 
@@ -510,14 +545,30 @@ class Surrogate(Section):
 
 
 class Loss(Section):
+    """How measured and simulated maps are compared."""
+
+    kind: Literal["mse", "likelihood"] = "mse"
     levels: Count = 3
     gain: Literal["fitted", "one"] = "fitted"
-    background: Literal["none", "level", "static"] = "none"
+    background: Literal["none", "level", "static"] = "none"  # taken out of both, mse only
+    floor: Positive | None = None  # over the mean measured power, likelihood only
+
+    @model_validator(mode="after")
+    def _fits_the_kind(self) -> "Loss":
+        if self.kind == "likelihood" and self.background != "none":
+            _fail(
+                f'expected background = "none" with kind = "likelihood", got "{self.background}"; '
+                "the floor stands for a background"
+            )
+        if self.kind == "mse" and self.floor is not None:
+            _fail('expected no `floor` with kind = "mse", got one; remove it')
+        return self
 
 
 class Optimizer(Section):
     kind: Literal["adam", "sgd"] = "adam"
-    rate: Positive = 0.03  # m and rad
+    rate: Positive = 0.03  # m, and rad without rotation_rate
+    rotation_rate: Positive | None = None  # rad
     final_rate: NonNegative | None = None  # on the last step; without it rate / 20
     momentum: Annotated[float, Field(ge=0, lt=1)] = 0.9
 
@@ -609,9 +660,12 @@ def _check_presence(section: Section, wanted: dict[str, bool], when: str) -> Non
     for key, needed in wanted.items():
         if needed != (getattr(section, key) is not None):
             verb, do = ("", "add it") if needed else ("no ", "remove it")
-            raise PydanticCustomError(
-                "presence", "{text}", {"text": f"expected {verb}`{key}` {when}; {do}"}
-            )
+            _fail(f"expected {verb}`{key}` {when}; {do}")
+
+
+def _fail(text: str, path: str = "") -> NoReturn:
+    """An error of a whole section, or of the key `path` of the run file."""
+    raise PydanticCustomError("section", "{text}", {"text": text, "path": path})
 
 
 # ----------------------------------------------------------------------------------- run file
@@ -624,7 +678,8 @@ class RunFile(Section):
     title: str = ""
     note: str = ""  # shown in the report
     seed: Seed = 0
-    scene: Annotated[dict[str, SceneObject], Field(min_length=1)]
+    scene: dict[str, SceneObject] = {}
+    scene_file: SceneFile | None = None
     truth: dict[str, Truth] = {}
     radar: Radar | None = None
     grid: Grid | None = None
@@ -641,6 +696,19 @@ class RunFile(Section):
 
     @model_validator(mode="after")
     def _names_exist(self) -> "RunFile":
+        if self.scene_file is None:
+            if not self.scene:
+                _fail("expected at least 1 object, got none; add [scene.<name>]", "scene")
+            # The names of a scene file are known once it is read.
+            for path, name in self.references():
+                if name not in self.scene:
+                    raise PydanticCustomError(
+                        "unknown_object", "unknown object", {"path": path, "name": name}
+                    )
+        return self
+
+    def references(self) -> list[tuple[str, str]]:
+        """Where the run file names an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
         for i, parameter in enumerate(self.parameters):
             if not isinstance(parameter, RadarParameter):
@@ -650,9 +718,4 @@ class RunFile(Section):
                 used.append((f"{section}.object", getattr(self, section).object))
         if self.gradcheck is not None and self.gradcheck.parameter.object is not None:
             used.append(("gradcheck.parameter.object", self.gradcheck.parameter.object))
-        for path, name in used:
-            if name not in self.scene:
-                raise PydanticCustomError(
-                    "unknown_object", "unknown object", {"path": path, "name": name}
-                )
-        return self
+        return used
