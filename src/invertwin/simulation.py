@@ -8,7 +8,6 @@ from torch import Tensor
 from invertwin.channel.bridge import use_backend
 from invertwin.channel.paths import Grid, Paths
 from invertwin.channel.tracer import RoughPoints, trace_field
-from invertwin.errors import InputError
 from invertwin.radar.range_profile import add_noise, beat_signal
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
@@ -68,14 +67,8 @@ def simulate(
         backend: See ``deposit_power``.
 
     Raises:
-        InputError: An object in motion: a frame is one instant. Use ``scene.at(time)``.
+        InputError: An object in motion: a frame is one instant.
     """
-    moving = [n for n, o in scene.objects.items() if o.velocity is not None and o.velocity.any()]
-    if moving:
-        raise InputError(
-            f"expected objects at rest, got velocities on {', '.join(moving)}; motion within a "
-            "capture is not simulated: pass scene.at(time) for each frame"
-        )
     with use_backend(backend):
         if surrogate is not None:
             return Simulation(

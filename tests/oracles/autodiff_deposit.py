@@ -6,7 +6,7 @@ import drjit as dr
 from torch import Tensor
 
 from invertwin.channel import kernel
-from invertwin.channel.bridge import flatten, to_float, to_torch, tracer
+from invertwin.channel.bridge import backend, flatten, to_float, to_torch, tracer
 from invertwin.channel.deposit import _Settings, _Trace
 from invertwin.channel.kernel import DIFFERENTIABLE, Contribution
 from invertwin.channel.paths import Grid, Link
@@ -28,7 +28,7 @@ def gradients(
         sampling="rays",
         reference=None,
         chunk=1 << 30,
-        backend=None,
+        backend=backend(),
     )
     trace = _Trace(settings)
     tables = {name: mi.Float(getattr(trace.inputs(), name)) for name in DIFFERENTIABLE}

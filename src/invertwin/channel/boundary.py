@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.bridge import Geometry, to_torch, tracer
+from invertwin.channel.bridge import Geometry, differentiated, to_torch, tracer
 from invertwin.channel.paths import Link
 from invertwin.channel.sampling import EdgeSampler, Shot, visible
+from invertwin.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,24 @@ class Edge:
     shadow: Float64[Tensor, "n 3"]
     normal: Float64[Tensor, "n 3"]
     speed: Float64[Tensor, " n"]
+
+
+def silhouettes_move(geometry: Geometry, link: Link) -> bool:
+    """Whether a derivative flows through anything that decides what is visible."""
+    return any(differentiated(value) for value in (geometry.vertices, link.tx, link.rx))
+
+
+def require_edges(geometry: Geometry, link: Link, samples: int) -> None:
+    """Refuse a derivative that would silently leave moving silhouettes out.
+
+    Raises:
+        InputError: Silhouettes move and there are no samples of them.
+    """
+    if samples < 1 and silhouettes_move(geometry, link):
+        raise InputError(
+            "expected boundary_samples >= 1 for a derivative in which silhouettes move, got "
+            f"{samples}; give some, or boundary=False for fixed visibility"
+        )
 
 
 def edge_points(shot: Shot, centre: str, samples: int, seed: int) -> EdgePoints:

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin import doctor
 from invertwin.errors import InputError
-from invertwin.scene.scene import Scene
+from invertwin.scene.scene import Object, Scene
 
 _VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 _KEPT_TOPOLOGIES = 8
@@ -129,9 +130,26 @@ class Geometry:
         return tuple(self.vertices[triangles[:, k]] for k in range(3))  # type: ignore[return-value]
 
 
+def differentiated(value: Tensor | None) -> bool:
+    """Whether derivatives flow through a tensor, in reverse or in forward mode."""
+    if value is None:
+        return False
+    return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None
+
+
 def flatten(scene: Scene, wavelength: float) -> Geometry:
-    """All objects of a scene in one set of tables."""
+    """All objects of a scene in one set of tables.
+
+    Raises:
+        InputError: An object in motion: a frame is one instant.
+    """
     objects = list(scene.objects.values())
+    moving = [n for n, o in scene.objects.items() if differentiated(o.velocity) or _moves(o)]
+    if moving:
+        raise InputError(
+            f"expected objects at rest, got velocities on {', '.join(moving)}; a frame is one "
+            "instant: use scene.at(time), then scene.replace(name, velocity=None)"
+        )
     faces, owners, offset = [], [], 0
     for index, item in enumerate(objects):
         faces.append(item.mesh.faces + offset)
@@ -142,7 +160,9 @@ def flatten(scene: Scene, wavelength: float) -> Geometry:
     surfaces = [item.material.surface(SPEED_OF_LIGHT / wavelength) for item in objects]
     vertices = torch.cat([item.vertices for item in objects])
     key = (_VARIANTS[backend()], *(id(item.mesh.faces) for item in objects))
-    topology = _topology(key, [item.mesh.faces for item in objects], faces, owners, vertices)
+    # In the objects' own frames, where equal positions are equal to the last bit.
+    shapes = torch.cat([item.mesh.vertices.detach() for item in objects])
+    topology = _topology(key, [item.mesh.faces for item in objects], faces, owners, shapes)
     return Geometry(
         vertices=vertices,
         faces=topology.faces,
@@ -154,6 +174,10 @@ def flatten(scene: Scene, wavelength: float) -> Geometry:
         coherent=tuple(item.material.coherent for item in objects),
         topology=topology,
     )
+
+
+def _moves(item: Object) -> bool:
+    return item.velocity is not None and bool(item.velocity.any())
 
 
 class Topology:
@@ -169,7 +193,10 @@ class Topology:
         owners = range(int(face_object.max()) + 1)
         self.object_vertices = [faces[face_object == owner].unique() for owner in owners]
         self.sound_face: int | None = None  # a triangle that was no sliver when last looked at
-        self.edges, self.opposite = edges_of(faces.numpy(), vertices.detach().numpy())
+        owner = torch.zeros(len(vertices), 1, dtype=torch.float64)
+        owner[faces.ravel(), 0] = face_object.repeat_interleave(3).double()
+        places = torch.cat([owner, vertices], dim=1).numpy()
+        self.edges, self.opposite = edges_of(faces.numpy(), places)
         self.device_faces = to_index(faces)
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
@@ -226,15 +253,16 @@ def _topology(
 
 
 def edges_of(
-    faces: np.ndarray, vertices: np.ndarray
+    faces: np.ndarray, places: np.ndarray
 ) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"]]:
     """Edges of a triangle mesh with the opposite vertex of every triangle at the edge.
 
-    Vertices at the same position count as one, so that a mesh with split vertices has no false
-    open edges. The second table has as many columns as the edge with most triangles (2 for a
-    manifold mesh); absent ones are −1.
+    Vertices with equal rows in ``places`` (object and position) count as one, so that a mesh
+    with split vertices has no false open edges; objects that touch may part. The second table
+    has as many columns as the edge with most triangles (2 for a manifold mesh); absent ones are
+    −1.
     """
-    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(places, axis=0, return_index=True, return_inverse=True)
     welded = first[inverse.ravel()][faces]
     corners = [(0, 1, 2), (1, 2, 0), (2, 0, 1)]
     ends = np.concatenate([np.sort(welded[:, [a, b]], axis=1) for a, b, _ in corners])

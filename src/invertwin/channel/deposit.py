@@ -12,8 +12,10 @@ from typing import Any, Literal
 import torch
 from jaxtyping import Float32
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from invertwin.channel import kernel
+from invertwin.channel import bridge, kernel
+from invertwin.channel.boundary import require_edges
 from invertwin.channel.bridge import (
     Geometry,
     flatten,
@@ -74,7 +76,8 @@ def deposit_power(
     not the divergence of Eq. 14.
 
     Raises:
-        InputError: Fewer than one sample, a non-finite scene, an unknown backend.
+        InputError: Fewer than one sample, no silhouette samples where a derivative needs them, an
+            antenna pattern that carries derivatives, objects in motion, an unknown backend.
     """
     if samples < 1 or boundary_samples < 0:
         raise InputError(
@@ -95,8 +98,10 @@ def deposit_power(
             sampling=sampling,
             reference=(flatten(reference[0], link.wavelength), reference[1]) if reference else None,
             chunk=max(1, int(memory_budget) // _BYTES_PER_SAMPLE),
-            backend=backend,
+            backend=bridge.backend(),
         )
+        if boundary:
+            require_edges(geometry, link, boundary_samples)
         return _Deposit.apply(settings, *settings.tables)  # type: ignore[no-any-return]
 
 
@@ -111,7 +116,7 @@ class _Settings:
     sampling: str
     reference: tuple[Geometry, Link] | None
     chunk: int
-    backend: str | None
+    backend: str
 
     @property
     def tables(self) -> list[Tensor]:
@@ -220,6 +225,7 @@ class _Deposit(torch.autograd.Function):
         return to_torch(out).reshape(settings.link.frame_count, *settings.grid.shape)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         import drjit as dr
 

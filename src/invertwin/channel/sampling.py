@@ -76,12 +76,16 @@ class Shot:
         self.link = link
         self.origin = link.tx.detach().mean(dim=0)
         self.local_vertices = (geometry.vertices.detach() - self.origin).to(torch.float32)
-        self.scene = geometry.topology.ray_scene(self.local_vertices)
         self.vertices = to_float(self.local_vertices)
         self.tx = to_float(link.tx.detach() - self.origin)
         self.rx = to_float(link.rx.detach() - self.origin)
         # Lanes without a hit are evaluated on a sound triangle, then masked: no NaN can leak.
         self.sound_face = opaque(_sound_face(geometry))
+
+    @property
+    def scene(self) -> Any:
+        """The ray scene. Asked for anew: another shot of the same objects may have moved them."""
+        return self.geometry.topology.ray_scene(self.local_vertices)
 
     def point(self, table: Any, index: Any) -> Any:
         """Rows of a flat table of points."""

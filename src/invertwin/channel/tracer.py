@@ -14,7 +14,13 @@ import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.boundary import Edge, edge_points, shadow_speed
+from invertwin.channel.boundary import (
+    Edge,
+    edge_points,
+    require_edges,
+    shadow_speed,
+    silhouettes_move,
+)
 from invertwin.channel.bridge import Geometry, flatten, to_torch, use_backend
 from invertwin.channel.paths import Link, Paths
 from invertwin.channel.sampling import RaySampler, Shot, face_areas, visible
@@ -120,6 +126,8 @@ def trace_power(
     with use_backend(backend):
         geometry = flatten(scene, link.wavelength)
         shot = Shot(geometry, link)
+        if boundary:
+            require_edges(geometry, link, boundary_samples)
         sampler = RaySampler(shot, samples, seed)
         points = _drawn(sampler)
         points = points.keep(points.weight > 0)
@@ -253,6 +261,8 @@ def trace_field(
         shot = Shot(geometry, link)
         parts = []
         if any(geometry.coherent):
+            if boundary:
+                require_edges(geometry, link, boundary_samples)
             parts.append(_coherent(geometry, link, shot, samples, seed))
             if boundary and boundary_samples:
 
@@ -270,7 +280,7 @@ def trace_field(
 
                 parts.append(_boundary_paths(geometry, link, shot, boundary_samples, seed, value))
         if not all(geometry.coherent):
-            if boundary and (geometry.vertices.requires_grad or link.tx.requires_grad):
+            if boundary and silhouettes_move(geometry, link):
                 raise InputError(
                     "expected no geometry derivative of rough field paths, got one: single points "
                     "appear and vanish; use power paths, or boundary=False for fixed visibility"

@@ -98,7 +98,7 @@ class Table(Pattern):
         gains: linear power gain at these angles.
 
     Raises:
-        InputError: wrong shapes or ranges, NaN, or a negative gain.
+        InputError: wrong shapes or ranges, NaN, a negative gain, or values that require grad.
     """
 
     theta: Float64[Tensor, " n"]
@@ -112,6 +112,11 @@ class Table(Pattern):
         phi = checked_tensor(self.phi, (None,), "pattern phi", do)
         gains = checked_tensor(self.gains, (len(theta), len(phi)), "pattern gains", do)
         _check_angles(theta, phi)
+        if any(value.requires_grad for value in (theta, phi, gains)):
+            raise InputError(
+                "expected a pattern without derivatives, got values that require grad; patterns "
+                "are resampled and cannot be fitted: detach them"
+            )
         if bool((gains < 0).any()):
             raise InputError(
                 f"expected linear power gains >= 0, got {float(gains.min()):g}; "
