@@ -1,0 +1,55 @@
+"""Simulate a radar: what one recording shows, and what it shows on average.
+
+Usage: python examples/01_simulate.py [folder]     (default out/examples)
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+from matplotlib.figure import Figure
+
+import invertwin as iw
+from invertwin.scene import RoughDielectric, linear_array, plate, rigid, rotation_from_vector, text
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
+folder.mkdir(parents=True, exist_ok=True)
+
+
+def at(x: float, y: float, z: float, yaw: float = 0.0) -> torch.Tensor:
+    """A pose: position [m] and turn about the vertical [rad]."""
+    return rigid(rotation_from_vector(torch.tensor([0.0, yaw, 0.0])), torch.tensor([x, y, z]))
+
+
+# The radar sits at the origin and looks along z; x is right, y is up.
+paint = RoughDielectric(permittivity=4.0)
+scene = iw.Scene(
+    {
+        "letter": iw.Object(text("A", size=0.6), paint, at(0.3, 0.0, 2.5, yaw=0.3)),
+        "wall": iw.Object(plate(3.0, 2.4), paint, at(0.0, 0.0, 3.3)),
+    }
+)
+chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=128)
+half = chirp.wavelength / 2
+radar = iw.Radar(linear_array(2, 16 * half), linear_array(16, half), chirp, [[0.0, 0.0, 0.0]])
+grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6)
+
+# The exact chain: fields of fixed scatterers, beat signals, window, FFT, beamforming. The
+# speckle is that of one rough surface; another seed is another surface.
+recorded = iw.simulate(scene, radar, grid, seed=1, snr_db=20.0)
+# The surrogate: the mean over all such surfaces, smooth in everything that may move.
+expected = iw.simulate(scene, radar, grid, seed=1, surrogate=iw.Surrogate())
+
+figure = Figure(figsize=(9, 4), layout="constrained")
+panels = figure.subplots(1, 2, sharey=True)
+maps = {"one recording (exact)": recorded.spectrum, "on average (surrogate)": expected.spectrum}
+for panel, (title, power) in zip(panels, maps.items(), strict=True):
+    level = 10 * torch.log10(power[0, :, :, 0].clamp_min(1e-30)).numpy()
+    image = panel.pcolormesh(grid.u.numpy(), grid.ranges.numpy(), level, vmin=level.max() - 40)
+    panel.set(title=title, xlabel="u = x/R")
+    figure.colorbar(image, ax=panel, label="received over transmitted power [dB]")
+panels[0].set_ylabel("range [m]")
+figure.savefig(folder / "simulate.png", dpi=100)
+
+print(f"beat signal {tuple(recorded.beat.shape)} (frame, tx, rx, sample)")
+print(f"picture: {folder / 'simulate.png'}")

@@ -1,0 +1,52 @@
+"""Your own mesh and your own board: simulate a capture, save it, load it, look at it.
+
+The board is like a TI AWR1843BOOST: two of its transmitters 2λ apart and four receivers λ/2 apart
+make a row of eight virtual antennas.
+Usage: python examples/04_own_mesh_and_board.py [folder [mesh.obj]]     (default out/examples)
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+
+import invertwin as iw
+from invertwin.scene import Cosine, PerfectConductor, linear_array, rigid, save_mesh, sphere
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
+folder.mkdir(parents=True, exist_ok=True)
+if len(sys.argv) > 2:
+    file = Path(sys.argv[2])
+else:  # no mesh given: make one, as another program would
+    file = folder / "ball.ply"
+    save_mesh(file, sphere(0.1, subdivisions=5))
+
+# OBJ, PLY, STL or glTF; metres. The file's origin goes to (0.4, 0, 2) m.
+mesh = iw.load_mesh(file)
+ball = iw.Object(mesh, PerfectConductor(), rigid(torch.eye(3), torch.tensor([0.4, 0.0, 2.0])))
+scene = iw.Scene({"ball": ball})
+
+chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=60e-6, samples=256)
+wavelength = chirp.wavelength
+patch = Cosine(exponent=3.0)  # power pattern of one antenna; ~75° between half-power points
+transmitters = linear_array(2, 2 * wavelength, pattern=patch)
+receivers = linear_array(4, wavelength / 2, pattern=patch)
+# Arrays are given about their own centre; on the board they lie side by side.
+receivers = iw.scene.AntennaArray(receivers.positions - torch.tensor([0.0, 0.01, 0.0]), patch)
+radar = iw.Radar(transmitters, receivers, chirp, positions=[[0.0, 0.0, 0.0]])
+grid = radar.grid(range_min=0.5, range_max=4.0)
+
+simulated = iw.simulate(scene, radar, grid, seed=1, samples=400_000, noise_figure_db=15.0)
+# ADC samples of a real board go the same way: complex [frame, tx, rx, sample].
+assert simulated.beat is not None
+capture = iw.Capture.from_beat(simulated.beat, radar)
+capture.save(folder / "ball.nc")
+
+loaded = iw.Capture.load(folder / "ball.nc")
+assert torch.equal(loaded.beat, capture.beat)
+spectrum = loaded.spectrum(grid)[0, :, :, 0]
+peak = int(spectrum.argmax())
+row, column = divmod(peak, grid.u_count)
+print(f"{loaded.frame_count} frame of {tuple(loaded.beat.shape[1:])} (tx, rx, sample)")
+print(f"strongest echo: R = {grid.ranges[row]:.2f} m, u = {grid.u[column]:+.2f}, "
+      f"{10 * spectrum.max().log10():.0f} dB")  # fmt: skip
