@@ -174,6 +174,8 @@ class _Trace:
 
     def boundary(self, inputs: Inputs) -> Iterator[Contribution]:
         """Boundary paths of each antenna segment."""
+        import drjit as dr
+
         link, settings = self.settings.link, self.settings
         centres = ("tx",) if link.shared_visibility else ("tx", "rx")
         for stream, centre in enumerate(centres):
@@ -184,7 +186,9 @@ class _Trace:
                 settings.seed + stream,
             )
             for index in _chunks(sampler.size, settings.chunk):
-                yield kernel.boundary(inputs, sampler.draw(index), centre, self.shot)
+                drawn = sampler.draw(index)
+                if dr.width(drawn.face):
+                    yield kernel.boundary(inputs, drawn, centre, self.shot)
 
     @staticmethod
     def _schedule(samples: Samples) -> None:
