@@ -46,6 +46,8 @@ from invertwin.scene.parameters import (
     Vertices,
 )
 
+_MOST_BINS = 1e9  # 4 GB a map
+
 
 def scene(run: schema.RunFile) -> Scene:
     """The scene of the `[scene.<name>]` tables and of the `[scene_file]`.
@@ -250,11 +252,29 @@ def _rotations(table: schema.Orientation, positions: Tensor) -> Tensor:
 
 
 def grid(table: schema.Grid, radar: Radar) -> Grid:
-    """The bins of the `[grid]` table for a radar."""
+    """The bins of the `[grid]` table for a radar.
+
+    Raises:
+        InputError: Limits that the radar refuses or does not reach, or a map of a size that only
+            a wrong unit explains.
+    """
+    wave = radar.waveform
+    if isinstance(wave, FMCW) and table.range_max > wave.max_range:
+        raise InputError(
+            f"grid.range_max: expected at most the waveform's unambiguous range, "
+            f"{wave.max_range:.4g} m, got {table.range_max:g}; give metres, or more samples"
+        )
     with about("grid"):
-        return radar.grid(
+        found = radar.grid(
             table.range_min, table.range_max, table.u_max, table.v_max, oversample=table.oversample
         )
+    bins = math.prod(found.shape) * radar.frame_count
+    if bins > _MOST_BINS:
+        raise InputError(
+            f"grid: expected a map of at most {_MOST_BINS:g} bins over all frames, got {bins:.3g}; "
+            "give limits in metres and direction cosines, or less oversampling"
+        )
+    return found
 
 
 def surrogate(table: schema.Surrogate) -> Surrogate:
