@@ -5,11 +5,13 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from cli.small import BEHIND, GRADCHECK, MATERIAL, RUN, STARTS, call, read_metrics
+from invertwin.cli import app
 from invertwin.cli.run_file import load_run
 
 
@@ -120,7 +122,6 @@ def test_many_starts_with_and_without_boundary_terms(run_file, monkeypatch):
     assert not (out / "parts").exists()
 
 
-# torch's forward mode loads its own deprecated scripts.
 def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
     files = []
     for name in ("first", "second"):
@@ -140,21 +141,30 @@ def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypatch):
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT])
+def test_ended_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypatch, ending):
     run_file.write_text(RUN.replace("steps = 8", "steps = 40") + STARTS)
     assert call(monkeypatch, "reconstruct", run_file, "-o", "whole") == 0
     whole = read_metrics(run_file.parent / "whole")
 
-    command = [sys.executable, "-c", "from invertwin.cli.app import main; main()"]
+    # A shell that starts tests in the background has them ignore interruptions.
+    heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    command = [sys.executable, "-c", heed + "from invertwin.cli.app import main; main()"]
     command += ["reconstruct", str(run_file), "-o", "cut"]
     checkpoint = run_file.parent / "cut" / "parts" / "full_01.pt"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
     deadline = time.monotonic() + 120
     while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.send_signal(ending)
+    _, said = process.communicate()
+    assert process.returncode == (130 if ending == signal.SIGINT else -signal.SIGKILL)
+    if ending == signal.SIGINT:
+        assert said.startswith("invertwin: interrupted; the same command with --resume goes on")
+        assert said.count("\n") == 1
     assert checkpoint.exists()
     assert not (run_file.parent / "cut" / "metrics.json").exists()
 
@@ -197,6 +207,35 @@ def test_demo_reconstructs_the_run_file_that_comes_along(tmp_path, monkeypatch):
     assert run.task == "demo"
     assert run.seed == 9
     assert path == Path("out/demo")
+
+
+def test_demo_replaces_its_own_results_but_no_others(tmp_path, monkeypatch, capsys):
+    from invertwin.cli import run_reconstruct
+
+    monkeypatch.chdir(tmp_path)
+
+    def noted(run, folder, console):
+        folder.write_json("metrics.json", {"seed": run.seed})
+        return []
+
+    monkeypatch.setattr(run_reconstruct, "run_reconstruct", noted)
+    for seed in (1, 2):
+        assert call(monkeypatch, "demo", "--seed", str(seed)) == 0
+        assert read_metrics(tmp_path / "out" / "demo")["seed"] == seed
+    assert call(monkeypatch, "demo", "--resume", "--seed", "2") == 0
+    assert "complete already" in capsys.readouterr().out
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "metrics.json").write_text("{}")
+    assert call(monkeypatch, "demo", "-o", "mine") == 2
+    assert (tmp_path / "mine" / "metrics.json").read_text() == "{}"
+
+
+def test_wheels_carry_the_demo(repository):
+    project = tomllib.loads((repository / "pyproject.toml").read_text())
+    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
+    ((source, target),) = wheel["force-include"].items()
+    assert (repository / source).read_text() == app._demo_file().read_text()
+    assert f"src/{target}" == str(Path(app.__file__).with_name("demo.toml").relative_to(repository))
 
 
 @pytest.mark.parametrize("ok", [True, False])

@@ -51,7 +51,9 @@ def folder(run_file, monkeypatch):
     save_mesh(folder / "whole.ply", plate(1.0, 1.0, 4))
     (folder / "cut.ply").write_bytes((folder / "whole.ply").read_bytes()[:300])
     (folder / "noise.stl").write_bytes(b"\x00\xff" * 100)
-    radar = build.radar(load_run(run_file).radar)
+    table = load_run(run_file).radar
+    assert table is not None
+    radar = build.radar(table)
     beat = torch.randn(2, 1, 24, 64, dtype=torch.complex128, generator=torch.Generator())
     capture = Capture.from_beat(beat, radar)
     capture.save(folder / "whole.nc")

@@ -1,15 +1,18 @@
 """What the tables of a run file become."""
 
 import math
+import tomllib
 from pathlib import Path
 
 import pytest
 import torch
 
 from invertwin.cli import build
-from invertwin.cli.run_file import validate
+from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
-from invertwin.scene import RoughDielectric, rotation_angle, rotation_from_vector
+from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.reconstruction import Optimizer
+from invertwin.scene import PerfectConductor, RoughDielectric, rotation_angle, rotation_from_vector
 
 ROUGH = {"kind": "rough_dielectric", "permittivity": 4.0, "lobe_width_deg": 30.0}
 ELEMENT = {"kind": "positions", "positions": [[0, 0, 0]]}
@@ -217,3 +220,103 @@ def test_material_value_that_a_conductor_does_not_have():
     )
     with pytest.raises(InputError, match=r"parameters\[0\]\.values"):
         build.parameters(run.parameters, build.scene(run))
+
+
+ROOM = """<scene version="3.0.0">
+  <shape type="rectangle" id="floor">
+    <transform name="to_world"><translate value="0 0 4"/></transform>
+    <ref id="mat-metal"/>
+  </shape>
+  <shape type="sphere" id="ball"><float name="radius" value="0.2"/></shape>
+</scene>
+"""
+
+
+def read_room(tmp_path, **changes):
+    (tmp_path / "room.xml").write_text(ROOM)
+    raw = {"task": "reconstruct", "scene_file": {"file": "room.xml"}} | changes
+    return validate(raw, tmp_path / "run.toml")
+
+
+def test_scene_file_beside_scene_tables(tmp_path):
+    metal = {"kind": "perfect_conductor"}
+    table = {"file": "room.xml", "materials": {"mat-metal": metal}, "material": ROUGH}
+    run = read_room(tmp_path, scene_file=table, scene={"box": make_box()})
+    assert validate(tomllib.loads(to_toml(run)), tmp_path / "run.toml") == run
+    scene = build.scene(run)
+    assert scene.names == ("floor", "ball", "box")
+    assert isinstance(scene["floor"].material, PerfectConductor)
+    ball = scene["ball"].material
+    assert isinstance(ball, RoughDielectric)
+    assert ball.permittivity == 4.0
+    assert bool((scene["floor"].vertices[:, 2] == 4).all())
+
+
+def test_truth_of_a_scene_file_places_from_where_the_file_does(tmp_path):
+    run = read_room(tmp_path, truth={"floor": {"position": [0.5, 0, 0]}, "ball": {"scale": 2.0}})
+    scene, truth = build.scene(run), build.true_scene(run)
+    found = build.residual(scene["floor"], truth["floor"])
+    torch.testing.assert_close(found.offset, torch.tensor([-0.5, 0, 0], dtype=torch.float64))
+    assert math.isclose(build.residual(scene["ball"], truth["ball"]).scale, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"parameters": [{"kind": "scale", "object": "bal"}]}, r"parameters\[0\].*mean `ball`"),
+        ({"scene": {"ball": make_box()}}, r"scene\.ball: .*choose another"),
+        ({"scene_file": {"file": "hall.xml"}}, r"scene_file: .*hall\.xml"),
+        (
+            {"scene_file": {"file": "room.xml", "materials": {"mat-wood": ROUGH}}},
+            r"scene_file: .*mat-wood",
+        ),
+    ],
+)
+def test_scene_file_errors_name_the_key(tmp_path, changes, said):
+    with pytest.raises(InputError, match=said):
+        build.scene(read_room(tmp_path, **changes))
+
+
+def test_table_pattern_in_degrees_and_decibels():
+    gain = [[6.0], [0.0], [-20.0]]
+    pattern = {"kind": "table", "theta_deg": [0, 60, 180], "gain_db": gain}
+    run = read(radar=RADAR | {"receivers": ELEMENT | {"pattern": pattern}})
+    assert run.radar is not None
+    found = build.radar(run.radar).receivers.pattern
+    tilt = math.radians(60)
+    ahead = torch.tensor([[0, 0, 1], [math.sin(tilt), 0, math.cos(tilt)]], dtype=torch.float64)
+    expected = torch.tensor([10**0.6, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(found.gain(ahead), expected, rtol=1e-3, atol=0)
+
+
+def test_table_pattern_of_the_wrong_shape_names_the_key():
+    pattern = {"kind": "table", "theta_deg": [0, 60], "gain_db": [[6.0, 1.0], [0.0]]}
+    with pytest.raises(InputError, match=r"receivers\.pattern: .*2 rows of 1, .*1 or 2"):
+        read(radar=RADAR | {"receivers": ELEMENT | {"pattern": pattern}})
+
+
+def test_loss_and_optimizer_pass_on_what_is_given():
+    run = read(
+        loss={"kind": "likelihood", "floor": 0.05, "levels": 2},
+        optimizer={"rate": 0.02, "rotation_rate": 0.2},
+    )
+    loss, optimizer = build.loss(run.loss), build.optimizer(run.optimizer)
+    assert (loss.kind, loss.floor, loss.levels) == ("likelihood", 0.05, 2)
+    assert (optimizer.rate, optimizer.rotation_rate) == (0.02, 0.2)
+    assert build.loss(read().loss) == SpectrumLoss()
+    assert build.optimizer(read().optimizer) == Optimizer()
+
+
+@pytest.mark.parametrize(
+    ("grid", "said"),
+    [
+        ({"range_min": 1, "range_max": 200}, r"grid\.range_max: .*4\.797 m, got 200"),
+        ({"range_min": 1, "range_max": 4, "oversample": 1e9}, r"grid: .*bins"),
+    ],
+)
+def test_grid_that_only_a_wrong_unit_explains(grid, said):
+    run = read(radar=RADAR, grid=grid)
+    assert run.radar is not None
+    assert run.grid is not None
+    with pytest.raises(InputError, match=said):
+        build.grid(run.grid, build.radar(run.radar))
