@@ -110,6 +110,7 @@ class Geometry:
         face_object: Index of the object of each triangle.
         amplitude: Per object, square root of the Fresnel reflectance over cosθ in [0, 1].
         diffuse, lobe, exponent: Per object, the weights of ``scene.material.Surface``.
+        has_lobe: Whether any lobe has weight, or a derivative that could give it some.
         coherent: Per object, whether its field paths have a deterministic phase.
         topology: What depends on the connectivity only.
     """
@@ -121,6 +122,7 @@ class Geometry:
     diffuse: Float64[Tensor, " object"]
     lobe: Float64[Tensor, " object"]
     exponent: Float64[Tensor, " object"]
+    has_lobe: bool
     coherent: tuple[bool, ...]
     topology: "Topology"
 
@@ -163,14 +165,16 @@ def flatten(scene: Scene, wavelength: float) -> Geometry:
     # In the objects' own frames, where equal positions are equal to the last bit.
     shapes = torch.cat([item.mesh.vertices.detach() for item in objects])
     topology = _topology(key, [item.mesh.faces for item in objects], faces, owners, shapes)
+    lobe = torch.stack([s.lobe for s in surfaces])
     return Geometry(
         vertices=vertices,
         faces=topology.faces,
         face_object=topology.face_object,
         amplitude=torch.stack([s.amplitude for s in surfaces]),
         diffuse=torch.stack([s.diffuse for s in surfaces]),
-        lobe=torch.stack([s.lobe for s in surfaces]),
+        lobe=lobe,
         exponent=torch.stack([s.exponent for s in surfaces]),
+        has_lobe=bool(lobe.any()) or differentiated(lobe),
         coherent=tuple(item.material.coherent for item in objects),
         topology=topology,
     )

@@ -18,6 +18,7 @@ from invertwin.channel import bridge, kernel
 from invertwin.channel.boundary import require_edges
 from invertwin.channel.bridge import (
     Geometry,
+    differentiated,
     flatten,
     opaque,
     to_float,
@@ -102,6 +103,11 @@ def deposit_power(
         )
         if boundary:
             require_edges(geometry, link, boundary_samples)
+        if any(differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
+            raise InputError(
+                "expected an antenna pattern without derivatives, got one that carries them; "
+                "power paths do not differentiate patterns: detach its values"
+            )
         return _Deposit.apply(settings, *settings.tables)  # type: ignore[no-any-return]
 
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from invertwin.channel.bridge import Geometry, differentiated, to_float, tracer
+from invertwin.channel.bridge import Geometry, to_float, tracer
 from invertwin.channel.paths import Link, Pattern
 from invertwin.channel.sampling import EdgeSamples, Samples, Shot
-from invertwin.errors import InputError
 
 #: The differentiable inputs of the kernel, in the order in which torch passes them.
 DIFFERENTIABLE = (
@@ -60,7 +59,7 @@ class Inputs:
             faces=topology.device_faces,
             face_object=topology.device_face_object,
             cosines=geometry.amplitude.shape[1],
-            has_lobe=bool((geometry.lobe != 0).any()) or differentiated(geometry.lobe),
+            has_lobe=geometry.has_lobe,
             monostatic=monostatic,
             tx_pattern=PatternTable.of(link.tx_pattern),
             rx_pattern=PatternTable.of(link.rx_pattern),
@@ -85,11 +84,6 @@ class PatternTable:
     @staticmethod
     def of(pattern: Pattern) -> "PatternTable":
         table = pattern.table()
-        if differentiated(table):
-            raise InputError(
-                "expected an antenna pattern without derivatives, got one that carries them; "
-                "power paths do not differentiate patterns: detach its values"
-            )
         rows, columns = int(table.shape[0]), int(table.shape[1])
         constant = float(table.reshape(-1)[0]) if rows * columns == 1 else None
         return PatternTable(to_float(table), (rows, columns), constant)

@@ -78,14 +78,9 @@ def aperture(radar: Radar) -> Aperture:
 
     Raises:
         InputError: The array is not flat in the radar's x-y plane, so that u and v alone do not
-            describe its response; or its element positions require grad.
+            describe its response.
     """
     places = radar.virtual_positions.cpu()
-    if places.requires_grad:
-        raise InputError(
-            "expected element positions without derivatives, got positions that require grad; "
-            "a spectrum does not differentiate its steering: detach them, or move the radar"
-        )
     key = tuple(tuple(place) for place in places.tolist())
     return _aperture(key, radar.waveform.wavelength, radar.array_window)
 

@@ -159,7 +159,8 @@ class AntennaArray:
         pattern: gain of every element.
 
     Raises:
-        InputError: no elements, wrong shape, NaN, or a pattern of another type.
+        InputError: no elements, wrong shape, NaN, positions that require grad, or a pattern of
+            another type.
     """
 
     positions: Float64[Tensor, "n 3"]
@@ -170,6 +171,11 @@ class AntennaArray:
         positions = checked_tensor(self.positions, (None, 3), "element positions", do)
         if len(positions) == 0:
             raise InputError(f"expected at least one antenna element, got none; {do}")
+        if positions.requires_grad:
+            raise InputError(
+                "expected element positions without derivatives, got positions that require "
+                "grad; spectra do not differentiate their steering: detach them"
+            )
         if not isinstance(self.pattern, Pattern):
             raise InputError(
                 f"expected a Pattern, got {type(self.pattern).__name__}; "

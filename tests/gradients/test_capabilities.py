@@ -1,0 +1,424 @@
+"""The capability table of docs/limitations.md, cell by cell."""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torch.autograd.forward_ad as forward_ad
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from invertwin.capture import Capture
+from invertwin.capture.track import Track
+from invertwin.channel.deposit import deposit_power
+from invertwin.channel.tracer import trace_field
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.inversion.gradcheck import gradcheck
+from invertwin.inversion.nuisances import ClockOffset, RangeBias
+from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum, surrogate_spectrum
+from invertwin.scene import (
+    AntennaArray,
+    Cosine,
+    PerfectConductor,
+    RoughDielectric,
+    Scene,
+    Table,
+    linear_array,
+)
+from invertwin.scene.parameters import (
+    MaterialValues,
+    Pose,
+    RadarPose,
+    Scale,
+    Translation,
+    Vertices,
+)
+from scenes import float64, occluder, relative
+
+Moves = Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "limitations.md"
+MECHANISMS = {
+    "power paths, interior": "interior",
+    "power paths, boundary": "boundary",
+    "coherent field": "coherent",
+    "rough field": "rough",
+}
+ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
+METAL = PerfectConductor()
+
+
+def table() -> dict[tuple[str, str], str]:
+    """(parameter, mechanism) → what the page says."""
+    rows = [
+        [cell.strip() for cell in line.strip("| \n").split("|")]
+        for line in PAGE.read_text(encoding="utf-8").splitlines()
+        if line.startswith("|")
+    ]
+    start = next(i for i, row in enumerate(rows) if row[0] == "parameter")
+    header = [MECHANISMS[name] for name in rows[start][1:]]
+    cells = {}
+    for row in rows[start + 2 :]:
+        if len(row) != len(header) + 1:
+            break
+        cells |= {(row[0], name): cell for name, cell in zip(header, row[1:], strict=True)}
+    return cells
+
+
+CELLS = table()
+
+
+def power_radar(positions: object = ((0.0, 0.0, 0.0),)) -> Radar:
+    """77 GHz, 16 elements in a row, a pattern that depends on direction."""
+    return Radar(
+        AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Cosine(2.0)),
+        linear_array(16, 1.9467e-3, pattern=Cosine(2.0)),
+        FMCW(76e9, 2e9, 50e-6, 64),
+        float64(positions),
+        array_window="rectangular",
+    )
+
+
+def field_radar(wavelength: float) -> Radar:
+    """Four places of one antenna, at a long wave so that few samples resolve the fringes."""
+    middle = SPEED_OF_LIGHT / wavelength
+    one = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Cosine(2.0))
+    places = [[-0.3, -0.1, 0.0], [0.3, -0.1, 0.0], [-0.3, 0.1, 0.0], [0.3, 0.1, 0.0]]
+    return Radar(one, one, FMCW(middle - 0.5e9, 1e9, 50e-6, 32), float64(places))
+
+
+def on_scene(module: nn.Module, values: Callable[[Tensor], dict[str, Tensor]]) -> Moves:
+    return lambda scene, radar, theta: (functional_call(module, values(theta), (scene,)), radar)
+
+
+def on_radar(module: nn.Module, values: Callable[[Tensor], dict[str, Tensor]]) -> Moves:
+    return lambda scene, radar, theta: (scene, functional_call(module, values(theta), (radar,)))
+
+
+def material(name: str, start: float) -> Moves:
+    module = MaterialValues("wall", **{name: start})
+    raw = module.raw[name].detach()
+    return on_scene(module, lambda theta: {f"raw.{name}": raw + theta})
+
+
+def turned(axis: list[float]) -> Callable[[Tensor], Tensor]:
+    return lambda theta: torch.cat([torch.ones(1, dtype=torch.float64), theta * float64(axis)])
+
+
+CORNERS = float64([[1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.3]])
+STILL = float64([0.0, 0.0, 0.0])
+MOVES: dict[str, Moves] = {
+    "translation": on_scene(
+        Translation("occluder"), lambda theta: {"translation": theta * float64([0.9, 0.3, 0.1])}
+    ),
+    "pose": on_scene(
+        Pose("occluder"),
+        lambda theta: {"translation": STILL, "rotation": turned([0.2, 0.9, 0.6])(theta)},
+    ),
+    "scale": on_scene(Scale("occluder"), lambda theta: {"log_scale": theta}),
+    "vertices": on_scene(Vertices("occluder", 4), lambda theta: {"offsets": theta * CORNERS}),
+    "radar position": on_radar(
+        RadarPose(),
+        lambda theta: {
+            "translation": theta * float64([0.9, 0.3, 0.1]),
+            "rotation": turned([0, 0, 0])(theta),
+        },
+    ),
+    "radar rotation": on_radar(
+        RadarPose(),
+        lambda theta: {"translation": STILL, "rotation": turned([0.2, 0.9, 0.1])(theta)},
+    ),
+    "permittivity": material("permittivity", 4.0),
+    "conductivity": material("conductivity", 0.5),
+    "diffuse fraction": material("diffuse", 0.6),
+    "lobe width": material("lobe_width", 0.5),
+}
+
+
+def clock() -> tuple[Radar, Moves]:
+    """A radar on a track, and the module that shifts its clock."""
+    times = torch.linspace(0, 1, 3, dtype=torch.float64)
+    path = float64([[-0.5, 0.0, 0.0], [0.5, 0.1, 0.1]])
+    track = Track(float64([-0.5, 1.5]), path)
+    radar = power_radar(track.at(times).tolist())
+    single = replace(radar, receivers=radar.transmitters)
+    profile = torch.ones(3, 8, dtype=torch.complex128)
+    capture = Capture.from_range_profile(
+        profile, torch.arange(8).double() * 0.1 + 1, single, times, track=track
+    )
+    return radar, on_radar(ClockOffset(capture), lambda theta: {"shift": theta})
+
+
+@dataclass(frozen=True)
+class Found:
+    """Derivatives of one power map."""
+
+    full: Tensor
+    interior: Tensor
+    truth: Tensor
+    noise: float
+
+
+def power_case(parameter: str) -> Found:
+    scene = occluder(wall=ROUGH, occluder=ROUGH)
+    radar, moves = clock() if parameter == "clock offset" else (power_radar(), MOVES[parameter])
+    report = gradcheck(
+        scene,
+        radar,
+        radar.grid(0.4, 2.8, 0.6, oversample=1),
+        moves,
+        surrogate=Surrogate("gaussian", range_width=2.0, angle_width=1.0),
+        samples=200_000 * radar.frame_count,
+        boundary_samples=50_000 * radar.frame_count,
+        repeats=2,
+        difference_samples=300_000 * radar.frame_count,
+        noise=0.01,
+        max_pairs=16,
+    )
+    return Found(
+        report.gradient, report.interior_gradient, report.difference, report.difference_noise
+    )
+
+
+def biased(theta: Tensor, scene: Scene, seed: int, boundary: bool) -> Tensor:
+    radar = power_radar()
+    return surrogate_spectrum(
+        scene,
+        radar,
+        radar.grid(0.4, 2.8, 0.6, oversample=1),
+        Surrogate(),
+        samples=50_000,
+        boundary_samples=0,
+        seed=seed,
+        boundary=boundary,
+        range_offset=functional_call(RangeBias(), {"bias": theta}, ()),
+    ).double()
+
+
+def bias_case() -> Found:
+    """The bias moves the map itself, so that one seed suffices."""
+    scene, zero = occluder(wall=ROUGH, occluder=ROUGH), torch.zeros((), dtype=torch.float64)
+    maps = [biased(zero + sign * 1e-4, scene, 0, True) for sign in (1, -1)]
+    both = [pushed(lambda theta, on=on: biased(theta, scene, 0, on)) for on in (True, False)]
+    return Found(both[0], both[1], (maps[0] - maps[1]) / 2e-4, 0.0)
+
+
+def pushed(function: Callable[[Tensor], Tensor]) -> Tensor:
+    """Forward-mode derivative at θ = 0, zeros where nothing depends on θ."""
+    with forward_ad.dual_level():
+        theta = forward_ad.make_dual(
+            torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
+        )
+        value, tangent = forward_ad.unpack_dual(function(theta))
+        return torch.zeros_like(value) if tangent is None else tangent
+
+
+def response(scene: Scene, radar: Radar, **options: Any) -> Tensor:
+    """Real and imaginary parts of the channel at the carrier, per frame."""
+    antennas = radar.link()
+    paths = trace_field(scene, antennas, **options)
+    phase = 2 * math.pi / antennas.wavelength * SPEED_OF_LIGHT * paths.delay
+    field = paths.coefficient * torch.polar(torch.ones_like(phase), -phase)
+    total = torch.zeros(antennas.frame_count, dtype=torch.complex128)
+    return torch.view_as_real(total.index_add(0, paths.frame, field))
+
+
+def coherent_case(parameter: str) -> Found:
+    scene, radar, moves = occluder(wall=METAL, occluder=METAL), field_radar(0.3), MOVES[parameter]
+    # A growing object has other areas, hence other samples: take a larger step.
+    step, pairs = 6e-2 if parameter == "scale" else 2e-2, 8
+
+    def value(theta: Tensor, seed: int, boundary: bool, samples: int, edges: int) -> Tensor:
+        return response(
+            *moves(scene, radar, theta),
+            samples=samples,
+            boundary_samples=edges,
+            seed=seed,
+            boundary=boundary,
+        )
+
+    def derivative(boundary: bool) -> Tensor:
+        return torch.stack(
+            [pushed(lambda t, s=s: value(t, s, boundary, 60_000, 20_000)) for s in range(2)]
+        ).mean(0)
+
+    ends = [
+        [value(torch.tensor(sign * step).double(), 9 + k, False, 60_000, 0) for sign in (1, -1)]
+        for k in range(pairs)
+    ]
+    differences = torch.stack([(up - down) / (2 * step) for up, down in ends])
+    truth = differences.mean(0)
+    noise = differences.std(0).div(math.sqrt(pairs)).sum() / truth.abs().sum().clamp_min(1e-300)
+    return Found(derivative(True), derivative(False), truth, float(noise))
+
+
+def rough_case(parameter: str) -> Found:
+    """Fixed points: differences are as smooth as the derivative."""
+    scene, radar, moves = occluder(wall=ROUGH, occluder=ROUGH), field_radar(0.3), MOVES[parameter]
+
+    def value(theta: Tensor) -> Tensor:
+        return response(*moves(scene, radar, theta), density=300.0, seed=0)
+
+    up, down = (value(torch.tensor(sign * 1e-4).double()) for sign in (1, -1))
+    found = pushed(value)
+    return Found(found, found, (up - down) / 2e-4, 0.0)
+
+
+_power: dict[str, Found] = {}
+
+
+def case(parameter: str, mechanism: str) -> Found:
+    if mechanism == "coherent":
+        return coherent_case(parameter)
+    if mechanism == "rough":
+        return rough_case(parameter)
+    if parameter not in _power:
+        _power[parameter] = bias_case() if parameter == "range bias" else power_case(parameter)
+    return _power[parameter]
+
+
+def test_the_table_is_whole():
+    named = {parameter for parameter, _ in CELLS}
+    assert named == {*MOVES, "range bias", "clock offset", *REFUSALS}
+    assert len(CELLS) == 4 * len(named)
+    assert set(CELLS.values()) == {"supported", "zero", "refused", "–"}
+
+
+def selected(word: str) -> list[Any]:
+    slow = {"pose", "scale", "vertices", "radar position"}
+    return [
+        pytest.param(
+            *cell,
+            id=re.sub(r"\W+", "_", " ".join(cell)),
+            marks=pytest.mark.slow if cell[1] == "coherent" and cell[0] in slow else (),
+        )
+        for cell, said in CELLS.items()
+        if said == word
+    ]
+
+
+@pytest.mark.parametrize(("parameter", "mechanism"), selected("supported"))
+def test_supported(parameter, mechanism):
+    found = case(parameter, mechanism)
+    assert found.noise < 0.02
+    assert float(found.truth.abs().sum()) > 0
+    assert relative(found.full, found.truth) < 0.03
+    if mechanism == "boundary":
+        assert relative(found.interior, found.truth) > 3 * relative(found.full, found.truth)
+
+
+@pytest.mark.parametrize(("parameter", "mechanism"), selected("zero"))
+def test_zero(parameter, mechanism):
+    found = case(parameter, mechanism)
+    if mechanism == "boundary":
+        # Atomic additions reorder; there is no boundary term in either.
+        assert relative(found.full, found.interior) < 1e-5
+    else:
+        assert not found.full.any()
+        assert not found.truth.any()
+
+
+def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
+    """Use a scene and a radar as the mechanism does."""
+    if mechanism in ("interior", "boundary"):
+        grid = radar.grid(0.4, 2.8, 0.6)
+        counts: dict[str, Any] = {"samples": 1_000, "boundary_samples": 100, "seed": 0}
+        on = mechanism == "boundary"
+        surrogate_spectrum(scene, radar, grid, Surrogate(), boundary=on, **counts)
+        return
+    paths = trace_field(
+        scene, radar.link(), samples=1_000, density=100.0, boundary_samples=100, seed=0
+    )
+    exact_spectrum(beat_signal(paths, radar), radar, radar.grid(0.4, 2.8, 0.6))
+
+
+def velocity(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
+    return scene.replace(
+        "wall", velocity=torch.zeros(3, dtype=torch.float64).requires_grad_()
+    ), radar
+
+
+def patterns(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
+    gains = torch.ones(2, 1, dtype=torch.float64, requires_grad=True)
+    pattern = Table(float64([0.0, 1.5]), float64([0.0]), gains)
+    return scene, replace(radar, receivers=replace(radar.receivers, pattern=pattern))
+
+
+def elements(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
+    places = radar.receivers.positions.clone().requires_grad_()
+    return scene, replace(radar, receivers=AntennaArray(places))
+
+
+REFUSALS: dict[str, Callable[[Scene, Radar], tuple[Scene, Radar]]] = {
+    "object velocity": velocity,
+    "antenna pattern": patterns,
+    "element positions": elements,
+}
+NAMES = {
+    "object velocity": "velocities on wall",
+    "antenna pattern": "expected a pattern without derivatives",
+    "element positions": "expected element positions without derivatives",
+    "permittivity": "expected a material with permittivity",
+    "conductivity": "expected a material with conductivity",
+    "diffuse fraction": "expected a material with diffuse",
+}
+
+
+@pytest.mark.parametrize(("parameter", "mechanism"), selected("refused"))
+def test_refused(parameter, mechanism):
+    surface = METAL if mechanism == "coherent" else ROUGH
+    scene, radar = occluder(wall=surface, occluder=surface), power_radar()
+    message = NAMES.get(parameter, "expected no geometry derivative of rough field paths")
+    theta = torch.zeros((), dtype=torch.float64, requires_grad=True)
+
+    def change() -> tuple[Scene, Radar]:
+        if parameter in REFUSALS:
+            return REFUSALS[parameter](scene, radar)
+        return MOVES[parameter](scene, radar, theta)
+
+    with pytest.raises(InputError, match=message):
+        attempt(mechanism, *change())
+    if parameter in MOVES and mechanism == "rough":
+        with pytest.raises(InputError, match=message):
+            pushed(lambda t: response(*MOVES[parameter](scene, radar, t), density=100.0, seed=0))
+
+
+def test_a_pattern_of_ones_own_is_refused_too():
+    class Own(Cosine):
+        def table(self) -> Tensor:
+            return super().table() * torch.ones(1, dtype=torch.float64, requires_grad=True)
+
+    radar = power_radar()
+    radar = replace(radar, receivers=replace(radar.receivers, pattern=Own(2.0)))
+    with pytest.raises(InputError, match="expected an antenna pattern without derivatives"):
+        deposit_power(
+            occluder(),
+            radar.link(),
+            radar.grid(0.4, 2.8),
+            samples=100,
+            boundary_samples=0,
+            seed=0,
+        )
+
+
+def test_a_lobe_that_starts_at_nothing_has_its_derivative():
+    """At diffuse = 1 the lobe weighs nothing, yet its derivative does."""
+    scene, radar = occluder(), power_radar()
+    grid = radar.grid(0.4, 2.8, 0.6, oversample=1)
+
+    def value(share: Tensor) -> Tensor:
+        surface = RoughDielectric(4.0, 0.0, 1 - share)
+        moved = scene.replace("wall", material=surface)
+        return deposit_power(
+            moved, radar.link(), grid, samples=50_000, boundary_samples=0, seed=0
+        ).double()
+
+    rate = pushed(value)
+    whole = value(torch.tensor(0.5).double()) - value(torch.zeros(()).double())
+    assert relative(rate, whole / 0.5) < 1e-4
