@@ -1,0 +1,148 @@
+"""Nothing in the docs is unexecuted: snippets run, examples run, names and links exist."""
+
+import ast
+import importlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
+EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
+
+SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+NAME = re.compile(r"`(invertwin(?:\.\w+)+)`")
+LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
+RUN_FILE = re.compile(r"\b(?:experiments|examples|benchmarks|tests)/[\w/*.]*\w")
+WRITES = {
+    "01_simulate.py": ["simulate.png"],
+    "02_reconstruct.py": ["twin.ply"],
+    "03_gradient.py": ["gradient.png"],
+    "04_own_mesh_and_board.py": ["ball.ply", "ball.nc"],
+}
+
+
+def run(arguments, folder):
+    """What a user would see; a warning is an error, but for one of torch about itself."""
+    ended = subprocess.run(
+        [
+            sys.executable,
+            *("-W", "error"),
+            *("-W", "ignore:`torch.jit.script` is deprecated:DeprecationWarning"),
+            *arguments,
+        ],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": ""},
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 0, ended.stderr[-3000:]
+    return ended.stdout
+
+
+def snippets(page):
+    return [match.group(1) for match in SNIPPET.finditer(page.read_text())]
+
+
+@pytest.fixture(scope="module")
+def readme(tmp_path_factory):
+    """What the README's two snippets print, run in one session."""
+    folder = tmp_path_factory.mktemp("readme")
+    return run(["-c", "\n".join(snippets(REPOSITORY / "README.md"))], folder)
+
+
+@pytest.mark.slow
+def test_readme_simulates_and_finds_the_letter(readme):
+    assert "[16, 2, 4, 128]" in readme
+    start, found = (float(cm) for cm in re.findall(r"([\d.]+) cm off", readme))
+    assert start > 30
+    assert found < 3
+
+
+def test_readme_snippets_are_short():
+    counts = [
+        sum(bool(line.strip()) for line in snippet.splitlines())
+        for snippet in snippets(REPOSITORY / "README.md")
+    ]
+    assert len(counts) == 2
+    assert max(counts) <= 15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WITH_PYTHON[1:], ids=lambda page: page.name)
+def test_snippets_of_a_page_run(page, tmp_path):
+    run(["-c", "\n".join(snippets(page))], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.name)
+def test_examples_run(script, tmp_path):
+    run([str(script)], tmp_path)
+    for name in WRITES[script.name]:
+        assert (tmp_path / "out" / "examples" / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.name)
+def test_examples_are_short_and_use_public_names(script):
+    assert len(script.read_text().splitlines()) <= 60
+    public = {
+        "invertwin",
+        *(f"invertwin.{room}" for room in importlib.import_module("invertwin").__all__),
+    }
+    for node in ast.walk(ast.parse(script.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("invertwin"):
+            assert node.module in public
+            room = importlib.import_module(node.module)
+            assert {alias.name for alias in node.names} <= set(room.__all__)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_names_exist(page):
+    for name in NAME.findall(page.read_text()):
+        assert resolved(name) is not None, f"{name} in {page.name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_files_exist(page):
+    text = page.read_text()
+    for link in LINK.findall(text):
+        if "://" not in link:
+            assert (page.parent / link).exists(), f"{link} in {page.name}"
+    for path in RUN_FILE.findall(text):
+        assert list(REPOSITORY.glob(path)), f"{path} in {page.name}"
+
+
+def test_every_difference_from_the_source_is_listed():
+    page = (REPOSITORY / "docs" / "derivations.md").read_text()
+    listed = set(NAME.findall(page.split("## Differs from the source")[1]))
+    assert listed == set(differing())
+
+
+def differing():
+    """Qualified names of modules, classes and functions whose docstring has the remark."""
+    source = REPOSITORY / "src"
+    for path in sorted((source / "invertwin").rglob("*.py")):
+        module = ".".join(path.relative_to(source).with_suffix("").parts)
+        for node in ast.walk(ast.parse(path.read_text())):
+            documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+            if documented and "Differs from the source" in (ast.get_docstring(node) or ""):
+                yield module if isinstance(node, ast.Module) else f"{module}.{node.name}"
+
+
+def resolved(name):
+    """The object of a qualified name: a module, or an attribute of one, or of a class in one."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            found = getattr(found, part, None)
+        return found
+    return None
