@@ -234,12 +234,21 @@ def _fit(
         "status": found.status,
         "steps": found.steps,
         "seconds": time.perf_counter() - begin,
-        "values": found.history[-1]["values"] if found.history else {},
+        "values": _values(found.parameters),
         "checkpoint": checkpoint,
         "losses": [step["loss"] for step in found.history],
     }
     folder.write_json(f"{part}.json", row)
     return row
+
+
+def _values(modules: nn.ModuleList) -> dict[str, Any]:
+    """Fitted values by name; vertices are in the mesh file and the checkpoint."""
+    rows: dict[str, Any] = {}
+    for module in modules:
+        found: dict[str, torch.Tensor] = getattr(module, "values", dict)()
+        rows |= {name: value.tolist() for name, value in found.items() if value.numel() <= 16}
+    return rows
 
 
 def _reconstruct(
@@ -539,10 +548,12 @@ def _write_report(
     title = run.title or "Reconstruction"
     again = Again("reconstruct run.toml", {"run.toml": to_toml(run)})
     parts = [*tables[:1], *shown, *tables[1:]]
-    folder.write_text("report.html", report_html(title, _status(metrics), run.note, parts, again))
+    folder.write_text(
+        "report.html", report_html(title, _status(run, metrics), run.note, parts, again)
+    )
 
 
-def _status(metrics: dict[str, Any]) -> str:
+def _status(run: RunFile, metrics: dict[str, Any]) -> str:
     """What came out, in a sentence or two."""
     count = metrics.get("starts_count", 1)
     which = f"Best of {count} starts: " if count > 1 else ""
@@ -551,4 +562,9 @@ def _status(metrics: dict[str, Any]) -> str:
         return f"{which}{ended}."
     turned = f" and {metrics['rotation_error_deg']:.2f}°" if "rotation_error_deg" in metrics else ""
     score = f"{which}{metrics['position_error_m']:.3f} m{turned} from the truth; {ended}."
-    return score + (f" {metrics['successes']} of {count} starts succeed." if count > 1 else "")
+    if count == 1:
+        return score
+    settings = need(run, "reconstruct", "reconstruct")
+    limits = f"{settings.position_limit:g} m"
+    limits += f" and {settings.rotation_limit_deg:g}°" if turned else ""
+    return f"{score} {metrics['successes']} of {count} starts end within {limits}."
