@@ -195,3 +195,12 @@ def test_isotropic_antenna_sees_behind_itself(run_file, monkeypatch):
     assert call(monkeypatch, "simulate", run_file) == 0
     metrics = read_metrics(run_file.parent / "out" / "small")
     assert metrics["peak_range_m"] == pytest.approx(1.2, abs=0.5)
+
+
+def test_parameters_that_are_not_numbers_end_as_diverged(run_file, monkeypatch):
+    run_file.write_text(RUN + "[optimizer]\nrate = 1.7e308\n")
+    assert call(monkeypatch, "reconstruct", run_file) == 0
+    metrics = read_metrics(run_file.parent / "out" / "small")
+    assert metrics["status"] == "diverged"
+    assert metrics["position_error_m"] == pytest.approx(metrics["start_distance_m"])
+    assert metrics["parameters"]["plate.translation"] == [0.0, 0.0, 0.0]
