@@ -336,6 +336,8 @@ def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
 
 def visible(shot: Shot, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]) -> Tensor:
     """Whether nothing lies between pairs of world points (torch in, torch out)."""
+    if not len(start):
+        return torch.zeros(0, dtype=torch.bool)
     mi = tracer()
     points = []
     for ends in (start, end):

@@ -74,7 +74,7 @@ class Direction:
             return scene.replace(self.object, mesh=mesh), radar
         pose = item.transform
         if self.kind == "translation":
-            shift = rigid(torch.eye(3, dtype=torch.float64), axis * theta)
+            shift = rigid(translation=axis * theta)
         else:
             turn, centre = rotation_from_vector(axis * theta), item.center.detach()
             shift = rigid(turn, centre - turn @ centre)

@@ -25,6 +25,7 @@ from invertwin.scene.scene import Scene
 Status = Literal["converged", "budget", "diverged"]
 
 _DIVERGED = 1e3  # times the first loss
+_WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
 _WINDOW = 20  # steps over which convergence is judged
 
 
@@ -85,7 +86,7 @@ class Reconstruction:
         parameters: The fitted modules.
         history: One row a step: ``step``, ``loss``, ``values`` (parameters by name).
         status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
-            ``diverged`` (then the best state is kept).
+            ``diverged`` (not finite, or worse than the start; then the best state is kept).
         steps: Steps done.
         loss: Of the state returned, at the widths of its step.
     """
@@ -106,7 +107,7 @@ def reconstruct(
     parameters: Sequence[nn.Module],
     *,
     grid: Grid,
-    loss: SpectrumLoss | None = None,
+    loss: Callable[[Tensor, Tensor], Tensor] | None = None,
     optimizer: Optimizer | None = None,
     surrogate: Surrogate | None = None,
     steps: int = 200,
@@ -137,7 +138,7 @@ def reconstruct(
         capture: Measured data.
         parameters: Modules Scene → Scene or Radar → Radar, applied in order (``scene.parameters``).
         grid: Bins that are compared.
-        loss: How maps are compared.
+        loss: How maps are compared: (simulated, measured) → a number.
         optimizer: Kind and rates.
         surrogate: Kernels, and the extra widths at the first step.
         steps: Budget.
@@ -187,20 +188,21 @@ def reconstruct(
             "give modules such as Pose('object')"
         )
     rates = optimizer or Optimizer()
-    state = _State(rates.build(fit.modules))
+    state = _State(rates.build(fit.modules), fit.parameters())
     path = Path(checkpoint) if checkpoint is not None else None
     if resume and path is not None and path.exists():
         state.load(path, fit)
     with use_backend(backend):
         status = _descend(fit, state, rates, tolerance, path, checkpoint_every, progress)
+        status = _judged(fit, state, status)
     if path is not None:
         state.save(path, fit)
     with torch.no_grad():
         moved, seen, _ = fit.applied()
-    row = state.history[-1] if state.history else {"loss": math.nan}
-    return Reconstruction(
-        moved, seen, fit.modules, state.history, status, state.step, float(row["loss"])
-    )
+    loss_then = state.history[-1]["loss"]
+    if status == "diverged" and state.best is not None:
+        loss_then = state.best[1]
+    return Reconstruction(moved, seen, fit.modules, state.history, status, state.step, loss_then)
 
 
 @dataclass
@@ -208,6 +210,7 @@ class _State:
     """What a checkpoint holds besides the parameters."""
 
     optimizer: torch.optim.Optimizer
+    first: dict[str, Tensor]
     step: int = 0
     history: list[dict[str, Any]] = field(default_factory=list)
     best: tuple[int, float, dict[str, Tensor]] | None = None
@@ -218,8 +221,7 @@ class _State:
             first = fit.annealed(self.step) and not fit.annealed(self.best[0])
             if not first and loss >= self.best[1]:
                 return
-        kept = {k: v.detach().clone() for k, v in fit.modules.state_dict().items()}
-        self.best = (self.step, loss, kept)
+        self.best = (self.step, loss, fit.parameters())
 
     def save(self, path: Path, fit: "_Fit") -> None:
         """Write atomically: a kill leaves the last whole file."""
@@ -227,6 +229,7 @@ class _State:
         content = {
             "modules": fit.modules.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            "first": self.first,
             "step": self.step,
             "history": self.history,
             "best": self.best,
@@ -247,12 +250,12 @@ class _State:
         if content.get("key") != fit.key():
             raise InputError(
                 f"expected a checkpoint of this fit in {path}, got one of another (steps, seed, "
-                "grid or parameters differ); start without resume"
+                "grid, loss, surrogate or parameters differ); start without resume"
             )
         fit.modules.load_state_dict(content["modules"])
         self.optimizer.load_state_dict(content["optimizer"])
+        self.first, self.best = content["first"], content["best"]
         self.step, self.history = content["step"], content["history"]
-        self.best = content["best"]
 
 
 @dataclass(frozen=True)
@@ -264,7 +267,7 @@ class _Fit:
     modules: nn.ModuleList
     measured: Float[Tensor, "frame range u v"]
     grid: Grid
-    loss: SpectrumLoss
+    loss: Callable[[Tensor, Tensor], Tensor]
     surrogate: Surrogate
     annealing: float
     seed: int
@@ -279,6 +282,7 @@ class _Fit:
         """What must be equal for a checkpoint to be of this fit."""
         shapes = [[n, list(p.shape)] for n, p in self.modules.named_parameters()]
         settings = [self.annealing, self.samples, self.boundary_samples, self.frames_per_step]
+        settings += [str(self.loss), str(self.surrogate)]
         return [self.steps, self.seed, list(self.grid.shape), self.boundary, settings, shapes]
 
     def applied(self) -> tuple[Scene, Radar, Tensor | None]:
@@ -293,6 +297,10 @@ class _Fit:
             if kind == "range":
                 offset = module()
         return scene, radar, offset
+
+    def parameters(self) -> dict[str, Tensor]:
+        """A copy of the present parameters."""
+        return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
 
     def widths(self, step: int) -> Surrogate:
         """The surrogate with the extra widths of a step."""
@@ -344,11 +352,20 @@ def _descend(
     while state.step < fit.steps:
         rates.apply(state.optimizer, state.step / fit.steps)
         state.optimizer.zero_grad()
-        value = fit.evaluate(state.step)
+        try:
+            value = fit.evaluate(state.step)
+        except InputError:
+            if state.best is None:  # not lost on the way, but wrong from the start
+                raise
+            value = torch.tensor(math.nan)
         number = float(value.detach())
         if _lost(number, state.history):
-            if state.best is not None:
-                fit.modules.load_state_dict(state.best[2])
+            if state.best is None:
+                raise InputError(
+                    f"expected a finite loss at the start, got {number}; check the capture and "
+                    "the initial parameters"
+                )
+            fit.modules.load_state_dict(state.best[2])
             return "diverged"
         state.keep_if_better(number, fit)
         value.backward()
@@ -364,6 +381,25 @@ def _descend(
     return "converged" if _settled(fit, state, max(tolerance, 1e-3)) else "budget"
 
 
+def _judged(fit: _Fit, state: _State, status: Status) -> Status:
+    """The status, or ``diverged`` for a fit that ends worse than it started; the best is kept."""
+    if status == "diverged" or state.best is None:
+        return status
+    ends = {"last": fit.parameters(), "first": state.first, "best": state.best[2]}
+    losses = {}
+    with torch.no_grad():
+        for name, parameters in ends.items():
+            fit.modules.load_state_dict(parameters)
+            losses[name] = float(fit.evaluate(fit.steps))
+    if losses["last"] <= _WORSE * losses["first"]:
+        fit.modules.load_state_dict(ends["last"])
+        return status
+    kept = min(("first", "best"), key=lambda name: losses[name])
+    fit.modules.load_state_dict(ends[kept])
+    state.best = (state.step, losses[kept], ends[kept])
+    return "diverged"
+
+
 def _lost(loss: float, history: list[dict[str, Any]]) -> bool:
     return not math.isfinite(loss) or bool(history and loss > _DIVERGED * history[0]["loss"])
 
@@ -377,9 +413,9 @@ def _settled(fit: _Fit, state: _State, tolerance: float) -> bool:
     return bool(before - after < tolerance * before)
 
 
-def _values(modules: nn.ModuleList) -> dict[str, list[float] | float]:
+def _values(modules: nn.ModuleList) -> dict[str, Any]:
     """Parameters by name as plain numbers; long ones (vertices) are left to the checkpoint."""
-    rows: dict[str, list[float] | float] = {}
+    rows: dict[str, Any] = {}
     for module in modules:
         for name, value in getattr(module, "values", dict)().items():
             if value.numel() <= 16:

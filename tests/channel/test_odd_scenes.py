@@ -1,0 +1,162 @@
+"""Views of nothing, antennas in odd places, and gradients that must stay finite."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from invertwin.capture import read
+from invertwin.channel.bridge import backend, use_backend
+from invertwin.channel.deposit import deposit_power
+from invertwin.channel.tracer import trace_field, trace_power
+from invertwin.errors import InputError
+from invertwin.scene import (
+    Cosine,
+    Mesh,
+    Object,
+    PerfectConductor,
+    RoughDielectric,
+    Scene,
+    plate,
+    rigid,
+    rotation_from_vector,
+    sphere,
+)
+from scenes import GRID, float64, link, occluder, thing
+
+COUNTS: dict[str, Any] = {"samples": 2_000, "boundary_samples": 500, "seed": 0}
+BACK = rotation_from_vector(float64([0.0, math.pi, 0.0]))[None]
+
+
+def movable(scene: Scene) -> tuple[Scene, dict[str, torch.Tensor]]:
+    leaves = {name: item.vertices.clone().requires_grad_() for name, item in scene.objects.items()}
+    objects = {
+        name: Object(Mesh(leaves[name], item.mesh.faces), item.material)
+        for name, item in scene.objects.items()
+    }
+    return Scene(objects), leaves
+
+
+@pytest.mark.parametrize(
+    ("scene", "antennas"),
+    [
+        (occluder(), link(rotations=BACK, pattern=Cosine(1.0))),
+        (occluder(), link(((0.0, 0.0, -50.0),))),
+        (Scene({"plate": thing(plate(1.0, 1.0), (0, 0, 2), (0.0, math.pi / 2, 0.0))}), link()),
+        (
+            Scene({"plate": thing(plate(1.0, 1.0), (0.0, 0.0, 0.0))}),
+            link(((0.0, 0.0, -1.0),), ((0.0, 0.0, 1.0),)),
+        ),
+    ],
+    ids=["target behind the radar", "beyond the grid", "edge-on", "antennas on opposite sides"],
+)
+def test_nothing_to_see_is_zeros(scene, antennas):
+    scene, leaves = movable(scene)
+    places = antennas.tx.clone().requires_grad_()
+    out = deposit_power(scene, replace(antennas, tx=places), GRID, **COUNTS)
+    assert not out.any()
+    gradients = torch.autograd.grad(out.sum(), [*leaves.values(), places])
+    assert not any(g.any() for g in gradients)
+
+
+def test_paths_of_an_empty_view():
+    scene = Scene({"plate": thing(plate(1.0, 1.0))})
+    apart = link(((0.0, 0.0, -1.0),), ((0.0, 0.0, 1.0),))
+    assert not trace_power(scene, apart, **COUNTS).power.any()
+    assert len(trace_field(scene, apart, density=500.0, seed=0)) == 0
+    metal = scene.replace("plate", material=PerfectConductor())
+    assert len(trace_field(metal, apart, samples=100, seed=0)) == 0
+
+
+def test_inside_an_object_the_walls_are_seen():
+    """Both sides of a triangle reflect: from inside a ball every ray lands."""
+    ball = Scene({"ball": thing(sphere(1.0, subdivisions=4), material=RoughDielectric(4.0))})
+    found = deposit_power(ball, link(), GRID, samples=20_000, boundary_samples=0, seed=0)
+    beyond = deposit_power(
+        ball, link(((0.0, 0.0, -3.0),)), GRID, samples=20_000, boundary_samples=0, seed=0
+    )
+    assert float(found.sum()) > float(beyond.sum()) > 0
+
+
+def test_an_object_without_area_is_refused():
+    point = Mesh(torch.zeros(3, 3, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
+    with pytest.raises(InputError, match="expected a triangle of positive area, got none"):
+        deposit_power(Scene({"point": thing(point)}), link(), GRID, **COUNTS)
+
+
+@pytest.mark.parametrize("radius", [0.01, 0.05])
+def test_small_balls_from_a_rail_have_finite_gradients(radius):
+    """Most rays miss, and some shadows graze: neither may leave a NaN."""
+    places = torch.zeros(60, 3, dtype=torch.float64)
+    places[:, 0] = torch.linspace(-2, 2, 60)
+    scene = Scene(
+        {
+            "a": thing(sphere(radius, subdivisions=2), (0.0, 0.1, 3.0)),
+            "b": thing(sphere(radius, subdivisions=2), (0.2, 0.1, 3.4)),
+        }
+    )
+    for seed in range(8):
+        moved, leaves = movable(scene)
+        track = places.clone().requires_grad_()
+        out = deposit_power(
+            moved, link(track), GRID, samples=6_000, boundary_samples=2_000, seed=seed
+        )
+        gradients = torch.autograd.grad(out.sum(), [*leaves.values(), track])
+        assert all(torch.isfinite(g).all() for g in gradients), seed
+
+
+def test_measured_track_has_finite_gradients(data_folder):
+    """Seed 36 once gave NaN: a boundary ray in the plane of the triangle that it met."""
+    capture = read(data_folder / "rail_sar", "rail_sar", clock_offset=9.216, range_bias=0.46257)
+    survey, radar = capture.survey, capture.radar()
+    assert survey is not None
+    shift = float64([-0.6, -0.04, 0.0]).requires_grad_()
+    eye = torch.eye(3, dtype=torch.float64)
+    ball, surface = sphere(0.05, subdivisions=2), RoughDielectric(5.0)
+    places = survey[0], survey[1] + shift
+    scene = Scene(
+        {f"ball {i}": Object(ball, surface, rigid(eye, at)) for i, at in enumerate(places)}
+    )
+    grid = radar.grid(6.8, 10.2, oversample=4)
+    for seed in (0, 36):
+        out = deposit_power(
+            scene, radar.link(), grid, samples=20_000, boundary_samples=2_000, seed=seed
+        )
+        (gradient,) = torch.autograd.grad((out * grid.ranges[:, None, None]).sum(), shift)
+        assert torch.isfinite(gradient).all()
+
+
+def test_backend_by_argument_and_by_environment(monkeypatch):
+    with use_backend("cpu"):
+        assert backend() == "cpu"
+        with use_backend(None):
+            assert backend() == "cpu"
+    monkeypatch.setenv("INVERTWIN_BACKEND", "cpu")
+    assert backend() == "cpu"
+    monkeypatch.setenv("INVERTWIN_BACKEND", "gpu")
+    with pytest.raises(InputError, match="correct the argument or INVERTWIN_BACKEND"):
+        backend()
+    monkeypatch.setenv("INVERTWIN_BACKEND", "auto")
+    assert backend() in ("cpu", "cuda")
+
+
+def test_cuda_where_there_is_none(monkeypatch):
+    monkeypatch.setattr("invertwin.channel.bridge._cuda_found", lambda: False)
+    with (
+        pytest.raises(InputError, match="expected an NVIDIA GPU for backend 'cuda'"),
+        use_backend("cuda"),
+    ):
+        pass
+    assert backend() == "cpu"
+
+
+def test_a_backward_pass_runs_where_its_forward_pass_ran(monkeypatch):
+    """The choice is that of the call, not of whoever asks for the derivative later."""
+    scene, leaves = movable(occluder())
+    with use_backend("cpu"):
+        out = deposit_power(scene, link(), GRID, **COUNTS)
+    monkeypatch.setenv("INVERTWIN_BACKEND", "nowhere")
+    gradients = torch.autograd.grad(out.sum(), list(leaves.values()))
+    assert all(torch.isfinite(g).all() for g in gradients)

@@ -1,0 +1,72 @@
+"""A plate off its place before a wall, and what a radar recorded of it, by the exact chain."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from invertwin.capture import Capture
+from invertwin.channel.paths import Grid
+from invertwin.inversion import Optimizer
+from invertwin.radar import Radar, Surrogate
+from invertwin.scene import Scene, plate
+from invertwin.scene.parameters import Translation
+from invertwin.simulation import simulate
+from scenes import float64, radar, thing
+
+OFFSET = float64([0.06, 0.0, -0.09])
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene as known, a recording of the scene as it is, and cheap settings."""
+
+    scene: Scene
+    radar: Radar
+    capture: Capture
+    grid: Grid
+
+    def settings(self, **changes: Any) -> dict[str, Any]:
+        """Keyword arguments of ``reconstruct``."""
+        return {
+            "grid": self.grid,
+            "steps": 30,
+            "samples": 8_000,
+            "boundary_samples": 2_000,
+            "optimizer": Optimizer(rate=0.02),
+            "surrogate": Surrogate(range_width=2.0, angle_width=1.0),
+            "seed": 1,
+            **changes,
+        }
+
+    @property
+    def offset(self) -> Tensor:
+        """Where the plate really is, from where it is thought to be [m]."""
+        return OFFSET
+
+    def parameters(self) -> list[Translation]:
+        return [Translation("plate")]
+
+    def error(self, scene: Scene) -> Tensor:
+        """Where the plate is, against where it really is [m]."""
+        return scene["plate"].center.detach() - self.scene["plate"].center - OFFSET
+
+
+@pytest.fixture(scope="session")
+def case() -> Case:
+    places = [[x, 0.0, 0.0] for x in (-0.3, -0.1, 0.1, 0.3)]
+    scene = Scene(
+        {
+            "plate": thing(plate(0.3, 0.3), (0.0, 0.0, 1.5), (0.0, 0.1, 0.0)),
+            "wall": thing(plate(1.6, 1.2), (0.0, 0.0, 2.1)),
+        }
+    )
+    device = radar(places, receivers=16)
+    grid = device.grid(1.0, 2.4, 0.5, oversample=1)
+    with torch.no_grad():
+        true = Translation("plate", OFFSET)(scene)
+        beat = simulate(true, device, grid, density=3_000.0, seed=7).beat
+    assert beat is not None
+    return Case(scene, device, Capture.from_beat(beat, device), grid)

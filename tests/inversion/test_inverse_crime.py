@@ -1,0 +1,110 @@
+"""No fit is shown data that its own model made: signals are exact, or recorded."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from invertwin.capture import Capture
+from invertwin.cli import build
+from invertwin.cli.run_file import load_run
+from invertwin.cli.schema import SimulatedData
+from invertwin.errors import InputError
+from invertwin.radar import Surrogate
+from invertwin.simulation import simulate
+from scenes import occluder, radar
+
+ROOT = Path(__file__).resolve().parents[2]
+RUNS = sorted(file for file in (ROOT / "experiments").rglob("*.toml"))
+SCRIPTS = sorted([*(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")])
+
+
+def sources() -> dict[str, str]:
+    found = {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in SCRIPTS}
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+        found |= {f"{page.name} block {i}": block for i, block in enumerate(blocks)}
+    return {name: text for name, text in found.items() if "reconstruct(" in text}
+
+
+SOURCES = sources()
+
+
+def test_there_is_something_to_guard():
+    assert RUNS
+    assert SOURCES
+
+
+def test_a_surrogate_has_no_signal_to_fit():
+    """A capture is made of signals, and the smooth model makes none."""
+    device = radar()
+    found = simulate(
+        occluder(), device, device.grid(0.5, 2.5), seed=0, surrogate=Surrogate(), samples=1_000
+    )
+    assert found.beat is None
+    assert found.paths is None
+    assert {name for name in dir(Capture) if name.startswith("from_")} == {
+        "from_beat",
+        "from_range_profile",
+    }
+
+
+@pytest.mark.parametrize("file", RUNS, ids=[str(f.relative_to(ROOT / "experiments")) for f in RUNS])
+def test_run_files_fit_exact_or_recorded_signals(file, monkeypatch):
+    """Whatever a run file simulates as data is traced as fields, point by point."""
+    run = load_run(file)
+    if run.data is None:
+        assert run.task not in ("reconstruct", "demo")
+        return
+    if not isinstance(run.data, SimulatedData):
+        assert run.data.kind in ("capture", "rail_sar")
+        return
+    from invertwin.cli import run_simulate
+
+    class FieldsTracedError(Exception):
+        """Stops before the work is done."""
+
+    def traced(*args, **options):
+        raise FieldsTracedError
+
+    monkeypatch.setattr("invertwin.simulation.trace_field", traced)
+    assert run.radar is not None
+    assert run.grid is not None
+    device = build.radar(run.radar)
+    with pytest.raises(FieldsTracedError):
+        run_simulate.exact(run, build.true_scene(run), device, build.grid(run.grid, device))
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_scripts_fit_exact_or_recorded_signals(name):
+    """What goes into a capture was not simulated with a surrogate."""
+    tree = ast.parse(SOURCES[name])
+    smooth = {
+        target.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign)
+        and isinstance(node.value, ast.Call)
+        and any(word.arg == "surrogate" for word in node.value.keywords)
+        and ast.unparse(node.value.func).endswith("simulate")
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+    captured = [
+        ast.unparse(node)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and re.search(
+            r"(Capture\.(from_beat|from_range_profile|load)|read)$", ast.unparse(node.func)
+        )
+    ]
+    assert captured, "a fit needs a capture"
+    assert not [call for call in captured if any(re.search(rf"\b{n}\b", call) for n in smooth)]
+
+
+def test_the_guard_sees_a_crime(unchecked):
+    device = radar()
+    grid = device.grid(0.5, 2.5)
+    smooth = simulate(occluder(), device, grid, seed=0, surrogate=Surrogate(), samples=1_000)
+    with pytest.raises((InputError, TypeError, AttributeError)):
+        Capture.from_beat(smooth.beat, device)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,310 @@
+"""The loop: it finds a small displacement, can be interrupted, and says why it stopped."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from invertwin.errors import InputError
+from invertwin.inversion import Optimizer, Reconstruction, SpectrumLoss, reconstruct
+from invertwin.inversion.regularization import Laplacian
+from invertwin.scene import Scene
+from invertwin.scene.parameters import RadarPose, Translation, Vertices
+
+FAST: dict[str, Any] = {"steps": 4, "samples": 2_000, "boundary_samples": 500}
+
+
+def moved(fit: Reconstruction) -> torch.Tensor:
+    """The translation that was found."""
+    return fit.parameters.state_dict()["0.translation"]
+
+
+class InterruptError(Exception):
+    """Stands for whatever ends a run."""
+
+
+@pytest.mark.parametrize("kind", ["mse", "likelihood"])
+def test_a_displaced_plate_is_found(case, kind):
+    found = reconstruct(
+        case.scene,
+        case.radar,
+        case.capture,
+        case.parameters(),
+        loss=SpectrumLoss(kind=kind),
+        **case.settings(steps=60),
+    )
+    assert found.status in ("budget", "converged")
+    error = case.error(found.scene)
+    assert float(case.error(case.scene).norm()) > 0.1
+    assert float(error[[0, 2]].norm()) < 0.02
+    assert len(found.history) == found.steps == 60
+    assert set(found.history[0]) >= {"step", "loss", "values"}
+    assert found.history[-1]["values"].keys() == {"plate.translation"}
+
+
+def test_momentum_finds_it_too(case):
+    found = reconstruct(
+        case.scene,
+        case.radar,
+        case.capture,
+        case.parameters(),
+        **case.settings(steps=60, optimizer=Optimizer("sgd", rate=2e-3, momentum=0.8)),
+    )
+    assert float(case.error(found.scene)[2].abs()) < 0.03
+
+
+def test_the_radar_is_found_as_well(case):
+    """A radar off its place, before a plate at its own: the same displacement, mirrored."""
+    found = reconstruct(
+        case.scene, case.radar, case.capture, [RadarPose()], **case.settings(steps=10)
+    )
+    assert not torch.equal(found.radar.positions, case.radar.positions)
+    assert found.scene["plate"].center.equal(case.scene["plate"].center)
+
+
+def test_same_seed_same_fit(case):
+    fits = [
+        reconstruct(
+            case.scene, case.radar, case.capture, case.parameters(), **case.settings(**FAST)
+        )
+        for _ in range(2)
+    ]
+    first, second = (moved(fit) for fit in fits)
+    assert torch.allclose(first, second, rtol=1e-4)
+
+
+def test_an_interrupted_run_resumes_to_the_same_result(case, tmp_path):
+    whole = reconstruct(
+        case.scene, case.radar, case.capture, case.parameters(), **case.settings(steps=12)
+    )
+
+    def stop(row):
+        if row["step"] == 7:
+            raise InterruptError
+
+    settings = case.settings(steps=12, checkpoint=tmp_path / "fit.pt", checkpoint_every=3)
+    with pytest.raises(InterruptError):
+        reconstruct(
+            case.scene, case.radar, case.capture, case.parameters(), progress=stop, **settings
+        )
+    resumed = reconstruct(
+        case.scene, case.radar, case.capture, case.parameters(), resume=True, **settings
+    )
+    assert [row["step"] for row in resumed.history] == list(range(12))
+    assert torch.allclose(moved(resumed), moved(whole), rtol=1e-4, atol=0)
+    # A finished run has nothing left to do.
+    again = reconstruct(
+        case.scene, case.radar, case.capture, case.parameters(), resume=True, **settings
+    )
+    assert torch.equal(moved(again), moved(resumed))
+    assert again.steps == 12
+
+
+SCRIPT = """
+import sys, time, torch
+from invertwin.capture import Capture
+from invertwin.inversion import Optimizer, reconstruct
+from invertwin.radar import Surrogate
+from invertwin.scene.parameters import Translation
+from scenes import thing
+from invertwin.scene import Scene, plate
+
+folder, resume = sys.argv[1], sys.argv[2] == "resume"
+capture = Capture.load(folder + "/data.nc")
+radar = capture.radar()
+scene = Scene({
+    "plate": thing(plate(0.3, 0.3), (0.0, 0.0, 1.5), (0.0, 0.1, 0.0)),
+    "wall": thing(plate(1.6, 1.2), (0.0, 0.0, 2.1)),
+})
+
+def slowly(row):
+    print(row["step"], flush=True)
+    if not resume:
+        time.sleep(0.2)
+
+fit = reconstruct(
+    scene, radar, capture, [Translation("plate")], grid=radar.grid(1.0, 2.4, 0.5, oversample=1),
+    steps=12, samples=8_000, boundary_samples=2_000, optimizer=Optimizer(rate=0.02),
+    surrogate=Surrogate(range_width=2.0, angle_width=1.0), seed=1,
+    checkpoint=folder + "/fit.pt", checkpoint_every=2, resume=resume, progress=slowly,
+)
+torch.save(fit.parameters[0].translation.detach(), folder + "/result.pt")
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_process_resumes_to_the_same_result(case, tmp_path):
+    case.capture.save(tmp_path / "data.nc")
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path)]
+    with subprocess.Popen(
+        [*command, "first"], env=environment, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.strip() == "6":
+                time.sleep(0.05)
+                process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert not (tmp_path / "result.pt").exists()
+    subprocess.run([*command, "resume"], env=environment, check=True, capture_output=True)
+    whole = reconstruct(
+        case.scene, case.radar, case.capture, case.parameters(), **case.settings(steps=12)
+    )
+    found = torch.load(tmp_path / "result.pt", weights_only=True)
+    assert torch.allclose(found, moved(whole), rtol=1e-4, atol=0)
+
+
+def test_checkpoints_of_other_fits_and_broken_ones_are_refused(case, tmp_path):
+    path = tmp_path / "fit.pt"
+    settings = case.settings(**FAST, checkpoint=path)
+    reconstruct(case.scene, case.radar, case.capture, case.parameters(), **settings)
+    for changes in ({"seed": 2}, {"steps": 5}, {"loss": SpectrumLoss("likelihood")}):
+        with pytest.raises(InputError, match=r"expected a checkpoint of this fit in .*fit\.pt"):
+            reconstruct(
+                case.scene,
+                case.radar,
+                case.capture,
+                case.parameters(),
+                **{**settings, **changes},
+                resume=True,
+            )
+    other = [Translation("plate"), RadarPose()]
+    with pytest.raises(InputError, match="one of another"):
+        reconstruct(case.scene, case.radar, case.capture, other, **settings, resume=True)
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(InputError, match="that cannot be read"):
+        reconstruct(
+            case.scene, case.radar, case.capture, case.parameters(), **settings, resume=True
+        )
+
+
+class Breaks(nn.Module):
+    """A translation that breaks the scene, or its gradient, after some steps."""
+
+    def __init__(self, how: str, after: int) -> None:
+        super().__init__()
+        self.inner, self.how, self.left = Translation("plate"), how, after
+
+    def forward(self, scene: Scene) -> Scene:
+        self.left -= 1
+        if self.left == -1 and self.how == "scene":
+            return scene.replace("plate", pose=torch.full((4, 4), torch.nan, dtype=torch.float64))
+        if self.left == -1:
+            self.inner.translation.data.fill_(torch.nan)
+        return self.inner(scene)
+
+
+@pytest.mark.parametrize("how", ["scene", "parameter"])
+def test_a_step_that_breaks_is_divergence_and_the_best_state_stays(case, how):
+    module = Breaks(how, after=5)
+    settings = case.settings(**FAST | {"steps": 9})
+    module_scene = module.inner
+    found = reconstruct(case.scene, case.radar, case.capture, [module], **settings)
+    assert found.status == "diverged"
+    assert found.steps == len(found.history) == 5
+    assert torch.isfinite(module_scene.translation).all()
+    assert found.loss == min(row["loss"] for row in found.history)
+
+
+def test_a_rate_far_too_large_diverges_to_the_best_state(case):
+    found = reconstruct(
+        case.scene,
+        case.radar,
+        case.capture,
+        [Vertices("plate", 4)],
+        regularizers=[Laplacian(case.scene, "plate", 1.0)],
+        **case.settings(steps=8, optimizer=Optimizer(rate=50.0), boundary_samples=500),
+    )
+    assert found.status == "diverged"
+    assert found.steps < 8
+    assert not found.parameters.state_dict()["0.offsets"].any()
+    assert found.loss == found.history[0]["loss"]
+
+
+def test_a_loss_that_settles_is_convergence(case):
+    """Started at the truth, with nothing to gain: it stops long before the budget."""
+    found = reconstruct(
+        case.scene,
+        case.radar,
+        case.capture,
+        [Translation("plate", case.offset)],
+        tolerance=0.05,
+        annealing=0.0,
+        **case.settings(steps=200, samples=4_000, optimizer=Optimizer(rate=1e-4)),
+    )
+    assert found.status == "converged"
+    assert found.steps < 200
+
+
+def test_few_steps_are_a_spent_budget(case):
+    found = reconstruct(
+        case.scene, case.radar, case.capture, case.parameters(), **case.settings(**FAST)
+    )
+    assert found.status == "budget"
+    assert found.steps == 4
+
+
+def test_subsets_of_frames(case, monkeypatch):
+    """Every step takes another few frames; over the steps all have their turn."""
+    from invertwin.inversion import reconstruction
+
+    seen = []
+    true = reconstruction.surrogate_spectrum
+
+    def spy(scene, radar, *rest, **options):
+        seen.append(radar.positions[:, 0].tolist())
+        return true(scene, radar, *rest, **options)
+
+    monkeypatch.setattr(reconstruction, "surrogate_spectrum", spy)
+    reconstruct(
+        case.scene,
+        case.radar,
+        case.capture,
+        case.parameters(),
+        frames_per_step=2,
+        **case.settings(**FAST | {"steps": 8}),
+    )
+    assert all(len(frames) == 2 for frames in seen)
+    assert {x for frames in seen for x in frames} == set(case.radar.positions[:, 0].tolist())
+
+
+def test_without_boundary_the_steps_differ(case):
+    fits = [
+        reconstruct(
+            case.scene,
+            case.radar,
+            case.capture,
+            case.parameters(),
+            boundary=boundary,
+            **case.settings(**FAST),
+        )
+        for boundary in (True, False)
+    ]
+    first, second = (moved(fit) for fit in fits)
+    assert not torch.allclose(first, second, rtol=1e-3)
+
+
+def test_nothing_to_fit_is_refused(case):
+    frozen = Translation("plate").requires_grad_(False)
+    for modules, changes in (([], {}), ([frozen], {}), (case.parameters(), {"steps": 0})):
+        with pytest.raises(InputError, match="expected parameters to fit and steps >= 1"):
+            reconstruct(case.scene, case.radar, case.capture, modules, **case.settings(**changes))
+
+
+def test_an_unknown_object_is_the_users_mistake_not_divergence(case):
+    with pytest.raises(InputError, match="got 'plane'"):
+        reconstruct(case.scene, case.radar, case.capture, [Translation("plane")], **case.settings())
+
+
+@pytest.mark.parametrize("options", [{"kind": "lbfgs"}, {"rate": 0.0}])
+def test_bad_optimizers_are_named(options, unchecked):
+    with pytest.raises(InputError, match="expected kind 'adam' or 'sgd' and rate > 0"):
+        Optimizer(**options)
