@@ -32,9 +32,9 @@ class OnTheFloor(torch.nn.Module):
         return scene.replace("letter", pose=pose)
 
 
-paint, straight = RoughDielectric(permittivity=4.0), torch.eye(3)
-letter = iw.Object(text("A"), paint, rigid(straight, torch.tensor([0.0, 0.0, 2.5])))
-wall = iw.Object(plate(3.0, 2.4), paint, rigid(straight, torch.tensor([0.0, 0.0, 3.3])))
+paint = RoughDielectric(permittivity=4.0)
+letter = iw.Object(text("A"), paint, rigid(translation=[0.0, 0.0, 2.5]))
+wall = iw.Object(plate(3.0, 2.4), paint, rigid(translation=[0.0, 0.0, 3.3]))
 start = iw.Scene({"letter": letter, "wall": wall})
 hidden = OnTheFloor(x=0.25, z=-0.15, yaw=0.3)
 

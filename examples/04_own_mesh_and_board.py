@@ -23,7 +23,7 @@ else:  # no mesh given: make one, as another program would
 
 # OBJ, PLY, STL or glTF; metres. The file's origin goes to (0.4, 0, 2) m.
 mesh = iw.load_mesh(file)
-ball = iw.Object(mesh, PerfectConductor(), rigid(torch.eye(3), torch.tensor([0.4, 0.0, 2.0])))
+ball = iw.Object(mesh, PerfectConductor(), rigid(translation=[0.4, 0.0, 2.0]))
 scene = iw.Scene({"ball": ball})
 
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=60e-6, samples=256)

@@ -30,6 +30,7 @@ from invertwin.scene import (
     Scene,
     Table,
     linear_array,
+    look_at,
     planar_array,
     rigid,
     rotation_angle,
@@ -239,16 +240,8 @@ def _rotations(table: schema.Orientation, positions: Tensor) -> Tensor:
     if isinstance(table, schema.Turned):
         turn = rotation_from_vector(torch.deg2rad(_float64(table.rotation_deg)))
         return turn.expand(len(positions), 3, 3).clone()
-    boresight = _float64(table.look_at) - positions
-    right = torch.linalg.cross(_float64([[0.0, 1.0, 0.0]]).expand_as(boresight), boresight)
-    if bool((right.norm(dim=1) < 1e-6 * (1 + boresight.norm(dim=1))).any()):
-        raise InputError(
-            "radar.orientation.look_at: expected a point that is not straight above or below a "
-            f"radar position, got {table.look_at}; move it or use rotation_deg"
-        )
-    boresight = boresight / boresight.norm(dim=1, keepdim=True)
-    right = right / right.norm(dim=1, keepdim=True)
-    return torch.stack([right, torch.linalg.cross(boresight, right), boresight], dim=-1)
+    with about("radar.orientation.look_at"):
+        return look_at(positions, table.look_at)
 
 
 def grid(table: schema.Grid, radar: Radar) -> Grid:
@@ -303,14 +296,10 @@ def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Modu
     for i, table in enumerate(tables):
         match table:
             case schema.TranslationParameter():
-                moved = Translation(table.object)
-                _only(moved.translation, table.axes)
-                modules.append(moved)
+                modules.append(Translation(table.object, axes="".join(table.axes)))
             case schema.PoseParameter():
-                posed = Pose(table.object)
-                _only(posed.translation, table.axes)
-                _only(posed.rotation, table.rotation_axes)
-                modules.append(posed)
+                axes, turns = "".join(table.axes), "".join(table.rotation_axes)
+                modules.append(Pose(table.object, axes=axes, rotation_axes=turns))
             case schema.ScaleParameter():
                 modules.append(Scale(table.object))
             case schema.VerticesParameter():
@@ -330,14 +319,6 @@ def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Modu
             case schema.RadarParameter():
                 modules.append(RadarPose())
     return modules
-
-
-def _only(parameter: nn.Parameter, axes: Sequence[str]) -> None:
-    """Keeps a parameter still along the world axes that are not sought."""
-    mask = torch.ones_like(parameter)
-    mask[-3:] = _float64([axis in axes for axis in "xyz"])
-    if not bool(mask.all()):
-        parameter.register_hook(lambda gradient: gradient * mask)
 
 
 def regularizers(tables: Sequence[schema.Parameter], scene: Scene) -> list[Laplacian]:

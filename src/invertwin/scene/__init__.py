@@ -31,6 +31,7 @@ from invertwin.scene.parameters import (
 )
 from invertwin.scene.pose import (
     compose,
+    look_at,
     quaternion_from_vector,
     rigid,
     rotation_angle,
@@ -70,6 +71,7 @@ __all__ = [
     "linear_array",
     "load_mesh",
     "load_scene_xml",
+    "look_at",
     "planar_array",
     "plate",
     "quaternion_from_vector",

@@ -37,19 +37,25 @@ class Translation(nn.Module):
 
     applies_to = "scene"
 
-    def __init__(self, object: str, initial: ArrayLike = ORIGIN) -> None:
+    def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: str = "xyz") -> None:
         """Move `object`, by `initial` [m] at the start.
 
+        Args:
+            object: name of the object.
+            initial: [m].
+            axes: world axes along which the fit may move it; the others keep their values.
+
         Raises:
-            InputError: `initial` is not three finite numbers.
+            InputError: `initial` is not three finite numbers, or an unknown axis.
         """
         super().__init__()
         self.object = object
         self.translation = nn.Parameter(_vector(initial, "initial translation [m]"))
+        self._axes = _checked_axes(axes)
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the object moved."""
-        motion = rigid(torch.eye(3, dtype=torch.float64), self.translation)
+        motion = rigid(translation=_sought(self.translation, self._axes))
         return scene.replace(self.object, pose=compose(scene[self.object].transform, motion))
 
     def values(self) -> dict[str, Tensor]:
@@ -60,10 +66,13 @@ class Translation(nn.Module):
 class _Motion(nn.Module):
     """A translation and a rotation without singularities: quaternion ∝ (w, r/2)."""
 
-    def __init__(self, translation: ArrayLike, rotation: ArrayLike) -> None:
+    def __init__(
+        self, translation: ArrayLike, rotation: ArrayLike, axes: str, rotation_axes: str
+    ) -> None:
         super().__init__()
         self.translation = nn.Parameter(_vector(translation, "initial translation [m]"))
         self.rotation = nn.Parameter(_rotation_numbers(rotation))
+        self._axes, self._rotation_axes = _checked_axes(axes), _checked_axes(rotation_axes)
 
     @property
     def rotation_matrix(self) -> Float64[Tensor, "3 3"]:
@@ -71,10 +80,16 @@ class _Motion(nn.Module):
         return rotation_from_quaternion(self._quaternion)
 
     @property
+    def shift(self) -> Float64[Tensor, "3"]:
+        """The translation [m], with a derivative along the axes that are sought."""
+        return _sought(self.translation, self._axes)
+
+    @property
     def _quaternion(self) -> Tensor:
         # Halving r makes (1, r) the rotation vector r [rad] to first order, so that one learning
         # rate in rad serves all components.
-        return self.rotation * self.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
+        halves = self.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
+        return _sought(self.rotation, self._rotation_axes) * halves
 
     def _named_values(self, name: str) -> dict[str, Tensor]:
         return {
@@ -100,6 +115,8 @@ class Pose(_Motion):
         object: str,
         translation: ArrayLike = ORIGIN,
         rotation: ArrayLike = ORIGIN,
+        axes: str = "xyz",
+        rotation_axes: str = "xyz",
     ) -> None:
         """Move `object`, from these values at the start.
 
@@ -107,18 +124,20 @@ class Pose(_Motion):
             object: name of the object.
             translation: [m].
             rotation: rotation vector of any angle [3] (rad), or q itself [4].
+            axes: world axes along which the fit may move it.
+            rotation_axes: components of the rotation vector that the fit may change.
 
         Raises:
-            InputError: wrong shapes, NaN, or q = 0.
+            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
         """
-        super().__init__(translation, rotation)
+        super().__init__(translation, rotation, axes, rotation_axes)
         self.object = object
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the object moved."""
         before = scene[self.object]
         rotation, center = self.rotation_matrix, before.center
-        motion = rigid(rotation, self.translation + center - rotation @ center)
+        motion = rigid(rotation, self.shift + center - rotation @ center)
         return scene.replace(self.object, pose=compose(before.transform, motion))
 
     def values(self) -> dict[str, Tensor]:
@@ -287,21 +306,29 @@ class RadarPose(_Motion):
 
     applies_to = "radar"
 
-    def __init__(self, translation: ArrayLike = ORIGIN, rotation: ArrayLike = ORIGIN) -> None:
+    def __init__(
+        self,
+        translation: ArrayLike = ORIGIN,
+        rotation: ArrayLike = ORIGIN,
+        axes: str = "xyz",
+        rotation_axes: str = "xyz",
+    ) -> None:
         """Move the radar, from these values at the start.
 
         Args:
             translation: [m].
             rotation: rotation vector of any angle [3] (rad), or q itself [4].
+            axes: world axes along which the fit may move it.
+            rotation_axes: components of the rotation vector that the fit may change.
 
         Raises:
-            InputError: wrong shapes, NaN, or q = 0.
+            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
         """
-        super().__init__(translation, rotation)
+        super().__init__(translation, rotation, axes, rotation_axes)
 
     def forward(self, radar: _Movable) -> Any:
         """The radar, moved."""
-        return radar.moved(self.rotation_matrix, self.translation)
+        return radar.moved(self.rotation_matrix, self.shift)
 
     def values(self) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] by name, for progress and reports."""
@@ -387,6 +414,19 @@ def _unbounded(name: str, value: float) -> Tensor:
 
 def _applies_to(module: nn.Module) -> str:
     return getattr(module, "applies_to", "scene")
+
+
+def _checked_axes(axes: str) -> str:
+    if set(axes) - set("xyz"):
+        raise InputError(f"expected axes among x, y and z, got {axes!r}; write them as 'xy'")
+    return axes
+
+
+def _sought(parameter: Tensor, axes: str) -> Tensor:
+    """The parameter, with no derivative in its last three numbers along the other axes."""
+    mask = torch.ones_like(parameter)
+    mask[-3:] = torch.tensor([float(axis in axes) for axis in "xyz"])
+    return parameter * mask + parameter.detach() * (1 - mask)
 
 
 def _vector(value: ArrayLike, what: str) -> Tensor:

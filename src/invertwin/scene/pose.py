@@ -1,12 +1,14 @@
 """Rotations and rigid transforms as matrices, differentiable and without singularities."""
 
+from collections.abc import Sequence
 from functools import reduce
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_tensor
 
 
 def quaternion_from_vector(vector: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
@@ -65,10 +67,46 @@ def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
     return torch.atan2(sine, trace - 1)
 
 
-def rigid(rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """The transform x → rotation x + translation [m] as a matrix."""
-    top = torch.cat([rotation, translation[:, None]], dim=1)
+def rigid(
+    rotation: Float[Tensor, "3 3"] | None = None,
+    translation: ArrayLike = (0.0, 0.0, 0.0),
+) -> Float[Tensor, "4 4"]:
+    """The transform x → rotation x + translation [m] as a matrix; no rotation where None.
+
+    Raises:
+        InputError: wrong shapes, or NaN.
+    """
+    moved = checked_tensor(translation, (3,), "translation [m]", "give x, y, z")
+    turned = torch.eye(3, dtype=torch.float64) if rotation is None else rotation
+    turned = checked_tensor(turned, (3, 3), "rotation", "give a 3 × 3 matrix")
+    top = torch.cat([turned, moved[:, None]], dim=1)
     return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])], dim=0)
+
+
+def look_at(
+    positions: Float[Tensor, "n 3"] | Sequence[Sequence[float]], target: ArrayLike
+) -> Float64[Tensor, "n 3 3"]:
+    """Rotations whose boresight (third column) points at a target, x level, y upwards.
+
+    Args:
+        positions: where the radar is [m].
+        target: what it looks at [m].
+
+    Raises:
+        InputError: wrong shapes, NaN, or a target straight above or below a position.
+    """
+    places = checked_tensor(positions, (None, 3), "positions [m]", "give x, y, z of each")
+    aim = checked_tensor(target, (3,), "target [m]", "give x, y, z")
+    boresight = aim - places
+    right = torch.linalg.cross(boresight.new_tensor([[0.0, 1.0, 0.0]]), boresight)
+    if bool((right.norm(dim=1) < 1e-6 * (1 + boresight.norm(dim=1))).any()):
+        raise InputError(
+            "expected a target that is not straight above or below a position, got "
+            f"{aim.tolist()}; move it or give rotations"
+        )
+    boresight = boresight / boresight.norm(dim=1, keepdim=True)
+    right = right / right.norm(dim=1, keepdim=True)
+    return torch.stack([right, torch.linalg.cross(boresight, right), boresight], dim=-1)
 
 
 def compose(*transforms: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

@@ -72,17 +72,17 @@ class Object:
         return self._to_world(self.mesh.center)
 
     def at(self, time: float) -> "Object":
-        """The object after moving with its velocity for `time` [s]."""
+        """The object after moving with its velocity for `time` [s], as an instant: at rest."""
         checked_number(time, "time [s]", -torch.inf)
         if self.velocity is None:
             return self
         if self.velocity.ndim == 1:
-            motion = rigid(torch.eye(3, dtype=torch.float64), self.velocity * time)
-            return replace(self, pose=compose(self.transform, motion))
+            motion = rigid(translation=self.velocity * time)
+            return replace(self, pose=compose(self.transform, motion), velocity=None)
         # Velocities are world vectors; row vectors times R turn them into the object's frame.
         offsets = self.velocity * time @ self.transform[:3, :3]
         mesh = Mesh(self.mesh.vertices + offsets, self.mesh.faces)
-        return replace(self, mesh=mesh)
+        return replace(self, mesh=mesh, velocity=None)
 
     def _to_world(self, points: Tensor) -> Tensor:
         if self.pose is None:
