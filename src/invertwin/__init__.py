@@ -28,6 +28,7 @@ _MENU = {
     "load_mesh": "scene.files",
     "reconstruct": "inversion.reconstruction",
     "simulate": "simulation",
+    "simulate_chirps": "simulation",
 }
 
 __all__ = ["__version__", *_MENU, *_ROOMS]  # pyright: ignore[reportUnsupportedDunderAll]

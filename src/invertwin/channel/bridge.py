@@ -113,6 +113,7 @@ class Geometry:
         has_lobe: Whether any lobe has weight, or a derivative that could give it some.
         coherent: Per object, whether its field paths have a deterministic phase.
         topology: What depends on the connectivity only.
+        velocities: World velocities of the vertices [m/s]; None = all at rest.
     """
 
     vertices: Float64[Tensor, "v 3"]
@@ -125,6 +126,7 @@ class Geometry:
     has_lobe: bool
     coherent: tuple[bool, ...]
     topology: "Topology"
+    velocities: Float64[Tensor, "v 3"] | None = None
 
     def corners(self, faces: Int64[Tensor, " n"]) -> tuple[Tensor, Tensor, Tensor]:
         """The three corners of the given triangles, ``[n, 3]`` each."""
@@ -139,18 +141,27 @@ def differentiated(value: Tensor | None) -> bool:
     return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None
 
 
-def flatten(scene: Scene, wavelength: float) -> Geometry:
+def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geometry:
     """All objects of a scene in one set of tables.
 
+    Args:
+        scene: Its objects.
+        wavelength: [m].
+        in_motion: Whether objects may move; their velocities are kept then.
+
     Raises:
-        InputError: An object in motion: a frame is one instant.
+        InputError: An object in motion where a frame is one instant, or a derivative with
+            respect to a velocity.
     """
     objects = list(scene.objects.values())
-    moving = [n for n, o in scene.objects.items() if differentiated(o.velocity) or _moves(o)]
-    if moving:
+    moving = [n for n, o in scene.objects.items() if _moves(o)]
+    differentiable = [n for n, o in scene.objects.items() if differentiated(o.velocity)]
+    if differentiable or (moving and not in_motion):
+        names = ", ".join(differentiable or moving)
+        what = "no derivatives by velocities, got" if differentiable else "objects at rest, got"
         raise InputError(
-            f"expected objects at rest, got velocities on {', '.join(moving)}; a frame is one "
-            "instant: use scene.at(time), then scene.replace(name, velocity=None)"
+            f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time), "
+            "or simulate_chirps for motion within a frame"
         )
     faces, owners, offset = [], [], 0
     for index, item in enumerate(objects):
@@ -177,11 +188,18 @@ def flatten(scene: Scene, wavelength: float) -> Geometry:
         has_lobe=bool(lobe.any()) or differentiated(lobe),
         coherent=tuple(item.material.coherent for item in objects),
         topology=topology,
+        velocities=torch.cat([_velocities(item) for item in objects]) if moving else None,
     )
 
 
 def _moves(item: Object) -> bool:
     return item.velocity is not None and bool(item.velocity.any())
+
+
+def _velocities(item: Object) -> Tensor:
+    """World velocity of every vertex [m/s]."""
+    still = torch.zeros(len(item.mesh.vertices), 3, dtype=torch.float64)
+    return still if item.velocity is None else still + item.velocity
 
 
 class Topology:

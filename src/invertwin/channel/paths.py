@@ -135,6 +135,7 @@ class Paths:
         kind: ``power``, ``coherent``, ``rough`` or ``field`` (a mixture of the last two).
         boundary: Which rows are boundary paths: zero in value, with the derivative of a moving
             shadow edge (derivations §3).
+        velocity: World velocity of the scattering point [m/s]; None = at rest.
     """
 
     frame: Int64[Tensor, " path"]
@@ -145,6 +146,7 @@ class Paths:
     last: Float64[Tensor, "path 3"]
     kind: str
     boundary: Bool[Tensor, " path"]
+    velocity: Float64[Tensor, "path 3"] | None = None
 
     def __len__(self) -> int:
         return self.delay.shape[0]
@@ -155,6 +157,14 @@ class Paths:
         return 0.5 * SPEED_OF_LIGHT * self.delay
 
     def __add__(self, other: "Paths") -> "Paths":
-        names = [f.name for f in fields(self) if f.name != "kind"]
+        names = [f.name for f in fields(self) if f.name not in ("kind", "velocity")]
         joined = {n: torch.cat([getattr(self, n), getattr(other, n)]) for n in names}
-        return Paths(**joined, kind=self.kind if self.kind == other.kind else "field")
+        velocity = None
+        if self.velocity is not None or other.velocity is not None:
+            rows = [
+                torch.zeros_like(p.last) if p.velocity is None else p.velocity
+                for p in (self, other)
+            ]
+            velocity = torch.cat(rows)
+        kind = self.kind if self.kind == other.kind else "field"
+        return Paths(**joined, kind=kind, velocity=velocity)

@@ -96,6 +96,14 @@ class _Points:
     def keep(self, mask: Bool[Tensor, " n"]) -> "_Points":
         return _Points(*(column[mask] for column in vars(self).values()))
 
+    def velocity(self, geometry: Geometry) -> Tensor | None:
+        """World velocity of the points [m/s]."""
+        if geometry.velocities is None:
+            return None
+        v0, v1, v2 = (geometry.velocities[geometry.faces[self.face, k]] for k in range(3))
+        b1, b2 = self.b1[:, None], self.b2[:, None]
+        return v0 * (1 - b1 - b2) + v1 * b1 + v2 * b2
+
     def place(self, geometry: Geometry) -> tuple[Tensor, Tensor, Tensor]:
         """Attached position, unit normal, and Jacobian of the area."""
         p0, p1, p2 = geometry.corners(self.face)
@@ -257,7 +265,7 @@ def trace_field(
             ``boundary`` off to accept fixed visibility.
     """
     with use_backend(backend):
-        geometry = flatten(scene, link.wavelength)
+        geometry = flatten(scene, link.wavelength, in_motion=True)
         shot = Shot(geometry, link)
         parts = []
         if any(geometry.coherent):
@@ -317,7 +325,14 @@ def _coherent(geometry: Geometry, link: Link, shot: Shot, samples: int, seed: in
     points, position, normal, jacobian = _seen(geometry, link, shot, points)
     found = view(geometry, link, points.frame, points.face, position, normal)
     coefficient = found.mirror * (jacobian * points.weight)
-    return _paths(points.frame, found.length, position, "coherent", coefficient=coefficient)
+    return _paths(
+        points.frame,
+        found.length,
+        position,
+        "coherent",
+        coefficient=coefficient,
+        velocity=points.velocity(geometry),
+    )
 
 
 def _rough(geometry: Geometry, link: Link, shot: Shot, fixed: RoughPoints) -> Paths:
@@ -334,7 +349,14 @@ def _rough(geometry: Geometry, link: Link, shot: Shot, fixed: RoughPoints) -> Pa
     found = view(geometry, link, points.frame, points.face, position, normal)
     amplitude = (found.power * jacobian / fixed.density).sqrt()
     coefficient = torch.polar(amplitude, points.weight)
-    return _paths(points.frame, found.length, position, "rough", coefficient=coefficient)
+    return _paths(
+        points.frame,
+        found.length,
+        position,
+        "rough",
+        coefficient=coefficient,
+        velocity=points.velocity(geometry),
+    )
 
 
 def _seen(
@@ -394,6 +416,7 @@ def _paths(
     power: Tensor | None = None,
     coefficient: Tensor | None = None,
     boundary: bool = False,
+    velocity: Tensor | None = None,
 ) -> Paths:
     count = len(frame)
     return Paths(
@@ -407,4 +430,5 @@ def _paths(
         last=position,
         kind=kind,
         boundary=torch.full((count,), boundary),
+        velocity=velocity,
     )

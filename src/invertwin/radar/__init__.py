@@ -1,5 +1,6 @@
 """Channel to radar data: the exact signal chain and its smooth surrogate, in plain torch."""
 
+from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.range_profile import add_noise, beat_signal, range_profile
 from invertwin.radar.spectrum import beamform, exact_spectrum
 from invertwin.radar.surrogate import Surrogate, airy, normalized_gaussian, surrogate_spectrum
@@ -7,6 +8,7 @@ from invertwin.radar.waveform import FMCW, Impulse, PhysicsWarning, Radar
 
 __all__ = [
     "FMCW",
+    "Chirps",
     "Impulse",
     "PhysicsWarning",
     "Radar",
@@ -16,6 +18,7 @@ __all__ = [
     "beamform",
     "beat_signal",
     "exact_spectrum",
+    "moving_beat",
     "normalized_gaussian",
     "range_profile",
     "surrogate_spectrum",
