@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from jaxtyping import config, install_import_hook
 
-# Before torch, Dr.Jit and matplotlib are imported: few threads, no display.
-os.environ.setdefault("OMP_NUM_THREADS", str(min(2, os.cpu_count() or 1)))
+# Before torch, Dr.Jit and matplotlib are imported: no display, and one thread for torch, whose
+# operations here are small. On a busy machine two threads that wait for each other cost eightfold.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 # Shape annotations are executed in tests only; users pay nothing for them. The numeric tower of
