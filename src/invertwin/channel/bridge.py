@@ -160,8 +160,8 @@ def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geom
         names = ", ".join(differentiable or moving)
         what = "no derivatives by velocities, got" if differentiable else "objects at rest, got"
         raise InputError(
-            f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time), "
-            "or simulate_chirps for motion within a frame"
+            f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time) "
+            "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
         )
     faces, owners, offset = [], [], 0
     for index, item in enumerate(objects):
