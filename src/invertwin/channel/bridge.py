@@ -67,6 +67,20 @@ def use_backend(name: str | None) -> Iterator[None]:
         _chosen.pop()
 
 
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Keep torch to one thread inside a ``with`` block.
+
+    What it does here is small, and its idle threads would spin on the cores that trace rays.
+    """
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+
+
 def tracer() -> Any:
     """The ``mitsuba`` module, set to the backend in force."""
     name = backend()

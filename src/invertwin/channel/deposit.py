@@ -20,6 +20,7 @@ from invertwin.channel.bridge import (
     Geometry,
     differentiated,
     flatten,
+    one_torch_thread,
     opaque,
     to_float,
     to_torch,
@@ -87,7 +88,7 @@ def deposit_power(
         )
     if sampling not in ("rays", "area"):
         raise InputError(f"expected sampling 'rays' or 'area', got {sampling!r}; choose one")
-    with use_backend(backend):
+    with use_backend(backend), one_torch_thread():
         geometry = flatten(scene, link.wavelength)
         settings = _Settings(
             geometry=geometry,
@@ -240,7 +241,7 @@ class _Deposit(torch.autograd.Function):
         import drjit as dr
 
         trace: _Trace = ctx.trace
-        with use_backend(trace.settings.backend):
+        with use_backend(trace.settings.backend), one_torch_thread():
             wanted = [n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[1:], strict=True) if w]
             plain = trace.inputs()
             tables = {name: type(plain.tx)(getattr(plain, name)) for name in wanted}
@@ -273,7 +274,7 @@ class _Deposit(torch.autograd.Function):
 
         mi = tracer()
         trace: _Trace = ctx.trace
-        with use_backend(trace.settings.backend):
+        with use_backend(trace.settings.backend), one_torch_thread():
             plain = trace.inputs()
             given = {
                 name: tangent
