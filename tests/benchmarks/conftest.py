@@ -1,0 +1,20 @@
+"""The benchmark scripts as modules."""
+
+import importlib
+from types import ModuleType
+
+import pytest
+
+
+@pytest.fixture
+def basin(repository, monkeypatch) -> ModuleType:
+    """`benchmarks/basin.py`."""
+    monkeypatch.syspath_prepend(repository / "benchmarks")
+    return importlib.import_module("basin")
+
+
+@pytest.fixture
+def throughput(repository, monkeypatch) -> ModuleType:
+    """`benchmarks/throughput.py`."""
+    monkeypatch.syspath_prepend(repository / "benchmarks")
+    return importlib.import_module("throughput")
