@@ -12,9 +12,11 @@ from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar import (
     FMCW,
+    OFDM,
     Impulse,
     PhysicsWarning,
     Radar,
+    SteppedFrequency,
     add_noise,
     beat_signal,
     exact_spectrum,
@@ -59,10 +61,14 @@ def track(waveform: FMCW) -> Radar:
     return Radar(linear_array(2, half, "y"), receivers, waveform, positions, rotations)
 
 
-def test_equals_the_plain_sum(track):
-    paths = two_bounces(track, 200)
-    expected = direct_beat(paths, track)
-    found = beat_signal(paths, track)
+@pytest.mark.parametrize(
+    "changed", [None, SteppedFrequency(76e9, 16e6, 64, 1e-6), OFDM(76e9, 16e6, 64)]
+)
+def test_equals_the_plain_sum(changed, track):
+    radar = replace(track, waveform=changed or track.waveform)
+    paths = two_bounces(radar, 200)
+    expected = direct_beat(paths, radar)
+    found = beat_signal(paths, radar)
     assert found.shape == (2, 2, 3, 64)
     assert (found - expected).norm() < 1e-8 * expected.norm()
 
@@ -125,10 +131,12 @@ def test_phase_at_200_m_in_exact_arithmetic(point_paths):
         assert abs(found[t, r, n].item() - expected) < 1e-5
 
 
-def test_gradients(track):
+# A low carrier, so that differences of the phase are accurate; the same code.
+@pytest.mark.parametrize(
+    "waveform", [FMCW(1e9, 0.2e9, 1e-6, 12), SteppedFrequency(1e9, 16e6, 12, 1e-6)]
+)
+def test_gradients(waveform, track):
     paths = two_bounces(track, 4)
-    waveform = FMCW(1e9, 0.2e9, 1e-6, 12)
-    # A low carrier, so that differences of the phase are accurate; the same code.
     radar = replace(track, waveform=waveform)
 
     def signal(coefficient, delay, first, last, positions):
@@ -243,6 +251,47 @@ def test_fft_equals_matrix(point_paths, linear):
     assert by_fft.shape == (1, 1, 16, grid.range_count)
     assert (by_fft - by_matrix).norm() < 1e-3 * by_fft.norm()
     assert not torch.equal(by_fft, by_matrix)
+
+
+def test_ofdm_in_the_time_domain(point_paths):
+    """Symbols, inverse FFT, cyclic prefix, two echoes, FFT, division: the beat signal of paths."""
+    waveform, prefix = OFDM(76e9, 2e6, 64), 24
+    one = linear_array(1, 1.0)
+    radar = Radar(one, one, waveform, torch.zeros(1, 3, dtype=torch.float64), window="rectangular")
+    generator = torch.Generator().manual_seed(1)
+    levels = torch.randint(0, 4, (2, 64), generator=generator).double() * 2 - 3
+    symbols = torch.complex(*levels) / math.sqrt(10)
+    sent = torch.fft.ifft(symbols)
+    sent = torch.cat([sent[-prefix:], sent])
+    coefficient = torch.tensor([0.7 - 0.2j, 0.3j], dtype=torch.complex128)
+    shifts = torch.tensor([5, 19])
+    delays = shifts.double() / waveform.bandwidth
+    echoes = torch.zeros_like(sent)
+    for shift, delay, a in zip(shifts.tolist(), delays, coefficient, strict=True):
+        carrier = torch.exp(-2j * math.pi * (waveform.start_frequency * delay % 1))
+        echoes[shift:] += a * carrier * sent[: len(sent) - shift]
+    received = torch.fft.fft(echoes[prefix:])
+    found = waveform.beat(received, symbols)
+    points = torch.zeros(2, 3, dtype=torch.float64)
+    points[:, 2] = shifts.double() * waveform.range_resolution
+    expected = beat_signal(point_paths(radar, points, coefficient), radar)
+    assert (found - expected).norm() < 1e-6 * expected.norm()
+    assert torch.allclose(waveform.received(expected[0, 0, 0], symbols), received, atol=1e-6)
+    # The range profile is the inverse FFT of Y/X.
+    grid = radar.grid(0, 63 * waveform.range_resolution, oversample=1)
+    profile = range_profile(found.expand(1, 1, 1, -1), radar, grid)[0, 0, 0]
+    assert torch.allclose(profile, torch.fft.ifft(received / symbols).conj())
+    assert profile.abs().topk(2).indices.tolist() == [5, 19]
+    assert profile.abs()[[5, 19]].tolist() == pytest.approx(coefficient.abs().tolist())
+
+
+def test_ofdm_symbols_must_fit():
+    waveform = OFDM(76e9, 2e6, 16)
+    samples = torch.ones(2, 16, dtype=torch.complex128)
+    with pytest.raises(InputError, match="expected 16 symbols, got 15"):
+        waveform.received(samples[:, :15], samples[0, :15])
+    with pytest.raises(InputError, match="got 1 zeros of 16"):
+        waveform.beat(samples, torch.arange(16.0).to(torch.complex128))
 
 
 def test_profile_of_a_target_on_a_bin_is_its_coefficient(point_paths, linear):

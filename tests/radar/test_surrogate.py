@@ -1,7 +1,7 @@
 """The surrogate against the exact chain, and the shape of each kernel."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -10,9 +10,14 @@ from invertwin.channel.paths import Grid
 from invertwin.channel.tracer import trace_field
 from invertwin.errors import InputError
 from invertwin.radar import (
+    FMCW,
+    OFDM,
     Impulse,
     Radar,
+    SampledWaveform,
+    SteppedFrequency,
     Surrogate,
+    Waveform,
     airy,
     beat_signal,
     exact_spectrum,
@@ -64,6 +69,62 @@ def test_mean_exact_spectrum_is_the_surrogate(array, planar, mimo, linear, point
     assert (exact - twin).norm() < 0.02 * exact.norm()
     assert (exact - twin).abs().max() < 0.02 * exact.max()
     assert twin.sum() == pytest.approx(float(exact.sum()), rel=0.005)
+
+
+# A rectangular window fills the whole band of the power profile: it asks for finer bins.
+@pytest.mark.parametrize(("window", "oversample"), [("hamming", 2), ("rectangular", 3)])
+@pytest.mark.parametrize(
+    "chosen",
+    [FMCW(77e9, 1e9, 20e-6, 48), SteppedFrequency(76.5e9, 20e6, 50, 1e-6), OFDM(76.5e9, 16e6, 61)],
+)
+def test_the_surrogate_follows_every_waveform(chosen, window, oversample, linear, point_paths):
+    radar = replace(linear, waveform=chosen, window=window)
+    points, power = cloud(40)
+    grid = radar.grid(3, 6, 0.7, oversample=oversample)
+    exact = expected_exact(radar, points, power, grid, point_paths)
+    twin = Surrogate().shape(deposited(points, power, grid), radar, grid)
+    assert (exact - twin).norm() < 0.02 * exact.norm()
+    assert (exact - twin).abs().max() < 0.02 * exact.max()
+
+
+def test_the_surrogate_follows_a_waveform_of_ones_own(linear, point_paths):
+    """Frequencies are all it takes: the exact chain and the kernel come with them."""
+
+    @dataclass(frozen=True)
+    class Falling(SampledWaveform):
+        start_frequency: float = 76.5e9
+        samples: int = 40
+        step: float = 25e6
+        bandwidth: float = 1e9
+        center_frequency: float = 77e9
+        noise_bandwidth: float = 1e6
+        residual_slope: float = -1e13
+
+    radar = replace(linear, waveform=Falling())
+    points, power = cloud(40)
+    grid = radar.grid(3, 6, 0.7)
+    exact = expected_exact(radar, points, power, grid, point_paths)
+    twin = Surrogate().shape(deposited(points, power, grid), radar, grid)
+    assert (exact - twin).norm() < 0.02 * exact.norm()
+
+
+def test_a_pulse_of_ones_own(linear):
+    @dataclass(frozen=True)
+    class Triangle(Waveform):
+        center_frequency: float = 4e9
+        bandwidth: float = 1e9
+
+        def range_response(self, distance, window):
+            return (1 - distance.abs() / 0.6).clamp_min(0)
+
+    radar = replace(linear, waveform=Triangle(), receivers=linear_array(1, 1.0))
+    grid = radar.grid(3, 6, oversample=4)
+    place = grid.ranges[20:21]
+    zero = torch.zeros(1, dtype=torch.float64)
+    spread = deposit(torch.ones(1, dtype=torch.float64), place, zero, zero, grid)
+    shaped = Surrogate().shape(spread[None], radar, grid)[0, :, 0, 0]
+    expected = (1 - (grid.ranges - place).abs() / 0.6).clamp_min(0)
+    assert (shaped - expected).abs().max() < 0.02
 
 
 def test_mean_over_phase_seeds(linear, point_paths):

@@ -7,7 +7,7 @@ import torch
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar import FMCW, Impulse, PhysicsWarning, Radar
+from invertwin.radar import FMCW, OFDM, Impulse, PhysicsWarning, Radar, SteppedFrequency
 from invertwin.radar.waveform import taper
 from invertwin.scene.antenna import AntennaArray, Isotropic, linear_array
 from invertwin.scene.pose import rotation_from_vector
@@ -25,8 +25,54 @@ def test_fmcw_numbers():
 
 
 @pytest.mark.parametrize(
+    "waveform",
+    [
+        SteppedFrequency(3e9, 5e6, 200, 1e-4),
+        OFDM(start_frequency=3e9, spacing=5e6, subcarriers=200),
+    ],
+)
+def test_waveforms_of_single_frequencies(waveform):
+    assert waveform.samples == 200
+    assert waveform.bandwidth == 1e9
+    assert waveform.range_resolution == pytest.approx(0.149896, rel=1e-5)
+    assert waveform.max_range == pytest.approx(SPEED_OF_LIGHT / (2 * 5e6))
+    assert waveform.frequencies[[0, -1]].tolist() == [3e9, 3e9 + 199 * 5e6]
+    assert waveform.center_frequency == pytest.approx(float(waveform.frequencies.mean()))
+    assert waveform.wavelength == pytest.approx(SPEED_OF_LIGHT / 3.4975e9)
+    assert waveform.residual_slope == 0
+
+
+def test_times_of_the_tones():
+    times = SteppedFrequency(3e9, 5e6, 4, 1e-4).sample_times
+    assert times.tolist() == pytest.approx([0, 1e-4, 2e-4, 3e-4])
+
+
+@pytest.mark.parametrize(
+    "waveform",
+    [FMCW(77e9, 1e9, 4e-5, 200), SteppedFrequency(77e9, 5e6, 200, 1e-6), OFDM(77e9, 5e6, 200)],
+)
+def test_range_response_of_a_rectangular_window(waveform):
+    """The Dirichlet kernel, which repeats after the unambiguous range."""
+    cells = torch.tensor([0.0, 0.3, 1, 2.5, 7, 200, 202.5], dtype=torch.float64)
+    found = waveform.range_response(cells * waveform.range_resolution, "rectangular")
+    angle = math.pi * cells[1:5]
+    expected = (torch.sin(angle) / (200 * torch.sin(angle / 200))).square()
+    assert torch.allclose(found[1:5], expected, atol=1e-12)
+    assert found[[0, 5]].tolist() == pytest.approx([1, 1])
+    assert found[6] == pytest.approx(float(found[3]))
+
+
+@pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: SteppedFrequency(3, 5e6, 200, 1e-4), "did you mean 3e9"),
+        (lambda: SteppedFrequency(3e9, 5, 200, 1e-4), "did you mean 5e6"),
+        (lambda: SteppedFrequency(3e9, -5e6, 200, 1e-4), "positive step"),
+        (lambda: SteppedFrequency(3e9, 5e6, 1, 1e-4), "at least 2 tones"),
+        (lambda: SteppedFrequency(3e9, 5e6, 200, 100), "did you mean 100e-6"),
+        (lambda: OFDM(77, 5e6, 200), "did you mean 77e9"),
+        (lambda: OFDM(77e9, 0.0, 200), "positive spacing"),
+        (lambda: OFDM(77e9, 5e6, 1), "at least 2 subcarriers"),
         (lambda: FMCW(77, 2e9, 40e-6, 128), "did you mean 77e9"),
         (lambda: FMCW(77e3, 2e9, 40e-6, 128), "did you mean 77000e6"),
         (lambda: FMCW(77e9, 2, 40e-6, 128), "did you mean 2e9"),

@@ -10,10 +10,20 @@ import xarray as xr
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.radar.waveform import FMCW, Impulse, Radar
+from invertwin.radar.waveform import (
+    FMCW,
+    OFDM,
+    Impulse,
+    Radar,
+    SampledWaveform,
+    SteppedFrequency,
+    Waveform,
+)
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, Table
 
-WAVEFORMS: dict[str, type[FMCW] | type[Impulse]] = {"FMCW": FMCW, "Impulse": Impulse}
+WAVEFORMS: dict[str, type[FMCW] | type[Impulse] | type[SteppedFrequency] | type[OFDM]] = {
+    kind.__name__: kind for kind in (FMCW, Impulse, SteppedFrequency, OFDM)
+}
 
 _VISIBILITY = {None: "auto", True: "shared", False: "separate"}
 
@@ -25,7 +35,8 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
         InputError: a waveform or pattern of one's own, which a file cannot hold.
     """
     kind = type(radar.waveform).__name__
-    if kind not in WAVEFORMS:
+    waveform = radar.waveform
+    if kind not in WAVEFORMS or not isinstance(waveform, tuple(WAVEFORMS.values())):
         raise InputError(f"expected a waveform of {', '.join(WAVEFORMS)}, got {kind}; use those")
     variables = {
         "position": labelled(("frame", "axis"), radar.positions, "m"),
@@ -33,11 +44,13 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     }
     attributes: dict[str, Any] = {
         "waveform": kind,
-        **asdict(radar.waveform),
+        **asdict(waveform),
         "window": radar.window,
         "array_window": radar.array_window,
         "visibility": _VISIBILITY[radar.shared_visibility],
     }
+    if isinstance(waveform, SampledWaveform):
+        attributes["samples"] = waveform.samples
     for end, array in (("tx", radar.transmitters), ("rx", radar.receivers)):
         variables[f"{end}_position"] = labelled((end, "radar_axis"), array.positions, "m")
         arrays, named = _pattern_fields(end, array.pattern)
@@ -66,7 +79,7 @@ def radar_from_fields(dataset: xr.Dataset) -> Radar:
     )
 
 
-def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> FMCW | Impulse:
+def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
     """The waveform named by the attribute ``waveform``, with its fields.
 
     Raises:

@@ -17,7 +17,7 @@ from torch import Tensor
 from invertwin.channel.paths import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.waveform import FMCW, PhysicsWarning, Radar, fmcw, sample_window
+from invertwin.radar.waveform import PhysicsWarning, Radar, SampledWaveform, sample_window, sampled
 
 _STANDARD_TEMPERATURE = 290.0  # K, at which noise figures are defined
 
@@ -27,13 +27,15 @@ def beat_signal(
 ) -> Complex128[Tensor, "frame tx rx sample"]:
     """Beat (IF) signal of every TX and RX element: transmit × conj(receive).
 
-        s[n] = Σ conj(a) exp(2πj (f0 τ + S τ t_n − S τ²/2))
+        s[n] = Σ conj(a) exp(2πj (f_n τ − S τ²/2))
 
-    with τ the delay from the TX element over the path to the RX element: the path's own delay
-    between the phase centres, corrected by the exact lengths from its first and last vertex, so
-    the near field and multiple bounces are exact. The sum is a non-uniform FFT (type 1) in
-    float64 on the CPU; its adjoint (type 2) gives gradients in the coefficient, delay, first
-    and last vertex and the radar's poses.
+    with f_n the frequency of the sample (f0 + S t_n on an FMCW ramp), S the slope of the ramp
+    (0 where the frequency stands: stepped frequency, OFDM, whose s is conj(H)), and τ the delay
+    from the TX element over the path to the RX element: the path's own delay between the phase
+    centres, corrected by the exact lengths from its first and last vertex, so the near field
+    and multiple bounces are exact. The sum is a non-uniform FFT (type 1) in float64 on the CPU;
+    its adjoint (type 2) gives gradients in the coefficient, delay, first and last vertex and
+    the radar's poses.
 
     Source: eq:fmcw_if of the paper; derivations §1 and §6.
     Differs from the source: the coefficient is conj(a) and holds the path's phase φ (printed
@@ -41,14 +43,14 @@ def beat_signal(
 
     Args:
         paths: Field paths; their frames index the radar's poses.
-        radar: An FMCW radar.
+        radar: One with samples: FMCW, stepped frequency, OFDM.
         tolerance: Relative error of the sum.
 
     Raises:
-        InputError: The radar is not FMCW, the paths carry power only, or a frame is missing.
+        InputError: The radar has no samples, the paths carry power only, or a frame is missing.
     """
-    waveform = fmcw(radar)
-    _check_paths(paths, radar, waveform)
+    waveform = sampled(radar)
+    check_paths(paths, radar, waveform)
     device = paths.delay.device
     tx, rx = (places.cpu() for places in radar.elements())
     centers = tx.mean(1), rx.mean(1)
@@ -81,12 +83,13 @@ def add_noise(
     """Beat signal plus white complex Gaussian noise.
 
     Give either a signal-to-noise ratio or a noise figure. The power per sample is the mean
-    signal power over ``snr_db``, or ``k T0 F / Δt`` (Δt the sampling interval, T0 = 290 K)
-    relative to the transmit power, since |s|² is received over transmitted power.
+    signal power over ``snr_db``, or ``k T0 F b`` (T0 = 290 K, b the waveform's noise bandwidth,
+    the sampling rate of an FMCW radar) relative to the transmit power, since |s|² is received
+    over transmitted power.
 
     Args:
         beat: Signal without noise.
-        radar: Needed with ``noise_figure_db`` for the sampling interval.
+        radar: Needed with ``noise_figure_db`` for the noise bandwidth.
         seed: The same seed gives the same noise.
         snr_db: Mean signal over noise power in each sample [dB].
         noise_figure_db: Of the receiver [dB].
@@ -103,8 +106,7 @@ def add_noise(
     if snr_db is not None:
         power = float(beat.detach().abs().square().mean()) * 10 ** (-snr_db / 10)
     elif noise_figure_db is not None and radar is not None:
-        waveform = fmcw(radar)
-        rate = waveform.samples / waveform.duration
+        rate = sampled(radar).noise_bandwidth
         factor = 10 ** (noise_figure_db / 10)
         power = BOLTZMANN * _STANDARD_TEMPERATURE * factor * rate / transmit_power
     else:
@@ -119,7 +121,7 @@ def add_noise(
 def range_profile(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar, grid: Grid
 ) -> Complex[Tensor, "frame tx rx range"]:
-    """Windowed range transform at the grid's ranges, R = c f/2S.
+    """Windowed range transform at the grid's ranges.
 
     Normalised by the window's sum: a path of coefficient a peaks at |a|. Ranges on the bins of
     a zero-padded FFT use it; others use the same sum as a matrix.
@@ -129,7 +131,7 @@ def range_profile(
     Raises:
         InputError: The signal does not fit the radar.
     """
-    waveform = fmcw(radar)
+    waveform = sampled(radar)
     expected = (
         radar.frame_count,
         len(radar.transmitters.positions),
@@ -150,7 +152,8 @@ def range_profile(
     return torch.fft.fft(tapered, length)[..., first : first + grid.range_count]
 
 
-def _check_paths(paths: Paths, radar: Radar, waveform: FMCW) -> None:
+def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
+    """Raise where the paths cannot be summed, warn where they appear at wrong ranges."""
     if paths.kind == "power":
         raise InputError(
             "expected field paths, got power paths, which have no phase; use trace_field, or "
@@ -167,13 +170,14 @@ def _check_paths(paths: Paths, radar: Radar, waveform: FMCW) -> None:
     if beyond:
         warnings.warn(
             f"{beyond} of {len(paths)} paths lie beyond the unambiguous range of "
-            f"{waveform.max_range:.2f} m and appear at wrong ranges; raise the sample count",
+            f"{waveform.max_range:.2f} m and appear at wrong ranges; use finer frequency steps, "
+            "which are more samples on a ramp",
             PhysicsWarning,
             stacklevel=3,
         )
 
 
-def _fft_bins(waveform: FMCW, grid: Grid) -> tuple[int, int] | None:
+def _fft_bins(waveform: SampledWaveform, grid: Grid) -> tuple[int, int] | None:
     """FFT length and first bin when all ranges are FFT bins, else None."""
     length = waveform.max_range / grid.range_step
     first = grid.range_start / grid.range_step
@@ -184,7 +188,7 @@ def _fft_bins(waveform: FMCW, grid: Grid) -> tuple[int, int] | None:
     return None
 
 
-def _range_matrix(waveform: FMCW, grid: Grid) -> Complex128[Tensor, "sample range"]:
+def _range_matrix(waveform: SampledWaveform, grid: Grid) -> Complex128[Tensor, "sample range"]:
     cycles = torch.arange(waveform.samples)[:, None] * (grid.ranges / waveform.max_range)
     return torch.exp(-2j * math.pi * cycles)
 
@@ -194,7 +198,7 @@ class _Signal:
     """One frame's paths in the form that the sums read: columns of numpy arrays.
 
     The samples are counted from the middle one, as finufft orders its modes: s[n] =
-    Σ b exp(j (carrier phase + (n − N//2) x)) with x = 2π B τ / N.
+    Σ b exp(j (carrier phase + (n − N//2) x)) with x = 2π step τ.
     """
 
     coefficient: np.ndarray  # conj(a), [path]
@@ -203,13 +207,13 @@ class _Signal:
     last: np.ndarray
     tx: np.ndarray  # m, [tx, 3]
     rx: np.ndarray
-    waveform: FMCW
+    waveform: SampledWaveform
     tolerance: float
 
     @property
     def rate(self) -> float:
         """Phase per sample and delay [rad/s]."""
-        return 2 * math.pi * self.waveform.bandwidth / self.waveform.samples
+        return 2 * math.pi * self.waveform.step
 
     def shares(self) -> list[list[tuple[int, int]]]:
         """All (tx, rx) pairs, dealt out to the threads."""
@@ -228,10 +232,9 @@ class _Signal:
     def carrier(self, delay: np.ndarray) -> np.ndarray:
         """exp(j phase at the middle sample)."""
         waveform = self.waveform
-        middle = waveform.samples // 2 / waveform.samples
         # In cycles, reduced in float64: at 77 GHz and 200 m the phase is 1e5 cycles.
-        cycles = (-0.5 * waveform.slope) * delay
-        cycles += waveform.start_frequency + waveform.bandwidth * middle
+        cycles = (-0.5 * waveform.residual_slope) * delay
+        cycles += waveform.start_frequency + waveform.samples // 2 * waveform.step
         cycles *= delay
         cycles -= np.rint(cycles)
         cycles *= 2 * math.pi
@@ -264,7 +267,7 @@ class _BeatSum(torch.autograd.Function):
         last: Float64[Tensor, "path 3"],
         tx: Float64[Tensor, "tx 3"],
         rx: Float64[Tensor, "rx 3"],
-        waveform: FMCW,
+        waveform: SampledWaveform,
         tolerance: float,
     ) -> Complex128[Tensor, "tx rx sample"]:
         signal = _Signal(
@@ -316,11 +319,11 @@ def _adjoint_share(
 ) -> list[np.ndarray]:
     """Gradients of the loss from some channels: dL = Re Σ conj(grad_n) ds_n.
 
-    With s_n = Σ b E_n: Σ grad_n conj(E_n) for b, and 2π Im(conj(b) Σ grad_n conj(E_n) f_n) with
-    the frequency f_n = f0 + S t_n − S τ for the delay.
+    With s_n = Σ b E_n: Σ grad_n conj(E_n) for b, and 2π Im(conj(b) Σ grad_n conj(E_n) (f_n − S τ))
+    for the delay.
     """
     waveform, count = signal.waveform, len(signal.inner)
-    frequency = waveform.start_frequency + waveform.slope * waveform.sample_times.numpy()
+    frequency = waveform.frequencies.numpy()
     plan = signal.plan(2, 2)
     of_b = np.zeros(count, dtype=np.complex128)
     of_delay = np.zeros(count)
@@ -331,7 +334,7 @@ def _adjoint_share(
         plan.setpts(signal.rate * delay)
         sums = plan.execute(np.stack([grad[t, r], grad[t, r] * frequency]))
         sums *= signal.carrier(delay).conj()
-        sums[1] -= waveform.slope * delay * sums[0]
+        sums[1] -= waveform.residual_slope * delay * sums[0]
         of_b += sums[0]
         of_channel = 2 * math.pi * (signal.coefficient.conj() * sums[1]).imag
         of_delay += of_channel

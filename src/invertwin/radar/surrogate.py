@@ -13,10 +13,9 @@ from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
 from invertwin.radar.spectrum import Aperture, aperture
-from invertwin.radar.waveform import FMCW, Impulse, Radar, sample_window
+from invertwin.radar.waveform import Radar, Waveform, gaussian_response
 from invertwin.scene.scene import Scene
 
-_SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
 # Kernels are tabulated at least this far out, so that short grids do not truncate them.
 _MIN_EXTENT = 64
 
@@ -180,7 +179,7 @@ def surrogate_spectrum(
 
 
 def range_point_spread(
-    waveform: FMCW | Impulse,
+    waveform: Waveform,
     distance: Float64[Tensor, " point"],
     window: str = "hamming",
     kernel: str = "response",
@@ -193,12 +192,9 @@ def range_point_spread(
         window: Taper of the samples.
         kernel: As ``Surrogate.range_kernel``.
     """
-    if kernel == "response" and isinstance(waveform, FMCW):
-        weight = sample_window(waveform, window)
-        cycles = distance[:, None] / waveform.max_range * torch.arange(waveform.samples)
-        return (torch.exp(2j * math.pi * cycles) @ (weight / weight.sum() + 0j)).abs().square()
-    sigma = _SIGMA_PER_FWHM * waveform.range_resolution
-    return torch.exp(-0.5 * (distance / sigma).square())
+    if kernel == "response":
+        return waveform.range_response(distance, window)
+    return gaussian_response(waveform, distance)
 
 
 def array_point_spread(
@@ -316,7 +312,7 @@ def _kernels(
     range_kernel: str,
     angle_kernel: str,
     radii: tuple[float, float],
-    waveform: FMCW | Impulse,
+    waveform: Waveform,
     window: str,
     array: Aperture | None,
     grid: Grid,

@@ -2,11 +2,12 @@
 
 import math
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Complex, Float, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.paths import Grid, Link
@@ -21,14 +22,86 @@ WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 _SHARED_VISIBILITY_DISTANCE = 0.1
 # Arrays are built for λ/2 at some frequency of the band, not exactly at its centre.
 _SPACING_TOLERANCE = 1.05
+_SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
 
 
 class PhysicsWarning(UserWarning):
     """The input is valid, but its result will not mean what one may expect."""
 
 
+class Waveform(ABC):
+    """What the radar and the surrogate ask of any waveform; hashable, so that kernels are cached.
+
+    Attributes:
+        center_frequency: [Hz].
+        bandwidth: [Hz].
+    """
+
+    center_frequency: float
+    bandwidth: float
+
+    @property
+    def wavelength(self) -> float:
+        """At the centre frequency [m]."""
+        return SPEED_OF_LIGHT / self.center_frequency
+
+    @property
+    def range_resolution(self) -> float:
+        """One range cell, c/2B [m]."""
+        return SPEED_OF_LIGHT / (2 * self.bandwidth)
+
+    @abstractmethod
+    def range_response(
+        self, distance: Float64[Tensor, " point"], window: str
+    ) -> Float64[Tensor, " point"]:
+        """Power of a point target at a distance from its range [m], peak 1."""
+
+
+class SampledWaveform(Waveform):
+    """One complex sample per frequency ``f_n = start_frequency + n · step``.
+
+    A path of delay τ gives the sample n the phase ``2π (f_n τ − residual_slope τ²/2)``; the
+    range transform, its windows and the surrogate's response follow from that alone.
+
+    Attributes:
+        start_frequency: Of the first sample [Hz].
+        samples: Number of frequencies.
+        step: From one sample to the next [Hz].
+        noise_bandwidth: Thermal noise in a sample is kT0F times this, over the transmit power
+            [Hz].
+    """
+
+    start_frequency: float
+    samples: int
+    step: float
+    noise_bandwidth: float
+
+    @property
+    def residual_slope(self) -> float:
+        """Slope of the residual video phase [Hz/s]; 0 unless the frequency moves in an echo."""
+        return 0.0
+
+    @property
+    def frequencies(self) -> Float64[Tensor, " sample"]:
+        """f_n [Hz]."""
+        return self.start_frequency + torch.arange(self.samples, dtype=torch.float64) * self.step
+
+    @property
+    def max_range(self) -> float:
+        """Unambiguous range of complex samples, N c/2B = c/(2 step) [m]."""
+        return self.samples * self.range_resolution
+
+    def range_response(
+        self, distance: Float64[Tensor, " point"], window: str
+    ) -> Float64[Tensor, " point"]:
+        """|Σ w_n exp(2πj n d/R_max) / Σ w_n|²."""
+        weight = sample_window(self, window)
+        cycles = distance[:, None] / self.max_range * torch.arange(self.samples)
+        return (torch.exp(2j * math.pi * cycles) @ (weight / weight.sum() + 0j)).abs().square()
+
+
 @dataclass(frozen=True)
-class FMCW:
+class FMCW(SampledWaveform):
     """Linear frequency ramp; samples at ``t_n = n · duration / samples``.
 
     The beat signal is complex (I/Q), so the unambiguous range is ``samples`` range cells.
@@ -68,24 +141,24 @@ class FMCW:
         return self.start_frequency + 0.5 * self.bandwidth
 
     @property
-    def wavelength(self) -> float:
-        """At the centre frequency [m]."""
-        return SPEED_OF_LIGHT / self.center_frequency
-
-    @property
     def slope(self) -> float:
         """S = B/T [Hz/s]."""
         return self.bandwidth / self.duration
 
     @property
-    def range_resolution(self) -> float:
-        """One range cell, c/2B [m]."""
-        return SPEED_OF_LIGHT / (2 * self.bandwidth)
+    def residual_slope(self) -> float:
+        """S: the ramp goes on while the echo is under way."""
+        return self.slope
 
     @property
-    def max_range(self) -> float:
-        """Unambiguous range of the complex beat signal, N c/2B [m]."""
-        return self.samples * self.range_resolution
+    def step(self) -> float:
+        """B/N [Hz]."""
+        return self.bandwidth / self.samples
+
+    @property
+    def noise_bandwidth(self) -> float:
+        """Sampling rate N/T [Hz]."""
+        return self.samples / self.duration
 
     @property
     def sample_times(self) -> Float64[Tensor, " sample"]:
@@ -94,7 +167,160 @@ class FMCW:
 
 
 @dataclass(frozen=True)
-class Impulse:
+class SteppedFrequency(SampledWaveform):
+    """Tones one after the other, each measured once its echoes have settled.
+
+    Attributes:
+        start_frequency: Of the first tone [Hz].
+        step: From one tone to the next [Hz].
+        samples: Number of tones.
+        dwell: Time on each tone, over which its sample is averaged [s].
+
+    Raises:
+        InputError: A value is not positive or its unit is evidently wrong.
+    """
+
+    start_frequency: float
+    step: float
+    samples: int
+    dwell: float
+
+    def __post_init__(self) -> None:
+        _check_frequency("start_frequency", self.start_frequency)
+        _check_step("step", self.step)
+        if self.samples < 2:
+            raise InputError(
+                f"expected at least 2 tones, got {self.samples}; "
+                "give the number of frequencies of one sweep"
+            )
+        if not 0 < self.dwell <= 1:
+            raise InputError(
+                f"expected a dwell time per tone in seconds, got {self.dwell:g}; "
+                f"did you mean {self.dwell:g}e-6?"
+            )
+
+    @property
+    def bandwidth(self) -> float:
+        """N · step [Hz]."""
+        return self.samples * self.step
+
+    @property
+    def center_frequency(self) -> float:
+        """Mean of the tones [Hz]."""
+        return self.start_frequency + 0.5 * (self.samples - 1) * self.step
+
+    @property
+    def noise_bandwidth(self) -> float:
+        """1 / dwell [Hz]."""
+        return 1 / self.dwell
+
+    @property
+    def sample_times(self) -> Float64[Tensor, " sample"]:
+        """t_n = n · dwell [s]."""
+        return torch.arange(self.samples, dtype=torch.float64) * self.dwell
+
+
+@dataclass(frozen=True)
+class OFDM(SampledWaveform):
+    """Subcarriers sent at once; known symbols are divided out, one sample per subcarrier.
+
+    ``Y = H X`` on every subcarrier, as a cyclic prefix longer than the largest delay makes it.
+    The power is shared evenly: ``|X|² = 1`` on average. In the library's sign the beat signal
+    is ``conj(H)``, so that ``range_profile`` forms the usual inverse FFT of ``Y/X``.
+
+    Attributes:
+        start_frequency: Of the lowest subcarrier [Hz].
+        spacing: Between subcarriers [Hz].
+        subcarriers: How many.
+
+    Raises:
+        InputError: A value is not positive or its unit is evidently wrong.
+    """
+
+    start_frequency: float
+    spacing: float
+    subcarriers: int
+
+    def __post_init__(self) -> None:
+        _check_frequency("start_frequency", self.start_frequency)
+        _check_step("spacing", self.spacing)
+        if self.subcarriers < 2:
+            raise InputError(
+                f"expected at least 2 subcarriers, got {self.subcarriers}; "
+                "give the number of subcarriers that carry symbols"
+            )
+
+    @property
+    def samples(self) -> int:
+        """One per subcarrier."""
+        return self.subcarriers
+
+    @property
+    def step(self) -> float:
+        """The spacing [Hz]."""
+        return self.spacing
+
+    @property
+    def bandwidth(self) -> float:
+        """N · spacing [Hz]."""
+        return self.subcarriers * self.spacing
+
+    @property
+    def center_frequency(self) -> float:
+        """Mean of the subcarriers [Hz]."""
+        return self.start_frequency + 0.5 * (self.subcarriers - 1) * self.spacing
+
+    @property
+    def noise_bandwidth(self) -> float:
+        """N · spacing [Hz]: a subcarrier has 1/N of the noise, and 1/N of the transmit power."""
+        return self.bandwidth
+
+    def received(
+        self, beat: Complex[Tensor, "*batch sample"], symbols: Complex[Tensor, "*#batch sample"]
+    ) -> Complex[Tensor, "*batch sample"]:
+        """Y = H X: what the receiver's FFT gives for these symbols.
+
+        Args:
+            beat: From ``beat_signal``.
+            symbols: X, sent on each subcarrier.
+
+        Raises:
+            InputError: Another number of symbols than subcarriers.
+        """
+        self._check_symbols(symbols)
+        return beat.conj() * symbols
+
+    def beat(
+        self, received: Complex[Tensor, "*batch sample"], symbols: Complex[Tensor, "*#batch sample"]
+    ) -> Complex[Tensor, "*batch sample"]:
+        """conj(Y / X), the samples that ``range_profile`` takes.
+
+        Args:
+            received: Y.
+            symbols: X, sent on each subcarrier.
+
+        Raises:
+            InputError: Another number of symbols than subcarriers, or one that is zero.
+        """
+        self._check_symbols(symbols)
+        silent = int((symbols == 0).sum())
+        if silent:
+            raise InputError(
+                f"expected symbols other than zero, got {silent} zeros of {symbols.numel()}; "
+                "nothing can be measured on silent subcarriers: keep to those in use"
+            )
+        return (received / symbols).conj()
+
+    def _check_symbols(self, symbols: Tensor) -> None:
+        if symbols.shape[-1] != self.subcarriers:
+            raise InputError(
+                f"expected {self.subcarriers} symbols, got {symbols.shape[-1]}; "
+                "give one per subcarrier"
+            )
+
+
+@dataclass(frozen=True)
+class Impulse(Waveform):
     """Pulse radar whose range profile is measured directly.
 
     The power of its pulse is taken as a Gaussian whose full width at half maximum is one range
@@ -115,15 +341,11 @@ class Impulse:
         _check_frequency("center_frequency", self.center_frequency)
         _check_frequency("bandwidth", self.bandwidth)
 
-    @property
-    def wavelength(self) -> float:
-        """At the centre frequency [m]."""
-        return SPEED_OF_LIGHT / self.center_frequency
-
-    @property
-    def range_resolution(self) -> float:
-        """One range cell, c/2B [m]."""
-        return SPEED_OF_LIGHT / (2 * self.bandwidth)
+    def range_response(
+        self, distance: Float64[Tensor, " point"], window: str
+    ) -> Float64[Tensor, " point"]:
+        """The pulse; it has no samples that a window could taper."""
+        return gaussian_response(self, distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +359,7 @@ class Radar:
     Attributes:
         transmitters: Transmitting array.
         receivers: Receiving array.
-        waveform: ``FMCW`` or ``Impulse``.
+        waveform: ``FMCW``, ``SteppedFrequency``, ``OFDM``, ``Impulse`` or one's own.
         positions: World position of the radar in each frame [m]; may carry a gradient.
         rotations: Orientation in each frame; None = axes of the world.
         window: Taper of the samples before the range transform.
@@ -152,7 +374,7 @@ class Radar:
 
     transmitters: AntennaArray
     receivers: AntennaArray
-    waveform: FMCW | Impulse
+    waveform: Waveform
     positions: Float64[Tensor, "frame 3"]
     rotations: Float64[Tensor, "frame 3 3"] | None = None
     window: str = "hamming"
@@ -280,7 +502,7 @@ class Radar:
                 f"and {oversample}; direction cosines are sines of angles"
             )
         step = self.waveform.range_resolution / oversample
-        if isinstance(self.waveform, FMCW):
+        if isinstance(self.waveform, SampledWaveform):
             step = self.waveform.max_range / round(oversample * self.waveform.samples)
         first = math.floor(range_min / step + 1e-9)
         last = math.ceil(range_max / step - 1e-9)
@@ -351,19 +573,27 @@ def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[T
     return 0.42 - 0.5 * torch.cos(angle) + 0.08 * torch.cos(2 * angle)
 
 
-def sample_window(waveform: FMCW, window: str) -> Float64[Tensor, " sample"]:
+def sample_window(waveform: SampledWaveform, window: str) -> Float64[Tensor, " sample"]:
     """Taper of the beat signal's samples."""
     position = torch.linspace(0, 1, waveform.samples, dtype=torch.float64)
     return taper(window, position, waveform.samples)
 
 
-def fmcw(radar: Radar) -> FMCW:
+def gaussian_response(
+    waveform: Waveform, distance: Float64[Tensor, " point"]
+) -> Float64[Tensor, " point"]:
+    """Gaussian of one range cell full width at half maximum, peak 1."""
+    sigma = _SIGMA_PER_FWHM * waveform.range_resolution
+    return torch.exp(-0.5 * (distance / sigma).square())
+
+
+def sampled(radar: Radar) -> SampledWaveform:
     """The radar's waveform, or the error that it has no beat signal."""
-    if isinstance(radar.waveform, FMCW):
+    if isinstance(radar.waveform, SampledWaveform):
         return radar.waveform
     raise InputError(
-        f"expected an FMCW radar, got {type(radar.waveform).__name__}, which has no beat signal; "
-        "use the surrogate for it"
+        f"expected an FMCW, stepped frequency or OFDM radar, got {type(radar.waveform).__name__}, "
+        "which has no beat signal; use the surrogate for it"
     )
 
 
@@ -374,6 +604,14 @@ def _check_frequency(name: str, value: float) -> None:
         meant = f"{value:g}e9" if value < 1e3 else f"{value:g}e6"
         raise InputError(f"expected {name} in Hz, got {value:g}; did you mean {meant}?")
     raise InputError(f"expected a positive {name}, got {value}; give it in Hz, such as 77e9")
+
+
+def _check_step(name: str, value: float) -> None:
+    if value >= 1e3:
+        return
+    if value > 0:
+        raise InputError(f"expected {name} in Hz, got {value:g}; did you mean {value:g}e6?")
+    raise InputError(f"expected a positive {name}, got {value}; give it in Hz, such as 1e6")
 
 
 def _checked_rotations(value: object, frames: int) -> Tensor:

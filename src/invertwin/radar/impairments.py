@@ -1,0 +1,395 @@
+"""What a real front end adds to the beat signal; each impairment is off unless asked for.
+
+The order is that of the hardware: phase noise and leakage on the way to the mixer, gain and phase
+errors of the channels, thermal noise, then the converter.
+"""
+
+import math
+import warnings
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Complex128, Float64
+from torch import Tensor
+
+from invertwin.channel.paths import Paths
+from invertwin.errors import InputError
+from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
+from invertwin.radar.waveform import (
+    FMCW,
+    PhysicsWarning,
+    Radar,
+    SteppedFrequency,
+    sampled,
+)
+
+# Phase of the highest offset between delays at which the residual is computed; linear between
+# them it is then off by less than 1 % there.
+_DELAY_STEP = 0.25
+# Offsets are this many times finer than one sweep resolves, so that noise does not repeat in it.
+_FINER = 4
+
+
+@dataclass(frozen=True)
+class PhaseNoise:
+    """Phase noise of the oscillator that drives both transmitter and mixer.
+
+    Between the points the level is a straight line over the logarithm of the offset; beyond the
+    first and last of several points it stays. A single point stands for −20 dB per decade.
+
+    Attributes:
+        offsets: From the carrier, ascending [Hz].
+        levels: Single-sideband level L(f) at them [dBc/Hz].
+
+    Raises:
+        InputError: Offsets that do not ascend from above zero, another number of levels, or
+            levels of 0 dBc/Hz and more.
+    """
+
+    offsets: tuple[float, ...]
+    levels: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        ascending = all(a < b for a, b in zip(self.offsets, self.offsets[1:], strict=False))
+        if not (self.offsets and self.offsets[0] > 0 and ascending):
+            raise InputError(
+                f"expected ascending offsets > 0, got {self.offsets}; give them in Hz, such as "
+                "(1e5, 1e6)"
+            )
+        if len(self.levels) != len(self.offsets):
+            raise InputError(
+                f"expected {len(self.offsets)} levels, got {len(self.levels)}; "
+                "give one level per offset"
+            )
+        if not all(-400 < level < 0 for level in self.levels):
+            raise InputError(
+                f"expected levels below 0 dBc/Hz, got {self.levels}; "
+                "give them relative to the carrier, such as -95"
+            )
+
+    def density(self, offset: Float64[Tensor, " offset"]) -> Float64[Tensor, " offset"]:
+        """One-sided S_φ(f) = 2 · 10^(L/10) [rad²/Hz].
+
+        Args:
+            offset: f > 0 [Hz].
+        """
+        if len(self.offsets) == 1:
+            level = self.levels[0] - 20 * torch.log10(offset / self.offsets[0])
+        else:
+            points = np.log10(np.asarray(self.offsets))
+            between = np.interp(np.log10(offset.numpy()), points, self.levels)
+            level = torch.from_numpy(between)
+        return 2 * 10 ** (level / 10)
+
+
+@dataclass(frozen=True)
+class Leakage:
+    """Direct path from transmitters to receivers, the same in every channel.
+
+    Attributes:
+        delay: [s].
+        level_db: Received over transmitted power [dB].
+
+    Raises:
+        InputError: A delay that is not one of a board, or more received than sent.
+    """
+
+    delay: float
+    level_db: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.delay <= 1e-6:
+            raise InputError(
+                f"expected a leakage delay in seconds, at most 1e-6, got {self.delay:g}; "
+                f"did you mean {self.delay:g}e-9?"
+            )
+        if not -400 < self.level_db < 0:
+            raise InputError(
+                f"expected a leakage level below 0 dB, got {self.level_db:g}; "
+                "give received over transmitted power, such as -40"
+            )
+
+
+@dataclass(frozen=True)
+class ADC:
+    """Converter of I and of Q: uniform steps, two's complement codes, clipped at the ends.
+
+    Attributes:
+        bits: Of each of the two.
+        full_scale: Amplitude that the most negative code stands for, in the units of the beat
+            signal, √(received over transmitted power).
+
+    Raises:
+        InputError: Impossible bits or full scale.
+    """
+
+    bits: int
+    full_scale: float
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.bits <= 32:
+            raise InputError(f"expected 2 to 32 bits, got {self.bits}; boards have 10 to 16")
+        if not 0 < self.full_scale < math.inf:
+            raise InputError(
+                f"expected a positive full_scale, got {self.full_scale}; "
+                "give the largest amplitude of the beat signal that shall fit"
+            )
+
+    @property
+    def step(self) -> float:
+        """One code, 2 · full_scale / 2^bits."""
+        return 2 * self.full_scale / 2**self.bits
+
+
+@dataclass(frozen=True)
+class Impairments:
+    """Which impairments a recording has; with the defaults it is the plain beat signal.
+
+    Attributes:
+        phase_noise: Of the common oscillator.
+        leakage: From transmitters to receivers.
+        gain_std_db: Standard deviation of the channels' gains [dB].
+        phase_std: Standard deviation of the channels' phases [rad].
+        snr_db: Thermal noise, relative to the mean power of the signal, leakage included [dB].
+        noise_figure_db: Thermal noise of a receiver instead [dB].
+        transmit_power: Of one transmitter, for the noise figure [W].
+        adc: Converter.
+
+    Raises:
+        InputError: Negative deviations, or two levels of thermal noise.
+    """
+
+    phase_noise: PhaseNoise | None = None
+    leakage: Leakage | None = None
+    gain_std_db: float = 0.0
+    phase_std: float = 0.0
+    snr_db: float | None = None
+    noise_figure_db: float | None = None
+    transmit_power: float = 0.01
+    adc: ADC | None = None
+
+    def __post_init__(self) -> None:
+        _check_deviations(self.gain_std_db, self.phase_std)
+        if self.snr_db is not None and self.noise_figure_db is not None:
+            raise InputError(
+                f"expected snr_db or noise_figure_db, got both, {self.snr_db} and "
+                f"{self.noise_figure_db}; give one of them"
+            )
+
+    def record(
+        self, paths: Paths, radar: Radar, *, seed: int
+    ) -> Complex128[Tensor, "frame tx rx sample"]:
+        """The beat signal of the paths with these impairments.
+
+        Each impairment draws from its own stream of the seed: adding one leaves the others'
+        numbers as they are.
+
+        Args:
+            paths: Field paths.
+            radar: One with samples.
+            seed: Of all that is drawn.
+
+        Raises:
+            InputError: As the single functions.
+        """
+        streams = [int(s) for s in np.random.SeedSequence(seed).generate_state(3, np.uint32)]
+        if self.phase_noise is None:
+            beat = beat_signal(paths, radar)
+        else:
+            beat = noisy_oscillator_beat(paths, radar, self.phase_noise, seed=streams[0])
+        if self.leakage is not None:
+            direct = leakage_signal(self.leakage, radar)
+            if self.phase_noise is not None:
+                delay = self.leakage.delay
+                residual = residual_phase(self.phase_noise, radar, delay, seed=streams[0])
+                direct = direct * _turn(residual)[:, :, None]
+            beat = beat + direct.to(beat.device)
+        if self.gain_std_db > 0 or self.phase_std > 0:
+            factors = channel_errors(radar, self.gain_std_db, self.phase_std, seed=streams[1])
+            beat = beat * factors[..., None].to(beat.device)
+        if self.snr_db is not None or self.noise_figure_db is not None:
+            beat = add_noise(
+                beat,
+                radar,
+                seed=streams[2],
+                snr_db=self.snr_db,
+                noise_figure_db=self.noise_figure_db,
+                transmit_power=self.transmit_power,
+            )
+        return beat if self.adc is None else quantize(beat, radar, self.adc)
+
+
+def noisy_oscillator_beat(
+    paths: Paths, radar: Radar, noise: PhaseNoise, *, seed: int
+) -> Complex128[Tensor, "frame tx rx sample"]:
+    """Beat signal of an oscillator with phase noise φ, which transmits and mixes.
+
+        s'[n] = Σ s_i[n] exp(j (φ(t_n) − φ(t_n − τ_i)))
+
+    with s_i the beat signal of one path: noise that the echo and the mixer share cancels. The
+    factor is computed at delays so close that it is linear between them.
+
+    Args:
+        paths: Field paths.
+        radar: An FMCW or stepped frequency radar.
+        noise: Its level.
+        seed: Of the noise, independent for each frame and transmitter.
+
+    Raises:
+        InputError: As ``beat_signal`` and ``residual_phase``.
+    """
+    waveform = _sampled_in_time(radar)
+    check_paths(paths, radar, waveform)
+    if len(paths) == 0:
+        return beat_signal(paths, radar)
+    first, last = (float(end) for end in paths.delay.detach().aminmax())
+    highest = 0.5 / float(waveform.sample_times[1])
+    intervals = math.ceil((last - first) * 2 * math.pi * highest / _DELAY_STEP)
+    spacing = (last - first) / max(intervals, 1)
+    place = (paths.delay - first) / spacing if intervals else torch.zeros_like(paths.delay)
+    total = None
+    for node in range(intervals + 1):
+        weight = (1 - (place - node).abs()).clamp_min(0)
+        part = _share(paths, weight)
+        with warnings.catch_warnings():
+            # All paths have been judged together.
+            warnings.simplefilter("ignore", PhysicsWarning)
+            beat = beat_signal(part, radar)
+        residual = residual_phase(noise, radar, first + node * spacing, seed=seed)
+        beat = beat * _turn(residual)[:, :, None].to(beat.device)
+        total = beat if total is None else total + beat
+    assert total is not None
+    return total
+
+
+def residual_phase(
+    noise: PhaseNoise, radar: Radar, delay: float, *, seed: int
+) -> Float64[Tensor, "frame tx sample"]:
+    """Phase noise left after mixing with an echo, φ(t_n) − φ(t_n − τ) [rad].
+
+    Its one-sided density is ``S_φ(f) · 4 sin²(πfτ)``. Offsets reach up to half the sampling
+    rate, where the IF filter ends; below a quarter of 1 / sweep, where little is left, there is
+    none. The same seed gives the same φ at every delay.
+
+    Args:
+        noise: Level of φ.
+        radar: An FMCW or stepped frequency radar.
+        delay: τ of the echo [s].
+        seed: Independent φ for each frame and transmitter, whose sweeps follow one another.
+
+    Raises:
+        InputError: A waveform whose samples are not taken in time.
+    """
+    waveform = _sampled_in_time(radar)
+    length = _FINER * waveform.samples
+    spacing = 1 / (length * float(waveform.sample_times[1]))
+    offsets = spacing * torch.arange(1, length // 2, dtype=torch.float64)
+    shape = (radar.frame_count, len(radar.transmitters.positions), len(offsets))
+    generator = torch.Generator().manual_seed(seed)
+    lines = torch.randn(shape, dtype=torch.complex128, generator=generator)
+    lines = lines * (2 * spacing * noise.density(offsets)).sqrt()
+    lines = lines * (1 - _turn(-2 * math.pi * delay * offsets))
+    # Re Σ lines exp(2πj f t): a real inverse FFT, but for its factor 2 / length and f = 0.
+    phase = torch.fft.irfft(torch.nn.functional.pad(lines, (1, 1)) * (0.5 * length), length)
+    return phase[..., : waveform.samples]
+
+
+def leakage_signal(leakage: Leakage, radar: Radar) -> Complex128[Tensor, " sample"]:
+    """Beat signal of the leakage alone, to be added to every channel.
+
+    Args:
+        leakage: Delay and level.
+        radar: One with samples.
+
+    Raises:
+        InputError: The radar has no samples.
+    """
+    waveform, delay = sampled(radar), leakage.delay
+    cycles = (waveform.frequencies - 0.5 * waveform.residual_slope * delay) * delay
+    return 10 ** (leakage.level_db / 20) * _turn(2 * math.pi * cycles)
+
+
+def channel_errors(
+    radar: Radar, gain_std_db: float = 0.0, phase_std: float = 0.0, *, seed: int
+) -> Complex128[Tensor, "tx rx"]:
+    """Factors of the virtual channels with normally distributed gains in dB and phases.
+
+    Args:
+        radar: Its arrays.
+        gain_std_db: Standard deviation of the gain [dB].
+        phase_std: Standard deviation of the phase [rad].
+        seed: Of both.
+
+    Raises:
+        InputError: A negative deviation.
+    """
+    _check_deviations(gain_std_db, phase_std)
+    shape = (2, len(radar.transmitters.positions), len(radar.receivers.positions))
+    generator = torch.Generator().manual_seed(seed)
+    gain, phase = torch.randn(shape, dtype=torch.float64, generator=generator)
+    return torch.polar(10 ** (gain_std_db / 20 * gain), phase_std * phase)
+
+
+def quantize(
+    beat: Complex[Tensor, "*batch sample"], radar: Radar, adc: ADC
+) -> Complex[Tensor, "*batch sample"]:
+    """The beat signal as the converter reads it: rounded to its codes, and clipped, with a warning.
+
+    Args:
+        beat: Signal without a gradient.
+        radar: An FMCW or stepped frequency radar.
+        adc: Converter.
+
+    Raises:
+        InputError: A gradient is asked for, or samples that are not taken in time.
+    """
+    _sampled_in_time(radar)
+    if beat.requires_grad:
+        raise InputError(
+            "expected a beat signal without a gradient, got one that carries it; codes are "
+            "constant between their steps: quantise data only, or detach() first"
+        )
+    parts = torch.view_as_real(beat.resolve_conj())
+    codes = torch.round(parts / adc.step)
+    lowest, highest = -(2 ** (adc.bits - 1)), 2 ** (adc.bits - 1) - 1
+    clipped = int(((codes < lowest) | (codes > highest)).any(-1).sum())
+    if clipped:
+        warnings.warn(
+            f"{clipped} of {beat.numel()} samples exceed the converter's full scale of "
+            f"{adc.full_scale:g}; raise it, or lower the leakage",
+            PhysicsWarning,
+            stacklevel=2,
+        )
+    return torch.view_as_complex(codes.clamp(lowest, highest) * adc.step)
+
+
+def _turn(phase: Tensor) -> Tensor:
+    return torch.polar(torch.ones_like(phase), phase)
+
+
+def _share(paths: Paths, weight: Tensor) -> Paths:
+    """The paths whose weight is not zero, with their coefficients times it."""
+    chosen = weight > 0
+    values = {f.name: getattr(paths, f.name) for f in fields(paths)}
+    kept = {name: value[chosen] for name, value in values.items() if isinstance(value, Tensor)}
+    part = replace(paths, **kept)
+    return replace(part, coefficient=part.coefficient * weight[chosen])
+
+
+def _sampled_in_time(radar: Radar) -> FMCW | SteppedFrequency:
+    waveform = sampled(radar)
+    if isinstance(waveform, FMCW | SteppedFrequency):
+        return waveform
+    raise InputError(
+        f"expected samples taken one after the other in time, got {type(waveform).__name__}; phase "
+        "noise and converter act in time: use them with FMCW or stepped frequency"
+    )
+
+
+def _check_deviations(gain_std_db: float, phase_std: float) -> None:
+    if not (0 <= gain_std_db < math.inf and 0 <= phase_std < math.inf):
+        raise InputError(
+            f"expected standard deviations >= 0, got {gain_std_db} dB and {phase_std} rad; "
+            "give 0 for channels without errors"
+        )

@@ -1,0 +1,51 @@
+"""Every waveform survives the way into a file and back."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from invertwin.capture import Capture
+from invertwin.errors import InputError
+from invertwin.radar import FMCW, OFDM, Impulse, Radar, SteppedFrequency
+from invertwin.scene.antenna import linear_array
+
+
+def radar(waveform) -> Radar:
+    one = linear_array(1, 1.0)
+    return Radar(one, one, waveform, torch.zeros(2, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    "waveform",
+    [FMCW(76e9, 1e9, 40e-6, 16), SteppedFrequency(3e9, 5e6, 16, 1e-4), OFDM(76e9, 2e6, 16)],
+)
+def test_beat_samples_of_every_waveform(waveform, tmp_path):
+    beat = torch.randn(
+        2, 1, 1, 16, dtype=torch.complex128, generator=torch.Generator().manual_seed(0)
+    )
+    Capture.from_beat(beat, radar(waveform)).save(tmp_path / "capture.nc")
+    loaded = Capture.load(tmp_path / "capture.nc")
+    assert loaded.radar().waveform == waveform
+    assert torch.equal(loaded.beat, beat)
+    with pytest.raises(InputError, match="expected 16 samples"):
+        Capture.from_beat(beat[..., :15], radar(waveform))
+
+
+def test_range_profiles_of_an_impulse_radar(tmp_path):
+    profile = torch.ones(2, 8, dtype=torch.complex128)
+    ranges = torch.arange(1.0, 9.0, dtype=torch.float64)
+    capture = Capture.from_range_profile(profile, ranges, radar(Impulse(4e9, 1e9)))
+    capture.save(tmp_path / "capture.nc")
+    assert Capture.load(tmp_path / "capture.nc").radar().waveform == Impulse(4e9, 1e9)
+
+
+def test_waveforms_of_ones_own_are_refused():
+    @dataclass(frozen=True)
+    class Chirp(FMCW):
+        pass
+
+    with pytest.raises(InputError, match="got Chirp; use those"):
+        Capture.from_beat(
+            torch.zeros(2, 1, 1, 16, dtype=torch.complex128), radar(Chirp(76e9, 1e9, 40e-6, 16))
+        )
