@@ -370,6 +370,8 @@ def test_ofdm_noise_is_that_of_its_subcarriers(point_paths):
         (lambda: ADC(12, math.nan), "positive full_scale"),
         (lambda: Impairments(gain_std_db=-1.0), "standard deviations >= 0"),
         (lambda: Impairments(snr_db=3.0, noise_figure_db=3.0), "got both"),
+        (lambda: Impairments(noise_figure_db=-1.0), "noise_figure_db >= 0"),
+        (lambda: Impairments(transmit_power=0.0), "positive transmit_power"),
         (lambda: channel_errors(recorder(), phase_std=-0.1, seed=0), "standard deviations >= 0"),
         (
             lambda: residual_phase(FLAT, recorder(waveform=OFDM(76e9, 2e6, 16)), 1e-8, seed=0),

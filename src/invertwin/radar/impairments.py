@@ -157,7 +157,7 @@ class Impairments:
         adc: Converter.
 
     Raises:
-        InputError: Negative deviations, or two levels of thermal noise.
+        InputError: Negative deviations, two levels of thermal noise, or impossible ones.
     """
 
     phase_noise: PhaseNoise | None = None
@@ -175,6 +175,12 @@ class Impairments:
             raise InputError(
                 f"expected snr_db or noise_figure_db, got both, {self.snr_db} and "
                 f"{self.noise_figure_db}; give one of them"
+            )
+        figure = 0.0 if self.noise_figure_db is None else self.noise_figure_db
+        if not (figure >= 0 and 0 < self.transmit_power < math.inf):
+            raise InputError(
+                f"expected noise_figure_db >= 0 and a positive transmit_power, got {figure} and "
+                f"{self.transmit_power}; give them in dB and in watts"
             )
 
     def record(
