@@ -7,6 +7,7 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
+from invertwin.radar.backprojection import backproject_beat, distances
 
 # Half widths and steps of the first search: wide against what clocks and cables are off by after
 # alignment by hand, dense against a range cell and the time in which a radar moves one beamwidth.
@@ -17,20 +18,23 @@ _BIAS_SEARCH = (0.1, 0.01)
 def backproject(
     capture: Capture, points: Float64[Tensor, "*point 3"]
 ) -> Complex128[Tensor, "*point"]:
-    """Mean over the frames of each range profile at the distance of a point.
+    """Mean over the frames (and channels) of the echo from the distance of a point.
 
     Echoes of a target at the point add in phase, since the profiles carry their carrier: the
-    matched filter of a point target without its spreading loss.
+    matched filter of a point target without its spreading loss. Beat samples go through
+    ``backproject_beat``.
 
     Args:
-        capture: range profiles.
+        capture: range profiles or beat samples.
         points: world positions [m].
 
     Raises:
-        InputError: the capture holds beat samples, or a point is beyond the measured ranges.
+        InputError: a point is beyond the measured ranges.
     """
+    if "beat" in capture.dataset:
+        return backproject_beat(capture.beat, capture.radar(), points)
     flat = points.reshape(-1, 3)
-    ranges = _distances(capture.radar().positions, flat)
+    ranges = distances(capture.radar().positions, flat)
     return capture.interpolator()(ranges).mean(0).reshape(points.shape[:-1])
 
 
@@ -49,7 +53,8 @@ def locate(
         step: of the image from which the search starts [m]; below half a resolution cell.
 
     Raises:
-        InputError: as `backproject`, or a step that is not positive and below the radius.
+        InputError: the capture holds beat samples, a point is beyond the measured ranges, or a step
+            that is not positive and below the radius.
     """
     if not 0 < step < radius:
         raise InputError(
@@ -61,7 +66,7 @@ def locate(
 
     def brightness(offset: Float64[Tensor, "point 2"]) -> Float64[Tensor, " point"]:
         points = center + torch.nn.functional.pad(offset, (0, 1))
-        return interpolator(_distances(positions, points)).mean(0).abs()
+        return interpolator(distances(positions, points)).mean(0).abs()
 
     # A column of the image at a time keeps the memory of frames × points small.
     image = torch.cat([brightness(part) for part in offsets.split(len(side))])
@@ -99,13 +104,6 @@ def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
     best = trials[focus(trials).argmax()]
     clock, bias = _refined(focus, best, (_CLOCK_SEARCH[1] / 2, _BIAS_SEARCH[1] / 2)).tolist()
     return capture.recalibrated(capture.clock_offset + clock, capture.range_bias + bias)
-
-
-def _distances(
-    positions: Float64[Tensor, "frame 3"], points: Float64[Tensor, "point 3"]
-) -> Float64[Tensor, "frame point"]:
-    # The matrix product that cdist takes by default cancels digits.
-    return torch.cdist(positions, points, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def _refined(measure, start: Tensor, sizes: tuple[float, float]) -> Float64[Tensor, "2"]:

@@ -8,10 +8,7 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-
-# Linear interpolation between samples this much denser errs by (π/8)²/8 = 2 % at the very edge of a
-# critically sampled band, and quadratically less within it.
-_UPSAMPLING = 8
+from invertwin.radar.backprojection import UPSAMPLING, between_samples
 
 
 class RangeInterpolator:
@@ -40,13 +37,13 @@ class RangeInterpolator:
         self._wavenumber = 2 * math.pi * shift / (count * step)
         self._first = float(ranges[0])
         self._last = float(ranges[-1])
-        self._step = step / _UPSAMPLING
+        self._step = step / UPSAMPLING
         band = torch.fft.fft(profile.to(torch.complex128), dim=1).roll(-shift, dims=1)
-        padded = band.new_zeros(len(profile), count * _UPSAMPLING)
+        padded = band.new_zeros(len(profile), count * UPSAMPLING)
         half = (count + 1) // 2
         padded[:, :half] = band[:, :half]
         padded[:, half - count :] = band[:, half:]
-        self._samples = torch.fft.ifft(padded, dim=1) * _UPSAMPLING
+        self._samples = torch.fft.ifft(padded, dim=1) * UPSAMPLING
 
     def __call__(self, ranges: Float64[Tensor, "frame point"]) -> Complex128[Tensor, "frame point"]:
         """Amplitude of every frame at its own ranges [m]; not differentiable.
@@ -61,12 +58,5 @@ class RangeInterpolator:
                 f"{low:g} to {high:g} m; choose a smaller grid or nearer points"
             )
         offset = ranges - self._first
-        cell = (offset / self._step).floor().clamp(0, self._samples.shape[1] - 2)
-        part = offset / self._step - cell
-        index = cell.long()
-        value = torch.lerp(
-            self._samples.gather(1, index),
-            self._samples.gather(1, index + 1),
-            part.to(torch.complex128),
-        )
+        value = between_samples(self._samples, offset / self._step)
         return value * torch.polar(torch.ones_like(offset), self._wavenumber * offset)

@@ -1,5 +1,23 @@
 """Channel to radar data: the exact signal chain and its smooth surrogate, in plain torch."""
 
+from invertwin.radar.backprojection import backproject_beat
+from invertwin.radar.detection import (
+    PointCloud,
+    cell_averaging_cfar,
+    ordered_statistics_cfar,
+    point_cloud,
+)
+from invertwin.radar.direction import capon, music, source_count
+from invertwin.radar.doppler import (
+    Spectrogram,
+    compensate_tdm,
+    micro_doppler,
+    range_doppler,
+    range_doppler_angle,
+    resolve_fold,
+    velocity_axis,
+    velocity_span,
+)
 from invertwin.radar.impairments import (
     ADC,
     Impairments,
@@ -36,23 +54,39 @@ __all__ = [
     "Leakage",
     "PhaseNoise",
     "PhysicsWarning",
+    "PointCloud",
     "Radar",
     "SampledWaveform",
+    "Spectrogram",
     "SteppedFrequency",
     "Surrogate",
     "Waveform",
     "add_noise",
     "airy",
+    "backproject_beat",
     "beamform",
     "beat_signal",
+    "capon",
+    "cell_averaging_cfar",
     "channel_errors",
+    "compensate_tdm",
     "exact_spectrum",
     "leakage_signal",
+    "micro_doppler",
     "moving_beat",
+    "music",
     "noisy_oscillator_beat",
     "normalized_gaussian",
+    "ordered_statistics_cfar",
+    "point_cloud",
     "quantize",
+    "range_doppler",
+    "range_doppler_angle",
     "range_profile",
     "residual_phase",
+    "resolve_fold",
+    "source_count",
     "surrogate_spectrum",
+    "velocity_axis",
+    "velocity_span",
 ]

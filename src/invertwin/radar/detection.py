@@ -1,0 +1,302 @@
+"""Targets out of power maps: constant false-alarm rate, point clouds. Not differentiable."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy.optimize import brentq
+from scipy.special import gammaincc, gammaincinv
+from scipy.stats import beta, f
+from torch import Tensor
+
+from invertwin.channel.bridge import differentiated
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.radar.doppler import velocity_axis, velocity_span
+from invertwin.radar.motion import Chirps
+from invertwin.radar.waveform import Radar
+
+_QUADRATURE = 4096  # nodes over the distribution of an order statistic
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Detected points, one row each.
+
+    Attributes:
+        frame: Radar pose that sees the point.
+        range: R = L/2 [m].
+        velocity: Range rate, positive moves away [m/s].
+        u, v: Direction cosines in the radar frame; 0 along an axis that is not resolved.
+        power: Of the strongest direction, received over transmitted.
+        position: In the world, from the middle of the phase centres [m].
+    """
+
+    frame: Int64[Tensor, " point"]
+    range: Float64[Tensor, " point"]
+    velocity: Float64[Tensor, " point"]
+    u: Float64[Tensor, " point"]
+    v: Float64[Tensor, " point"]
+    power: Float64[Tensor, " point"]
+    position: Float64[Tensor, "point 3"]
+
+    def __len__(self) -> int:
+        return self.range.shape[0]
+
+
+def cell_averaging_cfar(
+    power: Float[Tensor, "*batch first second"],
+    *,
+    guard: tuple[int, int] = (2, 2),
+    training: tuple[int, int] = (4, 4),
+    false_alarm: float = 1e-4,
+    looks: int = 1,
+) -> Bool[Tensor, "*batch first second"]:
+    """Cells whose power exceeds a multiple of the mean of their training cells.
+
+    The multiple keeps the rate of false alarms exact for noise whose power is exponentially
+    distributed (one look: a channel or a beam) or the mean of several such (looks: the channels,
+    where a grid without directions averages them), independent from cell to cell: tapers that
+    correlate neighbours raise it. Near the edges of the map fewer training cells are left and
+    the multiple is that of their number.
+
+    Args:
+        power: Maps over the last two axes, such as range rate and range.
+        guard: Cells to either side along both axes that the target itself fills.
+        training: Cells beyond those to either side.
+        false_alarm: Probability that a cell of noise is detected.
+        looks: Independent looks in the mean that is a cell's power.
+
+    Raises:
+        InputError: Power with gradients (a detection has none), values that are negative or not
+            finite, no training cells left, or a number out of range.
+    """
+    band, count = _training_cells(power, guard, training, "cell_averaging_cfar")
+    _check_rates(false_alarm, looks)
+    mean = torch.where(torch.isfinite(band), band, 0.0).sum(-1) / count
+    numbers, index = count.unique(return_inverse=True)
+    factors = f.isf(false_alarm, 2 * looks, 2 * looks * numbers.numpy())
+    return power > torch.from_numpy(factors)[index].to(power.device) * mean.to(power.device)
+
+
+def ordered_statistics_cfar(
+    power: Float[Tensor, "*batch first second"],
+    *,
+    guard: tuple[int, int] = (2, 2),
+    training: tuple[int, int] = (4, 4),
+    false_alarm: float = 1e-4,
+    looks: int = 1,
+    rank: float = 0.75,
+) -> Bool[Tensor, "*batch first second"]:
+    """Cells whose power exceeds a multiple of one of their training cells in order of power.
+
+    Other targets among the training cells hardly raise the threshold, as they do in the mean.
+
+    Source: Rohling, Radar CFAR thresholding in clutter and multiple target situations, 1983.
+
+    Args:
+        power: As for ``cell_averaging_cfar``, and so are the rest.
+        guard: Cells to either side that the target fills.
+        training: Cells beyond those.
+        false_alarm: Probability that a cell of noise is detected.
+        looks: Independent looks in a cell's power.
+        rank: Place of the chosen cell in ascending order, as a part of their number.
+
+    Raises:
+        InputError: As ``cell_averaging_cfar``, or a rank outside (0, 1].
+    """
+    band, count = _training_cells(power, guard, training, "ordered_statistics_cfar")
+    _check_rates(false_alarm, looks)
+    if not 0 < rank <= 1:
+        raise InputError(f"expected a rank in (0, 1], got {rank:g}; 0.75 is usual")
+    place = (rank * count - 1e-9).ceil().to(torch.int64)
+    # What is no training cell is infinite, so last in order.
+    level = band.sort(-1).values.gather(-1, (place - 1).expand(band.shape[:-1])[..., None])[..., 0]
+    numbers, index = count.unique(return_inverse=True)
+    factors = [
+        _ordered_factor(int(n), math.ceil(rank * float(n) - 1e-9), false_alarm, looks)
+        for n in numbers
+    ]
+    factor = torch.tensor(factors, dtype=torch.float64)[index]
+    return power > (factor * level).to(power.device)
+
+
+def point_cloud(
+    power: Float[Tensor, "frame velocity range u v"],
+    detections: Bool[Tensor, "frame velocity range"],
+    radar: Radar,
+    grid: Grid,
+    chirps: Chirps,
+    fold: Int64[Tensor, "frame velocity range"] | None = None,
+) -> PointCloud:
+    """One point for each local maximum over range rate and range among the detected cells.
+
+    Its direction is the strongest one that exists (u² + v² ≤ 1); all are refined by the parabola
+    through the logarithms of the power at a peak and its two neighbours. The
+    ends of the axis of range rates are neighbours.
+
+    Args:
+        power: Of ``range_doppler_angle``.
+        detections: Cells that hold targets.
+        radar: With the poses of the frames.
+        grid: Of the power.
+        chirps: Timing, for the range rates.
+        fold: What was given to ``range_doppler_angle``.
+
+    Raises:
+        InputError: Power with gradients, or shapes that do not fit each other.
+    """
+    _refuse_gradients(power, "point_cloud")
+    expected = (radar.frame_count, power.shape[1], *grid.shape)
+    if tuple(power.shape) != expected or tuple(detections.shape) != expected[:3]:
+        raise InputError(
+            f"expected power of shape {expected} (frame, velocity, range, u, v) and detections of "
+            f"shape {expected[:3]}, got {tuple(power.shape)} and {tuple(detections.shape)}; use "
+            "the radar and grid of range_doppler_angle"
+        )
+    power, detections = power.to("cpu", torch.float64), detections.cpu()
+    count = power.shape[1]
+    outside = grid.u[:, None].square() + grid.v.square() > 1
+    seen = power.masked_fill(outside, 0.0).flatten(3)
+    strongest = seen.amax(-1)
+    frame, velocity, place = torch.nonzero(
+        detections & (strongest == _neighbourhood_maximum(strongest)) & (strongest > 0),
+        as_tuple=True,
+    )
+    direction = seen.argmax(-1)[frame, velocity, place]
+    u, v = direction // grid.v_count, direction % grid.v_count
+    cell = [frame, velocity, place, u, v]
+    moved = [_refinement(power, cell, axis, wrap=axis == 1) for axis in range(1, 5)]
+    span = velocity_span(radar, chirps)
+    rates = velocity_axis(radar, chirps, count)[velocity] + moved[0] * span / count
+    if fold is not None:
+        rates = rates + fold.cpu()[frame, velocity, place] * span
+    ranges = grid.ranges[place] + moved[1] * grid.range_step
+    us = grid.u[u] + moved[2] * grid.u_step
+    vs = grid.v[v] + moved[3] * grid.v_step
+    ahead = (1 - us.square() - vs.square()).clamp(min=0).sqrt()
+    link = radar.link()
+    origin = (0.5 * (link.tx + link.rx)).detach().cpu()
+    local = ranges[:, None] * torch.stack([us, vs, ahead], dim=1)
+    turned = torch.einsum("pij,pj->pi", link.rotations.detach().cpu()[frame], local)
+    return PointCloud(
+        frame=frame,
+        range=ranges,
+        velocity=rates,
+        u=us,
+        v=vs,
+        power=power[tuple(cell)],
+        position=origin[frame] + turned,
+    )
+
+
+def _refuse_gradients(power: Tensor, name: str) -> None:
+    if differentiated(power):
+        raise InputError(
+            f"expected power without gradients in {name}, got a tensor that has them; a detection "
+            "is not differentiable: pass power.detach(), and fit with the power itself"
+        )
+
+
+def _check_rates(false_alarm: float, looks: int) -> None:
+    if not (0 < false_alarm < 1 and looks >= 1):
+        raise InputError(
+            "expected a false-alarm probability in (0, 1) and at least one look, got "
+            f"{false_alarm:g} and {looks}; 1e-4 and 1 are usual"
+        )
+
+
+def _training_cells(
+    power: Tensor, guard: tuple[int, int], training: tuple[int, int], name: str
+) -> tuple[Float64[Tensor, "*batch first second cell"], Float64[Tensor, "first second"]]:
+    """Power of each cell's training cells, infinite beyond the map, and their number."""
+    _refuse_gradients(power, name)
+    values = power.to("cpu", torch.float64)
+    if not (torch.isfinite(values).all() and (values >= 0).all()):
+        raise InputError(
+            "expected finite powers of at least 0, got others; pass the power, not the signal or dB"
+        )
+    if min(*guard, *training) < 0:
+        raise InputError(
+            f"expected guard and training cells of at least 0, got {guard} and {training}"
+        )
+    reach = [g + t for g, t in zip(guard, training, strict=True)]
+    sizes = [2 * r + 1 for r in reach]
+    around = torch.nn.functional.pad(
+        values, (reach[1], reach[1], reach[0], reach[0]), value=math.inf
+    )
+    around = around.unfold(-2, sizes[0], 1).unfold(-2, sizes[1], 1)
+    offsets = [(torch.arange(size) - r).abs() for size, r in zip(sizes, reach, strict=True)]
+    kept = (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])
+    cells = around[..., kept]
+    whole, inner = (
+        [_within(size, r) for size, r in zip(values.shape[-2:], sides, strict=True)]
+        for sides in (reach, guard)
+    )
+    count = whole[0][:, None] * whole[1] - inner[0][:, None] * inner[1]
+    if int(count.min()) < 1:
+        raise InputError(
+            f"expected training cells around every cell, got none around some of a map of "
+            f"{tuple(values.shape[-2:])}; use fewer guard cells or more training cells"
+        )
+    return cells, count
+
+
+def _within(size: int, reach: int) -> Float64[Tensor, " cell"]:
+    """How many cells of an axis are at most so far from each."""
+    place = torch.arange(size, dtype=torch.float64)
+    return (place + reach).clamp(max=size - 1) - (place - reach).clamp(min=0) + 1
+
+
+@lru_cache(maxsize=1024)
+def _ordered_factor(cells: int, place: int, false_alarm: float, looks: int) -> float:
+    """Multiple of the place-th of the cells that noise exceeds with the given probability."""
+    nodes = (np.arange(_QUADRATURE) + 0.5) / _QUADRATURE
+    weights = beta.pdf(nodes, place, cells - place + 1)
+    levels, weights = gammaincinv(looks, nodes), weights / weights.sum()
+
+    def excess(factor: float) -> float:
+        return math.log(float(weights @ gammaincc(looks, factor * levels)) / false_alarm)
+
+    high = 1.0
+    while excess(high) > 0:
+        high *= 2
+    root: Any = brentq(excess, 0.0, high, xtol=1e-9 * high)
+    return float(root)
+
+
+def _neighbourhood_maximum(
+    strongest: Float64[Tensor, "frame velocity range"],
+) -> Float64[Tensor, "frame velocity range"]:
+    """Maximum over 3 × 3 cells; the axis of range rates closes on itself."""
+    wrapped = torch.cat([strongest[:, -1:], strongest, strongest[:, :1]], dim=1)
+    padded = torch.nn.functional.pad(wrapped, (1, 1), value=-math.inf)
+    return torch.nn.functional.max_pool2d(padded[:, None], 3, stride=1)[:, 0]
+
+
+def _refinement(
+    power: Float64[Tensor, "frame velocity range u v"],
+    cell: list[Tensor],
+    axis: int,
+    wrap: bool,
+) -> Float64[Tensor, " point"]:
+    """Peak between the bins of one axis, in bins: within half a bin, 0 at an edge."""
+    size = power.shape[axis]
+    here = cell[axis]
+
+    def level(step: int) -> Tensor:
+        place = (here + step) % size if wrap else (here + step).clamp(0, size - 1)
+        values = power[tuple(place if k == axis else cell[k] for k in range(5))]
+        return values.clamp(min=torch.finfo(torch.float64).tiny).log()
+
+    before, middle, after = level(-1), level(0), level(1)
+    curvature = before - 2 * middle + after
+    offset = 0.5 * (before - after) / torch.where(curvature < 0, curvature, 1.0)
+    inside = (curvature < 0) & (middle >= before) & (middle >= after)
+    if not wrap:
+        inside &= (here > 0) & (here < size - 1)
+    return torch.where(inside, offset, 0.0)

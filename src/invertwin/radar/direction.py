@@ -1,0 +1,285 @@
+"""Directions finer than a beam: Capon and MUSIC, differentiable in the signal."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Complex, Complex128, Float, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.radar.spectrum import aperture
+from invertwin.radar.waveform import Radar
+
+# Gaps between signal and noise eigenvalues below this part of the largest one count as noise of
+# the arithmetic: there the derivative of the subspace is damped instead of unbounded.
+_SMALLEST_GAP = 1e-8
+# Uniform means to this part of the spacing.
+_UNIFORMITY = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class _Snapshots:
+    """What the estimators see: snapshots of a (sub)array and where its elements are.
+
+    Attributes:
+        values: One row per snapshot, elements as columns.
+        x, y: Of the elements, in the radar frame [m].
+    """
+
+    values: Complex128[Tensor, "frame range snapshot element"]
+    x: Float64[Tensor, " element"]
+    y: Float64[Tensor, " element"]
+
+    def manifold(self, grid: Grid, wavelength: float) -> Complex128[Tensor, "direction element"]:
+        """Beat phases across the array of a source in each direction: exp(−jk(ux + vy))."""
+        k = 2 * math.pi / wavelength
+        phase = k * (grid.u[:, None, None] * self.x + grid.v[None, :, None] * self.y)
+        return torch.polar(torch.ones_like(phase), -phase).flatten(0, 1).to(self.values.device)
+
+    def covariance(self) -> Complex128[Tensor, "frame range element element"]:
+        """Mean of x xᴴ over the snapshots."""
+        return self.values.mT @ self.values.conj() / self.values.shape[-2]
+
+
+def capon(
+    profile: Complex[Tensor, "frame snapshot tx rx range"],
+    radar: Radar,
+    grid: Grid,
+    *,
+    loading: float = 1e-2,
+    smoothing: tuple[int, int] | None = None,
+    forward_backward: bool = False,
+) -> Float64[Tensor, "frame range u v"]:
+    """Capon (minimum variance) power spectrum: 1 / aᴴ (R + δI)⁻¹ a.
+
+    A single point target of |a|² peaks at |a|² (1 + δ/elements) plus noise. Differentiable in
+    the profile.
+
+    Args:
+        profile: Range profiles; snapshots are chirps, or one snapshot per Doppler bin with the
+            bins as frames.
+        radar: Its array, without window; its poses are not used.
+        grid: Its directions.
+        loading: Diagonal loading δ in units of the mean power of an element.
+        smoothing: Elements of the subarrays along x and y over whose shifts the covariance is
+            averaged (spatial smoothing, which tells coherent targets apart); None = none.
+        forward_backward: Average with the array read backwards, which doubles the snapshots.
+
+    Raises:
+        InputError: The profile does not fit radar or grid, an axis of the array that the grid
+            does not resolve, a loading that is not positive, smoothing or forward_backward on an
+            array that is not a uniform rectangle of elements, or subarrays larger than it.
+    """
+    if not (math.isfinite(loading) and loading > 0):
+        raise InputError(
+            f"expected a positive loading, got {loading:g}; 0.01 of the mean power is usual"
+        )
+    snapshots = _snapshots(profile, radar, grid, smoothing, forward_backward)
+    covariance = snapshots.covariance()
+    level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1)
+    identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    # Empty bins have no scale; anything finite gives them the power zero.
+    scale = torch.where(level > 0, level, 1.0)
+    loaded = covariance / scale[..., None, None] + loading * identity
+    manifold = snapshots.manifold(grid, radar.waveform.wavelength)
+    whitened = torch.linalg.solve_triangular(
+        torch.linalg.cholesky(loaded), manifold.mT.expand(*level.shape, -1, -1), upper=False
+    )
+    power = level[..., None] / whitened.abs().square().sum(-2)
+    return power.unflatten(-1, (grid.u_count, grid.v_count))
+
+
+def music(
+    profile: Complex[Tensor, "frame snapshot tx rx range"],
+    radar: Radar,
+    grid: Grid,
+    *,
+    sources: int | str = "mdl",
+    smoothing: tuple[int, int] | None = None,
+    forward_backward: bool = False,
+) -> Float64[Tensor, "frame range u v"]:
+    """MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, E the noise subspace. At least 1, no unit.
+
+    Differentiable in the profile through the projector on the noise subspace, whose derivative
+    depends on the gap between signal and noise only: it is finite for equal eigenvalues within
+    either, and damped where the gap itself vanishes and the subspace jumps.
+
+    Args:
+        profile: As for ``capon``.
+        radar: Its array, without window; its poses are not used.
+        grid: Its directions.
+        sources: How many in every bin, or the rule that counts them in each: ``mdl`` or ``aic``.
+        smoothing: As for ``capon``.
+        forward_backward: As for ``capon``.
+
+    Raises:
+        InputError: As for ``capon``; an unknown rule; more sources than elements less one or
+            than the snapshots can show.
+    """
+    snapshots = _snapshots(profile, radar, grid, smoothing, forward_backward)
+    covariance = snapshots.covariance()
+    elements = covariance.shape[-1]
+    if isinstance(sources, str):
+        values = torch.linalg.eigvalsh(covariance.detach())
+        count = source_count(values, snapshots.values.shape[-2], sources)
+    else:
+        _check_sources(sources, elements, snapshots.values.shape[-2])
+        count = torch.full(covariance.shape[:2], sources, device=covariance.device)
+    # Eigenvalues ascend: the signal's are the last.
+    order = torch.arange(elements, device=covariance.device)
+    signal = order >= elements - count[..., None]
+    projector = _SignalProjector.apply(covariance, signal)
+    manifold = snapshots.manifold(grid, radar.waveform.wavelength)
+    inside = torch.einsum("dm,frmn,dn->frd", manifold.conj(), projector, manifold).real
+    # What is left of a source without noise is rounding error.
+    outside = (1 - inside / elements).clamp(min=1e-15)
+    return (1 / outside).unflatten(-1, (grid.u_count, grid.v_count))
+
+
+def source_count(
+    eigenvalues: Float[Tensor, "*batch element"], snapshots: int, rule: str = "mdl"
+) -> Int64[Tensor, "*batch"]:
+    """Number of sources from the eigenvalues of a covariance matrix.
+
+    Minimises −N (M − k) log(geometric/arithmetic mean of the M − k smallest) plus, with
+    d = k (2M − k), d for ``aic`` or d log(N)/2 for ``mdl``, over k = 0 … M − 1.
+
+    Source: Wax and Kailath, Detection of signals by information theoretic criteria, 1985.
+
+    Args:
+        eigenvalues: In any order, M of them.
+        snapshots: N, independent ones in the covariance.
+        rule: ``mdl`` (consistent) or ``aic`` (finds weaker sources, and some that are none).
+
+    Raises:
+        InputError: An unknown rule, or fewer snapshots than elements.
+    """
+    elements = eigenvalues.shape[-1]
+    if rule not in ("mdl", "aic"):
+        raise InputError(f"expected the rule mdl or aic, got {rule!r}; or give a number of sources")
+    if snapshots < elements:
+        raise InputError(
+            f"expected at least {elements} snapshots to count the sources on {elements} elements, "
+            f"got {snapshots}; give sources as a number, more chirps, or smaller smoothing"
+        )
+    values = eigenvalues.detach().to(torch.float64).sort(-1).values
+    # Below the rounding of the largest one, eigenvalues are noise of the arithmetic.
+    floor = 1e-14 * values[..., -1:].clamp(min=torch.finfo(torch.float64).tiny)
+    values = values.maximum(floor)
+    remaining = torch.arange(1, elements + 1, dtype=torch.float64, device=values.device)
+    spread = (values.cumsum(-1) / remaining).log() - values.log().cumsum(-1) / remaining
+    found = elements - remaining  # k of each entry
+    freedom = found * (2 * elements - found)
+    penalty = freedom if rule == "aic" else 0.5 * math.log(snapshots) * freedom
+    cost = snapshots * remaining * spread + penalty
+    return elements - 1 - cost.argmin(-1)
+
+
+class _SignalProjector(torch.autograd.Function):
+    """Projector on the chosen eigenvectors of Hermitian matrices.
+
+    Its derivative in a direction D is Σ (vⱼvⱼᴴ D vᵢvᵢᴴ + h.c.)/(λᵢ − λⱼ) over pairs of i chosen
+    and j not: gaps within either set do not enter.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        matrix: Complex128[Tensor, "*batch element element"],
+        chosen: Bool[Tensor, "*batch element"],
+    ) -> Complex128[Tensor, "*batch element element"]:
+        values, vectors = torch.linalg.eigh(matrix)
+        ctx.save_for_backward(values, vectors, chosen)
+        picked = vectors * chosen[..., None, :]
+        return picked @ picked.mH
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        values, vectors, chosen = ctx.saved_tensors
+        gradient = 0.5 * (grads[0] + grads[0].mH)
+        gap = values[..., :, None] - values[..., None, :]
+        smallest = _SMALLEST_GAP * values.abs().amax(-1)[..., None, None]
+        between = chosen[..., :, None] != chosen[..., None, :]
+        # Matrices of zeros have no scale; their derivative is taken as zero.
+        damped = gap / (gap.square() + smallest.square()).clamp(min=torch.finfo(gap.dtype).tiny)
+        sign = torch.where(chosen[..., :, None], 1.0, -1.0)
+        inner = (vectors.mH @ gradient @ vectors) * (between * sign * damped)
+        return vectors @ inner @ vectors.mH, None
+
+
+def _snapshots(
+    profile: Tensor,
+    radar: Radar,
+    grid: Grid,
+    smoothing: tuple[int, int] | None,
+    forward_backward: bool,
+) -> _Snapshots:
+    """Snapshots of the distinct elements, shifted subarrays and the reversed array included."""
+    channels = (len(radar.transmitters.positions), len(radar.receivers.positions))
+    expected = (*channels, grid.range_count)
+    if profile.ndim != 5 or tuple(profile.shape[2:]) != expected or 0 in profile.shape:
+        raise InputError(
+            f"expected a profile of shape (frame, snapshot, {', '.join(map(str, expected))}) with "
+            f"tx, rx and range last, got {tuple(profile.shape)}; use the radar and grid of "
+            "range_profile"
+        )
+    array = aperture(radar)
+    for name, places, bins in (("u", array.x, grid.u_count), ("v", array.y, grid.v_count)):
+        if len(places) > 1 and bins == 1:
+            raise InputError(
+                f"expected a grid that resolves {name}, got 1 bin; the array extends along that "
+                "axis, so give the grid its directions"
+            )
+    rows, columns = len(array.y), len(array.x)
+    flat = profile.to(torch.complex128).flatten(2, 3).movedim(-1, 1)
+    index = (array.column * rows + array.row).to(flat.device)
+    # Elements at the same place are averaged.
+    plane = flat.new_zeros(*flat.shape[:-1], columns * rows).index_add(-1, index, flat)
+    counts = array.counts.flatten().to(flat.device)
+    taken = counts > 0
+    plane = plane[..., taken] / counts[taken]
+    x = array.x.repeat_interleave(rows)[taken.cpu()]
+    y = array.y.repeat(columns)[taken.cpu()]
+    uniform = bool(taken.all()) and _uniform(array.x) and _uniform(array.y)
+    if (smoothing is not None or forward_backward) and not uniform:
+        raise InputError(
+            "expected a uniform rectangle of virtual elements for smoothing and "
+            f"forward_backward, got {len(x)} elements on a {columns} × {rows} grid of places; "
+            "leave both out for this array"
+        )
+    if smoothing is not None:
+        if not (1 <= smoothing[0] <= columns and 1 <= smoothing[1] <= rows):
+            raise InputError(
+                f"expected subarrays of 1..{columns} × 1..{rows} elements, got {smoothing}; give "
+                "the elements along x and along y"
+            )
+        shifted = plane.unflatten(-1, (columns, rows))
+        shifted = shifted.unfold(-2, smoothing[0], 1).unfold(-2, smoothing[1], 1)
+        plane = shifted.flatten(2, 4).flatten(-2, -1)
+        x, y = (p.unflatten(0, (columns, rows))[: smoothing[0], : smoothing[1]] for p in (x, y))
+        x, y = x.flatten(), y.flatten()
+    if forward_backward:
+        plane = torch.cat([plane, plane.flip(-1).conj()], dim=-2)
+    return _Snapshots(plane, x, y)
+
+
+def _uniform(places: Float64[Tensor, " place"]) -> bool:
+    steps = places.diff()
+    return len(steps) < 2 or bool((steps - steps.mean()).abs().max() <= _UNIFORMITY * steps.mean())
+
+
+def _check_sources(sources: int, elements: int, snapshots: int) -> None:
+    if not 0 <= sources < elements:
+        raise InputError(
+            f"expected 0 to {elements - 1} sources, fewer than the {elements} elements (of a "
+            f"subarray), got {sources}; a noise subspace must remain"
+        )
+    if sources > snapshots:
+        raise InputError(
+            f"expected at most {snapshots} sources from as many snapshots, got {sources}; give "
+            "more chirps as snapshots, or smoothing"
+        )

@@ -1,0 +1,154 @@
+"""Images of points from the beat signal: near field, moving radars, signs, gradients."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from invertwin.capture import Capture, backproject
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.radar import (
+    FMCW,
+    Impulse,
+    Radar,
+    backproject_beat,
+    beamform,
+    beat_signal,
+    range_profile,
+)
+from invertwin.radar.waveform import sample_window
+from invertwin.scene.antenna import linear_array
+from invertwin.scene.pose import rotation_from_vector
+
+
+@pytest.fixture(scope="module")
+def track(waveform) -> Radar:
+    """2 × 4 elements along 0.3 m of a bent track, turning on the way."""
+    half = 0.5 * waveform.wavelength
+    along = torch.linspace(-0.15, 0.15, 41, dtype=torch.float64)
+    places = torch.stack([along, 0.1 * along.square(), 0.02 * torch.sin(9 * along)], dim=1)
+    turns = [rotation_from_vector(torch.tensor([0.0, -0.2 * x, 0.1 * x])) for x in along]
+    return Radar(
+        linear_array(2, 4 * half),
+        linear_array(4, half),
+        waveform,
+        places,
+        torch.stack(turns).to(torch.float64),
+    )
+
+
+def recorded(point_paths, radar, points, coefficients):
+    count = len(points)
+    frame = torch.arange(radar.frame_count).repeat_interleave(count)
+    repeated = torch.as_tensor(coefficients).repeat(radar.frame_count)
+    paths = point_paths(radar, points.repeat(radar.frame_count, 1), repeated, frame)
+    return beat_signal(paths, radar)
+
+
+def plain(beat, radar, points):
+    """The sum as it is written, sample by sample."""
+    waveform = radar.waveform
+    window = sample_window(waveform, radar.window)
+    tx, rx = radar.elements()
+    image = []
+    for point in points:
+        to_tx, to_rx = (point - tx).norm(dim=-1), (point - rx).norm(dim=-1)
+        delay = ((to_tx[:, :, None] + to_rx[:, None]) / SPEED_OF_LIGHT)[..., None]
+        swept = waveform.slope * (waveform.sample_times - 0.5 * delay)
+        filtered = beat * torch.exp(-2j * math.pi * delay * (waveform.start_frequency + swept))
+        image.append((filtered * window).sum(-1).mean() / window.sum())
+    return torch.stack(image)
+
+
+def test_points_along_a_track(track, point_paths):
+    """conj(a) at each place, with a sharp peak; equal to the plain sum everywhere."""
+    points = torch.tensor([[0.1, 0.0, 1.5], [-0.4, 0.05, 2.1]], dtype=torch.float64)
+    beat = recorded(point_paths, track, points, [1.0, 0.5j])
+    image = backproject_beat(beat, track, points.reshape(2, 1, 3))
+    assert image.shape == (2, 1)
+    expected = torch.tensor([[1.0], [-0.5j]], dtype=torch.complex128)
+    assert (image - expected).abs().max() < 0.05
+    away = torch.tensor([[0.02, 0, 0], [0, 0, 0.25], [0.3, 0, 0.3]], dtype=torch.float64)
+    assert backproject_beat(beat, track, points[0] + away).abs().max() < 0.15
+    mixed = torch.cat([points, points[0] + 0.1 * away, points[1] + away])
+    difference = backproject_beat(beat, track, mixed) - plain(beat, track, mixed)
+    assert difference.abs().max() < 5e-3
+
+
+def test_near_field_of_an_array(waveform, point_paths):
+    """0.25 m in front of 0.25 m of elements: in focus here, blurred by plane-wave steering."""
+    radar = Radar(
+        linear_array(1, 1.0),
+        linear_array(128, waveform.wavelength / 2),
+        waveform,
+        torch.zeros(1, 3, dtype=torch.float64),
+    )
+    point = torch.tensor([[0.03, 0.0, 0.25]], dtype=torch.float64)
+    beat = recorded(point_paths, radar, point, [1.0])
+    offset = torch.linspace(-0.02, 0.02, 81, dtype=torch.float64)
+    line = point + torch.nn.functional.pad(offset[:, None], (0, 2))
+    image = backproject_beat(beat, radar, line).abs()
+    assert image.argmax() == 40
+    assert image[40] == pytest.approx(1.0, abs=0.01)
+    assert image[[30, 50]].max() < 0.3
+    grid = radar.grid(0.1, 0.5)
+    assert beamform(range_profile(beat, radar, grid), radar, grid).max().sqrt() < 0.4
+
+
+def test_far_away_it_is_the_range_profile(linear, point_paths):
+    """One frame of one channel: the same number as the windowed transform at that range."""
+    radar = replace(linear, receivers=linear_array(1, 1.0))
+    points = torch.tensor([[0.0, 0.0, 4.3]], dtype=torch.float64)
+    beat = recorded(point_paths, radar, points, [1.0])
+    grid = radar.grid(3, 6)
+    places = torch.nn.functional.pad(grid.ranges[:, None], (2, 0))
+    image = backproject_beat(beat, radar, places).abs()
+    profile = range_profile(beat, radar, grid)[0, 0, 0].abs()
+    assert torch.allclose(image, profile, atol=2e-3)
+
+
+def test_captures_of_beat_samples(track, point_paths):
+    points = torch.tensor([[0.1, 0.0, 1.5]], dtype=torch.float64)
+    beat = recorded(point_paths, track, points, [1.0])
+    image = backproject(Capture.from_beat(beat, track), points)
+    assert torch.allclose(image, backproject_beat(beat, track, points))
+
+
+def test_gradients():
+    """In the signal, the points and the poses; a low carrier keeps differences accurate."""
+    waveform = FMCW(1e9, 0.2e9, 1e-6, 12)
+    still = torch.zeros(2, 3, dtype=torch.float64)
+    radar = Radar(linear_array(2, 0.1, "y"), linear_array(2, 0.1), waveform, still)
+    generator = torch.Generator().manual_seed(0)
+    beat = torch.randn(2, 2, 2, 12, dtype=torch.complex128, generator=generator)
+    points = torch.tensor([[0.3, 0.2, 2.0], [-0.5, 0.1, 3.3]], dtype=torch.float64)
+    positions = 0.1 * torch.randn(2, 3, dtype=torch.float64, generator=generator)
+    assert torch.autograd.gradcheck(
+        lambda b, x, p: backproject_beat(b, replace(radar, positions=p), x),
+        [value.requires_grad_() for value in (beat, points, positions)],
+    )
+
+
+def test_gradient_at_77_ghz_is_that_of_the_plain_sum(track, point_paths):
+    points = torch.tensor([[0.1, 0.0, 1.5]], dtype=torch.float64)
+    beat = recorded(point_paths, track, points, [1.0])
+    near = (points + 4e-4).requires_grad_()
+    grads = [
+        torch.autograd.grad(image(beat, track, near).abs().square().sum(), near)[0]
+        for image in (backproject_beat, plain)
+    ]
+    assert (grads[0] - grads[1]).norm() < 0.02 * grads[1].norm()
+
+
+def test_wrong_input(linear):
+    beat = torch.zeros(1, 1, 16, 64, dtype=torch.complex128)
+    far = torch.tensor([[0.0, 0.0, 9.7]], dtype=torch.float64)
+    with pytest.raises(InputError, match="unambiguous range"):
+        backproject_beat(beat, linear, far)
+    with pytest.raises(InputError, match="beat signal of shape"):
+        backproject_beat(beat[:, :, :3], linear, far)
+    with pytest.raises(InputError, match="no beat signal"):
+        backproject_beat(beat, replace(linear, waveform=Impulse(77e9, 1e9)), far)
+    assert backproject_beat(beat, linear, torch.zeros(0, 3, dtype=torch.float64)).shape == (0,)

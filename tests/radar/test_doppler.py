@@ -1,0 +1,216 @@
+"""Range rates, TDM-MIMO and spectrograms of movers whose beat phase is written down directly."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from invertwin.errors import InputError
+from invertwin.radar import (
+    FMCW,
+    Chirps,
+    Radar,
+    beamform,
+    compensate_tdm,
+    micro_doppler,
+    moving_beat,
+    range_doppler,
+    range_doppler_angle,
+    resolve_fold,
+    velocity_axis,
+    velocity_span,
+)
+from invertwin.scene.antenna import linear_array
+from invertwin.scene.pose import rotation_from_vector
+from oracles.moving_point import moving_point
+
+WAVE = FMCW(76.5e9, 1e9, 40e-6, 64)
+HALF = WAVE.wavelength / 2
+CHIRPS = Chirps(count=32, interval=50e-6)
+U = 0.2
+
+
+def mimo(transmitters: int = 4, receivers: int = 4) -> Radar:
+    """Transmitters and receivers in a row whose virtual array is uniform without gaps."""
+    return Radar(
+        linear_array(transmitters, receivers * HALF),
+        linear_array(receivers, HALF),
+        WAVE,
+        torch.zeros(1, 3, dtype=torch.float64),
+        window="hann",
+        array_window="rectangular",
+    )
+
+
+def mover(radar: Radar, chirps: Chirps, rate: float) -> torch.Tensor:
+    return moving_point(radar, chirps, 4.0, rate, U)
+
+
+def direction(power, grid):
+    """u of the peak, refined by a parabola."""
+    line = power.amax((0, 1, 2))[:, 0]
+    peak = int(line.argmax())
+    a, b, c = line[peak - 1 : peak + 2].tolist()
+    return float(grid.u[peak]) + 0.5 * (a - c) / (a - 2 * b + c) * grid.u_step
+
+
+@pytest.mark.parametrize("tdm", [True, False])
+@pytest.mark.parametrize("rate", [-0.31, 0.17])
+def test_a_mover_is_found_at_its_range_and_rate(tdm, rate):
+    """Positive moves away; the peak is 1."""
+    radar, chirps = mimo(), replace(CHIRPS, tdm=tdm)
+    rate = rate * velocity_span(radar, chirps)
+    grid = radar.grid(2, 6, oversample=4)
+    power = range_doppler(mover(radar, chirps, rate), radar, grid, chirps, bins=256).abs().square()
+    assert power.shape == (1, 256, 4, 4, grid.range_count)
+    velocity, place = divmod(int(power.mean((0, 2, 3)).argmax()), grid.range_count)
+    axis = velocity_axis(radar, chirps, 256)
+    assert axis[velocity] == pytest.approx(rate, abs=float(axis[1] - axis[0]))
+    assert grid.ranges[place] == pytest.approx(4.0, abs=grid.range_step)
+    assert power.max() == pytest.approx(1.0, rel=0.05)
+
+
+def test_axis_of_range_rates():
+    radar = mimo()
+    axis = velocity_axis(radar, CHIRPS)
+    assert axis.shape == (32,)
+    assert axis[16] == 0
+    assert velocity_span(radar, CHIRPS) == pytest.approx(WAVE.wavelength / 2 / 200e-6)
+    assert -axis[0] == pytest.approx(CHIRPS.max_speed(WAVE.wavelength, 4))
+    assert axis[1] - axis[0] == pytest.approx(velocity_span(radar, CHIRPS) / 32)
+
+
+@pytest.mark.parametrize("transmitters", [2, 3, 4])
+@pytest.mark.parametrize("part", [-0.45, 0.3])
+def test_compensated_direction_within_the_axis(transmitters, part):
+    radar = mimo(transmitters)
+    rate = part * velocity_span(radar, CHIRPS)
+    grid = radar.grid(3, 5, u_max=0.9, oversample=8)
+    power = range_doppler_angle(mover(radar, CHIRPS, rate), radar, grid, CHIRPS, bins=128)
+    assert power.shape == (1, 128, *grid.shape)
+    assert power.max() == pytest.approx(1.0, rel=0.1)
+    assert abs(direction(power, grid) - U) < 0.1 * radar.beamwidth[0]
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_fast_mover_needs_the_compensation_and_its_sign(sign):
+    """1.25 spans beyond zero: without the phase, or with its opposite, over a beamwidth off."""
+    radar = mimo()
+    rate = sign * 1.25 * velocity_span(radar, CHIRPS)
+    grid = radar.grid(3, 5, u_max=0.9, oversample=8)
+    cube = range_doppler(mover(radar, CHIRPS, rate), radar, grid, CHIRPS, bins=128)
+    right = compensate_tdm(cube, radar, CHIRPS, fold=sign)
+    turn = compensate_tdm(torch.ones_like(cube), radar, CHIRPS, fold=sign)
+    reversed_sign = cube * turn.conj()
+    bins = radar.frames([0] * 128)
+
+    def seen(spectrum):
+        return direction(beamform(spectrum[0], bins, grid)[None], grid)
+
+    assert abs(seen(right) - U) < 0.1 * radar.beamwidth[0]
+    assert abs(seen(cube) - U) > radar.beamwidth[0]
+    assert abs(seen(reversed_sign) - U) > radar.beamwidth[0]
+    assert abs(seen(compensate_tdm(cube, radar, CHIRPS, fold=-sign)) - U) > radar.beamwidth[0]
+
+
+@pytest.mark.parametrize("spans", [-1.25, -0.3, 0.0, 0.4, 1.25])
+def test_the_fold_is_resolved(spans):
+    radar = mimo()
+    rate = spans * velocity_span(radar, CHIRPS)
+    grid = radar.grid(3, 5, u_max=0.9, oversample=4)
+    beat = mover(radar, CHIRPS, rate)
+    cube = range_doppler(beat, radar, grid, CHIRPS)
+    fold = resolve_fold(cube, radar, grid, CHIRPS)
+    assert fold.shape == (1, 32, grid.range_count)
+    power = range_doppler_angle(beat, radar, grid, CHIRPS, fold=fold)
+    velocity, place = divmod(int(power[0].amax((-2, -1)).argmax()), grid.range_count)
+    assert fold[0, velocity, place] == round(spans)
+    found = velocity_axis(radar, CHIRPS)[velocity] + fold[0, velocity, place] * velocity_span(
+        radar, CHIRPS
+    )
+    assert found == pytest.approx(rate, abs=velocity_span(radar, CHIRPS) / 32)
+    assert abs(direction(power, grid) - U) < 0.1 * radar.beamwidth[0]
+
+
+def test_transmitters_at_once_need_nothing():
+    radar, chirps = mimo(), replace(CHIRPS, tdm=False)
+    grid = radar.grid(3, 5)
+    cube = range_doppler(mover(radar, chirps, 3.0), radar, grid, chirps)
+    assert torch.equal(compensate_tdm(cube, radar, chirps), cube)
+
+
+def test_moving_paths_have_the_same_signal(point_paths):
+    """What ``moving_beat`` makes of a moving point is the closed form that these tests use."""
+    radar, rate = mimo(), 9.0
+    ray = torch.tensor([U, 0.0, math.sqrt(1 - U**2)], dtype=torch.float64)
+    start = (4.0 - rate * CHIRPS.times(4).mean()) * ray
+    paths = point_paths(radar, start, torch.tensor([1.0]))
+    beat = moving_beat(replace(paths, velocity=rate * ray[None]), radar, CHIRPS)
+    assert (beat - mover(radar, CHIRPS, rate)).abs().max() < 1e-6
+
+
+def test_frames_have_their_own_poses():
+    """Two frames with other places and attitudes of the radar see the same in their frames."""
+    one = mimo(2, 2)
+    turn = rotation_from_vector(torch.tensor([0.2, -0.5, 0.3], dtype=torch.float64))
+    places = torch.tensor([[0.0, 0, 0], [1.0, -2, 0.5]], dtype=torch.float64)
+    both = replace(one, positions=places, rotations=torch.stack([torch.eye(3).double(), turn]))
+    beat = mover(both, CHIRPS, -2.0)
+    grid = both.grid(3, 5)
+    power = range_doppler_angle(beat, both, grid, CHIRPS)
+    assert torch.allclose(power[0], power[1], atol=1e-6)
+    alone = range_doppler_angle(beat[:1], one, grid, CHIRPS)
+    assert torch.allclose(power[:1], alone)
+
+
+def test_spectrogram_follows_a_swinging_point():
+    """Range 3 m + 2 cm · sin(2π 5 t): the ridge is the derivative of the range."""
+    radar = replace(mimo(1, 1), transmitters=linear_array(1, HALF))
+    chirps = Chirps(count=2000, interval=1e-4)
+    times = torch.arange(2000, dtype=torch.float64) * 1e-4
+    distance = 3 + 0.02 * torch.sin(2 * math.pi * 5 * times)
+    signal = 0.5 * torch.exp(4j * math.pi / WAVE.wavelength * distance)
+    result = micro_doppler(signal[None], radar, chirps, length=100, step=50)
+    assert result.power.shape == (1, 39, 100)
+    assert result.times[1] == pytest.approx(99.5e-4)
+    ridge = result.velocities[result.power[0].argmax(-1)]
+    expected = 0.02 * 2 * math.pi * 5 * torch.cos(2 * math.pi * 5 * result.times)
+    assert (ridge - expected).abs().max() < 1.5 * (result.velocities[1] - result.velocities[0])
+    assert result.power.max() == pytest.approx(0.25, rel=0.1)
+
+
+def test_gradients():
+    radar, chirps = mimo(2, 2), Chirps(3, 50e-6)
+    grid = replace(radar.grid(3.9, 4.1), u_count=3)
+    generator = torch.Generator().manual_seed(0)
+    beat = torch.randn(1, 3, 2, 2, 64, dtype=torch.complex128, generator=generator)
+    assert torch.autograd.gradcheck(
+        lambda b: range_doppler_angle(b, radar, grid, chirps, bins=4),
+        beat.requires_grad_(),
+        fast_mode=True,
+    )
+    slow = beat.detach()[0, :, 0, 0, :4].T.requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda s: micro_doppler(s, radar, chirps, length=2).power, slow, fast_mode=True
+    )
+
+
+def test_wrong_input():
+    radar = mimo()
+    grid = radar.grid(3, 5)
+    beat = mover(radar, CHIRPS, 0.0)
+    with pytest.raises(InputError, match="32 chirps"):
+        range_doppler(beat[:, :9], radar, grid, CHIRPS)
+    with pytest.raises(InputError, match="at least 32 bins"):
+        range_doppler(beat, radar, grid, CHIRPS, bins=16)
+    with pytest.raises(InputError, match="'kaiser'"):
+        range_doppler(beat, radar, grid, CHIRPS, window="kaiser")
+    cube = range_doppler(beat, radar, grid, CHIRPS)
+    with pytest.raises(InputError, match="4 transmitters"):
+        compensate_tdm(cube[:, :, :2], radar, CHIRPS)
+    with pytest.raises(InputError, match="candidate"):
+        resolve_fold(cube, radar, grid, CHIRPS, candidates=())
+    for length, step in ((33, 1), (1, 1), (8, 0)):
+        with pytest.raises(InputError, match=r"window of 2\.\.32"):
+            micro_doppler(cube[0, :, 0, 0, 0], radar, CHIRPS, length=length, step=step)
