@@ -8,9 +8,19 @@ import torch
 
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
-from invertwin.radar import Radar, beamform, capon, music, source_count
+from invertwin.radar import (
+    Chirps,
+    Radar,
+    beamform,
+    capon,
+    compensate_tdm,
+    music,
+    range_doppler,
+    source_count,
+)
 from invertwin.radar.direction import _SignalProjector
 from invertwin.scene.antenna import AntennaArray, linear_array
+from oracles.moving_point import moving_point
 
 MUSIC = _SignalProjector.apply
 
@@ -114,6 +124,29 @@ def test_smoothing_of_a_plane(planar):
     values = column[1:-1][column[1:-1].gt(column[:-2]).logical_and(column[1:-1] >= column[2:])]
     best = sorted((found.ravel() + grid.v_step)[values.argsort(descending=True)[:2]].tolist())
     assert best == pytest.approx([-0.15, 0.25], abs=grid.v_step)
+
+
+@pytest.mark.parametrize("method", [capon, music])
+def test_movers_of_one_range_and_rate(method, waveform):
+    """Doppler bins as frames, transmitters in turn compensated: two movers within 1.2 beams."""
+    half, chirps = 0.5 * waveform.wavelength, Chirps(32, 50e-6)
+    radar = Radar(
+        linear_array(4, 4 * half),
+        linear_array(4, half),
+        waveform,
+        torch.zeros(1, 3, dtype=torch.float64),
+    )
+    truth = [0.1, 0.1 + 1.2 * radar.beamwidth[0]]
+    beat = torch.stack([moving_point(radar, chirps, 4.0, 3.0, u) for u in truth]).sum(0)
+    cube = range_doppler(beat, radar, radar.grid(3, 5), chirps)
+    cube = compensate_tdm(cube, radar, chirps)
+    strongest = cube.abs().square().sum((0, 2, 3))
+    rate, place = divmod(int(strongest.argmax()), cube.shape[-1])
+    grid = line(count=1801)
+    bins = cube.flatten(0, 1)[rate : rate + 1, None, :, :, place : place + 1]
+    options = {"sources": 2} if method is music else {"loading": 1e-5}
+    power = method(bins, radar, grid, smoothing=(10, 1), forward_backward=True, **options)
+    assert peaks(power, grid) == pytest.approx(truth, abs=0.1 * radar.beamwidth[0])
 
 
 def test_forward_backward_of_a_uniform_array_keeps_the_directions(linear):

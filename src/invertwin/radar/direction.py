@@ -60,7 +60,7 @@ def capon(
 
     Args:
         profile: Range profiles; snapshots are chirps, or one snapshot per Doppler bin with the
-            bins as frames.
+            bins as frames: of movers, where transmitters take turns, after ``compensate_tdm``.
         radar: Its array, without window; its poses are not used.
         grid: Its directions.
         loading: Diagonal loading δ in units of the mean power of an element.
