@@ -88,3 +88,9 @@ def test_a_view_of_nothing_is_nothing():
     for surrogate in (None, Surrogate()):
         found = simulate(away, device, grid, seed=0, surrogate=surrogate, samples=1_000)
         assert float(found.spectrum.max()) < 1e-30
+
+
+def test_a_mean_spectrum_has_no_noise():
+    device = radar()
+    with pytest.raises(InputError, match="no noise with a surrogate"):
+        simulate(occluder(), device, device.grid(0.5, 2.5), seed=0, surrogate=Surrogate(), snr_db=9)

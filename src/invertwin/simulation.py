@@ -70,10 +70,15 @@ def simulate(
         backend: See ``deposit_power``.
 
     Raises:
-        InputError: An object in motion: a frame is one instant.
+        InputError: An object in motion: a frame is one instant. Noise on a mean spectrum.
     """
     with use_backend(backend):
         if surrogate is not None:
+            if snr_db is not None or noise_figure_db is not None:
+                raise InputError(
+                    "expected no noise with a surrogate, got a noise level; the surrogate is the "
+                    "mean spectrum: leave the noise out, or simulate without a surrogate"
+                )
             return Simulation(
                 surrogate_spectrum(
                     scene,

@@ -230,3 +230,9 @@ def test_tapers(name):
     if name == "hann":
         inner = torch.hann_window(11, periodic=False, dtype=torch.float64)[1:-1]
         assert torch.allclose(weight, inner)
+
+
+def test_a_grid_beyond_the_unambiguous_range_is_refused(planar):
+    with pytest.raises(InputError, match="unambiguous"):
+        planar.grid(1.0, 1.01 * planar.waveform.max_range)
+    assert planar.grid(1.0, planar.waveform.max_range).range_count > 1

@@ -56,18 +56,27 @@ class Capture:
     @classmethod
     def from_beat(
         cls,
-        beat: Complex[Tensor, "frame tx rx sample"],
+        beat: Complex[Tensor, "frame tx rx sample"] | np.ndarray,
         radar: Radar,
         times: Float64[Tensor, " frame"] | None = None,
     ) -> "Capture":
         """Raw samples of an FMCW radar.
 
         Args:
-            beat: samples of every virtual channel; dtype and bits are kept.
+            beat: complex (I/Q) samples of every virtual channel; dtype and bits are kept.
             radar: what measured them.
             times: of each frame [s].
+
+        Raises:
+            InputError: real samples, or a shape that the radar does not have.
         """
-        variables = {"beat": labelled(BEAT_DIMS, beat, "1")}
+        samples = torch.as_tensor(beat)
+        if not samples.is_complex():
+            raise InputError(
+                f"expected complex (I/Q) beat samples, got {samples.dtype}; of real ADC samples "
+                "take the analytic signal (scipy.signal.hilbert) along the last axis first"
+            )
+        variables = {"beat": labelled(BEAT_DIMS, samples, "1")}
         return cls._assembled(variables, radar, times)
 
     @classmethod

@@ -104,7 +104,7 @@ def reconstruct(
     scene: Scene,
     radar: Radar,
     capture: Capture,
-    parameters: Sequence[nn.Module],
+    parameters: nn.Module | Sequence[nn.Module],
     *,
     grid: Grid,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
@@ -136,7 +136,8 @@ def reconstruct(
         scene: Starting scene.
         radar: The radar of the capture.
         capture: Measured data.
-        parameters: Modules Scene → Scene or Radar → Radar, applied in order (``scene.parameters``).
+        parameters: One or more modules Scene → Scene or Radar → Radar, applied in order
+            (``scene.parameters``).
         grid: Bins that are compared.
         loss: How maps are compared: (simulated, measured) → a number.
         optimizer: Kind and rates.
@@ -164,10 +165,11 @@ def reconstruct(
     Raises:
         InputError: Nothing to fit, a map of zeros, a checkpoint of another fit.
     """
+    listed = [parameters] if isinstance(parameters, nn.Module) else list(parameters)
     fit = _Fit(
         scene=scene,
         radar=radar,
-        modules=nn.ModuleList([*parameters, *nuisances]),
+        modules=nn.ModuleList([*listed, *nuisances]),
         measured=capture.spectrum(grid).to(torch.float32),
         grid=grid,
         loss=loss or SpectrumLoss(),

@@ -489,7 +489,8 @@ class Radar:
             oversample: Bins per range cell.
 
         Raises:
-            InputError: The limits are not increasing or out of bounds.
+            InputError: The limits are not increasing, out of bounds, or beyond the unambiguous
+                range.
         """
         if not 0 <= range_min < range_max:
             raise InputError(
@@ -503,6 +504,11 @@ class Radar:
             )
         step = self.waveform.range_resolution / oversample
         if isinstance(self.waveform, SampledWaveform):
+            if range_max > (1 + 1e-9) * self.waveform.max_range:
+                raise InputError(
+                    f"expected range_max within the unambiguous {self.waveform.max_range:.4g} m, "
+                    f"got {range_max:g}; a waveform with more samples reaches farther"
+                )
             step = self.waveform.max_range / round(oversample * self.waveform.samples)
         first = math.floor(range_min / step + 1e-9)
         last = math.ceil(range_max / step - 1e-9)
