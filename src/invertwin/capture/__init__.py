@@ -6,14 +6,22 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from invertwin.capture import rail_sar
+from invertwin.capture import described_arrays, openradar, rail_sar, ti
 from invertwin.capture.backprojection import backproject, calibrate, locate
 from invertwin.capture.capture import Capture
+from invertwin.capture.channels import ChannelCalibration, estimate_channels
+from invertwin.capture.chirps import ChirpData, ChirpSettings, adc_counts, settings_of
 from invertwin.capture.track import Track
 from invertwin.errors import InputError
 
 READERS: MappingProxyType[str, Callable[..., Capture]] = MappingProxyType(
-    {"netcdf": Capture.load, "rail_sar": rail_sar.read}
+    {
+        "netcdf": Capture.load,
+        "rail_sar": rail_sar.read,
+        "openradar": openradar.read,
+        "dca1000": ti.read,
+        "arrays": described_arrays.read,
+    }
 )
 """Name → function that takes a path, and options of its own, and returns a `Capture`."""
 
@@ -37,4 +45,18 @@ def read(path: str | Path, reader: str = "netcdf", **options: Any) -> Capture:
     return READERS[reader](path, **options)
 
 
-__all__ = ["READERS", "Capture", "Track", "backproject", "calibrate", "locate", "read"]
+__all__ = [
+    "READERS",
+    "Capture",
+    "ChannelCalibration",
+    "ChirpData",
+    "ChirpSettings",
+    "Track",
+    "adc_counts",
+    "backproject",
+    "calibrate",
+    "estimate_channels",
+    "locate",
+    "read",
+    "settings_of",
+]

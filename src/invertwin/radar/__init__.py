@@ -1,6 +1,7 @@
 """Channel to radar data: the exact signal chain and its smooth surrogate, in plain torch."""
 
 from invertwin.radar.backprojection import backproject_beat
+from invertwin.radar.boards import BOARDS, Board, board
 from invertwin.radar.detection import (
     PointCloud,
     cell_averaging_cfar,
@@ -46,8 +47,10 @@ from invertwin.radar.waveform import (
 
 __all__ = [
     "ADC",
+    "BOARDS",
     "FMCW",
     "OFDM",
+    "Board",
     "Chirps",
     "Impairments",
     "Impulse",
@@ -66,6 +69,7 @@ __all__ = [
     "backproject_beat",
     "beamform",
     "beat_signal",
+    "board",
     "capon",
     "cell_averaging_cfar",
     "channel_errors",

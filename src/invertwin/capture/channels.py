@@ -1,0 +1,174 @@
+"""Gain and phase of every channel: estimated from a reflector, saved, taken out of the data."""
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Complex, Complex128, Float64
+from torch import Tensor
+
+from invertwin.capture.capture import Capture
+from invertwin.capture.chirps import ChirpData
+from invertwin.capture.radar_fields import labelled
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.radar.waveform import sample_window, sampled
+from invertwin.scene.checks import checked_tensor
+
+_DEAD = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelCalibration:
+    """What every virtual channel multiplies its signal by.
+
+    Attributes:
+        gains: measured over ideal signal, [tx, rx]; the mean of their squares is 1 and the sum is
+            real and positive, since neither common power nor common phase can be told from the
+            reflector's.
+
+    Raises:
+        InputError: another shape, NaN, or a channel without signal.
+    """
+
+    gains: Complex128[Tensor, "tx rx"]
+
+    def __post_init__(self) -> None:
+        gains = self.gains
+        finite = bool(torch.isfinite(torch.view_as_real(gains)).all()) if gains.numel() else False
+        if gains.ndim != 2 or not finite:
+            raise InputError(
+                f"expected finite gains [tx, rx], got shape {tuple(gains.shape)}; "
+                "give one complex number per virtual channel"
+            )
+        weak = gains.abs() < _DEAD * gains.abs().max()
+        if bool(weak.any()):
+            tx, rx = (int(index) for index in weak.nonzero()[0])
+            raise InputError(
+                f"expected signal in every channel, got less than {_DEAD:g} of the strongest from "
+                f"TX element {tx} to RX element {rx} (from 0); leave out the dead element"
+            )
+        gains = gains / gains.abs().square().mean().sqrt()
+        total = gains.sum()
+        # Phases that cancel have no common one.
+        if total.abs() > 1e-9 * gains.numel():
+            gains = gains * (total.conj() / total.abs())
+        object.__setattr__(self, "gains", gains)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ChannelCalibration":
+        """Reads what `save` wrote.
+
+        Raises:
+            InputError: no such file, or one that holds no calibration.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(f"expected a calibration, got no file {path}; check the path")
+        try:
+            parts = torch.tensor(json.loads(path.read_text())["gains"], dtype=torch.float64)
+            if parts.ndim != 3 or parts.shape[2] != 2:
+                raise ValueError(f"shape {tuple(parts.shape)}")
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"expected gains [tx][rx][real, imaginary] in {path}, got none ({error}); "
+                "it is no calibration, or damaged"
+            ) from error
+        calibration = cls(torch.view_as_complex(parts))
+        # As written: normalising again would change the last bit.
+        object.__setattr__(calibration, "gains", torch.view_as_complex(parts))
+        return calibration
+
+    def save(self, path: str | Path) -> None:
+        """Writes JSON, every bit kept; an interrupted write leaves what was there before.
+
+        Raises:
+            InputError: the folder does not exist.
+        """
+        path = Path(path)
+        if not path.parent.is_dir():
+            raise InputError(f"expected an existing folder, got {path.parent}; create it first")
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            part.write_text(json.dumps({"gains": torch.view_as_real(self.gains).tolist()}) + "\n")
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+
+    def apply(self, capture: Capture) -> Capture:
+        """The capture with every channel divided by its gain.
+
+        Raises:
+            InputError: range profiles, or another number of channels.
+        """
+        beat = self._corrected(capture.beat)
+        variable = labelled(("frame", "tx", "rx", "sample"), beat, "1")
+        return Capture(capture.dataset.assign(beat=variable))
+
+    def apply_to_chirps(self, data: ChirpData) -> ChirpData:
+        """The same for every chirp. The samples are no whole counts any more.
+
+        Raises:
+            InputError: another number of channels, or real samples: a phase turns only complex
+                ones, so calibrate their `ChirpData.capture`.
+        """
+        if data.settings.real:
+            raise InputError(
+                "expected complex samples, got real ones; calibrate the capture made from them"
+            )
+        return replace(data, samples=self._corrected(data.samples))
+
+    def _corrected(self, samples: Complex[Tensor, "*batch tx rx sample"]) -> Tensor:
+        expected = tuple(self.gains.shape)
+        if tuple(samples.shape[-3:-1]) != expected:
+            raise InputError(
+                f"expected data of {expected} TX and RX elements as in the calibration, got "
+                f"{tuple(samples.shape[-3:-1])}; calibrate with the same elements"
+            )
+        return (samples / self.gains[:, :, None]).to(samples.dtype)
+
+
+def estimate_channels(
+    capture: Capture, reflector: Float64[Tensor, "3"] | list[float]
+) -> ChannelCalibration:
+    """Gains of the channels, from a reflector at a known place.
+
+    Each channel is compared with the beat signal of an ideal point there,
+    ``c = Σ w_n s[n] conj(ideal[n])``, whose delays are exact to every element (so the reflector
+    may be close), which weighs down echoes from other ranges. Over several frames
+    ``c ≈ amplitude(frame) · gain(channel)``: the gains are the leading singular vector, whatever
+    phase the reflector has in each frame. Positions of the elements that are wrong count as phases;
+    they are right in the direction of this reflector only.
+
+    Args:
+        capture: samples with the reflector as the strongest echo at its range.
+        reflector: where it is in the world [m].
+
+    Raises:
+        InputError: range profiles, a place that is no position or beyond the unambiguous range,
+            or a channel without signal.
+    """
+    do = "give the world position of the reflector in metres"
+    place = checked_tensor(reflector, (3,), "reflector", do)
+    radar = capture.radar()
+    waveform = sampled(radar)
+    tx, rx = radar.elements()
+    to_tx, to_rx = (tx - place).norm(dim=-1), (rx - place).norm(dim=-1)
+    delay = (to_tx[:, :, None] + to_rx[:, None]) / SPEED_OF_LIGHT
+    farthest = float(delay.max()) * SPEED_OF_LIGHT / 2
+    if farthest >= waveform.max_range:
+        raise InputError(
+            f"expected a reflector within {waveform.max_range:g} m, got one at {farthest:g} m; {do}"
+        )
+    cycles = waveform.frequencies * delay[..., None]
+    cycles = cycles - 0.5 * waveform.residual_slope * delay.square()[..., None]
+    ideal = torch.exp(2j * torch.pi * cycles)
+    window = sample_window(waveform, radar.window)
+    matched = (capture.beat.to(torch.complex128) * ideal.conj() * window).sum(dim=-1)
+    # Rows are frames, columns channels.
+    _, strength, channels = torch.linalg.svd(matched.flatten(1), full_matrices=False)
+    if float(strength[0]) == 0:
+        raise InputError("expected an echo of the reflector, got samples of zero; record again")
+    return ChannelCalibration(channels[0].reshape(matched.shape[1:]))

@@ -1,0 +1,338 @@
+"""Raw samples chirp by chirp, and the settings they were recorded with."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Float64
+from scipy.signal import hilbert
+from torch import Tensor
+
+from invertwin.capture.capture import Capture
+from invertwin.errors import InputError
+from invertwin.radar.motion import Chirps
+from invertwin.radar.waveform import FMCW, PhysicsWarning, Radar
+from invertwin.scene.antenna import AntennaArray
+from invertwin.scene.checks import checked_count, checked_number
+
+CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
+
+
+@dataclass(frozen=True)
+class ChirpSettings:
+    """What a board was told to send and to record: one FMCW profile, transmitters in turn (TDM).
+
+    Attributes:
+        start_frequency: of the ramp, before the ADC starts [Hz].
+        slope: of the ramp [Hz/s].
+        sample_rate: of the ADC's output [Hz].
+        samples: per chirp and receiver.
+        transmit_order: numbers from 1 of the transmitters, in the order of sending in one loop.
+        receivers: numbers from 1 of the recorded receivers, ascending.
+        loops: per frame; every transmitter sends once per loop.
+        frames: recorded; None = until it is stopped.
+        frame_period: from frame to frame [s]; None = not known.
+        idle_time: before each ramp [s].
+        adc_start_time: from the start of the ramp to the first sample [s].
+        ramp_end_time: from the start of the ramp to its end [s]; None = with the last sample.
+        real: whether the ADC records real samples instead of I and Q.
+        swap_iq: whether Q comes before I in the file.
+        bits: of the ADC.
+        lanes: of the LVDS link, 2 (xWR16xx, 18xx, 68xx) or 4 (xWR12xx, 14xx); None = not known.
+
+    Raises:
+        InputError: a value out of range, a transmitter that sends twice per loop, or a ramp that
+            ends before its last sample.
+    """
+
+    start_frequency: float
+    slope: float
+    sample_rate: float
+    samples: int
+    transmit_order: tuple[int, ...]
+    receivers: tuple[int, ...]
+    loops: int
+    frames: int | None = None
+    frame_period: float | None = None
+    idle_time: float = 0.0
+    adc_start_time: float = 0.0
+    ramp_end_time: float | None = None
+    real: bool = False
+    swap_iq: bool = False
+    bits: int = 16
+    lanes: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, low in (("start_frequency", 1e6), ("slope", 1.0), ("sample_rate", 1.0)):
+            checked_number(getattr(self, name), f"{name} in SI units", low)
+        checked_count(self.samples, "samples per chirp", 2)
+        checked_count(self.loops, "loops per frame", 1)
+        if self.frames is not None:
+            checked_count(self.frames, "frames", 1)
+        for name in ("idle_time", "adc_start_time"):
+            checked_number(getattr(self, name), f"{name} [s]", 0.0, 1.0)
+        order, receivers = tuple(self.transmit_order), tuple(self.receivers)
+        object.__setattr__(self, "transmit_order", order)
+        object.__setattr__(self, "receivers", receivers)
+        if not order or min(order) < 1 or len(set(order)) < len(order):
+            raise InputError(
+                f"expected each transmitter (from 1) once per loop, got the order {order}; "
+                "only transmitters that take turns (TDM) can be separated"
+            )
+        if not receivers or min(receivers) < 1 or list(receivers) != sorted(set(receivers)):
+            raise InputError(
+                f"expected ascending receiver numbers from 1, got {receivers}; "
+                "name the receivers that were recorded"
+            )
+        if self.lanes not in (None, 2, 4):
+            raise InputError(
+                f"expected 2 or 4 LVDS lanes, got {self.lanes}; xWR12xx and xWR14xx have 4, "
+                "later devices record through 2"
+            )
+        if self.bits not in (12, 14, 16):
+            raise InputError(f"expected an ADC of 12, 14 or 16 bits, got {self.bits}; see adcCfg")
+        last = self.adc_start_time + self.samples / self.sample_rate
+        if self.ramp_end_time is not None and self.ramp_end_time < last * (1 - 1e-9):
+            raise InputError(
+                f"expected a ramp of at least {last:g} s (ADC start and samples), got "
+                f"{self.ramp_end_time:g} s; lower samples or raise the sample rate"
+            )
+
+    @property
+    def waveform(self) -> FMCW:
+        """The sampled part of the ramp; its start frequency is that of the first sample."""
+        duration = self.samples / self.sample_rate
+        start = self.start_frequency + self.slope * self.adc_start_time
+        return FMCW(start, self.slope * duration, duration, self.samples)
+
+    @property
+    def ramp_time(self) -> float:
+        """From the start of a ramp to its end [s]."""
+        if self.ramp_end_time is not None:
+            return self.ramp_end_time
+        return self.adc_start_time + self.samples / self.sample_rate
+
+    @property
+    def chirps(self) -> Chirps:
+        """When the ramps of a frame start, as range-Doppler processing asks for it."""
+        return Chirps(self.loops, self.idle_time + self.ramp_time)
+
+
+@dataclass(frozen=True, eq=False)
+class ChirpData:
+    """Raw samples of every chirp, the transmitters already separated.
+
+    Attributes:
+        samples: (frame, chirp, tx, rx, sample); chirps are loops, transmitters in the order of
+            sending, receivers ascending. Real samples have no imaginary part. ADC counts where
+            they come from a file.
+        settings: what they were recorded with; its `frames` is None or the number of frames.
+
+    Raises:
+        InputError: another shape than the settings say, or NaN.
+    """
+
+    samples: Complex[Tensor, "frame chirp tx rx sample"]
+    settings: ChirpSettings
+
+    def __post_init__(self) -> None:
+        settings = self.settings
+        expected = (
+            settings.loops,
+            len(settings.transmit_order),
+            len(settings.receivers),
+            settings.samples,
+        )
+        shape = tuple(self.samples.shape)
+        if shape[1:] != expected or len(shape) != 5 or shape[0] < 1:
+            raise InputError(
+                f"expected samples (frame, chirp, tx, rx, sample) of shape (any, "
+                f"{', '.join(map(str, expected))}) as in the settings, got {shape}; "
+                "data and settings must describe the same recording"
+            )
+        if not torch.isfinite(torch.view_as_real(self.samples)).all():
+            raise InputError("expected finite samples, got NaN or infinity; drop those frames")
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return self.samples.shape[0]
+
+    def warn_if_saturated(self) -> None:
+        """Warns (`PhysicsWarning`) of samples at the ends of the ADC's range."""
+        parts = torch.view_as_real(self.samples)
+        top = 2 ** (self.settings.bits - 1) - 1
+        count = int(((parts >= top) | (parts <= -top - 1)).any(dim=-1).sum())
+        if count:
+            warnings.warn(
+                f"{count} of {self.samples.numel()} samples are at the ends of the ADC's range "
+                f"(±{top}): they are saturated, and echoes show harmonics; lower the RX gain",
+                PhysicsWarning,
+                stacklevel=3,
+            )
+
+    @property
+    def beat(self) -> Complex[Tensor, "frame chirp tx rx sample"]:
+        """Complex beat signals: the samples or, of real ones, their analytic signal.
+
+        An analytic signal holds for ranges below half of the waveform's `max_range`.
+        """
+        return self._complex(self.samples)
+
+    def radar(
+        self,
+        transmitters: AntennaArray,
+        receivers: AntennaArray,
+        positions: Float64[Tensor, "frame 3"] | None = None,
+        rotations: Float64[Tensor, "frame 3 3"] | None = None,
+    ) -> Radar:
+        """What recorded the samples.
+
+        Args:
+            transmitters: elements in the order of sending.
+            receivers: elements in the order of `ChirpSettings.receivers`.
+            positions: of the radar in every frame [m]; None = the origin.
+            rotations: of the radar in every frame; None = axes of the world.
+
+        Raises:
+            InputError: another number of elements.
+        """
+        for name, array, count in (
+            ("TX", transmitters, self.samples.shape[2]),
+            ("RX", receivers, self.samples.shape[3]),
+        ):
+            if len(array.positions) != count:
+                raise InputError(
+                    f"expected {count} {name} elements as in the recording, got "
+                    f"{len(array.positions)}; choose the elements that were in use"
+                )
+        if positions is None:
+            positions = torch.zeros(self.frame_count, 3, dtype=torch.float64)
+        return Radar(transmitters, receivers, self.settings.waveform, positions, rotations)
+
+    def capture(
+        self,
+        transmitters: AntennaArray,
+        receivers: AntennaArray,
+        *,
+        chirps: int | str,
+        positions: Float64[Tensor, "frame 3"] | None = None,
+        rotations: Float64[Tensor, "frame 3 3"] | None = None,
+    ) -> Capture:
+        """One beat signal per frame and channel, for a scene that stands still within a frame.
+
+        A static scene is the same in every chirp, so the mean over the chirps is the recording with
+        less noise; echoes that move by λ/4 or more during a frame vanish in it. One chosen chirp
+        keeps them, but its transmitters still send one after the other: what moves has phase steps
+        from TX to TX, which `invertwin.radar.compensate_tdm` takes out of whole frames.
+
+        Args:
+            transmitters: elements in the order of sending.
+            receivers: elements in the order of `ChirpSettings.receivers`.
+            chirps: "mean", or the number from 0 of the chirp to take.
+            positions: of the radar in every frame [m]; None = the origin.
+            rotations: of the radar in every frame; None = axes of the world.
+
+        Raises:
+            InputError: another number of elements, or a chirp that does not exist.
+        """
+        radar = self.radar(transmitters, receivers, positions, rotations)
+        beat = self._complex(self._chosen(chirps))
+        period = self.settings.frame_period
+        times = None
+        if period is not None:
+            times = torch.arange(self.frame_count, dtype=torch.float64) * period
+        return Capture.from_beat(beat, radar, times)
+
+    def _complex(self, samples: Tensor) -> Tensor:
+        if not self.settings.real:
+            return samples
+        analytic = np.asarray(hilbert(samples.real.numpy().astype(np.float64), axis=-1))
+        return torch.from_numpy(analytic)
+
+    def _chosen(self, chirps: int | str) -> Tensor:
+        if chirps == "mean":
+            return self.samples.mean(dim=1)
+        count = self.samples.shape[1]
+        if isinstance(chirps, bool) or not isinstance(chirps, int) or not 0 <= chirps < count:
+            raise InputError(
+                f'expected chirps to be "mean" or a number from 0 to {count - 1}, got {chirps!r}; '
+                "say how a frame becomes one signal"
+            )
+        return self.samples[:, chirps]
+
+
+def adc_counts(
+    beat: Complex[Tensor, "frame chirp tx rx sample"] | Complex[Tensor, "frame tx rx sample"],
+    settings: ChirpSettings,
+    full_scale: float,
+) -> ChirpData:
+    """Simulated samples as the counts that an ADC would have written.
+
+    Amplitudes up to ``full_scale`` fit, what is beyond is clipped (and warned of). Of complex
+    samples a real ADC keeps the real part.
+
+    Args:
+        beat: simulated; without a chirp dimension every chirp of a frame is the same.
+        settings: whose bits, loops and kind of samples are used.
+        full_scale: amplitude of the largest count, in the units of ``beat``.
+
+    Raises:
+        InputError: a full scale that is not positive, or a shape that the settings contradict.
+    """
+    checked_number(full_scale, "full scale", 0.0, open_low=True)
+    if beat.ndim == 4:
+        beat = beat[:, None].expand(-1, settings.loops, -1, -1, -1)
+    top = 2 ** (settings.bits - 1) - 1
+    parts = torch.view_as_real(beat.to(torch.complex128).resolve_conj()) * (top / full_scale)
+    parts = parts.round().clamp(-top - 1, top)
+    if settings.real:
+        parts = parts * torch.tensor([1.0, 0.0], dtype=torch.float64)
+    data = ChirpData(torch.view_as_complex(parts.contiguous()).to(torch.complex64), settings)
+    data.warn_if_saturated()
+    return data
+
+
+def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], int]:
+    """A repeated order of transmitters as its shortest period, sent that many times more often."""
+    for length in range(1, len(order) + 1):
+        repeats = len(order) // length
+        if length * repeats == len(order) and tuple(order) == tuple(order[:length]) * repeats:
+            return tuple(order[:length]), loops * repeats
+    return tuple(order), loops
+
+
+def settings_of(
+    waveform: FMCW,
+    transmitters: int,
+    receivers: int,
+    *,
+    loops: int = 1,
+    frames: int | None = None,
+    frame_period: float | None = None,
+    idle_time: float = 0.0,
+    lanes: int | None = None,
+) -> ChirpSettings:
+    """Settings that record this waveform with TX1, TX2, … in turn and all receivers.
+
+    Raises:
+        InputError: see `ChirpSettings`.
+    """
+    rate = waveform.samples / waveform.duration
+    nearest = round(rate)
+    return ChirpSettings(
+        start_frequency=waveform.start_frequency,
+        slope=waveform.slope,
+        sample_rate=float(nearest) if math.isclose(rate, nearest, rel_tol=1e-12) else rate,
+        samples=waveform.samples,
+        transmit_order=tuple(range(1, transmitters + 1)),
+        receivers=tuple(range(1, receivers + 1)),
+        loops=loops,
+        frames=frames,
+        frame_period=frame_period,
+        idle_time=idle_time,
+        lanes=lanes,
+    )

@@ -1,0 +1,304 @@
+"""Samples in NumPy, HDF5 or MATLAB files, described by a small TOML file beside them."""
+
+import os
+import tomllib
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import scipy.io
+import torch
+
+from invertwin.capture.capture import Capture
+from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
+from invertwin.capture.elements import elements
+from invertwin.errors import InputError
+from invertwin.scene.antenna import AntennaArray
+from invertwin.scene.checks import checked_tensor
+
+_KEYS = {
+    "data": {"file", "variable", "dimensions", "conjugate"},
+    "settings": {
+        "start_frequency",
+        "slope",
+        "sample_rate",
+        "transmit_order",
+        "receivers",
+        "frame_period",
+        "idle_time",
+        "adc_start_time",
+        "ramp_end_time",
+        "bits",
+    },
+    "radar": {"board", "elevation", "azimuth", "tx_positions", "rx_positions"},
+}
+_ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")
+_UNREADABLE = (
+    *(OSError, ValueError, TypeError, EOFError),
+    *(zipfile.BadZipFile, zlib.error, scipy.io.matlab.MatReadError),
+)
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+def read(
+    path: str | Path,
+    *,
+    chirps: int | str,
+    board: str | None = None,
+    elevation: int | None = None,
+    azimuth: int | None = None,
+    arrays: tuple[AntennaArray, AntennaArray] | None = None,
+) -> Capture:
+    """Described samples as a `Capture`, one beat signal per frame.
+
+    The elements are those of the arguments or, without any, of the description's ``[radar]``:
+    ``board``, ``elevation`` and ``azimuth`` of a preset, or ``tx_positions`` and ``rx_positions``
+    [m].
+
+    Args:
+        path: the TOML file, see `read_chirps`.
+        chirps: "mean" or a chirp number, see `ChirpData.capture`.
+        board: preset of `invertwin.radar.boards`.
+        elevation: sign of elevation of the preset, see `Board.arrays`.
+        azimuth: sign of azimuth of the preset.
+        arrays: TX and RX elements in use, instead of a preset.
+
+    Raises:
+        InputError: what `read_chirps` and `ChirpData.capture` raise, or no elements.
+    """
+    path = Path(path)
+    described = _description(path).get("radar", {})
+    if board is None and arrays is None:
+        board = described.get("board")
+        tx, rx = described.get("tx_positions"), described.get("rx_positions")
+        if tx is not None and rx is not None:
+            arrays = (_elements(tx, "TX"), _elements(rx, "RX"))
+    elevation = described.get("elevation") if elevation is None else elevation
+    azimuth = described.get("azimuth", 1) if azimuth is None else azimuth
+    data = read_chirps(path)
+    assert azimuth is not None
+    chosen = elements(data.settings, board, elevation, azimuth, arrays)
+    return data.capture(*chosen, chirps=chirps)
+
+
+def read_chirps(path: str | Path) -> ChirpData:
+    """Every chirp of described samples.
+
+    The description, in SI units::
+
+        [data]
+        file = "adc.npy"          # or .npz, .h5, .hdf5, .mat, beside the description
+        variable = "adc"          # its name in all but .npy
+        dimensions = ["frame", "chirp", "tx", "rx", "sample"]   # those it has, in its order
+        conjugate = false         # true where ranges come out at negative frequencies
+
+        [settings]                # as in ChirpSettings; the sizes are those of the data
+        start_frequency = 77e9
+        slope = 60e12
+        sample_rate = 5e6
+
+    Dimensions that are left out have one element, ``virtual`` stands for tx and rx (tx-major).
+    Files of MATLAB 7.3 are read in the order of dimensions that MATLAB shows. Transmitters and
+    receivers are numbered from 1 unless ``transmit_order`` and ``receivers`` say otherwise; the
+    dimension tx is in the order of sending.
+
+    Raises:
+        InputError: no file, a damaged one, unknown or missing keys, or dimensions that do not fit.
+    """
+    path = Path(path)
+    description = _description(path)
+    data, given = description["data"], description["settings"]
+    array = _array(path.parent / str(data["file"]), data.get("variable"))
+    real = array.dtype.kind != "c"
+    order = data.get("dimensions", list(CHIRP_DIMS))
+    samples = _arranged(array, order, len(given.get("transmit_order", [])) or None)
+    if data.get("conjugate", False):
+        samples = samples.conj()
+    _, loops, tx, rx, count = samples.shape
+    values: dict[str, Any] = {
+        **given,
+        "transmit_order": tuple(given.get("transmit_order", range(1, tx + 1))),
+        "receivers": tuple(given.get("receivers", range(1, rx + 1))),
+    }
+    values |= {"samples": count, "loops": loops, "frames": len(samples), "real": real}
+    try:
+        settings = ChirpSettings(**values)
+    except TypeError as error:
+        raise InputError(
+            f"expected start_frequency, slope and sample_rate in [settings] of {path.name}, got "
+            f"others ({error}); add them in SI units"
+        ) from error
+    found = ChirpData(torch.from_numpy(samples), settings)
+    if array.dtype.kind in "iu" or "bits" in given:
+        found.warn_if_saturated()
+    return found
+
+
+def write_chirps(path: str | Path, data: ChirpData, file: str) -> None:
+    """Writes samples, bit for bit, and the description that `read_chirps` reads.
+
+    Args:
+        path: the TOML file.
+        data: what to write; real samples are written as real numbers.
+        file: name of the data file beside it; its ending says the format: .npy, .npz, .h5, .hdf5
+            or .mat (MATLAB 5).
+
+    Raises:
+        InputError: the folder does not exist, or another ending.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
+    target = path.parent / file
+    if target.suffix not in _ENDINGS or target.parent != path.parent:
+        raise InputError(
+            f"expected a file name that ends in {', '.join(_ENDINGS)}, got {file!r}; "
+            "the data lie beside their description"
+        )
+    s = data.settings
+    samples = data.samples.detach().cpu().resolve_conj().numpy()
+    array = np.ascontiguousarray(samples.real) if s.real else samples
+    part = target.with_name(f".{os.getpid()}.part{target.suffix}")
+    try:
+        if target.suffix == ".npy":
+            np.save(part, array)
+        elif target.suffix == ".npz":
+            np.savez(part, allow_pickle=False, adc=array)
+        elif target.suffix == ".mat":
+            scipy.io.savemat(part, {"adc": array})
+        else:
+            with h5py.File(part, "w") as opened:
+                opened["adc"] = array
+        os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)
+    numbers = {
+        name: getattr(s, name)
+        for name in sorted(_KEYS["settings"] - {"transmit_order", "receivers"})
+        if getattr(s, name) is not None
+    }
+    lines = [
+        "[data]",
+        f'file = "{file}"',
+        *([] if target.suffix == ".npy" else ['variable = "adc"']),
+        f"dimensions = {list(CHIRP_DIMS)!r}",
+        "",
+        "[settings]",
+        *(f"{name} = {value!r}" for name, value in numbers.items()),
+        f"transmit_order = {list(s.transmit_order)}",
+        f"receivers = {list(s.receivers)}",
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _elements(positions: Any, name: str) -> AntennaArray:
+    do = "give one [x, y, z] in metres per element in [radar]"
+    return AntennaArray(checked_tensor(positions, (None, 3), f"{name} positions", do))
+
+
+def _description(path: Path) -> dict[str, dict[str, Any]]:
+    if not path.is_file():
+        raise InputError(f"expected a TOML description, got no file {path}; check the path")
+    try:
+        description = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"expected TOML in {path}, got text that is none ({error}); "
+            "give the description of the data, not the data"
+        ) from error
+    for section, keys in description.items():
+        known = _KEYS.get(section)
+        if known is None or not isinstance(keys, dict) or not set(keys) <= known:
+            wrong = f"[{section}]" if known is None else f"{keys!r} in [{section}]"
+            raise InputError(
+                f"expected sections {', '.join(_KEYS)} with the keys of the documentation in "
+                f"{path.name}, got {wrong}; known keys: {sorted(known or _KEYS)}"
+            )
+    if "file" not in description.get("data", {}) or "settings" not in description:
+        raise InputError(
+            f"expected [data] with a file and [settings] in {path.name}, got none; add them"
+        )
+    return description
+
+
+def _array(path: Path, variable: str | None) -> np.ndarray:
+    if not path.is_file():
+        raise InputError(f"expected the data file {path}, got no such file; check [data] file")
+    ending = path.suffix.lower()
+    if ending not in _ENDINGS:
+        raise InputError(
+            f"expected a file that ends in {', '.join(_ENDINGS)}, got {path.name}; convert it"
+        )
+    if ending != ".npy" and variable is None:
+        raise InputError(f"expected a variable in {path.name}, got none; add it to [data]")
+    try:
+        array = _loaded(path, ending, variable)
+    except KeyError as error:
+        raise InputError(
+            f"expected a variable {variable!r} in {path.name}, got none; check its spelling"
+        ) from error
+    except _UNREADABLE as error:
+        raise InputError(
+            f"expected a whole {ending} file, got {path}, which cannot be read "
+            f"({type(error).__name__}); it is damaged or of another kind"
+        ) from error
+    if array.dtype.names is not None and len(array.dtype.names) == 2:
+        # Complex numbers as MATLAB 7.3 stores them.
+        real, imaginary = (array[name] for name in array.dtype.names)
+        parts = np.stack([real, imaginary], axis=-1)
+        array = parts.astype(np.float64 if parts.dtype.itemsize > 4 else np.float32)
+        array = array.view(np.complex128 if array.itemsize == 8 else np.complex64)[..., 0]
+    if array.dtype.kind not in "iufc":
+        raise InputError(
+            f"expected numbers in {path.name}, got {array.dtype}; name the variable of the samples"
+        )
+    return array
+
+
+def _loaded(path: Path, ending: str, variable: str | None) -> np.ndarray:
+    if ending in (".npy", ".npz"):
+        with path.open("rb") as opened:
+            loaded = np.load(opened, allow_pickle=False)
+            return loaded if ending == ".npy" else loaded[variable]
+    with path.open("rb") as opened:
+        start = opened.read(520)
+    if ending == ".mat" and _HDF5 not in start[:8] + start[512:]:
+        return np.asarray(scipy.io.loadmat(path, variable_names=[str(variable)])[str(variable)])
+    with h5py.File(path, "r") as opened:
+        array = np.asarray(opened[str(variable)])
+    # MATLAB stores the first dimension fastest.
+    return array.T if ending == ".mat" else array
+
+
+def _arranged(array: np.ndarray, order: Any, transmitters: int | None) -> np.ndarray:
+    """Complex (frame, chirp, tx, rx, sample)."""
+    allowed = {*CHIRP_DIMS, "virtual"}
+    valid = isinstance(order, list) and set(order) <= allowed and len(set(order)) == len(order)
+    both = valid and "virtual" in order and {"tx", "rx"} & set(order)
+    if not valid or both or "sample" not in order or len(order) != array.ndim:
+        raise InputError(
+            f"expected dimensions as {array.ndim} different names of {sorted(allowed)} with "
+            f"sample, and virtual instead of tx and rx, got {order} for shape {array.shape}; "
+            "name the dimensions of the data in their order"
+        )
+    if "virtual" in order:
+        axis = order.index("virtual")
+        size = array.shape[axis]
+        if transmitters is None or size % transmitters:
+            raise InputError(
+                f"expected transmit_order in [settings] that divides {size} virtual channels, got "
+                f"{transmitters or 'none'}; say which transmitters sent"
+            )
+        shape = (*array.shape[:axis], transmitters, size // transmitters, *array.shape[axis + 1 :])
+        array = array.reshape(shape)
+        order = [*order[:axis], "tx", "rx", *order[axis + 1 :]]
+    array = array.transpose([order.index(name) for name in CHIRP_DIMS if name in order])
+    for axis, name in enumerate(CHIRP_DIMS):
+        if name not in order:
+            array = np.expand_dims(array, axis)
+    double = array.dtype.itemsize > (8 if array.dtype.kind == "c" else 4)
+    kind = np.complex128 if double or array.dtype == np.int32 else np.complex64
+    return np.ascontiguousarray(array, dtype=kind)

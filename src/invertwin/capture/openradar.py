@@ -1,0 +1,100 @@
+"""Reader for a public recording of a 77 GHz board with two transmitters.
+
+``openradar.npz`` (github.com/PreSenseRadar/OpenRadar, Apache-2.0): one frame of 128 loops, 2 TX in
+turn × 4 RX, 128 complex samples at 2.5 MS/s; people move at about 3 m. Nothing was surveyed.
+"""
+
+import json
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from invertwin.capture.capture import Capture
+from invertwin.capture.chirps import ChirpData, ChirpSettings
+from invertwin.capture.elements import elements
+from invertwin.errors import InputError
+from invertwin.scene.antenna import AntennaArray
+
+FILE = "openradar.npz"
+_TX, _RX = 2, 4
+
+
+def read(
+    folder: str | Path,
+    *,
+    chirps: int | str,
+    board: str = "xWR1642",
+    elevation: int | None = None,
+    azimuth: int = 1,
+    arrays: tuple[AntennaArray, AntennaArray] | None = None,
+) -> Capture:
+    """The recording as a `Capture` of one frame.
+
+    Args:
+        folder: where the file lies.
+        chirps: "mean" or a chirp number, see `ChirpData.capture`; the mean removes what moves.
+        board: preset; the file does not name one, OpenRadar's demos are for the xWR1642.
+        elevation: sign of elevation of the preset, where it has one.
+        azimuth: sign of azimuth of the preset.
+        arrays: TX and RX elements instead of a preset.
+
+    Raises:
+        InputError: what `read_chirps` and `ChirpData.capture` raise.
+    """
+    data = read_chirps(folder)
+    chosen = elements(data.settings, None if arrays else board, elevation, azimuth, arrays)
+    return data.capture(*chosen, chirps=chirps)
+
+
+def read_chirps(folder: str | Path) -> ChirpData:
+    """Every chirp of the recording, in ADC counts.
+
+    The frequency in the file is taken as that of the first sample: the ADC's start is not recorded.
+
+    Raises:
+        InputError: no file, a damaged one, an array of another shape, or no settings.
+    """
+    path = Path(folder) / FILE
+    if not path.is_file():
+        raise InputError(f"expected {FILE} in {path.parent}, got no such file; check the folder")
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(
+            f"expected a whole npz file, got {path}, which cannot be read "
+            f"({type(error).__name__}); it is damaged or truncated, copy it again"
+        ) from error
+    frame = arrays.get("frame_2tx4rx")
+    if frame is None or frame.ndim != 3 or frame.shape[1] != _TX * _RX or frame.dtype.kind != "c":
+        got = "none" if frame is None else f"{frame.dtype} of shape {frame.shape}"
+        raise InputError(
+            f"expected complex frame_2tx4rx of shape (chirps, {_TX * _RX}, samples), got {got}; "
+            "take the file from its public original"
+        )
+    try:
+        meta = json.loads(str(arrays["meta"]))
+        settings = ChirpSettings(
+            start_frequency=float(meta["f0_hz"]),
+            slope=float(meta["slope_hz_s"]),
+            sample_rate=float(meta["fs_hz"]),
+            samples=frame.shape[2],
+            transmit_order=(1, 2),
+            receivers=(1, 2, 3, 4),
+            loops=frame.shape[0],
+            frames=1,
+            idle_time=float(meta["idle_s"]),
+            ramp_end_time=float(meta["ramp_end_s"]),
+        )
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise InputError(
+            f"expected meta with f0, slope, sample rate, idle and ramp end time, got one without "
+            f"({error}); take the file from its public original"
+        ) from error
+    samples = frame.reshape(1, len(frame), _TX, _RX, frame.shape[2])
+    data = ChirpData(torch.from_numpy(samples.copy()), settings)
+    data.warn_if_saturated()
+    return data

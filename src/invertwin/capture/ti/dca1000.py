@@ -1,0 +1,278 @@
+"""Samples as the DCA1000 records them: little-endian 16-bit words in the order of the LVDS lanes.
+
+Through 4 lanes (xWR12xx, xWR14xx) all receivers come side by side, RX1 to RX4 whether enabled or
+not: the four I of one sample, then its four Q. Through 2 lanes (xWR16xx, 18xx, 68xx) the enabled
+receivers come one after the other in every chirp, two samples at a time: I, I, Q, Q. Real samples
+have no Q. (TI, SWRA581, "Mmwave Radar Device ADC Raw Data Capture".)
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.capture.capture import Capture
+from invertwin.capture.chirps import ChirpData, ChirpSettings
+from invertwin.capture.elements import elements
+from invertwin.capture.ti.settings_files import read_settings, recorded_files
+from invertwin.errors import InputError
+from invertwin.radar.waveform import PhysicsWarning
+from invertwin.scene.antenna import AntennaArray
+
+_WORD = np.dtype("<i2")
+_LANE_COUNT = 4
+
+
+def read(
+    path: str | Path,
+    settings: str | Path | ChirpSettings,
+    *,
+    chirps: int | str,
+    board: str | None = None,
+    elevation: int | None = None,
+    azimuth: int = 1,
+    arrays: tuple[AntennaArray, AntennaArray] | None = None,
+    lanes: int | None = None,
+    positions: Float64[Tensor, "frame 3"] | None = None,
+    rotations: Float64[Tensor, "frame 3 3"] | None = None,
+) -> Capture:
+    """A DCA1000 recording as a `Capture`, one beat signal per frame.
+
+    Args:
+        path: `.bin` file, or a `.setup.json` that names the files.
+        settings: what the recording was set up with, or its file (`read_settings`).
+        chirps: "mean" or a chirp number, see `ChirpData.capture`.
+        board: preset of `invertwin.radar.boards` whose elements in use are those of the settings.
+        elevation: sign of elevation of the preset, see `Board.arrays`.
+        azimuth: sign of azimuth of the preset.
+        arrays: TX and RX elements in use, instead of a preset.
+        lanes: of the LVDS link, where the settings do not say.
+        positions: of the radar in every frame [m]; None = the origin.
+        rotations: of the radar in every frame; None = axes of the world.
+
+    Raises:
+        InputError: what `read_samples` and `ChirpData.capture` raise, or no board.
+    """
+    known = settings if isinstance(settings, ChirpSettings) else read_settings(settings)
+    if lanes is not None:
+        known = replace(known, lanes=lanes)
+    transmitters, receivers = elements(known, board, elevation, azimuth, arrays)
+    data = read_samples(recorded_files(path), known)
+    return data.capture(
+        transmitters, receivers, chirps=chirps, positions=positions, rotations=rotations
+    )
+
+
+def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSettings) -> ChirpData:
+    """Every chirp of a recording, in ADC counts.
+
+    Warns (`PhysicsWarning`) of an incomplete last frame, which is dropped, of frames that are
+    missing, and of saturated samples.
+
+    Args:
+        path: `.bin` file, or the files of one recording in their order.
+        settings: what it was set up with; `lanes` must be known.
+
+    Raises:
+        InputError: no file, an odd number of bytes, less than one frame, or a size that the
+            settings contradict; the message says which settings fit.
+    """
+    paths = [Path(path)] if isinstance(path, str | Path) else [Path(part) for part in path]
+    settings = _with_lanes(settings)
+    for part in paths:
+        if not part.is_file():
+            raise InputError(f"expected a recording, got no file {part}; check the path")
+    # Files are split anywhere, so only their sum counts.
+    size = sum(part.stat().st_size for part in paths)
+    name = paths[0].name if paths else "nothing"
+    if size % _WORD.itemsize:
+        raise InputError(
+            f"expected 16-bit samples in {name}, got an odd number of bytes ({size}); "
+            "the file is damaged or no raw recording, copy it again"
+        )
+    frames = _whole_frames(size, settings, name)
+    stream = b"".join(part.read_bytes() for part in paths)
+    frame_words = _frame_words(settings)
+    words = np.frombuffer(stream, _WORD, frames * frame_words).astype(np.float32)
+    if settings.bits < 16:
+        # Negative numbers may come without their sign bits.
+        words[words > 2 ** (settings.bits - 1) - 1] -= 2**settings.bits
+    data = ChirpData(_separated(words, settings, frames), replace(settings, frames=frames))
+    data.warn_if_saturated()
+    return data
+
+
+def write_samples(path: str | Path, data: ChirpData) -> None:
+    """Writes what `read_samples` reads, word for word.
+
+    Args:
+        path: `.bin` file.
+        data: ADC counts; make them from simulated samples with `adc_counts`.
+
+    Raises:
+        InputError: samples that are no counts of the ADC, real samples with an imaginary part,
+            or settings without lanes.
+    """
+    settings = _with_lanes(data.settings)
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
+    _check_parity(settings)
+    samples = data.samples.detach().cpu().resolve_conj().numpy().astype(np.complex128)
+    parts = np.stack([samples.real, samples.imag], axis=-1)
+    top = 2 ** (settings.bits - 1) - 1
+    if (parts != parts.round()).any() or parts.max() > top or parts.min() < -top - 1:
+        raise InputError(
+            f"expected whole counts from {-top - 1} to {top}, got others; "
+            "scale and round the samples with adc_counts(beat, settings, full_scale)"
+        )
+    if settings.real and parts[..., 1].any():
+        raise InputError(
+            "expected samples without imaginary part from a real ADC, got some with; "
+            "take their real part or set real=False"
+        )
+    _joined(parts, settings).astype(_WORD).tofile(path)
+
+
+def _with_lanes(settings: ChirpSettings) -> ChirpSettings:
+    if settings.lanes is None:
+        raise InputError(
+            "expected settings with 2 or 4 LVDS lanes, got none; set lanes: 4 for xWR12xx and "
+            "xWR14xx, 2 for xWR16xx, xWR18xx and xWR68xx"
+        )
+    if settings.lanes == _LANE_COUNT and max(settings.receivers) > _LANE_COUNT:
+        raise InputError(
+            f"expected receivers 1 to {_LANE_COUNT}, one per lane, got {settings.receivers}; "
+            "the DCA1000 records one device"
+        )
+    return settings
+
+
+def _frame_words(settings: ChirpSettings) -> int:
+    receivers = _LANE_COUNT if settings.lanes == _LANE_COUNT else len(settings.receivers)
+    parts = 1 if settings.real else 2
+    chirps = settings.loops * len(settings.transmit_order)
+    return chirps * receivers * settings.samples * parts
+
+
+def _check_parity(settings: ChirpSettings) -> None:
+    count = settings.samples * len(settings.receivers)
+    if settings.lanes == 2 and not settings.real and count % 2:
+        raise InputError(
+            f"expected an even number of samples per chirp through 2 lanes, got {count}; "
+            "they come in pairs, the settings are those of another recording"
+        )
+
+
+def _whole_frames(size: int, settings: ChirpSettings, name: str) -> int:
+    """How many frames to read, after warnings of what is missing."""
+    _check_parity(settings)
+    frame = _frame_words(settings) * _WORD.itemsize
+    frames, rest = divmod(size, frame)
+    expected = settings.frames
+    if expected is not None and size != expected * frame:
+        fitting = _fitting(size, settings)
+        if size > expected * frame or (fitting and frames) or not frames:
+            raise InputError(
+                f"expected {expected * frame} bytes in {name} ({expected} frames of {frame}), got "
+                f"{size}; what fits: {_listed(size, frame, fitting)}"
+            )
+    if not frames:
+        raise InputError(
+            f"expected at least one frame of {frame} bytes in {name}, got {size} bytes; "
+            "nothing was recorded, or the settings are those of another recording"
+        )
+    if rest:
+        warnings.warn(
+            f"{name} ends within a frame: {frames} whole frames are read, 1 incomplete frame "
+            f"({rest} of {frame} bytes) is dropped",
+            PhysicsWarning,
+            stacklevel=4,
+        )
+    elif expected is not None and frames < expected:
+        warnings.warn(
+            f"{name} holds {frames} of the {expected} frames in its settings: "
+            "the recording was stopped early",
+            PhysicsWarning,
+            stacklevel=4,
+        )
+    return frames
+
+
+def _fitting(size: int, settings: ChirpSettings) -> list[str]:
+    """Single changes of the settings with which the size is exact."""
+    assert settings.frames is not None
+    found = []
+    changes: list[tuple[str, ChirpSettings]] = [
+        (f"lanes={6 - (settings.lanes or 2)}", replace(settings, lanes=6 - (settings.lanes or 2))),
+        (f"real={not settings.real}", replace(settings, real=not settings.real)),
+        *(
+            (f"{count} receivers", replace(settings, receivers=tuple(range(1, count + 1))))
+            for count in range(1, _LANE_COUNT + 1)
+            if count != len(settings.receivers)
+        ),
+        *(
+            (f"{count} transmitters", replace(settings, transmit_order=tuple(range(1, count + 1))))
+            for count in range(1, 5)
+            if count != len(settings.transmit_order)
+        ),
+    ]
+    for text, changed in changes:
+        if _frame_words(changed) * _WORD.itemsize * settings.frames == size:
+            found.append(text)
+    for field in ("samples", "loops"):
+        value = getattr(settings, field)
+        unit = _frame_words(settings) // value * _WORD.itemsize * settings.frames
+        whole = size // unit
+        if size % unit == 0 and whole > 1 and whole != value:
+            found.append(f"{field}={whole}")
+    return found
+
+
+def _listed(size: int, frame: int, fitting: list[str]) -> str:
+    if size and size % frame == 0:
+        fitting = [f"frames={size // frame}", *fitting]
+    if not fitting:
+        return "no single change of the settings, find those of this recording"
+    return " or ".join(fitting)
+
+
+def _separated(words: np.ndarray, settings: ChirpSettings, frames: int) -> Tensor:
+    """(frame, chirp, tx, rx, sample) of words in the order of the file."""
+    s, parts = settings, 1 if settings.real else 2
+    chirps = (frames, s.loops, len(s.transmit_order))
+    if s.lanes == _LANE_COUNT:
+        sides = words.reshape(*chirps, s.samples, parts, _LANE_COUNT)
+        sides = sides[..., [number - 1 for number in s.receivers]]
+        sides = np.moveaxis(sides, (-1, -2), (-3, -1))
+    elif s.real:
+        sides = words.reshape(*chirps, len(s.receivers), s.samples, 1)
+    else:
+        pairs = words.reshape(-1, parts, 2).swapaxes(1, 2)
+        sides = pairs.reshape(*chirps, len(s.receivers), s.samples, parts)
+    samples = np.zeros(sides.shape[:-1], np.complex64)
+    samples.real = sides[..., 1 if s.swap_iq and not s.real else 0]
+    if not s.real:
+        samples.imag = sides[..., 0 if s.swap_iq else 1]
+    return torch.from_numpy(samples)
+
+
+def _joined(parts: np.ndarray, settings: ChirpSettings) -> np.ndarray:
+    """The words of (frame, chirp, tx, rx, sample, I and Q): the inverse of `_separated`."""
+    s = settings
+    if s.real:
+        parts = parts[..., :1]
+    elif s.swap_iq:
+        parts = parts[..., ::-1]
+    if s.lanes == _LANE_COUNT:
+        lanes = np.zeros((*parts.shape[:3], _LANE_COUNT, *parts.shape[4:]))
+        lanes[:, :, :, [number - 1 for number in s.receivers]] = parts
+        return np.moveaxis(lanes, (-3, -1), (-1, -2)).ravel()
+    if s.real:
+        return parts.ravel()
+    return parts.reshape(-1, 2, 2).swapaxes(1, 2).ravel()

@@ -1,0 +1,264 @@
+"""Settings that mmWave Studio saves: `.mmwave.json` (the device) and `.setup.json` (the bench)."""
+
+import json
+from decimal import Decimal
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+from invertwin.capture.chirps import ChirpSettings
+from invertwin.capture.ti.chirp_table import (
+    lanes_of,
+    mask,
+    numbers,
+    read_text,
+    scaled,
+    settings,
+    text,
+    transmit_order,
+)
+from invertwin.errors import InputError
+
+_BITS = {0: 12, 1: 14, 2: 16}
+_VARIATIONS = (
+    "startFreqVar_MHz",
+    "freqSlopeVar_KHz_usec",
+    "idleTimeVar_usec",
+    "adcStartTimeVar_usec",
+)
+
+
+def read_studio(path: str | Path) -> ChirpSettings:
+    """Settings of a `.mmwave.json` file, or of the one that a `.setup.json` file names.
+
+    A setup names its files by their absolute path on the PC that recorded them; where that does
+    not exist, the file of that name beside the setup is taken.
+
+    Raises:
+        InputError: no file, no JSON, a key that is missing, or settings that are not supported:
+            several devices (cascade), several transmitters at once, several profiles, chirps that
+            differ, frames with sub-frames.
+    """
+    path = Path(path)
+    content = _json(path)
+    device = ""
+    if "configUsed" in content:
+        device = str(content.get("mmWaveDevice", ""))
+        _check_logging(content)
+        path = _beside(path, str(content["configUsed"]))
+        content = _json(path)
+    try:
+        return _settings(content, device)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from error
+    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+        raise InputError(
+            f"expected the keys of mmWave Studio in {path.name}, got none or another value for "
+            f"{error}; save the settings again with mmWave Studio"
+        ) from error
+
+
+def setup_files(path: str | Path) -> list[Path]:
+    """The raw files that a `.setup.json` file names, in the order of recording.
+
+    Raises:
+        InputError: no file, no JSON, or none that names raw files.
+    """
+    path = Path(path)
+    content = _json(path)
+    try:
+        captured = content["capturedFiles"]
+        names = [str(file["rawFileName"]) for file in captured["files"]]
+        base = str(captured.get("fileBasePath", ""))
+    except (KeyError, TypeError):
+        names, base = [], ""
+    if not names:
+        raise InputError(
+            f"expected capturedFiles in {path.name}, got none; name the .bin files yourself"
+        )
+    return [_beside(path, str(PureWindowsPath(base) / name)) for name in names]
+
+
+def _json(path: Path) -> dict[str, Any]:
+    whole = read_text(path, "a .json file of mmWave Studio")
+    try:
+        content = json.loads(whole, parse_float=Decimal)
+    except ValueError as error:
+        raise InputError(
+            f"expected JSON in {path}, got text that is none ({error}); save it again"
+        ) from error
+    if not isinstance(content, dict):
+        raise InputError(
+            f"expected an object in {path}, got {type(content).__name__}; save it again"
+        )
+    return content
+
+
+def _beside(path: Path, named: str) -> Path:
+    if Path(named).is_file():
+        return Path(named)
+    # The name of a file on Windows or on this machine.
+    return path.parent / PureWindowsPath(named).name
+
+
+def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
+    devices = content["mmWaveDevices"]
+    if len(devices) != 1:
+        raise InputError(
+            f"expected settings of one device, got {len(devices)}; recordings of a cascade are "
+            "not read, give its samples as arrays"
+        )
+    radio, record = devices[0]["rfConfig"], devices[0]["rawDataCaptureConfig"]
+    kind = radio.get("waveformType", "legacyFrameChirp")
+    if kind != "legacyFrameChirp":
+        raise InputError(f"expected legacyFrameChirp, got {kind}; other frames are not supported")
+    profiles = {
+        int(item["rlProfileCfg_t"]["profileId"]): item["rlProfileCfg_t"]
+        for item in radio["rlProfiles"]
+    }
+    chirps: dict[int, tuple[int, int]] = {}
+    for item in radio["rlChirps"]:
+        chirp = item["rlChirpCfg_t"]
+        first, last = int(chirp["chirpStartIdx"]), int(chirp["chirpEndIdx"])
+        if any(float(chirp.get(name, 0)) for name in _VARIATIONS):
+            raise InputError(
+                f"expected chirps {first} to {last} as their profile, got variations; "
+                "chirps that differ are not supported"
+            )
+        for number in range(first, last + 1):
+            chirps[number] = (int(chirp["profileId"]), _integer(chirp["txEnable"]))
+    frame, channel = radio["rlFrameCfg_t"], radio["rlChanCfg_t"]
+    order, used = transmit_order(
+        chirps, int(frame["chirpStartIdx"]), int(frame["chirpEndIdx"]), list(profiles)
+    )
+    profile, output = profiles[used], radio["rlAdcOutCfg_t"]["fmt"]
+    _check_transfer(record)
+    layout = record["rlDevDataFmtCfg_t"]
+    lanes = _lanes(record, device)
+    _check_interleave(int(layout["chInterleave"]), lanes)
+    return settings(
+        order,
+        int(frame["numLoops"]),
+        int(frame["numFrames"]),
+        frame["framePeriodicity_msec"],
+        start_frequency=scaled(profile["startFreqConst_GHz"], 9),
+        idle_time=scaled(profile["idleTimeConst_usec"], -6),
+        adc_start_time=scaled(profile["adcStartTimeConst_usec"], -6),
+        ramp_end_time=scaled(profile["rampEndTime_usec"], -6),
+        slope=scaled(profile["freqSlopeConst_MHz_usec"], 12),
+        samples=int(profile["numAdcSamples"]),
+        sample_rate=scaled(profile["digOutSampleRate"], 3),
+        receivers=numbers(_integer(channel["rxChannelEn"])),
+        real=int(output["b2AdcOutFmt"]) in (0, 3),
+        swap_iq=bool(int(layout["iqSwapSel"])),
+        bits=_BITS[int(output["b2AdcBits"])],
+        lanes=lanes,
+    )
+
+
+def _lanes(record: dict[str, Any], device: str) -> int | None:
+    if "rlDevLaneEnable_t" in record:
+        return len(numbers(_integer(record["rlDevLaneEnable_t"]["laneEn"])))
+    return lanes_of(device)
+
+
+def _check_logging(setup: dict[str, Any]) -> None:
+    mode = (setup.get("DCA1000Config") or {}).get("dataLoggingMode", "raw")
+    if mode != "raw":
+        raise InputError(
+            f"expected a recording in raw mode (dataLoggingMode), got {mode}; "
+            "files of other modes have headers and are not read"
+        )
+
+
+def _check_transfer(record: dict[str, Any]) -> None:
+    content = (record.get("rlDevDataPathCfg_t") or {}).get("transferFmtPkt0", "0x1")
+    if _integer(content) != 1:
+        raise InputError(
+            f"expected packets of samples only (transferFmtPkt0 0x1), got {content}; "
+            "record without chirp parameters and quality data"
+        )
+
+
+def _check_interleave(interleave: int, lanes: int | None) -> None:
+    """0 = receivers interleaved, as through 4 lanes; 1 = one after the other, as through 2."""
+    if lanes in (2, 4) and interleave != (0 if lanes == 4 else 1):
+        raise InputError(
+            f"expected chInterleave {0 if lanes == 4 else 1} with {lanes} LVDS lanes, got "
+            f"{interleave}; this order of samples is not supported"
+        )
+
+
+def _integer(value: Any) -> int:
+    return int(value, 0) if isinstance(value, str) else int(value)
+
+
+def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
+    """Writes the `.mmwave.json` that `read_studio` reads.
+
+    Raises:
+        InputError: the folder does not exist, or settings without a number of lanes.
+    """
+    path, s = Path(path), chirp_settings
+    if not path.parent.is_dir():
+        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
+    if s.lanes is None:
+        raise InputError("expected settings with 2 or 4 lanes, got none; set lanes")
+
+    def number(value: float, exponent: int) -> float:
+        return float(text(value, exponent))
+
+    radio = {
+        "waveformType": "legacyFrameChirp",
+        "MIMOScheme": "TDM",
+        "rlChanCfg_t": {
+            "rxChannelEn": f"0x{mask(s.receivers):X}",
+            "txChannelEn": f"0x{mask(s.transmit_order):X}",
+            "cascading": 0,
+        },
+        "rlAdcOutCfg_t": {
+            "fmt": {
+                "b2AdcBits": {value: key for key, value in _BITS.items()}[s.bits],
+                "b2AdcOutFmt": 0 if s.real else 1,
+                "b8FullScaleReducFctr": 0,
+            }
+        },
+        "rlProfiles": [
+            {
+                "rlProfileCfg_t": {
+                    "profileId": 0,
+                    "startFreqConst_GHz": number(s.start_frequency, -9),
+                    "idleTimeConst_usec": number(s.idle_time, 6),
+                    "adcStartTimeConst_usec": number(s.adc_start_time, 6),
+                    "rampEndTime_usec": number(s.ramp_time, 6),
+                    "freqSlopeConst_MHz_usec": number(s.slope, -12),
+                    "numAdcSamples": s.samples,
+                    "digOutSampleRate": number(s.sample_rate, -3),
+                }
+            }
+        ],
+        "rlChirps": [
+            {
+                "rlChirpCfg_t": {
+                    "chirpStartIdx": index,
+                    "chirpEndIdx": index,
+                    "profileId": 0,
+                    **dict.fromkeys(_VARIATIONS, 0.0),
+                    "txEnable": f"0x{mask([tx]):X}",
+                }
+            }
+            for index, tx in enumerate(s.transmit_order)
+        ],
+        "rlFrameCfg_t": {
+            "chirpStartIdx": 0,
+            "chirpEndIdx": len(s.transmit_order) - 1,
+            "numLoops": s.loops,
+            "numFrames": s.frames or 0,
+            "framePeriodicity_msec": number(s.frame_period or 0.0, 3),
+        },
+    }
+    record = {
+        "rlDevDataFmtCfg_t": {"iqSwapSel": int(s.swap_iq), "chInterleave": int(s.lanes == 2)},
+        "rlDevLaneEnable_t": {"laneEn": f"0x{2**s.lanes - 1:X}"},
+    }
+    device = {"mmWaveDeviceId": 0, "rfConfig": radio, "rawDataCaptureConfig": record}
+    path.write_text(json.dumps({"mmWaveDevices": [device]}, indent=2) + "\n", encoding="utf-8")

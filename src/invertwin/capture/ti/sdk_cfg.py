@@ -1,0 +1,183 @@
+"""Settings files (`.cfg`) of the mmWave SDK and its demos: one command per line."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from invertwin.capture.chirps import ChirpSettings
+from invertwin.capture.ti.chirp_table import (
+    lanes_of,
+    mask,
+    numbers,
+    read_text,
+    scaled,
+    settings,
+    text,
+    transmit_order,
+)
+from invertwin.errors import InputError
+
+# Fewest arguments of the commands that are read.
+_ARGUMENTS = {
+    "channelCfg": 2,
+    "adcCfg": 2,
+    "adcbufCfg": 4,
+    "profileCfg": 11,
+    "chirpCfg": 8,
+    "frameCfg": 5,
+    "lvdsStreamCfg": 2,
+}
+_ONCE = ("channelCfg", "adcCfg", "frameCfg")
+_BITS = {0: 12, 1: 14, 2: 16}
+
+
+def read_cfg(path: str | Path) -> ChirpSettings:
+    """Settings of a `.cfg` file: `channelCfg`, `adcCfg`, `profileCfg`, `chirpCfg`, `frameCfg`.
+
+    The byte order of I and Q is that of `adcbufCfg`, where there is one; lanes are those of the
+    device in a comment such as ``% Platform:xWR18xx``. All other commands concern what the demo
+    computes, and are passed over. In MCU+ SDK files (AWR2944), `frameCfg` repeats the number of
+    samples before the period.
+
+    Raises:
+        InputError: no file, a command that is missing or cannot be understood, or one that asks for
+            what is not supported: several transmitters at once, several profiles, chirps that
+            differ, sub-frames, headers in the stream.
+    """
+    path = Path(path)
+    lines = read_text(path, "a .cfg file of the mmWave SDK").splitlines()
+    found: dict[str, list[list[str]]] = {}
+    platform = ""
+    for line in lines:
+        stripped = line.strip()
+        if stripped.startswith("%"):
+            if "platform" in stripped.lower():
+                platform = stripped.partition(":")[2]
+            continue
+        if stripped:
+            command, *arguments = stripped.split("%")[0].split()
+            found.setdefault(command, []).append(arguments)
+    if "advFrameCfg" in found or "subFrameCfg" in found:
+        raise InputError(
+            f"expected one kind of frame (frameCfg) in {path.name}, got advFrameCfg; "
+            "sub-frames are not supported"
+        )
+    try:
+        return _settings(found, lanes_of(platform))
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from error
+    except (ValueError, ArithmeticError) as error:
+        raise InputError(
+            f"expected numbers as arguments in {path.name}, got others ({error}); "
+            "compare with the SDK's user guide"
+        ) from error
+
+
+def _settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSettings:
+    for command in (*_ONCE, "profileCfg", "chirpCfg"):
+        if command not in found:
+            raise InputError(
+                f"expected a line {command}, got none; the settings are incomplete, or no .cfg file"
+            )
+    for command, count in _ARGUMENTS.items():
+        for arguments in found.get(command, []):
+            if len(arguments) < count:
+                raise InputError(
+                    f"expected at least {count} arguments of {command}, got {len(arguments)}; "
+                    "the line is incomplete"
+                )
+    channel, adc, frame = (found[command][-1] for command in _ONCE)
+    chirps: dict[int, tuple[int, int]] = {}
+    for arguments in found["chirpCfg"]:
+        first, last, profile = (int(value) for value in arguments[:3])
+        if any(float(value) for value in arguments[3:7]):
+            raise InputError(
+                f"expected chirps {first} to {last} as their profile, got variations "
+                f"{' '.join(arguments[3:7])}; chirps that differ are not supported"
+            )
+        for chirp in range(first, last + 1):
+            chirps[chirp] = (profile, int(arguments[7], 0))
+    profiles = {int(arguments[0]): arguments for arguments in found["profileCfg"]}
+    order, used = transmit_order(chirps, int(frame[0]), int(frame[1]), list(profiles))
+    profile = profiles[used]
+    unused = set(order) - set(numbers(int(channel[1], 0)))
+    if unused:
+        raise InputError(
+            f"expected chirps of the transmitters that channelCfg enables, got TX {unused}; "
+            "enable them or correct chirpCfg"
+        )
+    samples = int(profile[9])
+    # MCU+ SDK: first, last, loops, frames, samples, period, trigger, delay.
+    period = frame[5] if len(frame) >= 8 else frame[4]
+    if len(frame) >= 8 and int(frame[4]) != samples:
+        raise InputError(
+            f"expected {samples} samples in frameCfg as in profileCfg, got {frame[4]}; "
+            "the two commands contradict each other"
+        )
+    for arguments in found.get("lvdsStreamCfg", []):
+        if int(arguments[1]):
+            raise InputError(
+                "expected a stream of samples only, got headers (lvdsStreamCfg); record without"
+            )
+    bits, kind = int(adc[0]), int(adc[1])
+    if bits not in _BITS or kind not in (0, 1, 2):
+        raise InputError(
+            f"expected adcCfg with bits 0 to 2 and format 0 to 2, got {bits} and {kind}; "
+            "see the SDK's user guide"
+        )
+    return settings(
+        order,
+        int(frame[2]),
+        int(frame[3]),
+        period,
+        start_frequency=scaled(profile[1], 9),
+        idle_time=scaled(profile[2], -6),
+        adc_start_time=scaled(profile[3], -6),
+        ramp_end_time=scaled(profile[4], -6),
+        slope=scaled(profile[7], 12),
+        samples=samples,
+        sample_rate=scaled(profile[10], 3),
+        receivers=numbers(int(channel[0], 0)),
+        real=kind == 0,
+        swap_iq=_swapped(found.get("adcbufCfg", [])),
+        bits=_BITS[bits],
+        lanes=lanes,
+    )
+
+
+def _swapped(commands: Sequence[list[str]]) -> bool:
+    """SampleSwap: 1 = Q in the lower half word, so first in the file."""
+    # Since SDK 2 a sub-frame number comes first.
+    return bool(commands) and bool(int(commands[-1][-3]))
+
+
+def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
+    """Writes what `read_cfg` reads. What the settings do not hold is written as the demos have it.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
+    s = chirp_settings
+    devices = {2: "xWR18xx", 4: "xWR1443"}
+    bits = {value: key for key, value in _BITS.items()}[s.bits]
+    count = len(s.transmit_order)
+    kind = 0 if s.real else 1
+    lines = [
+        *([f"% Platform:{devices[s.lanes]}"] if s.lanes else []),
+        "sensorStop",
+        "flushCfg",
+        "dfeDataOutputMode 1",
+        f"channelCfg {mask(s.receivers)} {mask(s.transmit_order)} 0",
+        f"adcCfg {bits} {kind}",
+        f"adcbufCfg -1 {int(s.real)} {int(s.swap_iq)} 1 1",
+        f"profileCfg 0 {text(s.start_frequency, -9)} {text(s.idle_time, 6)} "
+        f"{text(s.adc_start_time, 6)} {text(s.ramp_time, 6)} 0 0 {text(s.slope, -12)} 0 "
+        f"{s.samples} {text(s.sample_rate, -3)} 0 0 30",
+        *(f"chirpCfg {i} {i} 0 0 0 0 0 {mask([tx])}" for i, tx in enumerate(s.transmit_order)),
+        f"frameCfg 0 {count - 1} {s.loops} {s.frames or 0} {text(s.frame_period or 0, 3)} 1 0",
+        "lvdsStreamCfg -1 0 1 0",
+        "sensorStart",
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

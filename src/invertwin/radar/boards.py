@@ -1,0 +1,235 @@
+"""Radar boards as people own them: where their antenna elements are.
+
+Element positions are the nominal ones of the layouts that TI and open code print, on a grid of half
+wavelengths at the frequency the board was drawn for. Electrical phase centres differ from them by
+fractions of a millimetre: estimate that from a reflector (`invertwin.capture.estimate_channels`).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import torch
+from torch import Tensor
+
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern
+from invertwin.scene.checks import checked_number
+
+Places = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Board:
+    """Where the elements of a board are, in half wavelengths.
+
+    Columns (x) and rows (y) are those of the source, but for the columns of ``antGeometry0``, which
+    are taken with the other sign, so that they grow with the numbers of the elements. A table of
+    one's own is one more ``Board``.
+
+    Differs from the source: the sources count the columns and rows of TX and of RX each from an
+    origin of its own and do not say how far apart these are. Here TX and RX are each centred at
+    the origin of the radar frame, which shifts where the radar is by up to a centimetre or so.
+
+    Attributes:
+        name: of the board.
+        transmitters: (column, row) of TX1, TX2, … [λ/2].
+        receivers: (column, row) of RX1, RX2, … [λ/2].
+        design_frequency: whose half wavelength is the unit [Hz].
+        source: where the numbers come from.
+
+    Raises:
+        InputError: no elements, places that are not pairs of numbers, or a frequency that is not
+            in Hz.
+    """
+
+    name: str
+    transmitters: Places
+    receivers: Places
+    design_frequency: float
+    source: str = "user"
+
+    def __post_init__(self) -> None:
+        for end in ("transmitters", "receivers"):
+            places = getattr(self, end)
+            try:
+                pairs = tuple((float(column), float(row)) for column, row in places)
+            except (TypeError, ValueError):
+                pairs = ()
+            if not pairs:
+                raise InputError(
+                    f"expected {end} of {self.name} as pairs (column, row), got {places!r}; "
+                    "give one pair in half wavelengths per element"
+                )
+            object.__setattr__(self, end, pairs)
+        frequency = checked_number(self.design_frequency, "design frequency [Hz]", 1e6)
+        object.__setattr__(self, "design_frequency", frequency)
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether it resolves elevation, so that the sign of elevation matters."""
+        return any(len({row for _, row in end}) > 1 for end in (self.transmitters, self.receivers))
+
+    def arrays(
+        self,
+        *,
+        elevation: int | None = None,
+        azimuth: int = 1,
+        design_frequency: float | None = None,
+        transmitters: Sequence[int] | None = None,
+        receivers: Sequence[int] | None = None,
+        pattern: Pattern | None = None,
+    ) -> tuple[AntennaArray, AntennaArray]:
+        """TX and RX elements in the radar frame (x right, y up, z boresight).
+
+        Public sources disagree on which way is up: TI's drawings of the xWR1843 put its middle
+        transmitter above the others, TI's own ``antGeometry`` and published processing chains use
+        either sign. So the sign of elevation has no default where it matters. To find it, place a
+        reflector above the board: its spectrum must peak at v > 0. Likewise for left and right.
+
+        Args:
+            elevation: +1 = rows grow upwards (y), −1 = downwards; required if the board has rows.
+            azimuth: +1 = columns grow to the right (x), −1 = to the left.
+            design_frequency: whose half wavelength is the unit [Hz]; None = the board's own.
+            transmitters: numbers from 1 of the elements in use, in this order; None = all.
+            receivers: the same for RX.
+            pattern: gain of every element, isotropic by default.
+
+        Returns:
+            transmitters, receivers.
+
+        Raises:
+            InputError: a missing or wrong sign, or an element that the board does not have.
+        """
+        if elevation is None and self.has_rows:
+            raise InputError(
+                f"expected elevation=+1 or -1 for {self.name}, got none; public sources disagree "
+                "which way its rows grow: try a reflector above the board, which must be at v > 0"
+            )
+        signs = (azimuth, 1 if elevation is None else elevation)
+        for name, sign in zip(("azimuth", "elevation"), signs, strict=True):
+            if sign not in (-1, 1):
+                raise InputError(f"expected {name} to be +1 or -1, got {sign!r}; it is a sign")
+        frequency = self.design_frequency
+        if design_frequency is not None:
+            frequency = checked_number(design_frequency, "design frequency [Hz]", 1e6)
+        unit = SPEED_OF_LIGHT / frequency / 2
+        pattern = Isotropic() if pattern is None else pattern
+
+        def array(places: Places, chosen: Sequence[int] | None, name: str) -> AntennaArray:
+            grid = torch.tensor(places, dtype=torch.float64)
+            grid = (grid - grid.mean(dim=0)) * torch.tensor(signs, dtype=torch.float64) * unit
+            positions = torch.cat([grid, torch.zeros_like(grid[:, :1])], dim=1)
+            return AntennaArray(positions[self._indices(places, chosen, name)], pattern)
+
+        return array(self.transmitters, transmitters, "TX"), array(self.receivers, receivers, "RX")
+
+    def _indices(self, places: Places, chosen: Sequence[int] | None, name: str) -> Tensor:
+        numbers = list(range(1, len(places) + 1)) if chosen is None else list(chosen)
+        wrong = [number for number in numbers if not 1 <= number <= len(places)]
+        if wrong or not numbers or len(set(numbers)) < len(numbers):
+            raise InputError(
+                f"expected different {name} numbers of {self.name} from 1 to {len(places)}, got "
+                f"{numbers}; choose elements that it has"
+            )
+        return torch.tensor(numbers) - 1
+
+
+def _row(*columns: float) -> Places:
+    return tuple((column, 0.0) for column in columns)
+
+
+# Two azimuth transmitters 2λ apart and one raised by λ/2 between them.
+_RAISED_MIDDLE = ((0.0, 0.0), (2.0, 1.0), (4.0, 0.0))
+_FOUR = _row(0, 1, 2, 3)
+
+_CASCADE_TX = (
+    ((11.0, 6.0), (10.0, 4.0), (9.0, 1.0)),  # master
+    _row(32, 28, 24),
+    _row(20, 16, 12),
+    _row(8, 4, 0),
+)
+_CASCADE_RX = (_row(11, 12, 13, 14), _row(50, 51, 52, 53), _row(46, 47, 48, 49), _FOUR)
+
+BOARDS: Mapping[str, Board] = MappingProxyType(
+    {
+        board.name: board
+        for board in (
+            Board(
+                "xWR1443",
+                _RAISED_MIDDLE,
+                _FOUR,
+                79e9,
+                "xWR1443BOOST user guide, antenna section; M. E. Yanik, MIMO-SAR toolbox, "
+                "getAntennaLocations.m (drawn turned by 90°, with the middle TX at −λ/2)",
+            ),
+            Board(
+                "xWR1642",
+                _row(0, 4),
+                _FOUR,
+                79e9,
+                "xWR1642BOOST user guide, antenna section; OpenRadar, issue 15 (no elevation)",
+            ),
+            Board(
+                "xWR1843",
+                _RAISED_MIDDLE,
+                _FOUR,
+                79e9,
+                "xWR1843BOOST user guide, antenna section; OpenRadar, dsp/angle_estimation.py, "
+                "naive_xyz (TX2 above RX3 and RX4 of TX1)",
+            ),
+            Board(
+                "IWR6843ISK",
+                _RAISED_MIDDLE,
+                _FOUR,
+                62e9,
+                "mmWave SDK 3D people tracking, ISK_6m_default.cfg: antGeometry0 0 -1 -2 -3 -2 -3 "
+                "-4 -5 -4 -5 -6 -7, antGeometry1 -1 -1 -1 -1 0 0 0 0 -1 -1 -1 -1",
+            ),
+            Board(
+                "IWR6843AOP",
+                ((0.0, 2.0), (2.0, 0.0), (0.0, 0.0)),
+                ((1.0, 0.0), (1.0, 1.0), (0.0, 0.0), (0.0, 1.0)),
+                62e9,
+                "mmWave SDK 3D people tracking, AOP_6m_default.cfg: antGeometry0 -1 -1 0 0 -3 -3 "
+                "-2 -2 -1 -1 0 0, antGeometry1 -1 0 -1 0 -3 -2 -3 -2 -3 -2 -3 -2; the signs of "
+                "its antPhaseRot (half of the elements are fed from the other side) are a channel "
+                "calibration, not a place",
+            ),
+            Board(
+                "AWR2944",
+                # Rows are 0.8 λ apart, not λ/2.
+                ((0.0, 0.0), (2.0, 1.6), (4.0, 0.0), (8.0, 0.0)),
+                _FOUR,
+                77e9,
+                "mmWave MCU+ SDK, AWR294X profiles: antGeometryCfg 1 0 1 1 1 2 1 3 0 2 0 3 0 4 0 5 "
+                "1 4 1 5 1 6 1 7 1 8 1 9 1 10 1 11 0.5 0.8",
+            ),
+            Board(
+                "MMWCAS-RF",
+                sum(_CASCADE_TX, ()),
+                sum(_CASCADE_RX, ()),
+                76.8e9,
+                "TI mmWave Studio, 4chip_cascade_MIMO_example, module_param.m: "
+                "TI_Cascade_TX_position_azi/ele and RX_position_azi, in the order of the devices; "
+                "TI TIDUEN5 (JAJU737), figures 6 and 7",
+            ),
+        )
+    }
+)
+"""Name → preset. xWR boards serve the AWR and the IWR of that number."""
+
+
+def board(name: str) -> Board:
+    """A preset of `BOARDS`.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    if name not in BOARDS:
+        raise InputError(
+            f"expected a board of {', '.join(BOARDS)}, got {name!r}; "
+            "describe another one as a Board with its own table"
+        )
+    return BOARDS[name]
