@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from invertwin.capture import Capture, ChirpData, ChirpSettings, adc_counts, read
-from invertwin.capture.ti import read_samples, recorded_files, write_cfg, write_samples
+from invertwin.capture.ti import (
+    read_samples,
+    recorded_files,
+    write_cfg,
+    write_samples,
+    write_studio,
+)
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
 from invertwin.radar.waveform import PhysicsWarning
@@ -248,6 +254,20 @@ def test_a_recording_becomes_a_capture(tmp_path):
         lanes=2,
     )
     torch.testing.assert_close(given.beat, data.samples.mean(1))
+
+
+def test_a_setup_is_enough(tmp_path):
+    data = counts(SETTINGS)
+    write_samples(tmp_path / "adc_Raw_0.bin", data)
+    write_studio(tmp_path / "bench.mmwave.json", SETTINGS)
+    files = {"fileBasePath": "D:\\data", "files": [{"rawFileName": "adc_Raw_0.bin"}]}
+    setup = {"configUsed": "D:\\data\\bench.mmwave.json", "capturedFiles": files}
+    (tmp_path / "bench.setup.json").write_text(json.dumps(setup))
+    options = {"chirps": 0, "board": "xWR1843", "elevation": 1}
+    capture = read(tmp_path / "bench.setup.json", "dca1000", **options)
+    assert torch.equal(capture.beat, data.samples[:, 0])
+    with pytest.raises(InputError, match=r"settings in a .cfg or .json file"):
+        read(tmp_path / "adc_Raw_0.bin", "dca1000", **options)
 
 
 def test_a_simulated_echo_is_found_in_its_file(tmp_path):

@@ -30,7 +30,7 @@ _LANE_COUNT = 4
 
 def read(
     path: str | Path,
-    settings: str | Path | ChirpSettings,
+    settings: str | Path | ChirpSettings | None = None,
     *,
     chirps: int | str,
     board: str | None = None,
@@ -45,7 +45,8 @@ def read(
 
     Args:
         path: `.bin` file, or a `.setup.json` that names the files.
-        settings: what the recording was set up with, or its file (`read_settings`).
+        settings: what the recording was set up with, or its file (`read_settings`); None = those
+            that the `.setup.json` names.
         chirps: "mean" or a chirp number, see `ChirpData.capture`.
         board: preset of `invertwin.radar.boards` whose elements in use are those of the settings.
         elevation: sign of elevation of the preset, see `Board.arrays`.
@@ -58,6 +59,8 @@ def read(
     Raises:
         InputError: what `read_samples` and `ChirpData.capture` raise, or no board.
     """
+    if settings is None:
+        settings = path
     known = settings if isinstance(settings, ChirpSettings) else read_settings(settings)
     if lanes is not None:
         known = replace(known, lanes=lanes)
