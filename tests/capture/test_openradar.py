@@ -10,6 +10,7 @@ from invertwin.capture import read
 from invertwin.capture.openradar import FILE, read_chirps
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
+from invertwin.radar.doppler import compensate_tdm, range_doppler
 
 META = {"f0_hz": 77e9, "slope_hz_s": 6e13, "fs_hz": 2.5e6, "idle_s": 3e-5, "ramp_end_s": 6.2e-5}
 
@@ -84,3 +85,18 @@ def test_the_recording_has_movers_near_three_metres(data_folder):
     assert 2.8 < float(ranges[profile.argmax()]) < 3.2
     capture = read(data_folder / "openradar", "openradar", chirps=0)
     assert capture.radar().waveform.center_frequency == pytest.approx(78.956e9, rel=1e-4)
+
+
+def test_the_channels_of_the_mover_are_a_plane_wave(data_folder):
+    data = read_chirps(data_folder / "openradar")
+    radar = data.radar(*board("xWR1642").arrays())
+    moving = (data.beat - data.beat.mean(1, keepdim=True)).to(torch.complex128)
+    spectrum = range_doppler(moving, radar, radar.grid(2.5, 3.5), data.settings.chirps)
+    spectrum = compensate_tdm(spectrum, radar, data.settings.chirps)[0]
+    power = spectrum.abs().square().sum((1, 2))
+    rate, bin_ = divmod(int(power.argmax()), power.shape[1])
+    channels = spectrum[rate, :, :, bin_].flatten()
+    steps = torch.linspace(-torch.pi, torch.pi, 721, dtype=torch.float64)
+    waves = torch.exp(-1j * steps[:, None] * torch.arange(8))
+    coherence = (waves * channels / channels.abs()).mean(1).abs().max()
+    assert coherence > 0.99

@@ -160,7 +160,7 @@ def write_chirps(path: str | Path, data: ChirpData, file: str) -> None:
         )
     s = data.settings
     samples = data.samples.detach().cpu().resolve_conj().numpy()
-    array = np.ascontiguousarray(samples.real) if s.real else samples
+    array = np.ascontiguousarray(np.real(samples)) if s.real else samples
     part = target.with_name(f".{os.getpid()}.part{target.suffix}")
     try:
         if target.suffix == ".npy":

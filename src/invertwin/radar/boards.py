@@ -36,7 +36,9 @@ class Board:
         name: of the board.
         transmitters: (column, row) of TX1, TX2, … [λ/2].
         receivers: (column, row) of RX1, RX2, … [λ/2].
-        design_frequency: whose half wavelength is the unit [Hz].
+        design_frequency: whose half wavelength is the unit [Hz]. Presets whose source names none
+            take the middle of the band (xWR1642, xWR1843, AWR2944), or that of their sister, the
+            IWR6843L of TI's SWRU585 (IWR6843ISK, IWR6843AOP).
         source: where the numbers come from.
 
     Raises:
@@ -83,10 +85,10 @@ class Board:
     ) -> tuple[AntennaArray, AntennaArray]:
         """TX and RX elements in the radar frame (x right, y up, z boresight).
 
-        Public sources disagree on which way is up: TI's drawings of the xWR1843 put its middle
-        transmitter above the others, TI's own ``antGeometry`` and published processing chains use
-        either sign. So the sign of elevation has no default where it matters. To find it, place a
-        reflector above the board: its spectrum must peak at v > 0. Likewise for left and right.
+        Public sources disagree which way is up, for the xWR1843's middle transmitter for one, and
+        phases in some of them have the other sign. So the sign of elevation has no default where it
+        matters. To find it, place a reflector above the board: its spectrum must peak at v > 0.
+        Likewise for left and right.
 
         Args:
             elevation: +1 = rows grow upwards (y), −1 = downwards; required if the board has rows.
@@ -161,23 +163,24 @@ BOARDS: Mapping[str, Board] = MappingProxyType(
                 _RAISED_MIDDLE,
                 _FOUR,
                 79e9,
-                "xWR1443BOOST user guide, antenna section; M. E. Yanik, MIMO-SAR toolbox, "
-                "getAntennaLocations.m (drawn turned by 90°, with the middle TX at −λ/2)",
+                "M. E. Yanik and M. Torlak, MIMO-SAR toolbox, getAntennaLocations.m (there turned "
+                "by 90°, with the middle TX at −λ/2; 79 GHz)",
             ),
             Board(
                 "xWR1642",
                 _row(0, 4),
                 _FOUR,
                 79e9,
-                "xWR1642BOOST user guide, antenna section; OpenRadar, issue 15 (no elevation)",
+                "OpenRadar's recording, whose 8 channels are a plane wave on this grid, and its "
+                "issue 15 (no elevation)",
             ),
             Board(
                 "xWR1843",
                 _RAISED_MIDDLE,
                 _FOUR,
                 79e9,
-                "xWR1843BOOST user guide, antenna section; OpenRadar, dsp/angle_estimation.py, "
-                "naive_xyz (TX2 above RX3 and RX4 of TX1)",
+                "OpenRadar, dsp/angle_estimation.py and issue 61: in the order TX1, TX3, TX2, "
+                "channels 9 to 12 are the raised row over channels 3 to 6",
             ),
             Board(
                 "IWR6843ISK",
@@ -213,7 +216,8 @@ BOARDS: Mapping[str, Board] = MappingProxyType(
                 76.8e9,
                 "TI mmWave Studio, 4chip_cascade_MIMO_example, module_param.m: "
                 "TI_Cascade_TX_position_azi/ele and RX_position_azi, in the order of the devices; "
-                "TI TIDUEN5 (JAJU737), figures 6 and 7",
+                "86 azimuth places as in TI's JAJU737A, whose text has the last two RX groups "
+                "farther apart",
             ),
         )
     }
