@@ -43,11 +43,13 @@ expected = iw.simulate(scene, radar, grid, seed=1, surrogate=iw.Surrogate())
 figure = Figure(figsize=(9, 4), layout="constrained")
 panels = figure.subplots(1, 2, sharey=True)
 maps = {"one recording (exact)": recorded.spectrum, "on average (surrogate)": expected.spectrum}
-for panel, (title, power) in zip(panels, maps.items(), strict=True):
-    level = 10 * torch.log10(power[0, :, :, 0].clamp_min(1e-30)).numpy()
-    image = panel.pcolormesh(grid.u.numpy(), grid.ranges.numpy(), level, vmin=level.max() - 40)
+levels = {title: 10 * torch.log10(p[0, :, :, 0].clamp_min(1e-30)) for title, p in maps.items()}
+top = max(float(level.max()) for level in levels.values())  # one scale for both panels
+for panel, (title, level) in zip(panels, levels.items(), strict=True):
+    u, ranges = grid.u.numpy(), grid.ranges.numpy()
+    image = panel.pcolormesh(u, ranges, level.numpy(), vmin=top - 40, vmax=top)
     panel.set(title=title, xlabel="u = x/R")
-    figure.colorbar(image, ax=panel, label="received over transmitted power [dB]")
+figure.colorbar(image, ax=panels, label="received over transmitted power [dB]")
 panels[0].set_ylabel("range [m]")
 figure.savefig(folder / "simulate.png", dpi=100)
 

@@ -56,3 +56,4 @@ for name, theta in ("start", torch.zeros(3)), ("found", sought.theta.detach()):
     x, z, yaw = (theta - hidden.theta.detach()).tolist()
     print(f"{name}: {100 * math.hypot(x, z):.1f} cm and {math.degrees(abs(yaw)):.1f}° off")
 iw.scene.save_mesh(folder / "twin.ply", fit.scene)
+print(f"the scene as found: {folder / 'twin.ply'}")

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import torch
+from matplotlib.figure import Figure
 
 import invertwin as iw
 from invertwin.scene import Cosine, PerfectConductor, linear_array, rigid, save_mesh, sphere
@@ -22,8 +23,7 @@ else:  # no mesh given: make one, as another program would
     save_mesh(file, sphere(0.1, subdivisions=5))
 
 # OBJ, PLY, STL or glTF; metres. The file's origin goes to (0.4, 0, 2) m.
-mesh = iw.load_mesh(file)
-ball = iw.Object(mesh, PerfectConductor(), rigid(translation=[0.4, 0.0, 2.0]))
+ball = iw.Object(iw.load_mesh(file), PerfectConductor(), rigid(translation=[0.4, 0.0, 2.0]))
 scene = iw.Scene({"ball": ball})
 
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=60e-6, samples=256)
@@ -45,8 +45,16 @@ capture.save(folder / "ball.nc")
 loaded = iw.Capture.load(folder / "ball.nc")
 assert torch.equal(loaded.beat, capture.beat)
 spectrum = loaded.spectrum(grid)[0, :, :, 0]
-peak = int(spectrum.argmax())
-row, column = divmod(peak, grid.u_count)
-print(f"{loaded.frame_count} frame of {tuple(loaded.beat.shape[1:])} (tx, rx, sample)")
-print(f"strongest echo: R = {grid.ranges[row]:.2f} m, u = {grid.u[column]:+.2f}, "
-      f"{10 * spectrum.max().log10():.0f} dB")  # fmt: skip
+level = 10 * torch.log10(spectrum.clamp_min(1e-30)).numpy()
+row, column = divmod(int(spectrum.argmax()), grid.u_count)
+nearest = min(ball.vertices, key=torch.linalg.norm)  # a smooth ball shines there
+
+figure = Figure(figsize=(5, 4), layout="constrained")
+panel = figure.subplots()
+image = panel.pcolormesh(grid.u.numpy(), grid.ranges.numpy(), level, vmin=level.max() - 60)
+panel.set(title="received over transmitted power [dB]", xlabel="u = x/R", ylabel="range [m]")
+figure.colorbar(image, ax=panel)
+figure.savefig(folder / "ball.png", dpi=100)
+print(f"strongest echo: R = {grid.ranges[row]:.2f} m, u = {grid.u[column]:+.2f}")
+print(f"nearest point:  R = {nearest.norm():.2f} m, u = {nearest[0] / nearest.norm():+.2f}")
+print(f"picture: {folder / 'ball.png'}")

@@ -2,17 +2,26 @@
 
 import ast
 import importlib
+import json
 import os
+import pickle
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from invertwin.capture import rail_sar
+from invertwin.cli.run_file import load_run, validate
+from invertwin.cli.schema import RunFile
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
-WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
+WITH_PYTHON = [page for page in PAGES[1:] if "```python" in page.read_text()]
+NEEDS_DATA = ["measured_data.md"]
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 
 SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -23,7 +32,7 @@ WRITES = {
     "01_simulate.py": ["simulate.png"],
     "02_reconstruct.py": ["twin.ply"],
     "03_gradient.py": ["gradient.png"],
-    "04_own_mesh_and_board.py": ["ball.ply", "ball.nc"],
+    "04_own_mesh_and_board.py": ["ball.ply", "ball.nc", "ball.png"],
 }
 
 
@@ -74,9 +83,55 @@ def test_readme_snippets_are_short():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", WITH_PYTHON[1:], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [p for p in WITH_PYTHON if p.name not in NEEDS_DATA], ids=lambda page: page.name
+)
 def test_snippets_of_a_page_run(page, tmp_path):
     run(["-c", "\n".join(snippets(page))], tmp_path)
+    assert not list(tmp_path.iterdir()), "a snippet leaves a file behind"
+
+
+def test_recipe_of_the_rail_data_makes_the_file_that_is_read(data_folder, tmp_path):
+    made = "bwsi_rail_trial6.npz"
+    with np.load(data_folder / "rail_sar" / made) as file:
+        arrays = {name: file[name] for name in file.files if name != "meta"}
+    recorded = arrays | {"range_bins": arrays["range_bins"][None]}  # as the original has it
+    (tmp_path / "master_data.pkl").write_bytes(pickle.dumps(recorded))
+    (recipe,) = snippets(REPOSITORY / "docs" / "measured_data.md")
+    run(["-c", recipe], tmp_path)
+    with np.load(tmp_path / made) as file:
+        for name, values in arrays.items():
+            np.testing.assert_array_equal(file[name], values)
+    taken, own = (rail_sar.read(folder) for folder in (tmp_path, data_folder / "rail_sar"))
+    assert taken.dataset.identical(own.dataset)
+
+
+def test_run_files_on_the_page_fit_the_schema(tmp_path):
+    page = (REPOSITORY / "docs" / "run_files.md").read_text()
+    examples = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert examples
+    for text in examples:
+        found = validate(tomllib.loads(text), tmp_path / "run.toml")
+        (tmp_path / "run.toml").write_text(text)
+        assert load_run(tmp_path / "run.toml") == found
+
+
+@pytest.mark.slow
+def test_run_file_on_the_page_finds_the_ball(tmp_path):
+    page = (REPOSITORY / "docs" / "run_files.md").read_text()
+    (text,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (tmp_path / "ball.toml").write_text(text)
+    for command in ("simulate", "reconstruct"):
+        line = ["-c", "from invertwin.cli.app import main; main()", command, "ball.toml"]
+        run([*line, "--out", command], tmp_path)
+    assert json.loads((tmp_path / "reconstruct" / "metrics.json").read_text())["success"]
+
+
+def test_page_on_run_files_names_every_section():
+    page = (REPOSITORY / "docs" / "run_files.md").read_text()
+    cells = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    named = {re.sub(r"\W*(\w+).*", r"\1", name) for c in cells for name in re.findall("`.+?`", c)}
+    assert named == set(RunFile.model_fields)
 
 
 @pytest.mark.slow

@@ -1,5 +1,11 @@
 """Digital twins from radar: differentiable ray-traced radar simulation, visibility included.
 
+Data flows one way. ``scene`` turns parameters θ (``scene/parameters.py``) into meshes, materials
+and antennas; ``channel`` traces them into paths; ``radar`` makes beat signals and spectra of paths,
+or their smooth mean, the surrogate; ``inversion`` compares spectra with a capture and moves θ.
+``simulation.py`` is the way from scene to spectrum on one page. Beside it, ``capture`` holds
+measured data and ``cli`` the commands.
+
 The names below are the public menu. Each is loaded when it is first used, so ``import invertwin``
 is quick, and ``invertwin doctor`` runs where no ray tracer can.
 """
