@@ -13,6 +13,7 @@ from invertwin.capture.ti import (
     recorded_files,
     write_cfg,
     write_samples,
+    write_setup,
     write_studio,
 )
 from invertwin.errors import InputError
@@ -266,6 +267,15 @@ def test_a_setup_is_enough(tmp_path):
     options = {"chirps": 0, "board": "xWR1843", "elevation": 1}
     capture = read(tmp_path / "bench.setup.json", "dca1000", **options)
     assert torch.equal(capture.beat, data.samples[:, 0])
+    write_setup(
+        tmp_path / "own.setup.json", tmp_path / "bench.mmwave.json", [tmp_path / "adc_Raw_0.bin"]
+    )
+    own = read(tmp_path / "own.setup.json", "dca1000", **options)
+    assert torch.equal(own.beat, capture.beat)
+    with pytest.raises(InputError, match=r"expected adc_Raw_1\.bin beside"):
+        write_setup(tmp_path / "x.setup.json", "bench.mmwave.json", ["adc_Raw_1.bin"])
+    with pytest.raises(InputError, match="existing folder"):
+        write_setup(tmp_path / "nowhere" / "x.setup.json", "bench.mmwave.json", [])
     with pytest.raises(InputError, match=r"settings in a .cfg or .json file"):
         read(tmp_path / "adc_Raw_0.bin", "dca1000", **options)
 

@@ -1,6 +1,7 @@
 """Settings that mmWave Studio saves: `.mmwave.json` (the device) and `.setup.json` (the bench)."""
 
 import json
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -262,3 +263,33 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
     }
     device = {"mmWaveDeviceId": 0, "rfConfig": radio, "rawDataCaptureConfig": record}
     path.write_text(json.dumps({"mmWaveDevices": [device]}, indent=2) + "\n", encoding="utf-8")
+
+
+def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str | Path]) -> None:
+    """Writes a `.setup.json` that names its settings and raw files, which lie beside it.
+
+    Args:
+        path: the setup.
+        settings: the `.mmwave.json` file.
+        recordings: the `.bin` files in the order of recording.
+
+    Raises:
+        InputError: the folder does not exist, or a file that is not in it.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
+    for file in (settings, *recordings):
+        if not (path.parent / Path(file).name).is_file():
+            raise InputError(
+                f"expected {Path(file).name} beside {path}, got no such file; write it there first"
+            )
+    names = [{"rawFileName": Path(file).name, "processedFileName": ""} for file in recordings]
+    files = {"numFilesCollected": len(names), "fileBasePath": "", "files": names}
+    setup = {
+        "configUsed": Path(settings).name,
+        "captureHardware": "DCA1000",
+        "DCA1000Config": {"dataLoggingMode": "raw"},
+        "capturedFiles": files,
+    }
+    path.write_text(json.dumps(setup, indent=2) + "\n", encoding="utf-8")
