@@ -1,6 +1,6 @@
 """Simulate a radar: what one recording shows, and what it shows on average.
 
-Usage: python examples/01_simulate.py [folder]     (default out/examples)
+Usage: .venv/bin/python examples/01_simulate.py [folder]     (default out/examples)
 """
 
 import sys

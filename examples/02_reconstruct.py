@@ -1,7 +1,7 @@
 """Find where a letter stands and how it is turned, from radar signals alone.
 
 What may move is a torch module of one's own: here the letter slides and turns on the floor.
-Usage: python examples/02_reconstruct.py [folder]     (default out/examples)
+Usage: .venv/bin/python examples/02_reconstruct.py [folder]     (default out/examples)
 """
 
 import math

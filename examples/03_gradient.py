@@ -1,6 +1,6 @@
 """The derivative of a radar map when an object moves: with and without visibility.
 
-Usage: python examples/03_gradient.py [folder]     (default out/examples)
+Usage: .venv/bin/python examples/03_gradient.py [folder]     (default out/examples)
 """
 
 import sys

@@ -2,7 +2,7 @@
 
 The board is like a TI AWR1843BOOST: two of its transmitters 2λ apart and four receivers λ/2 apart
 make a row of eight virtual antennas.
-Usage: python examples/04_own_mesh_and_board.py [folder [mesh.obj]]     (default out/examples)
+Usage: .venv/bin/python examples/04_own_mesh_and_board.py [folder [mesh.obj]]  (out/examples)
 """
 
 import sys
