@@ -26,7 +26,7 @@ _MENU = {
     "Grid": "channel.paths",
     "InputError": "errors",
     "Object": "scene.scene",
-    "Radar": "radar.waveform",
+    "Radar": "radar.radar",
     "Scene": "scene.scene",
     "SpectrumLoss": "inversion.loss",
     "Surrogate": "radar.surrogate",

@@ -19,6 +19,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import textwrap
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -225,14 +226,21 @@ def probe_library(path: str) -> Verdict:
     if ended.returncode < 0:
         # Killed from outside (memory, a time limit) says nothing about the library.
         final = -ended.returncode in (signal.SIGABRT, signal.SIGSEGV, signal.SIGILL)
-        reason = f"aborts the process (signal {-ended.returncode}): {lines[0][:60]}"
+        reason = f"aborts the process (signal {-ended.returncode}): {_brief(lines[0])}"
         return Verdict(False, reason, final)
     missing = re.search(r"ImportError: (\S+): cannot open shared object", ended.stderr)
     if missing:
         return Verdict(False, f"could not be tried: Dr.Jit needs {missing[1]}", final=False)
     if lines[0].startswith("Traceback"):
-        return Verdict(False, f"could not be tried: {lines[-1][:120]}", final=False)
-    return Verdict(False, "refused: " + lines[0].split("(): ")[-1].split(". ")[0].rstrip(".")[:120])
+        return Verdict(False, f"could not be tried: {_brief(lines[-1])}", final=False)
+    reason = lines[0].split("(): ")[-1].split(". ")[0].rstrip(".")
+    return Verdict(False, f"refused: {_brief(reason)}")
+
+
+def _brief(message: str) -> str:
+    """A message without addresses of memory, cut between words."""
+    plain = re.sub(r":? ?\b0x[0-9a-f]+\b,?", "", message)
+    return textwrap.shorten(plain, 120, placeholder=" …")
 
 
 def gpu_name() -> str | None:

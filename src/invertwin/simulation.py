@@ -11,10 +11,10 @@ from invertwin.channel.paths import Grid, Paths
 from invertwin.channel.tracer import RoughPoints, rough_points, trace_field
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps, moving_beat
+from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import add_noise, beat_signal
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
-from invertwin.radar.waveform import Radar
 from invertwin.scene.scene import Scene
 
 

@@ -6,7 +6,8 @@ import torch
 from invertwin.capture import Capture, Track, backproject, calibrate, locate
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.waveform import Impulse, Radar
+from invertwin.radar.radar import Radar
+from invertwin.radar.waveform import Impulse
 from invertwin.scene.antenna import AntennaArray
 
 TARGET = torch.tensor([7.0, 0.4, 0.1], dtype=torch.float64)

@@ -7,8 +7,9 @@ import xarray as xr
 from invertwin.capture import READERS, Capture, Track, read
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import exact_spectrum
-from invertwin.radar.waveform import FMCW, Impulse, Radar
+from invertwin.radar.waveform import FMCW, Impulse
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Table, linear_array
 from invertwin.scene.pose import rotation_from_vector
 

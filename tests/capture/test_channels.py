@@ -8,7 +8,8 @@ import torch
 from invertwin.capture import Capture, ChannelCalibration, ChirpData, estimate_channels, settings_of
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
-from invertwin.radar.waveform import FMCW, Impulse, Radar
+from invertwin.radar.radar import Radar
+from invertwin.radar.waveform import FMCW, Impulse
 from invertwin.scene.antenna import AntennaArray
 
 CHIRP = FMCW(77e9, 2e9, 50e-6, 128)

@@ -74,16 +74,17 @@ def test_spectra_of_every_layout_and_of_silence():
         power = rng.random((3, 6, u, v))
         png = pictures.spectra_picture({"measured": power, "start": np.zeros_like(power)}, axes)
         assert png[:8] == PNG
-        png = pictures.gradient_picture({"differences": power, "full": 0 * power}, axes)
+        maps = {"differences": power, "full": 0 * power}
+        png = pictures.gradient_picture(maps, ("full − differences", power), axes, "1/m")
         assert png[:8] == PNG
 
 
 def test_curves():
     x = np.linspace(-1, 1, 9)
     losses = {"full": [[1.0, 0.5], [0.0, 0.0]], "interior": [[1.0, 0.01]]}
-    assert pictures.loss_picture(losses, annealed=1.0)[:8] == PNG
+    assert pictures.loss_picture(losses, annealed=1.0, before=0.7)[:8] == PNG
     assert pictures.loss_picture({})[:8] == PNG
-    assert pictures.landscape_picture((x, x**2), {"wide": (x, x**2)})[:8] == PNG
+    assert pictures.landscape_picture((x, x**2), {"wide": (x, x**2)}, "plate along z")[:8] == PNG
 
 
 def test_pictures_repeat_byte_for_byte():

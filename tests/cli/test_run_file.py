@@ -119,9 +119,45 @@ def test_errors_name_path_allowed_values_and_nearest_match(raw, parts):
         assert part in message
 
 
-def test_number_of_further_errors_is_said():
+def test_further_errors_are_said_too_but_not_without_end():
     message = error_of(run(radar=radar(window="x", array_window="y")))
-    assert message.endswith("(and 1 more)")
+    first, second = message.split(" — also ")
+    assert first.startswith("radar.window: ")
+    assert second.startswith("radar.array_window: ")
+    assert error_of(run(radar=radar(positions=[["x"] * 3] * 9))).count(" — also ") == 3
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ("x", 'expected an integer, got "x"'),
+        (2.5, "expected an integer, got 2.5; correct"),
+    ],
+)
+def test_integers_are_asked_for_in_good_english(value, said):
+    assert said in error_of(run(seed=value))
+
+
+def test_a_section_that_is_no_table_says_so():
+    assert "grid: expected a table, got 3" in error_of(run(grid=3))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('task = "demo"\nseed = = 3\n', 'line 2: expected TOML, got "seed = = 3" (Invalid value)'),
+        ('task = "demo"\na = [1,', "line 2: expected TOML"),
+        ("a = 1\na = 2\n", "line 2: expected TOML"),
+        ("[", "line 1: expected TOML"),
+    ],
+)
+def test_a_syntax_error_names_the_line(tmp_path, text, said):
+    file = tmp_path / "bad.toml"
+    file.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_run(file)
+    assert str(caught.value).startswith(f"{file}: {said}")
+    assert "\n" not in str(caught.value)
 
 
 def test_files_are_looked_for_beside_the_run_file_then_in_the_data_folder(tmp_path, monkeypatch):

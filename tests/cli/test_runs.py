@@ -94,10 +94,13 @@ def test_failed_overwrite_puts_the_results_back(tmp_path, error):
 
 
 def test_failed_first_run_leaves_no_folder(tmp_path):
-    out = tmp_path / "out"
     with pytest.raises(InputError):
-        broken_run(out, InputError, {"metrics.json": "{}"})
-    assert not out.exists()
+        broken_run(tmp_path / "out" / "deep", InputError, {"metrics.json": "{}"})
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out" / "other").mkdir(parents=True)
+    with pytest.raises(InputError):
+        broken_run(tmp_path / "out" / "deep", InputError, {"metrics.json": "{}"})
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["other"]
 
 
 def test_interrupted_run_resumes_with_the_same_run_file_only(tmp_path):

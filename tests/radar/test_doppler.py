@@ -21,6 +21,7 @@ from invertwin.radar import (
     velocity_axis,
     velocity_span,
 )
+from invertwin.radar.boards import BOARDS
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.pose import rotation_from_vector
 from oracles.moving_point import moving_point
@@ -214,3 +215,45 @@ def test_wrong_input():
     for length, step in ((33, 1), (1, 1), (8, 0)):
         with pytest.raises(InputError, match=r"window of 2\.\.32"):
             micro_doppler(cube[0, :, 0, 0, 0], radar, CHIRPS, length=length, step=step)
+
+
+@pytest.mark.filterwarnings("ignore:virtual elements are 0.80 wavelengths:UserWarning")
+@pytest.mark.parametrize("name", BOARDS)
+def test_every_board_needs_the_compensation(name):
+    """With it within 0.1 beamwidth; without it, or with its sign reversed, over one off.
+
+    Transmitters in two columns can be off by one beamwidth at most, where their phases are
+    opposite: there the bound is half of one.
+    """
+    board = BOARDS[name]
+    tx, rx = board.arrays(elevation=1 if board.has_rows else None)
+    wave = replace(WAVE, start_frequency=board.design_frequency - 0.5e9)
+    radar = Radar(tx, rx, wave, torch.zeros(1, 3, dtype=torch.float64), array_window="rectangular")
+    whole = radar.grid(4.0, 4.05, u_max=0.9, v_max=0.9)
+    truth = torch.tensor([U, 0.1 if board.has_rows else 0.0], dtype=torch.float64)
+    cells = torch.tensor(radar.beamwidth, dtype=torch.float64)
+    start, step = truth - 0.3 * cells, 0.05 * cells
+    near = replace(whole, u_start=float(start[0]), u_step=float(step[0]), u_count=13)
+    if board.has_rows:
+        near = replace(near, v_start=float(start[1]), v_step=float(step[1]), v_count=13)
+
+    def off(spectrum, grid):
+        power = beamform(spectrum[:, 0], radar, grid).amax((0, 1))
+        i, j = divmod(int(power.argmax()), grid.v_count)
+        found = torch.stack([grid.u[i], grid.v[j]])
+        return float(((found - truth) / cells).abs().max())
+
+    worst = []
+    for spans in (0.8, 1.2):
+        rate = spans * velocity_span(radar, CHIRPS)
+        beat = moving_point(radar, CHIRPS, 4.0, rate, *truth.tolist())
+        cube = range_doppler(beat, radar, whole, CHIRPS)
+        turn = compensate_tdm(torch.ones_like(cube), radar, CHIRPS, fold=1)
+        peak = int(cube.abs().amax((0, 2, 3, 4)).argmax())
+        right, without, reversed_sign = (
+            spectrum[:, peak : peak + 1] for spectrum in (cube * turn, cube, cube * turn.conj())
+        )
+        assert off(right, near) < 0.101
+        assert off(right, whole) < 0.5
+        worst.append(max(off(without, whole), off(reversed_sign, whole)))
+    assert max(worst) > (1 if len(tx.positions[:, 0].unique()) > 2 else 0.5)

@@ -22,8 +22,8 @@ from invertwin.capture.range_interpolation import RangeInterpolator
 from invertwin.capture.track import Track
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import exact_spectrum
-from invertwin.radar.waveform import Radar
 
 BEAT_DIMS = ("frame", "tx", "rx", "sample")
 PROFILE_DIMS = ("frame", "range")

@@ -14,7 +14,8 @@ from invertwin.capture.chirps import ChirpData
 from invertwin.capture.radar_fields import labelled
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.waveform import sample_window, sampled
+from invertwin.radar.radar import sampled
+from invertwin.radar.waveform import sample_window
 from invertwin.scene.checks import checked_tensor
 
 _DEAD = 1e-3

@@ -14,7 +14,8 @@ from torch import Tensor
 from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps
-from invertwin.radar.waveform import FMCW, PhysicsWarning, Radar
+from invertwin.radar.radar import Radar
+from invertwin.radar.waveform import FMCW, PhysicsWarning
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_count, checked_number
 

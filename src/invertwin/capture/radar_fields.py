@@ -10,11 +10,11 @@ import xarray as xr
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import (
     FMCW,
     OFDM,
     Impulse,
-    Radar,
     SampledWaveform,
     SteppedFrequency,
     Waveform,

@@ -17,7 +17,8 @@ from scipy.signal import hilbert
 from invertwin.capture.capture import Capture
 from invertwin.capture.track import Track
 from invertwin.errors import InputError
-from invertwin.radar.waveform import Impulse, Radar
+from invertwin.radar.radar import Radar
+from invertwin.radar.waveform import Impulse
 from invertwin.scene.antenna import AntennaArray
 
 FILE = "bwsi_rail_trial6.npz"

@@ -1,9 +1,10 @@
-"""The command line `invertwin`: simulate, reconstruct, gradcheck, demo, doctor."""
+"""The command line `invertwin`: simulate, reconstruct, gradcheck, demo, doctor, keys."""
 
 import os
 import sys
+import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -14,21 +15,25 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from invertwin.cli.report import Table, shown
-from invertwin.cli.run_file import load_run, need
+from invertwin import __version__
+from invertwin.cli.keys import key_tables
+from invertwin.cli.report import Table, is_number, shown
+from invertwin.cli.run_file import about_file, load_run, need
 from invertwin.cli.runs import RunFolder, open_run
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
 app = typer.Typer(
     name="invertwin",
-    help="Digital twins from radar: find a scene from its echoes by differentiating ray tracing.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
 )
 # Tables in a log file or a pipe keep the width that holds their columns.
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+
+
+_LOG_SECONDS = 10.0  # between lines of progress in a log
 
 
 class Backend(StrEnum):
@@ -71,6 +76,25 @@ FileArgument = Annotated[Path, typer.Argument(help="Run file (TOML).", show_defa
 FilesArgument = Annotated[list[Path], typer.Argument(help="Run files (TOML).", show_default=False)]
 
 
+def _show_version(wanted: bool) -> bool:
+    if wanted:
+        print(f"invertwin {__version__}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Show the version and end."
+        ),
+    ] = False,
+) -> None:
+    """Digital twins from radar: find a scene from its echoes by differentiating ray tracing."""
+
+
 @app.command()
 def simulate(
     file: FileArgument,
@@ -84,7 +108,9 @@ def simulate(
     with _folder(out or _default(file), runs, overwrite, False) as folder:
         from invertwin.cli.run_simulate import run_simulate
 
-        _print(run_simulate(runs[file.stem], folder))
+        with about_file(file):
+            tables = run_simulate(runs[file.stem], folder)
+        _print(tables)
 
 
 @app.command()
@@ -132,8 +158,20 @@ def gradcheck(
         from invertwin.cli.run_gradcheck import run_gradcheck
 
         with console.status("tracing") as status:
-            table = run_gradcheck(runs, folder, status.update)
+            say = status.update if console.is_terminal else _now_and_then()
+            table = run_gradcheck(runs, {file.stem: file for file in files}, folder, say)
         _print([table])
+
+
+@app.command()
+def keys(
+    section: Annotated[
+        str | None,
+        typer.Argument(help="Such as radar or radar.waveform; default: all.", show_default=False),
+    ] = None,
+) -> None:
+    """Print the keys of run files: what may be written where, units, defaults."""
+    _print(key_tables(section))
 
 
 @app.command()
@@ -164,7 +202,10 @@ def _reconstruct(file: Path, out: Path, overwrite: bool, resume: bool, seed: int
             return
         from invertwin.cli.run_reconstruct import run_reconstruct
 
-        _print(run_reconstruct(runs[file.stem], folder, console))
+        with about_file(file):
+            tables, outcome = run_reconstruct(runs[file.stem], folder, console)
+        _print(tables)
+        console.print(outcome, markup=False, soft_wrap=True)
 
 
 @contextmanager
@@ -197,10 +238,28 @@ def _load(
                 f"expected run files of different names, got {file.stem} twice; rename one"
             )
         run = load_run(file)
-        for section in sections:
-            need(run, section, command)
+        other = "reconstruct" if run.task == "demo" else run.task
+        cure = "add it"
+        if other != command:
+            cure = f"its task is {run.task}: use `invertwin {other} {file}`"
+        with about_file(file):
+            for section in sections:
+                need(run, section, command, cure)
         runs[file.stem] = run if seed is None else run.model_copy(update={"seed": seed})
     return runs
+
+
+def _now_and_then() -> Callable[[str], None]:
+    """Prints a line of progress, unless one was printed just now."""
+    last = -_LOG_SECONDS
+
+    def say(line: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _LOG_SECONDS:
+            last = time.monotonic()
+            console.print(line, markup=False, soft_wrap=True)
+
+    return say
 
 
 def _default(file: Path) -> Path:
@@ -217,7 +276,8 @@ def _print(tables: list[Table]) -> None:
     for table in tables:
         grid = RichTable(title=Text(table.title), title_justify="left")
         for i, column in enumerate(table.columns):
-            grid.add_column(Text(column), justify="right" if i else "left", no_wrap=i == 0)
+            numbers = any(is_number(row[i]) for row in table.rows)
+            grid.add_column(Text(column), justify="right" if numbers else "left", no_wrap=i == 0)
         for row in table.rows:
             grid.add_row(*(Text(shown(cell)) for cell in row))
         console.print(grid)

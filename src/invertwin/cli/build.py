@@ -15,8 +15,9 @@ from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
 from invertwin.inversion.regularization import Laplacian
+from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
-from invertwin.radar.waveform import FMCW, Impulse, Radar
+from invertwin.radar.waveform import FMCW, Impulse
 from invertwin.scene import (
     AntennaArray,
     Cosine,

@@ -13,9 +13,9 @@ from invertwin.cli import build, pictures
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import beat_signal
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
-from invertwin.radar.waveform import Radar
 from invertwin.scene import AntennaArray, Scene
 
 
@@ -51,7 +51,16 @@ def landscape(
         }
     counts = {name: pictures.count_minima(losses) for name, (_, losses) in smooth.items()}
     minima = {"exact": pictures.count_minima(exact[1]), **counts}
-    return pictures.landscape_picture(exact, smooth), {"local_minima": minima}
+    along = f"{table.object} along {_name(table.axis)}"
+    return pictures.landscape_picture(exact, smooth, along), {"local_minima": minima}
+
+
+def _name(axis: list[float]) -> str:
+    """x, y or z, or the direction's numbers."""
+    used = [name for name, value in zip("xyz", axis, strict=True) if value]
+    if len(used) == 1 and sum(axis) > 0:
+        return used[0]
+    return f"({', '.join(f'{value:g}' for value in axis)})"
 
 
 def _exact(

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from invertwin.radar.waveform import Radar
+from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
 PALETTE = ("#4c78a8", "#e0803c", "#54a24b", "#b279a2", "#9d755d")
@@ -24,7 +24,7 @@ U_LABEL, V_LABEL = "direction cosine u (to the right)", "direction cosine v (up)
 MAX_TRIANGLES = 40_000
 
 MARKED_SHARE = 0.015  # of a view: objects that look smaller get a mark
-TRACK_COUNT = 24  # radar positions: more of them are drawn as a line
+TRACK_COUNT = 24  # radar positions: more of them are drawn as dots
 
 VIEWS: Mapping[str, tuple[int, int, int]] = {
     "from the radar": (0, 1, 2),
@@ -169,9 +169,9 @@ def _draw_scene(
         if np.ptp(vertices[:, plane], axis=0).max() < smallest:
             axes.plot(*vertices[:, plane].mean(axis=0), "+", color=OUTLINE, ms=11, mew=1.2)
     if drawing.radar is not None and depth != 2:
-        line = len(drawing.radar) > TRACK_COUNT
-        style = {"linewidth": 2} if line else {"marker": "v", "linestyle": "", "markersize": 4}
-        axes.plot(*drawing.radar[:, plane].T, color="black", **style)
+        many = len(drawing.radar) > TRACK_COUNT
+        style = {"marker": ".", "markersize": 5} if many else {"marker": "v", "markersize": 4}
+        axes.plot(*drawing.radar[:, plane].T, color="black", linestyle="", mew=0, **style)
     for set_limits, k, c in ((axes.set_xlim, across, 0), (axes.set_ylim, up, 1)):
         ends = window[c] + window[c + 2] / 2 * np.array([-1, 1])
         set_limits(*ends[:: nearest.sign[k]])
@@ -221,8 +221,15 @@ def _legend(figure: Figure, drawings: Mapping[str, Drawing]) -> None:
         if drawing.outline:
             handles["truth"] = Line2D([], [], color=OUTLINE, linewidth=1, label="truth")
         if drawing.radar is not None:
+            count = len(drawing.radar)
+            label = f"radar, {count} positions" if count > 1 else "radar"
             handles["radar"] = Line2D(
-                [], [], color="black", marker="v", linestyle="", markersize=4, label="radar"
+                [],
+                [],
+                color="black",
+                marker="." if count > TRACK_COUNT else "v",
+                ls="",
+                label=label,
             )
     figure.legend(
         handles=list(handles.values()),
@@ -311,13 +318,16 @@ def spectra_picture(spectra: Mapping[str, NDArray], axes: Axes) -> bytes:
 
 
 def loss_picture(
-    losses: Mapping[str, Sequence[Sequence[float]]], annealed: float | None = None
+    losses: Mapping[str, Sequence[Sequence[float]]],
+    annealed: float | None = None,
+    before: float | None = None,
 ) -> bytes:
     """Loss over steps, one colour per group and one line per fit.
 
     Args:
         losses: Losses of every fit, by group.
         annealed: Step from which the surrogate has no extra width.
+        before: Loss of the start without extra width.
     """
     figure = Figure(figsize=(7, 3.2), layout="constrained")
     axes = figure.subplots()
@@ -326,10 +336,14 @@ def loss_picture(
             style = {"color": PALETTE[i % len(PALETTE)], "linewidth": 1.1, "alpha": 0.7}
             axes.plot(values, label="_" if k else f"{name} ({len(fits)})", **style)
     values = [value for fits in losses.values() for row in fits for value in row if value > 0]
+    values += [before] if before else []
     if values and max(values) > 5 * min(values):
         axes.set_yscale("log")
     if annealed is not None:
-        axes.axvline(annealed, color="black", linewidth=0.8, linestyle=":", label="no extra width")
+        label = "extra width shrinks to 0: losses not comparable"
+        axes.axvspan(0, annealed, color="black", alpha=0.07, linewidth=0, label=label)
+    if before is not None:
+        axes.plot([0], [before], "k*", markersize=8, label="start, without extra width")
     axes.set_xlabel("step")
     axes.set_ylabel("loss")
     axes.grid(alpha=0.3)
@@ -338,10 +352,11 @@ def loss_picture(
     return _png(figure)
 
 
-def landscape_picture(exact: Curve, surrogates: Mapping[str, Curve]) -> bytes:
+def landscape_picture(exact: Curve, surrogates: Mapping[str, Curve], along: str) -> bytes:
     """The exact signal's loss beside the surrogate's, over the offset from the truth.
 
     Args:
+        along: What is moved and in which direction, such as ``letter along z``.
         exact: Offsets (m) and losses of the exact signal.
         surrogates: Offsets (m) and losses of the surrogate, by name.
     """
@@ -349,12 +364,12 @@ def landscape_picture(exact: Curve, surrogates: Mapping[str, Curve]) -> bytes:
     left, right = figure.subplots(1, 2)
     left.plot(exact[0] * 1e3, exact[1], color=PALETTE[0], linewidth=0.8)
     left.set_title(f"exact signal: {count_minima(exact[1])} local minima", fontsize=9)
-    left.set_xlabel("offset from the truth [mm]")
+    left.set_xlabel(f"offset of {along} from the truth, in millimetres [mm]", fontsize=9)
     for i, (name, (offsets, losses)) in enumerate(surrogates.items()):
         color = PALETTE[(i + 1) % len(PALETTE)]
         right.plot(offsets, losses, color=color, label=f"{name} ({count_minima(losses)})")
     right.set_title("surrogate, and its number of local minima", fontsize=9)
-    right.set_xlabel("offset from the truth [m]")
+    right.set_xlabel(f"offset of {along} from the truth, in metres [m]", fontsize=9)
     right.legend(fontsize=8)
     for axes in (left, right):
         axes.axvline(0, color="black", linewidth=0.6, linestyle=":")
@@ -368,17 +383,27 @@ def count_minima(values: NDArray) -> int:
     return int(np.sum((values[1:-1] < values[:-2]) & (values[1:-1] < values[2:])))
 
 
-def gradient_picture(gradients: Mapping[str, NDArray], axes: Axes) -> bytes:
-    """Derivative maps [frame, range, u, v] side by side on one symmetric colour scale."""
+def gradient_picture(
+    gradients: Mapping[str, NDArray], error: tuple[str, NDArray], axes: Axes, unit: str
+) -> bytes:
+    """Derivative maps [frame, range, u, v] side by side on one symmetric colour scale.
+
+    Args:
+        gradients: Maps, by title.
+        error: Title and map of a difference, on a colour scale of its own.
+        axes: Of all maps.
+        unit: Of the derivative, such as ``1/m``.
+    """
     flats = {
         name: g.sum(axis=3)[0] if len(axes.u) > 1 else g.sum(axis=(2, 3)).T
-        for name, g in gradients.items()
+        for name, g in {**gradients, error[0]: error[1]}.items()
     }
-    limit = max((np.quantile(np.abs(flat), 0.998) for flat in flats.values()), default=0) or 1.0
+    limits = {name: float(np.quantile(np.abs(flat), 0.998)) for name, flat in flats.items()}
+    common = max(limits[name] for name in gradients) or 1.0
     figure = Figure(figsize=(3.7 * len(flats), 3.3), layout="constrained")
     grid = figure.subplots(1, len(flats), squeeze=False)[0]
-    image = None
     for cell, (name, flat) in zip(grid, flats.items(), strict=True):
+        limit = common if name in gradients else limits[name] or 1.0
         across = (axes.u[0], axes.u[-1]) if len(axes.u) > 1 else (-0.5, flat.shape[1] - 0.5)
         image = cell.imshow(
             flat,
@@ -392,9 +417,14 @@ def gradient_picture(gradients: Mapping[str, NDArray], axes: Axes) -> bytes:
         cell.set_title(name, fontsize=9)
         cell.set_xlabel(U_LABEL if len(axes.u) > 1 else "frame", fontsize=8)
         cell.tick_params(labelsize=7)
+        if cell is grid[-2]:
+            bar = figure.colorbar(image, ax=grid[:-1], shrink=0.8)
+            bar.set_label(f"∂ power (received/sent) [{unit}]", fontsize=8)
+        elif cell is grid[-1]:
+            figure.colorbar(image, ax=cell, shrink=0.8).set_label(
+                "own scale, same unit", fontsize=8
+            )
     grid[0].set_ylabel("range [m]", fontsize=8)
-    if image is not None:
-        figure.colorbar(image, ax=grid, shrink=0.8)
     return _png(figure)
 
 

@@ -84,6 +84,11 @@ def report_html(
     )
 
 
+def is_number(value: Any) -> bool:
+    """Whether a cell is right-aligned."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def shown(value: Any) -> str:
     """A cell as people read it: four significant digits, yes and no, a dash for nothing."""
     if value is None:

@@ -4,7 +4,8 @@ import difflib
 import json
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,15 @@ from pydantic_core import ErrorDetails
 
 from invertwin.cli.schema import TAG_MARK, RunFile
 from invertwin.errors import InputError
+
+_MOST_ERRORS = 4  # in one line
+_WORDS = {
+    r"a valid dictionary( or .*)?": "a table",
+    r"a valid string": "a text in quotes",
+    r"a valid boolean": "true or false",
+    r"a valid integer": "an integer",
+    r"a valid ": "a ",
+}
 
 
 def load_run(path: Path) -> RunFile:
@@ -26,34 +36,41 @@ def load_run(path: Path) -> RunFile:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise InputError(
-            f"expected a run file, got the path {path}, which does not exist; check the path"
+            f"{path}: expected a run file, got a path that does not exist; check the path"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
-            f"expected a readable run file, got {path}: {reason}; give a TOML text file"
+            f"{path}: expected a readable run file, got an error: {reason}; give a TOML text file"
         ) from None
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"expected TOML in {path}, got an error: {error}; correct that line"
-        ) from None
+        raise InputError(_syntax_error(path, text, str(error))) from None
     return validate(raw, path)
 
 
-def need(run: RunFile, section: str, command: str) -> Any:
+def need(run: RunFile, section: str, command: str, otherwise: str = "add it") -> Any:
     """A section that a command cannot do without.
 
     Raises:
-        InputError: The run file does not have it.
+        InputError: The run file does not have it; the message ends with `otherwise`.
     """
     found = getattr(run, section)
     if found in (None, []):
         raise InputError(
-            f"expected a section [{section}] for {command}, got a run file without one; add it"
+            f"expected a section [{section}] for {command}, got a run file without one; {otherwise}"
         )
     return found
+
+
+@contextmanager
+def about_file(path: Path) -> Iterator[None]:
+    """Errors with the name of the run file that they are about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def validate(raw: dict[str, Any], source: Path) -> RunFile:
@@ -66,8 +83,8 @@ def validate(raw: dict[str, Any], source: Path) -> RunFile:
         return RunFile.model_validate(raw, context={"folder": source.parent})
     except ValidationError as error:
         errors = error.errors(include_url=False)
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise InputError(f"{source}: {_explain(errors[0])}{more}") from None
+        lines = dict.fromkeys(_explain(item) for item in errors)
+        raise InputError(f"{source}: {' — also '.join([*lines][:_MOST_ERRORS])}") from None
 
 
 def to_toml(run: RunFile) -> str:
@@ -92,6 +109,18 @@ def unknown_object(path: str, name: str, known: Sequence[str]) -> str:
     return (
         f"{path}: expected the name of an object of the scene ({', '.join(known)}), "
         f"got {_shown(name)}; " + _nearest(name, known, "add it to the scene")
+    )
+
+
+def _syntax_error(path: Path, text: str, message: str) -> str:
+    place = re.search(r" \(at line (\d+), column \d+\)$", message)
+    lines = text.splitlines() or [""]
+    number = int(place[1]) if place else len(lines)
+    reason = message[: place.start()] if place else message
+    line = lines[min(number, len(lines)) - 1].strip()
+    return (
+        f"{path}: line {number}: expected TOML, got {_shown(line)} ({' '.join(reason.split())}); "
+        "correct that line"
     )
 
 
@@ -145,7 +174,10 @@ def _explain(error: ErrorDetails) -> str:
             return f"{path}: expected {size} items, got {got}; correct the list"
         case "section":
             return f"{context['path'] or path}: {error['msg']}"
-    expected = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
+    # Pydantic says "..., got a number with a fractional part": the value itself says it, too.
+    expected = error["msg"].removeprefix("Input should be ").split(", got ")[0]
+    for words, ours in _WORDS.items():
+        expected = re.sub(words, ours, expected)
     return f"{path}: expected {expected}, got {got}; correct the value"
 
 
@@ -163,20 +195,21 @@ def _nearest(given: str, allowed: Sequence[str], otherwise: str) -> str:
 
 
 def _lines(table: Mapping[str, Any]) -> list[str]:
-    return [f"{_key(key)} = {_inline(value)}" for key, value in table.items()]
+    return [f"{_key(key)} = {inline(value)}" for key, value in table.items()]
 
 
 def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _inline(key)
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else inline(key)
 
 
-def _inline(value: Any) -> str:
+def inline(value: Any) -> str:
+    """A value as TOML writes it on one line."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(k)} = {_inline(v)}" for k, v in value.items()) + "}"
+        return "{" + ", ".join(f"{_key(k)} = {inline(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(map(_inline, value)) + "]"
+        return "[" + ", ".join(map(inline, value)) + "]"
     return repr(value)

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,11 @@ import numpy as np
 from invertwin.channel.paths import Grid
 from invertwin.cli import build, pictures
 from invertwin.cli.report import Again, Picture, Table, report_html
-from invertwin.cli.run_file import need, to_toml
+from invertwin.cli.run_file import about_file, need, to_toml
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import Gradcheck, RunFile
 from invertwin.inversion.gradcheck import Direction, GradientReport, gradcheck
-from invertwin.radar.waveform import Radar
+from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
 COLUMNS = (
@@ -32,8 +33,29 @@ COLUMNS = (
 )
 
 
+_LEGEND = (
+    "L1 full, L1 interior: distance of the gradient to the differences over the size of the "
+    "differences, ‖g − g_FD‖₁ / ‖g_FD‖₁, with boundary terms (silhouettes) and without; 0 is best. "
+    "ratio: interior over full, how much the boundary terms gain. L2 full: the same in ‖·‖₂. "
+    "correlation: of the two maps, bin by bin. noise: relative standard error of the differences; "
+    "L1 full cannot be expected below it. steps differ: relative change of the differences when "
+    "their step is halved, noise included. order: how the gap to the differences grows with their "
+    "step; 2 for a right gradient, 0 for a wrong one. pairs: difference pairs averaged."
+)
+_UNITS = {
+    "translation": "1/m",
+    "rotation": "1/rad",
+    "scale": "per relative size",
+    "radar_translation": "1/m",
+    "radar_rotation": "1/rad",
+}
+
+
 def run_gradcheck(
-    runs: Mapping[str, RunFile], folder: RunFolder, say: Callable[[str], None]
+    runs: Mapping[str, RunFile],
+    files: Mapping[str, Path],
+    folder: RunFolder,
+    say: Callable[[str], None],
 ) -> Table:
     """Checks every run file, writes the folder, and returns the table to print.
 
@@ -46,7 +68,8 @@ def run_gradcheck(
         part = f"{PARTS}/{name}.json"
         found = folder.read_json(part)
         if found is None:
-            found = _check(name, run, folder, lambda line, name=name: say(f"{name}: {line}"))
+            with about_file(files[name]):
+                found = _check(name, run, folder, lambda line, name=name: say(f"{name}: {line}"))
             folder.write_json(part, found)
         scenes[name] = found
         parts += [
@@ -54,15 +77,15 @@ def run_gradcheck(
             Picture(name, (folder.path / f"{name}.png").read_bytes(), note=_note(run, found)),
         ]
     seconds = time.perf_counter() - begin
-    table = Table("Agreement with central differences", COLUMNS, [_row(*s) for s in scenes.items()])
+    rows = [_row(*item) for item in scenes.items()]
+    table = Table("Agreement with central differences", COLUMNS, rows, _LEGEND)
     folder.write_json(
         "metrics.json", {"task": "gradcheck", "scenes": scenes, "wall_seconds": seconds}
     )
+    count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
     folder.write_text(
         "report.html",
-        report_html(
-            "Gradient check", f"{len(scenes)} scenes checked.", "", [table, *parts], _again(runs)
-        ),
+        report_html("Gradient check", f"{count} checked.", "", [table, *parts], _again(runs)),
     )
     folder.remove([f"{PARTS}/{name}.json" for name in runs])
     return table
@@ -101,7 +124,9 @@ def _check(
         seed=run.seed,
         progress=say,
     )
-    folder.write_bytes(f"{name}.png", _maps(report, grid))
+    table = settings.parameter
+    unit = _UNITS.get(table.kind, f"per unit of {table.value}")
+    folder.write_bytes(f"{name}.png", _maps(report, grid, unit))
     folder.write_bytes(f"{name}_scene.png", _picture(scene, radar, settings.parameter.object))
     return {
         "full": asdict(report.full),
@@ -121,15 +146,16 @@ def _direction(settings: Gradcheck) -> Direction:
     return Direction(**values)
 
 
-def _maps(report: GradientReport, grid: Grid) -> bytes:
+def _maps(report: GradientReport, grid: Grid, unit: str) -> bytes:
     maps = {
         "differences": report.difference,
         "full": report.gradient,
         "interior only": report.interior_gradient,
-        "full − differences": report.gradient - report.difference,
     }
+    error = ("full − differences, own scale", np.asarray(report.gradient - report.difference))
     axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
-    return pictures.gradient_picture({k: np.asarray(v) for k, v in maps.items()}, axes)
+    maps = {name: np.asarray(value) for name, value in maps.items()}
+    return pictures.gradient_picture(maps, error, axes, unit)
 
 
 def _picture(scene: Scene, radar: Radar, sought: str | None) -> bytes:

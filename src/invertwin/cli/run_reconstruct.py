@@ -18,7 +18,7 @@ from invertwin.capture import Capture, calibrate, locate, rail_sar
 from invertwin.channel.paths import Grid
 from invertwin.cli import build, pictures
 from invertwin.cli.landscape import landscape
-from invertwin.cli.report import Again, Picture, Table, report_html
+from invertwin.cli.report import Again, Picture, Table, report_html, shown
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
@@ -26,8 +26,8 @@ from invertwin.cli.schema import CaptureData, RadarParameter, RailSarData, RunFi
 from invertwin.errors import InputError
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
+from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import surrogate_spectrum
-from invertwin.radar.waveform import Radar
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 
@@ -66,8 +66,8 @@ class Problem:
     target: str | None
 
 
-def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> list[Table]:
-    """Fits from every start, writes the folder, and returns the tables to print.
+def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
+    """Fits from every start, writes the folder; returns the tables to print and the outcome.
 
     Starts that an interrupted run has finished are not fitted again.
     """
@@ -90,10 +90,17 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> list[T
     best = min(rows[modes[0]], key=lambda row: _finite(row["loss"]))
     start = scenes[best["start"]]
     twin, radar, offset = _restored(problem, start, folder, best["checkpoint"])
+    maps = {
+        "measured": problem.capture.spectrum(problem.grid).float(),
+        "start": _sharp_spectrum(problem, start, problem.radar, None),
+        "twin": _sharp_spectrum(problem, twin, radar, offset),
+    }
     metrics = {
         "task": run.task,
         **_summary(problem, rows, modes),
         **{key: best[key] for key in _COLUMNS if key in best and key != "seconds"},
+        "start_loss_sharp": _misfit(run, maps["start"], maps["measured"]),
+        "loss_sharp": _misfit(run, maps["twin"], maps["measured"]),
         "parameters": best["values"],
         **({"calibration": calibration} if calibration else {}),
         **_heldout(problem, rows[modes[0]], best),
@@ -106,16 +113,17 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> list[T
         png, found = landscape(run, problem.truth, problem.radar, problem.grid, problem.capture)
         folder.write_bytes("landscape.png", png)
         metrics["landscape"] = found
+    metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
     tables = _tables(problem, metrics, start, twin, rows)
-    _draw(problem, folder, rows, start, twin, radar, offset)
+    _draw(problem, folder, rows, metrics, start, twin, radar, maps)
     save_mesh(folder.file("twin.ply"), twin)
     if not single:
         shutil.copyfile(folder.path / best["checkpoint"], folder.file(CHECKPOINT))
     folder.write_json("metrics.json", metrics)
     _write_report(run, folder, metrics, tables)
     folder.remove([name for name in folder.names if name.startswith(PARTS)])
-    return tables
+    return tables, _status(run, metrics)
 
 
 def _finite(loss: float | None) -> float:
@@ -288,9 +296,10 @@ def _reconstruct(
 
 
 class _Bar:
-    """A progress bar with the loss and the first parameters."""
+    """Progress with the loss and the first parameters: a bar, or lines where no terminal is."""
 
     def __init__(self, console: Console, name: str, steps: int):
+        self._console, self._name, self._steps = console, name, steps
         self._bar = Progress(
             TextColumn(name),
             BarColumn(),
@@ -302,11 +311,13 @@ class _Bar:
         self._task = self._bar.add_task("", total=steps)
 
     def __enter__(self) -> "_Bar":
-        self._bar.start()
+        if self._console.is_terminal:
+            self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        if self._console.is_terminal:
+            self._bar.stop()
 
     def advance(self, row: dict[str, Any]) -> None:
         """Shows a row of the history."""
@@ -316,7 +327,12 @@ class _Bar:
             if np.size(value) <= 3
         )
         text = f"loss {row['loss']:.4f} {values}"
-        self._bar.update(self._task, completed=row["step"] + 1, description=text)
+        done = row["step"] + 1
+        if self._console.is_terminal:
+            self._bar.update(self._task, completed=done, description=text)
+        elif done * 10 // self._steps > row["step"] * 10 // self._steps:
+            line = f"{self._name}: step {done} of {self._steps}, {text}"
+            self._console.print(line, markup=False, soft_wrap=True)
 
 
 def _sought(run: RunFile) -> list[str]:
@@ -328,9 +344,11 @@ def _steps(problem: Problem) -> int:
     return need(problem.run, "reconstruct", "reconstruct").steps
 
 
-def _widths(run: RunFile) -> bool:
-    """Whether the surrogate starts with extra widths."""
-    return run.surrogate.range_width > 0 or run.surrogate.angle_width > 0
+def _annealed(run: RunFile) -> float | None:
+    """The step from which the surrogate has no extra widths; None if it never has."""
+    settings = need(run, "reconstruct", "reconstruct")
+    wide = run.surrogate.range_width > 0 or run.surrogate.angle_width > 0
+    return settings.annealing * settings.steps if wide else None
 
 
 def _nuisances(problem: Problem) -> list[nn.Module]:
@@ -361,17 +379,68 @@ def _restored(
     return scene, radar, offset
 
 
+def _sharp_spectrum(
+    problem: Problem, scene: Scene, radar: Radar, offset: torch.Tensor | None
+) -> torch.Tensor:
+    """The surrogate's map of a scene without extra widths."""
+    settings = need(problem.run, "reconstruct", "reconstruct")
+    sharp = replace(build.surrogate(problem.run.surrogate), range_width=0.0, angle_width=0.0)
+    with torch.no_grad():
+        return surrogate_spectrum(
+            scene,
+            radar,
+            problem.grid,
+            sharp,
+            samples=4 * settings.samples,
+            boundary_samples=0,
+            seed=problem.run.seed,
+            range_offset=offset,
+        )
+
+
+def _misfit(run: RunFile, simulated: torch.Tensor, measured: torch.Tensor) -> float | None:
+    """The loss of two maps; None where a map without power has none."""
+    try:
+        return float(build.loss(run.loss)(simulated, measured))
+    except InputError:
+        return None
+
+
 _COLUMNS = {
-    "start_distance_m": "from [m]",
-    "start_angle_deg": "from [°]",
-    "position_error_m": "error [m]",
-    "rotation_error_deg": "error [°]",
-    "scale_error": "size error",
-    "success": "success",
+    "start_distance_m": "off at the start [m]",
+    "start_angle_deg": "off at the start [°]",
+    "position_error_m": "off at the end [m]",
+    "rotation_error_deg": "off at the end [°]",
+    "scale_error": "size off by",
+    "success": "within the limits",
     "loss": "loss",
-    "status": "status",
+    "status": "ended as",
     "steps": "steps",
     "seconds": "time [s]",
+}
+_LABELS = {
+    "start_distance_m": "distance to the truth, start [m]",
+    "start_angle_deg": "angle to the truth, start [°]",
+    "position_error_m": "distance to the truth, twin [m]",
+    "rotation_error_deg": "angle to the truth, twin [°]",
+    "scale_error": "size, share off the truth",
+    "start_loss_sharp": "loss without extra width, start",
+    "loss_sharp": "loss without extra width, twin",
+    "loss": "loss at the last step",
+    "heldout_error_m": "held-out object, distance to the survey [m]",
+    "heldout_error_worst_m": "held-out object, the same of the worst start [m]",
+    "backprojection_error_m": "held-out object, by backprojection instead [m]",
+    "spread_m": "spread of the starts' results [m]",
+    "backprojection_distance_m": "between the objects, by backprojection [m]",
+    "surveyed_distance_m": "between the objects, by survey [m]",
+    "fit_seconds": "time of the fits [s]",
+    "wall_seconds": "time of all, pictures included [s]",
+}
+_CALIBRATION_LABELS = {
+    "loss": "calibration: loss",
+    "status": "calibration ended as",
+    "clock_offset_s": "calibration: clock offset [s]",
+    "range_bias_m": "calibration: range bias [m]",
 }
 
 
@@ -448,13 +517,14 @@ def _tables(
     twin: Scene,
     rows: dict[str, list[dict[str, Any]]],
 ) -> list[Table]:
-    plain = [(k, v) for k, v in metrics.items() if not isinstance(v, dict | list) and k != "task"]
-    plain += [(f"calibration: {k}", v) for k, v in metrics.get("calibration", {}).items()]
-    tables = [Table("Result", ["quantity", "value"], [list(item) for item in plain])]
+    tables = [Table("Result", ["quantity", "value"], _result(problem.run, metrics))]
     for mode, fits in rows.items():
         if len(fits) > 1:
             keys = [key for key in _COLUMNS if key in fits[0]]
-            cells = [[row["start"] + 1, *(row[key] for key in keys)] for row in fits]
+            cells = [
+                [row["start"] + 1, *(_ENDS[row[k]] if k == "status" else row[k] for k in keys)]
+                for row in fits
+            ]
             title = f"Starts, {_MODES[mode]}"
             tables.append(Table(title, ["start", *(_COLUMNS[key] for key in keys)], cells))
     cells = []
@@ -462,29 +532,78 @@ def _tables(
         scenes = [start, twin, *([problem.truth] if name in problem.known else [])]
         centers = [scene[name].center.detach().tolist() for scene in scenes]
         for i, axis in enumerate("xyz"):
-            cells.append([f"{name}.{axis} [m]", *(center[i] for center in centers)])
+            cells.append([f"{name}.{axis} [m]", *(_clean(center[i]) for center in centers)])
         if name in problem.known and "rotation_error_deg" in metrics:
             angles = [
-                math.degrees(build.residual(scene[name], problem.truth[name]).angle)
+                _clean(math.degrees(build.residual(scene[name], problem.truth[name]).angle))
                 for scene in scenes
             ]
             cells.append([f"{name}, angle to the truth [°]", *angles])
     for row in cells:
         row += [None] * (4 - len(row))
     tables.append(Table("Parameters", ["parameter", "start", "result", "truth"], cells))
-    moves = [[k, v] for k, v in metrics["parameters"].items()]
+    units = {"translation": " [m]", "rotation": " [rad, rotation vector]", "scale": " [factor]"}
+    moves = [[k + units.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
     tables.append(Table("Moves from the start", ["parameter", "value"], moves))
     return tables
+
+
+def _clean(value: float) -> float:
+    """Without what rounding leaves of a zero."""
+    return round(value, 9) + 0.0
+
+
+def _result(run: RunFile, metrics: dict[str, Any]) -> list[list[Any]]:
+    """The rows of the result table."""
+    rows: list[list[Any]] = [["how it ended", _ended(run, metrics)]]
+    if "success" in metrics:
+        count = metrics["starts_count"]
+        limits = _limits(run, metrics)
+        if count == 1:
+            rows.append([f"within {limits} of the truth", metrics["success"]])
+        else:
+            rows.append([f"starts that end within {limits}", f"{metrics['successes']} of {count}"])
+        if "successes_interior_only" in metrics:
+            text = f"{metrics['successes_interior_only']} of {count}"
+            rows.append(["the same without boundary terms", text])
+    skipped = () if _annealed(run) else ("start_loss_sharp", "loss_sharp")
+    for key, label in _LABELS.items():
+        if key in metrics and key not in skipped:
+            rows.append([label, metrics[key]])
+    for key, label in _CALIBRATION_LABELS.items():
+        if key in metrics.get("calibration", {}):
+            value = metrics["calibration"][key]
+            rows.append([label, _ENDS[value] if key == "status" else value])
+    return rows
+
+
+def _ended(run: RunFile, metrics: dict[str, Any]) -> str:
+    steps = need(run, "reconstruct", "reconstruct").steps
+    match metrics["status"]:
+        case "budget":
+            return f"all {steps} steps used"
+        case "converged":
+            return f"converged: the loss no longer falls after {metrics['steps']} steps"
+    return f"diverged after {metrics['steps']} steps: the best state is kept"
+
+
+def _limits(run: RunFile, metrics: dict[str, Any]) -> str:
+    """How near the truth counts as a success."""
+    settings = need(run, "reconstruct", "reconstruct")
+    turned = "rotation_error_deg" in metrics
+    angle = f" and {settings.rotation_limit_deg:g}°" if turned else ""
+    return f"{settings.position_limit:g} m{angle}"
 
 
 def _draw(
     problem: Problem,
     folder: RunFolder,
     rows: dict[str, list[dict[str, Any]]],
+    metrics: dict[str, Any],
     start: Scene,
     twin: Scene,
     radar: Radar,
-    offset: torch.Tensor | None,
+    maps: dict[str, torch.Tensor],
 ) -> None:
     """Writes the pictures of the best fit."""
     sought = _sought(problem.run)
@@ -503,33 +622,17 @@ def _draw(
             pictures.frame_of(radar),
         ),
     )
-    settings = need(problem.run, "reconstruct", "reconstruct")
-    sharp = replace(build.surrogate(problem.run.surrogate), range_width=0.0, angle_width=0.0)
-
-    def spectrum(scene: Scene) -> np.ndarray:
-        with torch.no_grad():
-            return surrogate_spectrum(
-                scene,
-                radar,
-                problem.grid,
-                sharp,
-                samples=4 * settings.samples,
-                boundary_samples=0,
-                seed=problem.run.seed,
-                range_offset=offset,
-            ).numpy()
-
     grid = problem.grid
     axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
-    maps = {
-        "measured": problem.capture.spectrum(grid).numpy(),
-        "simulated, start": spectrum(start),
-        "simulated, twin": spectrum(twin),
-    }
-    folder.write_bytes("spectra.png", pictures.spectra_picture(maps, axes))
+    simulated = isinstance(problem.run.data, SimulatedData)
+    data = "data (exact simulation)" if simulated else "data (measured)"
+    titles = {"measured": data, "start": "surrogate, start", "twin": "surrogate, twin"}
+    titled = {titles[name]: power.numpy() for name, power in maps.items()}
+    folder.write_bytes("spectra.png", pictures.spectra_picture(titled, axes))
     losses = {_MODES[mode]: [row["losses"] for row in fits] for mode, fits in rows.items()}
-    annealed = settings.annealing * settings.steps if _widths(problem.run) else None
-    folder.write_bytes("loss.png", pictures.loss_picture(losses, annealed))
+    annealed = _annealed(problem.run)
+    before = metrics["start_loss_sharp"] if annealed else None
+    folder.write_bytes("loss.png", pictures.loss_picture(losses, annealed, before))
 
 
 def _write_report(
@@ -538,7 +641,8 @@ def _write_report(
     notes = {
         "scene": "In red: where the sought objects really are." if "success" in metrics else "",
         "spectra": "Each map in dB below its own peak; maps over direction are summed over frames.",
-        "landscape": "Left: one channel's exact signal. Right: the power maps of the fit.",
+        "loss": _loss_note(run, metrics),
+        "landscape": _landscape_note(run, metrics),
     }
     shown = [
         Picture(name.capitalize(), (folder.path / f"{name}.png").read_bytes(), notes.get(name, ""))
@@ -553,18 +657,46 @@ def _write_report(
     )
 
 
+def _loss_note(run: RunFile, metrics: dict[str, Any]) -> str:
+    if _annealed(run) is None:
+        return ""
+    note = (
+        "In the shaded part, data and simulation are both blurred by an extra width, which shrinks "
+        "step by step. A blurred map is easier to match, so the loss may rise while the blur is "
+        "taken away although the twin gets better: losses of the shaded part are not comparable "
+        "with each other or with later ones."
+    )
+    before, after = metrics["start_loss_sharp"], metrics["loss_sharp"]
+    if before is None or after is None:
+        return note
+    return f"{note} Without extra width the start has a loss of {before:.4g}, the twin {after:.4g}."
+
+
+def _landscape_note(run: RunFile, metrics: dict[str, Any]) -> str:
+    if run.landscape is None or "landscape" not in metrics:
+        return ""
+    minima = metrics["landscape"]["local_minima"]
+    return (
+        f"The loss when {run.landscape.object} alone is moved off the truth (dotted line), all "
+        "else being right. A descent ends in the nearest minimum. The exact signal of one channel "
+        f"(left, offsets in mm) has {minima['exact']} of them within ±"
+        f"{run.landscape.exact_span * 1e3:g} mm, about one every half wavelength: a fit would have "
+        "to start within a millimetre or so. The surrogate's power maps (right, offsets in m) are "
+        "what the fit descends on; where they have a single minimum, the truth is found from "
+        "anywhere on the line."
+    )
+
+
 def _status(run: RunFile, metrics: dict[str, Any]) -> str:
     """What came out, in a sentence or two."""
     count = metrics.get("starts_count", 1)
     which = f"Best of {count} starts: " if count > 1 else ""
-    ended = f"{_ENDS[metrics['status']]} after {metrics['steps']} steps"
+    ended = _ended(run, metrics)
     if "position_error_m" not in metrics:
         return f"{which}{ended}."
     turned = f" and {metrics['rotation_error_deg']:.2f}°" if "rotation_error_deg" in metrics else ""
     score = f"{which}{metrics['position_error_m']:.3f} m{turned} from the truth; {ended}."
+    limits = _limits(run, metrics)
     if count == 1:
-        return score
-    settings = need(run, "reconstruct", "reconstruct")
-    limits = f"{settings.position_limit:g} m"
-    limits += f" and {settings.rotation_limit_deg:g}°" if turned else ""
+        return f"{score} A success is within {limits}: {shown(metrics['success'])}."
     return f"{score} {metrics['successes']} of {count} starts end within {limits}."

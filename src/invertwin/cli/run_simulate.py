@@ -14,13 +14,25 @@ from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
-from invertwin.radar.waveform import Radar
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 from invertwin.simulation import Simulation, simulate
 
 _SURROGATE_SAMPLES = 2_000_000
+_LABELS = {
+    "frames": "frames",
+    "channels": "virtual channels",
+    "paths": "paths",
+    "bins": "bins of range, u, v",
+    "peak_power_db": "strongest bin of a frame, received over sent [dB]",
+    "peak_range_m": "strongest bin over all frames, range [m]",
+    "peak_u": "strongest bin over all frames, u",
+    "peak_v": "strongest bin over all frames, v",
+    "correlation_with_surrogate": "correlation with the surrogate's map",
+    "wall_seconds": "time of the exact simulation [s]",
+}
 
 
 def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
@@ -75,7 +87,8 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
         "wall_seconds": seconds,
     }
     folder.write_json("metrics.json", metrics)
-    table = Table("Simulation", ["quantity", "value"], [list(row) for row in metrics.items()])
+    rows = [[label, metrics[key]] for key, label in _LABELS.items()]
+    table = Table("Simulation", ["quantity", "value"], rows)
     drawing = pictures.Drawing(
         pictures.meshes_of(scene), sought=list(run.truth), radar=radar.positions.numpy()
     )

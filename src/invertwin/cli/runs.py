@@ -116,8 +116,10 @@ class RunFolder:
         if previous.exists():
             _move(previous, self.path, _files_under(previous))
             shutil.rmtree(previous)
-        if self._manifest["created"] and not any(self.path.iterdir()):
-            self.path.rmdir()
+        for made in [self.path, *self.path.parents][: self._manifest["created"]]:
+            if any(made.iterdir()):
+                return
+            made.rmdir()
 
 
 def open_run(
@@ -154,7 +156,7 @@ def open_run(
             f"expected a folder without results, got {path} with {found[0]} in it; "
             "add --overwrite or --resume, or choose another -o"
         )
-    created = not path.exists()
+    created = sum(not folder.exists() for folder in (path, *path.parents))
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -70,7 +70,9 @@ WorldAxes = Annotated[list[Literal["x", "y", "z"]], Field(min_length=1)]
 class Section(BaseModel):
     """A table of the run file; keys it does not know are errors that name the nearest match."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -95,9 +97,13 @@ class RoughDielectric(Section):
 
     kind: Literal["rough_dielectric"]
     permittivity: Annotated[float, Field(ge=1)]
-    conductivity: NonNegative = 0.0  # S/m
+    """relative, real part"""
+    conductivity: NonNegative = 0.0
+    """S/m"""
     diffuse: Annotated[float, Field(ge=0, le=1)] = 1.0
+    """share of the reflected power that is scattered evenly"""
     lobe_width_deg: Positive | None = None
+    """full width at half power of the rest"""
 
 
 class PerfectConductor(Section):
@@ -105,6 +111,7 @@ class PerfectConductor(Section):
 
     kind: Literal["perfect_conductor"]
     lobe_width_deg: Positive | None = None
+    """full width at half power of the mirror lobe"""
 
 
 Material = Annotated[
@@ -120,52 +127,69 @@ Material = Annotated[
 class Placement(Section):
     """Where a shape stands: scaled, then rotated about its own origin, then moved."""
 
-    position: Vector = [0.0, 0.0, 0.0]  # m
-    rotation_deg: Vector = [0.0, 0.0, 0.0]  # rotation vector
+    position: Vector = [0.0, 0.0, 0.0]
+    """m"""
+    rotation_deg: Vector = [0.0, 0.0, 0.0]
+    """rotation vector"""
     scale: Positive = 1.0
+    """factor"""
 
 
 class Plate(Placement):
     shape: Literal["plate"]
     width: Positive
+    """m, along x"""
     height: Positive
+    """m, along y"""
     divisions: Count = 1
+    """cells along each side"""
 
 
 class Box(Placement):
     shape: Literal["box"]
     size: Annotated[list[Positive], Field(min_length=3, max_length=3)]
+    """m, along x, y, z"""
     divisions: Count = 1
+    """cells along each side"""
 
 
 class Sphere(Placement):
     shape: Literal["sphere"]
     radius: Positive
+    """m"""
     subdivisions: Annotated[int, Field(ge=0, le=8)] = 4
+    """each one divides every triangle in four"""
 
 
 class Dihedral(Placement):
     shape: Literal["dihedral"]
     edge: Positive
+    """m; two squares, open to −z"""
 
 
 class Trihedral(Placement):
     shape: Literal["trihedral"]
     edge: Positive
+    """m; three triangles, open to −z"""
 
 
 class Text(Placement):
     shape: Literal["text"]
     text: Annotated[str, Field(min_length=1)]
+    """letters"""
     size: Positive = 0.6
+    """m, height of the text"""
     depth: Positive = 0.12
+    """m"""
     max_edge: Positive = 0.06
+    """m, longest edge of the mesh"""
 
 
 class File(Placement):
     """A mesh file: OBJ, PLY, STL or glTF."""
 
     file: InputPath
+    """path, from the run file's folder"""
 
 
 Part = Annotated[
@@ -184,13 +208,16 @@ class Parts(Placement):
     """Several shapes as one rigid object of one material."""
 
     parts: Annotated[list[Part], Field(min_length=1)]
+    """shapes, each placed within the object"""
 
 
 class Body(Section):
     """What makes a shape an object of the scene."""
 
     material: Material
-    velocity: Vector | None = None  # m/s
+    """what it is made of"""
+    velocity: Vector | None = None
+    """m/s"""
 
 
 class PlateObject(Plate, Body):
@@ -242,16 +269,22 @@ class SceneFile(Section):
     """Objects from the geometry of a Mitsuba or Sionna scene file (XML), named as in the file."""
 
     file: InputPath
-    materials: dict[str, Material] = {}  # by the file's material ids
-    material: Material | None = None  # of all other objects; without it concrete
+    """path, from the run file's folder"""
+    materials: dict[str, Material] = {}
+    """by the file's material ids"""
+    material: Material | None = None
+    """of all other objects; without it concrete"""
 
 
 class Truth(Section):
     """Where an object really is: replaces the placement of its scene table, key by key."""
 
     position: Vector | None = None
+    """m"""
     rotation_deg: Vector | None = None
+    """rotation vector"""
     scale: Positive | None = None
+    """factor"""
 
 
 # -------------------------------------------------------------------------------------- radar
@@ -259,16 +292,22 @@ class Truth(Section):
 
 class Fmcw(Section):
     kind: Literal["fmcw"]
-    start_frequency: Positive  # Hz
-    bandwidth: Positive  # Hz
-    duration: Positive  # s
+    start_frequency: Positive
+    """Hz"""
+    bandwidth: Positive
+    """Hz"""
+    duration: Positive
+    """s, of one ramp"""
     samples: Count
+    """of one ramp"""
 
 
 class Impulse(Section):
     kind: Literal["impulse"]
-    center_frequency: Positive  # Hz
-    bandwidth: Positive  # Hz
+    center_frequency: Positive
+    """Hz"""
+    bandwidth: Positive
+    """Hz"""
 
 
 Waveform = Annotated[
@@ -286,6 +325,7 @@ class Cosine(Section):
 
     kind: Literal["cosine"]
     exponent: NonNegative
+    """n"""
 
 
 class TablePattern(Section):
@@ -293,8 +333,11 @@ class TablePattern(Section):
 
     kind: Literal["table"]
     theta_deg: Annotated[list[float], Field(min_length=2)]
-    phi_deg: Annotated[list[float], Field(min_length=1)] = [0.0]  # one: symmetric about boresight
+    """from 0 at boresight"""
+    phi_deg: Annotated[list[float], Field(min_length=1)] = [0.0]
+    """one: symmetric about boresight"""
     gain_db: list[list[float]]
+    """one row per theta, one column per phi"""
 
     @model_validator(mode="after")
     def _rectangular(self) -> "TablePattern":
@@ -319,26 +362,34 @@ Pattern = Annotated[
 class ArraySection(Section):
     """Antenna elements in the radar frame (x right, y up, z boresight)."""
 
-    center: Vector = [0.0, 0.0, 0.0]  # m
+    center: Vector = [0.0, 0.0, 0.0]
+    """m, in the radar frame"""
     pattern: Pattern = Isotropic(kind="isotropic")
+    """of every element"""
 
 
 class PlanarArray(ArraySection):
     kind: Literal["planar"]
     count: Annotated[list[Count], Field(min_length=2, max_length=2)]
-    spacing: Annotated[list[Positive], Field(min_length=2, max_length=2)]  # m
+    """elements along x, y"""
+    spacing: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    """m, along x, y"""
 
 
 class LinearArray(ArraySection):
     kind: Literal["linear"]
     count: Count
-    spacing: Positive  # m
+    """elements"""
+    spacing: Positive
+    """m"""
     axis: Literal["x", "y"] = "x"
+    """of the radar frame"""
 
 
 class PositionArray(ArraySection):
     kind: Literal["positions"]
-    positions: Annotated[list[Vector], Field(min_length=1)]  # m
+    positions: Annotated[list[Vector], Field(min_length=1)]
+    """m, in the radar frame"""
 
 
 Array = Annotated[
@@ -351,29 +402,40 @@ Array = Annotated[
 
 class LineTrack(Section):
     kind: Literal["line"]
-    start: Vector  # m
-    stop: Vector  # m
+    start: Vector
+    """m"""
+    stop: Vector
+    """m"""
     count: Count
+    """positions"""
 
 
 class ArcTrack(Section):
     """A level arc about `center`; 0° is on its −z side, 90° on its +x side."""
 
     kind: Literal["arc"]
-    center: Vector  # m
-    radius: Positive  # m
+    center: Vector
+    """m"""
+    radius: Positive
+    """m"""
     start_deg: float
+    """0 is on the −z side of the centre"""
     stop_deg: float
+    """90 is on its +x side"""
     count: Count
+    """positions"""
 
 
 class GridTrack(Section):
     """An upright rectangle of positions in the x-y plane through `center`."""
 
     kind: Literal["grid"]
-    center: Vector  # m
-    size: Annotated[list[NonNegative], Field(min_length=2, max_length=2)]  # m along x, y
+    center: Vector
+    """m"""
+    size: Annotated[list[NonNegative], Field(min_length=2, max_length=2)]
+    """m along x, y"""
     count: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    """positions along x, y"""
 
 
 Track = Annotated[
@@ -386,11 +448,13 @@ Track = Annotated[
 
 
 class LookAt(Section):
-    look_at: Vector  # m
+    look_at: Vector
+    """m, the point that boresight is turned to"""
 
 
 class Turned(Section):
-    rotation_deg: Vector  # rotation vector, the same at every position
+    rotation_deg: Vector
+    """rotation vector, the same at every position"""
 
 
 Orientation = Annotated[
@@ -406,23 +470,36 @@ class Radar(Section):
     """Arrays, waveform and poses; one frame per position."""
 
     waveform: Waveform
+    """what is sent"""
     transmitters: Array
+    """antenna elements"""
     receivers: Array
+    """antenna elements"""
     window: Window = "hamming"
+    """over the samples of a ramp"""
     array_window: Window = "hamming"
-    positions: Track = [[0.0, 0.0, 0.0]]  # m
+    """over the elements"""
+    positions: Track = [[0.0, 0.0, 0.0]]
+    """m, one frame each: a list of points or a track"""
     orientation: Orientation = Turned(rotation_deg=[0.0, 0.0, 0.0])
+    """look_at or rotation_deg"""
     shared_visibility: bool | None = None
+    """what the transmitter sees, the receiver sees; default: when both are within 0.1 m"""
 
 
 class Grid(Section):
     """The map that is compared: metres of range, direction cosines."""
 
     range_min: NonNegative
+    """m"""
     range_max: Positive
+    """m"""
     u_max: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """direction cosine to the right"""
     v_max: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """direction cosine up"""
     oversample: Positive = 2.0
+    """bins per resolution cell"""
 
 
 # --------------------------------------------------------------------------------------- data
@@ -432,11 +509,16 @@ class SimulatedData(Section):
     """Exact signals of the true scene, with noise."""
 
     kind: Literal["simulated"]
-    density: Positive  # rough points per m²
-    samples: Count = 200_000  # coherent paths
+    density: Positive
+    """rough points per m²"""
+    samples: Count = 200_000
+    """coherent paths"""
     snr_db: float | None = None
+    """signal to noise per sample; without it no noise"""
     noise_figure_db: float | None = None
-    seed: Seed | None = None  # without it the run's
+    """thermal noise of a receiver instead of snr_db"""
+    seed: Seed | None = None
+    """without it the run's"""
 
     @model_validator(mode="after")
     def _one_noise_level(self) -> "SimulatedData":
@@ -450,6 +532,7 @@ class CaptureData(Section):
 
     kind: Literal["capture"]
     file: InputPath
+    """path, from the run file's folder"""
 
 
 class RailSarData(Section):
@@ -457,6 +540,7 @@ class RailSarData(Section):
 
     kind: Literal["rail_sar"]
     folder: InputPath
+    """path, from the run file's folder, then from INVERTWIN_DATA"""
 
 
 Data = Annotated[
@@ -475,7 +559,9 @@ class TranslationParameter(Section):
 
     kind: Literal["translation"]
     object: str
+    """name in the scene"""
     axes: WorldAxes = ["x", "y", "z"]
+    """of the world"""
 
 
 class PoseParameter(Section):
@@ -483,13 +569,17 @@ class PoseParameter(Section):
 
     kind: Literal["pose"]
     object: str
+    """name in the scene"""
     axes: WorldAxes = ["x", "y", "z"]
+    """of the world"""
     rotation_axes: WorldAxes = ["x", "y", "z"]
+    """of the world"""
 
 
 class ScaleParameter(Section):
     kind: Literal["scale"]
     object: str
+    """name in the scene"""
 
 
 class VerticesParameter(Section):
@@ -497,7 +587,9 @@ class VerticesParameter(Section):
 
     kind: Literal["vertices"]
     object: str
+    """name in the scene"""
     laplacian: NonNegative = 0.0
+    """weight; 0 = free"""
 
 
 class MaterialParameter(Section):
@@ -505,7 +597,9 @@ class MaterialParameter(Section):
 
     kind: Literal["material"]
     object: str
+    """name in the scene"""
     values: Annotated[list[Literal["permittivity", "conductivity", "diffuse"]], Field(min_length=1)]
+    """which are sought"""
 
 
 class RadarParameter(Section):
@@ -527,31 +621,47 @@ class Starts(Section):
     """Random starting poses about the true pose of one object."""
 
     object: str
+    """name in the scene"""
     count: Count = 1
-    distance: Interval  # m
+    """of starts"""
+    distance: Interval
+    """m, least and most"""
     angle_deg: Interval = [0.0, 0.0]
-    axes: WorldAxes = ["x", "y", "z"]  # of the offset
-    rotation_axis: Vector | None = None  # without it any axis
-    seed: Seed | None = None  # without it the run's
+    """least and most"""
+    axes: WorldAxes = ["x", "y", "z"]
+    """of the offset"""
+    rotation_axis: Vector | None = None
+    """without it any axis"""
+    seed: Seed | None = None
+    """without it the run's"""
 
 
 class Surrogate(Section):
     """Kernels of the smooth model; the extra widths anneal to zero, in cells."""
 
     range_kernel: Literal["response", "gaussian"] = "response"
+    """response = that of waveform and window"""
     angle_kernel: Literal["response", "airy"] = "response"
+    """response = that of arrays and window"""
     range_width: NonNegative = 0.0
+    """extra blur at the first step, in range cells; falls to 0"""
     angle_width: NonNegative = 0.0
+    """extra blur at the first step, in beamwidths; falls to 0"""
 
 
 class Loss(Section):
     """How measured and simulated maps are compared."""
 
     kind: Literal["mse", "likelihood"] = "mse"
+    """mse = squared difference; likelihood = of speckle, for a dim object before a bright wall"""
     levels: Count = 3
+    """resolutions that are compared"""
     gain: Literal["fitted", "one"] = "fitted"
-    background: Literal["none", "level", "static"] = "none"  # taken out of both, mse only
-    floor: Positive | None = None  # over the mean measured power, likelihood only
+    """fitted = the unknown overall gain is divided out"""
+    background: Literal["none", "level", "static"] = "none"
+    """taken out of both, mse only"""
+    floor: Positive | None = None
+    """over the mean measured power, likelihood only"""
 
     @model_validator(mode="after")
     def _fits_the_kind(self) -> "Loss":
@@ -567,25 +677,42 @@ class Loss(Section):
 
 class Optimizer(Section):
     kind: Literal["adam", "sgd"] = "adam"
-    rate: Positive = 0.03  # m, and rad without rotation_rate
-    rotation_rate: Positive | None = None  # rad
-    final_rate: NonNegative | None = None  # on the last step; without it rate / 20
+    """how a gradient becomes a step"""
+    rate: Positive = 0.03
+    """m, and rad without rotation_rate"""
+    rotation_rate: Positive | None = None
+    """rad"""
+    final_rate: NonNegative | None = None
+    """on the last step; without it rate / 20"""
     momentum: Annotated[float, Field(ge=0, lt=1)] = 0.9
+    """of sgd"""
 
 
 class Reconstruct(Section):
     steps: Count
+    """budget"""
     samples: Count = 400_000
+    """rays a step"""
     boundary_samples: Count = 50_000
-    annealing: Annotated[float, Field(gt=0, le=1)] = 0.7  # share of the steps with extra width
+    """silhouette samples a step"""
+    annealing: Annotated[float, Field(gt=0, le=1)] = 0.7
+    """share of the steps with extra width"""
     frames_per_step: Count | None = None
-    tolerance: NonNegative = 0.0  # 0 = use all steps
+    """random frames a step; without it all"""
+    tolerance: NonNegative = 0.0
+    """stop when the loss falls by less than this share; 0 = use all steps"""
     checkpoint_every: Count = 10
+    """steps"""
     nuisances: list[Literal["range_bias", "clock_offset"]] = []
+    """fitted along"""
     boundary: bool = True
+    """with boundary terms (silhouettes)"""
     also_interior_only: bool = False
-    position_limit: Positive = 0.03  # m, of a success
+    """fit again without boundary terms, to compare"""
+    position_limit: Positive = 0.03
+    """m, of a success"""
     rotation_limit_deg: Positive = 3.0
+    """of a success"""
 
 
 class Calibration(Section):
@@ -596,20 +723,30 @@ class Calibration(Section):
     """
 
     object: str
+    """name of the known object"""
     method: Literal["fit", "backprojection"] = "fit"
-    steps: Count | None = None  # without it those of the main fit
+    """a fit of the two numbers, or what focuses the object best"""
+    steps: Count | None = None
+    """without it those of the main fit"""
     rate: Positive | None = None
+    """without it that of the main fit"""
 
 
 class Landscape(Section):
     """Losses along a line through the truth: exact signal beside surrogate."""
 
     object: str
+    """name in the scene"""
     axis: Vector
-    span: Positive = 0.4  # m on either side, surrogate
+    """direction of the line"""
+    span: Positive = 0.4
+    """m on either side, surrogate"""
     points: Annotated[int, Field(ge=3)] = 41
-    exact_span: Positive = 0.01  # m on either side, exact signal
+    """on the line"""
+    exact_span: Positive = 0.01
+    """m on either side, exact signal"""
     exact_points: Annotated[int, Field(ge=3)] = 201
+    """on the line"""
 
 
 class GradientParameter(Section):
@@ -619,8 +756,11 @@ class GradientParameter(Section):
         "translation", "rotation", "scale", "material", "radar_translation", "radar_rotation"
     ]
     object: str | None = None
+    """name in the scene; none for the radar's"""
     axis: Vector | None = None
+    """direction, or axis of the turn"""
     value: Literal["permittivity", "conductivity", "diffuse"] | None = None
+    """for kind material"""
 
     @model_validator(mode="after")
     def _complete(self) -> "GradientParameter":
@@ -637,15 +777,25 @@ class Gradcheck(Section):
     """Derivative of the map against central differences."""
 
     parameter: GradientParameter
-    step: Positive | None = None  # of the differences: m, or relative for scale
-    step_deg: Positive | None = None  # the same for rotations
-    noise: Positive = 0.007  # ‖standard error‖₁/‖g_FD‖₁ at which repeating stops
+    """the scalar θ"""
+    step: Positive | None = None
+    """of the differences: m, or relative for scale"""
+    step_deg: Positive | None = None
+    """the same for rotations"""
+    noise: Positive = 0.007
+    """‖standard error‖₁/‖g_FD‖₁ at which repeating stops"""
     max_pairs: Count = 64
+    """of differences, at most"""
     samples: Count = 4_000_000
+    """rays of one derivative"""
     boundary_samples: Count = 1_000_000
+    """silhouette samples of one derivative"""
     repeats: Count = 4
+    """derivatives averaged"""
     difference_samples: Count = 8_000_000
+    """samples of one end of a pair"""
     sampling: Literal["rays", "area"] = "rays"
+    """of the differences"""
 
     @model_validator(mode="after")
     def _complete(self) -> "Gradcheck":
@@ -675,24 +825,43 @@ class RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
     task: Literal["simulate", "reconstruct", "gradcheck", "demo"]
+    """what the file is for"""
     title: str = ""
-    note: str = ""  # shown in the report
+    """heading of the report"""
+    note: str = ""
+    """shown in the report"""
     seed: Seed = 0
+    """of everything random"""
     scene: dict[str, SceneObject] = {}
+    """[scene.<name>]: an object each"""
     scene_file: SceneFile | None = None
+    """objects from a file"""
     truth: dict[str, Truth] = {}
+    """[truth.<name>]: where an object really is"""
     radar: Radar | None = None
+    """what measures; not with a capture"""
     grid: Grid | None = None
+    """the map that is compared"""
     data: Data | None = None
+    """what is fitted"""
     parameters: list[Parameter] = []
+    """[[parameters]]: what is sought"""
     starts: Starts | None = None
+    """where fits start; without it where the scene says"""
     surrogate: Surrogate = Surrogate()
+    """kernels of the smooth model"""
     loss: Loss = Loss()
+    """how maps are compared"""
     optimizer: Optimizer = Optimizer()
+    """how a gradient becomes a step"""
     reconstruct: Reconstruct | None = None
+    """the fit"""
     calibration: Calibration | None = None
+    """before the fit"""
     landscape: Landscape | None = None
+    """losses along a line"""
     gradcheck: Gradcheck | None = None
+    """the gradient check"""
 
     @model_validator(mode="after")
     def _names_exist(self) -> "RunFile":

@@ -13,8 +13,8 @@ from torch import Tensor
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
-from invertwin.radar.waveform import Radar
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rigid, rotation_from_vector
 from invertwin.scene.scene import Scene

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.capture.capture import Capture
-from invertwin.radar.waveform import Radar
+from invertwin.radar.radar import Radar
 
 
 class RangeBias(nn.Module):

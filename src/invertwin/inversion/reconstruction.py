@@ -18,8 +18,8 @@ from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.regularization import Regularizer
+from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
-from invertwin.radar.waveform import Radar
 from invertwin.scene.scene import Scene
 
 Status = Literal["converged", "budget", "diverged"]

@@ -31,6 +31,7 @@ from invertwin.radar.impairments import (
     residual_phase,
 )
 from invertwin.radar.motion import Chirps, moving_beat
+from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import add_noise, beat_signal, range_profile
 from invertwin.radar.spectrum import beamform, exact_spectrum
 from invertwin.radar.surrogate import Surrogate, airy, normalized_gaussian, surrogate_spectrum
@@ -39,7 +40,6 @@ from invertwin.radar.waveform import (
     OFDM,
     Impulse,
     PhysicsWarning,
-    Radar,
     SampledWaveform,
     SteppedFrequency,
     Waveform,

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.waveform import Radar, sample_window, sampled
+from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.waveform import sample_window
 
 # Linear interpolation between samples this much denser errs by (π/8)²/8 = 2 % at the very edge of a
 # critically sampled band, and quadratically less within it.

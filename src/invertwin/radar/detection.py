@@ -18,7 +18,7 @@ from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
 from invertwin.radar.doppler import velocity_axis, velocity_span
 from invertwin.radar.motion import Chirps
-from invertwin.radar.waveform import Radar
+from invertwin.radar.radar import Radar
 
 _QUADRATURE = 4096  # nodes over the distribution of an order statistic
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import aperture
-from invertwin.radar.waveform import Radar
 
 # Gaps between signal and noise eigenvalues below this part of the largest one count as noise of
 # the arithmetic: there the derivative of the subspace is damped instead of unbounded.

@@ -11,9 +11,10 @@ from torch import Tensor
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps
+from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
 from invertwin.radar.spectrum import beamform
-from invertwin.radar.waveform import WINDOWS, Radar, taper
+from invertwin.radar.waveform import WINDOWS, taper
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,14 +15,9 @@ from torch import Tensor
 
 from invertwin.channel.paths import Paths
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
-from invertwin.radar.waveform import (
-    FMCW,
-    PhysicsWarning,
-    Radar,
-    SteppedFrequency,
-    sampled,
-)
+from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
 
 # Phase of the highest offset between delays at which the residual is computed; linear between
 # them it is then off by less than 1 % there.

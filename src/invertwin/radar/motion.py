@@ -10,8 +10,9 @@ from torch import Tensor
 from invertwin.channel.paths import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import beat_signal
-from invertwin.radar.waveform import PhysicsWarning, Radar
+from invertwin.radar.waveform import PhysicsWarning
 
 
 @dataclass(frozen=True)

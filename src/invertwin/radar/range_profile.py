@@ -17,7 +17,8 @@ from torch import Tensor
 from invertwin.channel.paths import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.waveform import PhysicsWarning, Radar, SampledWaveform, sample_window, sampled
+from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, sample_window
 
 _STANDARD_TEMPERATURE = 290.0  # K, at which noise figures are defined
 

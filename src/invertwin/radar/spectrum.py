@@ -10,8 +10,9 @@ from torch import Tensor
 
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
-from invertwin.radar.waveform import Radar, taper
+from invertwin.radar.waveform import taper
 
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
 _FLATNESS = 0.05

@@ -12,8 +12,9 @@ from torch import Tensor
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import Aperture, aperture
-from invertwin.radar.waveform import Radar, Waveform, gaussian_response
+from invertwin.radar.waveform import Waveform, gaussian_response
 from invertwin.scene.scene import Scene
 
 # Kernels are tabulated at least this far out, so that short grids do not truncate them.

@@ -1,27 +1,18 @@
 """Waveforms and the radar: what is transmitted, from where, and which bins it resolves."""
 
 import math
-import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex, Float, Float64, Int64
+from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
-from invertwin.channel.paths import Grid, Link
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import checked_tensor
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
-# Antennas closer than this see the same surfaces: one visibility test serves both.
-_SHARED_VISIBILITY_DISTANCE = 0.1
-# Arrays are built for λ/2 at some frequency of the band, not exactly at its centre.
-_SPACING_TOLERANCE = 1.05
 _SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
 
 
@@ -348,216 +339,6 @@ class Impulse(Waveform):
         return gaussian_response(self, distance)
 
 
-@dataclass(frozen=True, eq=False)
-class Radar:
-    """Antenna arrays, a waveform, and one or more poses.
-
-    Element positions are in the radar frame (x right, y up, z boresight); ``positions`` is the
-    origin of that frame in the world and the columns of ``rotations`` are its axes. The phase
-    centre of an array is the mean of its element positions.
-
-    Attributes:
-        transmitters: Transmitting array.
-        receivers: Receiving array.
-        waveform: ``FMCW``, ``SteppedFrequency``, ``OFDM``, ``Impulse`` or one's own.
-        positions: World position of the radar in each frame [m]; may carry a gradient.
-        rotations: Orientation in each frame; None = axes of the world.
-        window: Taper of the samples before the range transform.
-        array_window: Taper of the virtual array along x and along y.
-        shared_visibility: One visibility test for both antennas; None = when the phase centres
-            are at most 0.1 m apart.
-
-    Raises:
-        InputError: Wrong shapes, values that are not finite, matrices that are not rotations,
-            unknown windows, or separate visibility with several transmitters.
-    """
-
-    transmitters: AntennaArray
-    receivers: AntennaArray
-    waveform: Waveform
-    positions: Float64[Tensor, "frame 3"]
-    rotations: Float64[Tensor, "frame 3 3"] | None = None
-    window: str = "hamming"
-    array_window: str = "hamming"
-    shared_visibility: bool | None = None
-
-    def __post_init__(self) -> None:
-        do = "give one position [x, y, z] in metres per pose"
-        positions = checked_tensor(self.positions, (None, 3), "radar positions", do)
-        if len(positions) == 0:
-            raise InputError(f"expected at least one radar pose, got none; {do}")
-        object.__setattr__(self, "positions", positions)
-        if self.rotations is not None:
-            rotations = _checked_rotations(self.rotations, len(positions))
-            object.__setattr__(self, "rotations", rotations)
-        for name in ("window", "array_window"):
-            if getattr(self, name) not in WINDOWS:
-                raise InputError(
-                    f"expected {name} to be one of {', '.join(WINDOWS)}, "
-                    f"got {getattr(self, name)!r}; choose one of them"
-                )
-        if not self._shared_visibility and len(self.transmitters.positions) > 1:
-            raise InputError(
-                "expected one transmitter when TX and RX see separately, got "
-                f"{len(self.transmitters.positions)}; set shared_visibility=True "
-                "or use one transmitter"
-            )
-        self._warn_about_spacing()
-
-    @property
-    def frame_count(self) -> int:
-        """Number of poses."""
-        return self.positions.shape[0]
-
-    @property
-    def virtual_positions(self) -> Float64[Tensor, "virtual 3"]:
-        """TX + RX element offsets from their phase centres, TX-major, in the radar frame [m]."""
-        tx, rx = self.transmitters.positions, self.receivers.positions
-        tx, rx = tx - tx.mean(0), rx - rx.mean(0)
-        return (tx[:, None] + rx[None]).reshape(-1, 3)
-
-    @property
-    def aperture(self) -> tuple[float, float]:
-        """Extent of the virtual array along x and y plus half a wavelength [m]."""
-        extent = self.virtual_positions.amax(0) - self.virtual_positions.amin(0)
-        half = 0.5 * self.waveform.wavelength
-        return float(extent[0]) + half, float(extent[1]) + half
-
-    @property
-    def beamwidth(self) -> tuple[float, float]:
-        """One cell in u and in v, λ/D with D the virtual aperture."""
-        return (
-            self.waveform.wavelength / self.aperture[0],
-            self.waveform.wavelength / self.aperture[1],
-        )
-
-    def elements(self) -> tuple[Float64[Tensor, "frame tx 3"], Float64[Tensor, "frame rx 3"]]:
-        """World positions of all TX and RX elements [m]."""
-        return self._world(self.transmitters.positions), self._world(self.receivers.positions)
-
-    def link(self) -> Link:
-        """What the channel needs to know: phase centres, axes, patterns."""
-        return Link(
-            tx=self._world(self.transmitters.positions.mean(0, keepdim=True))[:, 0],
-            rx=self._world(self.receivers.positions.mean(0, keepdim=True))[:, 0],
-            rotations=self._rotations,
-            tx_pattern=self.transmitters.pattern,
-            rx_pattern=self.receivers.pattern,
-            wavelength=self.waveform.wavelength,
-            shared_visibility=self._shared_visibility,
-        )
-
-    def moved(self, rotation: Float64[Tensor, "3 3"], translation: Float64[Tensor, "3"]) -> "Radar":
-        """All poses moved rigidly: turned about the mean position, then translated.
-
-        Args:
-            rotation: World rotation matrix.
-            translation: World translation [m].
-        """
-        center = self.positions.mean(0)
-        return replace(
-            self,
-            positions=center + (self.positions - center) @ rotation.T + translation,
-            rotations=rotation @ self._rotations,
-        )
-
-    def frames(self, indices: Sequence[int] | Int64[Tensor, " chosen"]) -> "Radar":
-        """The same radar with only these poses, in this order."""
-        chosen = torch.as_tensor(indices, dtype=torch.int64)
-        return replace(self, positions=self.positions[chosen], rotations=self._rotations[chosen])
-
-    def grid(
-        self,
-        range_min: float,
-        range_max: float,
-        u_max: float = 1.0,
-        v_max: float = 1.0,
-        oversample: float = 2,
-    ) -> Grid:
-        """Bins that hold the spectrum without loss.
-
-        Ranges fall on the bins of a zero-padded FFT and are spaced by one range cell over
-        ``oversample`` (2 = Nyquist of the power profile). Direction cosines are spaced by
-        λ/(2·oversample·D), D the virtual aperture (1 = Nyquist of the power pattern). An axis
-        along which the virtual array has no extent is not resolved.
-
-        Args:
-            range_min: First range to cover [m].
-            range_max: Last range to cover [m].
-            u_max: Direction cosines from -u_max to u_max.
-            v_max: The same for v.
-            oversample: Bins per range cell.
-
-        Raises:
-            InputError: The limits are not increasing, out of bounds, or beyond the unambiguous
-                range.
-        """
-        if not 0 <= range_min < range_max:
-            raise InputError(
-                f"expected 0 <= range_min < range_max, got {range_min} and {range_max}; "
-                "give the limits in metres"
-            )
-        if not (0 < u_max <= 1 and 0 < v_max <= 1 and oversample >= 1):
-            raise InputError(
-                f"expected u_max and v_max in (0, 1] and oversample >= 1, got {u_max}, {v_max} "
-                f"and {oversample}; direction cosines are sines of angles"
-            )
-        step = self.waveform.range_resolution / oversample
-        if isinstance(self.waveform, SampledWaveform):
-            if range_max > (1 + 1e-9) * self.waveform.max_range:
-                raise InputError(
-                    f"expected range_max within the unambiguous {self.waveform.max_range:.4g} m, "
-                    f"got {range_max:g}; finer frequency steps (more samples) reach farther"
-                )
-            step = self.waveform.max_range / round(oversample * self.waveform.samples)
-        first = math.floor(range_min / step + 1e-9)
-        last = math.ceil(range_max / step - 1e-9)
-        axes = {}
-        half = 0.5 * self.waveform.wavelength
-        for name, limit, size in zip("uv", (u_max, v_max), self.aperture, strict=True):
-            if size < 1.001 * half:
-                continue
-            spacing = self.waveform.wavelength / (2 * oversample * size)
-            side = math.ceil(limit / spacing - 1e-9)
-            axes |= {
-                f"{name}_start": -side * spacing,
-                f"{name}_step": spacing,
-                f"{name}_count": 2 * side + 1,
-            }
-        return Grid(first * step, step, last - first + 1, **axes)
-
-    @property
-    def _rotations(self) -> Float64[Tensor, "frame 3 3"]:
-        if self.rotations is not None:
-            return self.rotations
-        return torch.eye(3, dtype=torch.float64).expand(self.frame_count, 3, 3)
-
-    @property
-    def _shared_visibility(self) -> bool:
-        if self.shared_visibility is not None:
-            return self.shared_visibility
-        tx, rx = self.transmitters.positions.mean(0), self.receivers.positions.mean(0)
-        return bool((tx - rx).norm() <= _SHARED_VISIBILITY_DISTANCE)
-
-    def _world(self, elements: Float64[Tensor, "n 3"]) -> Float64[Tensor, "frame n 3"]:
-        return self.positions[:, None] + elements @ self._rotations.mT
-
-    def _warn_about_spacing(self) -> None:
-        wavelength = self.waveform.wavelength
-        for axis, name in enumerate("xy"):
-            places = torch.unique((self.virtual_positions[:, axis] / wavelength * 1e3).round())
-            if len(places) < 2:
-                continue
-            spacing = float(places.diff().min()) / 1e3
-            if spacing > 0.5 * _SPACING_TOLERANCE:
-                warnings.warn(
-                    f"virtual elements are {spacing:.2f} wavelengths apart along {name}, more "
-                    "than 0.5: the spectrum repeats (grating lobes) within the field of view",
-                    PhysicsWarning,
-                    stacklevel=4,
-                )
-
-
 def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[Tensor, " element"]:
     """Window weights by position, so that it serves samples and any array alike.
 
@@ -593,16 +374,6 @@ def gaussian_response(
     return torch.exp(-0.5 * (distance / sigma).square())
 
 
-def sampled(radar: Radar) -> SampledWaveform:
-    """The radar's waveform, or the error that it has no beat signal."""
-    if isinstance(radar.waveform, SampledWaveform):
-        return radar.waveform
-    raise InputError(
-        f"expected an FMCW, stepped frequency or OFDM radar, got {type(radar.waveform).__name__}, "
-        "which has no beat signal; use the surrogate for it"
-    )
-
-
 def _check_frequency(name: str, value: float) -> None:
     if value >= 1e6:
         return
@@ -618,16 +389,3 @@ def _check_step(name: str, value: float) -> None:
     if value > 0:
         raise InputError(f"expected {name} in Hz, got {value:g}; did you mean {value:g}e6?")
     raise InputError(f"expected a positive {name}, got {value}; give it in Hz, such as 1e6")
-
-
-def _checked_rotations(value: object, frames: int) -> Tensor:
-    do = "its columns are the radar's x (right), y (up) and z (boresight) axes in the world"
-    rotations = checked_tensor(value, (frames, 3, 3), "radar rotations", do)
-    fixed = rotations.detach()
-    error = (fixed.mT @ fixed - torch.eye(3, dtype=torch.float64, device=fixed.device)).abs()
-    if not (error.amax() < 1e-6 and (torch.linalg.det(fixed) > 0).all()):
-        raise InputError(
-            "expected radar rotations to be orthonormal with determinant +1, got matrices off by "
-            f"up to {float(error.amax()):.2g} or mirrored; {do}"
-        )
-    return rotations

@@ -1,0 +1,51 @@
+"""The table of run-file keys says all that the schema knows."""
+
+import pytest
+
+from cli.small import call
+from invertwin.cli import schema
+from invertwin.cli.keys import key_tables
+from invertwin.errors import InputError
+
+
+def test_every_key_of_every_section_is_listed_and_explained():
+    listed = {row[0]: row for table in key_tables() for row in table.rows}
+    for section in vars(schema).values():
+        if isinstance(section, type) and issubclass(section, schema.Section):
+            for key, field in section.model_fields.items():
+                assert key in listed
+                assert field.description or key in ("kind", "shape"), (section, key)
+
+
+def test_units_limits_and_defaults_are_shown():
+    (table,) = key_tables("grid")
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert table.title == "[grid]"
+    assert rows["range_min"] == ["number ≥ 0", "required", "m"]
+    assert rows["u_max"] == ["number > 0, ≤ 1", "1.0", "direction cosine to the right"]
+
+
+def test_kinds_are_listed_apart_with_what_they_share_first():
+    titles = [table.title for table in key_tables("radar.waveform")]
+    assert titles == [
+        "[radar.waveform], all kinds",
+        '[radar.waveform] kind = "fmcw"',
+        '[radar.waveform] kind = "impulse"',
+    ]
+
+
+def test_sections_repeated_elsewhere_are_referred_to():
+    rows = {row[0]: row for row in key_tables("radar")[0].rows}
+    assert rows["receivers"][3].endswith("keys as in [radar.transmitters]")
+
+
+def test_unknown_sections_get_the_nearest():
+    with pytest.raises(InputError, match="did you mean `radar`"):
+        key_tables("radra")
+
+
+def test_the_command_prints_them(monkeypatch, capsys):
+    assert call(monkeypatch, "keys", "reconstruct") == 0
+    said = capsys.readouterr().out
+    assert "position_limit" in said
+    assert "0.03" in said
