@@ -31,7 +31,7 @@ def test_help_names_the_commands(monkeypatch, capsys):
         (["gradcheck", "small.toml"], "its task is reconstruct: use `invertwin reconstruct small"),
         (["gradcheck", "check.toml", "check.toml"], "check twice"),
         (["reconstruct", "mesh.toml"], "invertwin: mesh.toml: scene.car: expected"),
-        (["reconstruct", "behind.toml"], "behind.toml: expected a map with power"),
+        (["reconstruct", "behind.toml"], "invertwin: behind.toml: expected a"),
         (["reconstruct", "small.toml", "-o", "full"], "metrics.json"),
         (["reconstruct", "small.toml", "--resume"], "interrupted run"),
         (["reconstruct", "small.toml", "--resume", "--overwrite"], "both"),

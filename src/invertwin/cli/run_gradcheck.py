@@ -37,8 +37,8 @@ _LEGEND = (
     "L1 full, L1 interior: distance of the gradient to the differences over the size of the "
     "differences, ‖g − g_FD‖₁ / ‖g_FD‖₁, with boundary terms (silhouettes) and without; 0 is best. "
     "ratio: interior over full, how much the boundary terms gain. L2 full: the same in ‖·‖₂. "
-    "correlation: of the two maps, bin by bin. noise: relative standard error of the differences; "
-    "L1 full cannot be expected below it. steps differ: relative change of the differences when "
+    "correlation: of the two maps, bin by bin. noise: relative standard error of the differences, "
+    "that is how sharp this check is. steps differ: relative change of the differences when "
     "their step is halved, noise included. order: how the gap to the differences grows with their "
     "step; 2 for a right gradient, 0 for a wrong one. pairs: difference pairs averaged."
 )
