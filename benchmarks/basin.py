@@ -17,13 +17,14 @@ do. The basin is the largest offset up to which 19 of 20 seeds converge.
 - `surrogate`: `invertwin.reconstruct` with annealed widths. It knows nothing of the phases.
 
 The loss of spectra, the optimiser and the number of steps are the same for all. The exact chain
-has a smaller rate, the best for it of 3, 10, 20 and 50 mm; starts within half a cell need only not
-be led away.
+has its own rate, the best for it of 3, 10, 20 and 50 mm. A start within half a cell counts as
+converged unless it is led away.
 """
 
 import argparse
 import json
 import os
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -190,12 +191,13 @@ def success_counts(offsets: dict[str, Sequence[float]], seeds: int) -> dict[str,
     A method stops at the first offset from which fewer than a quarter of the seeds converge.
     """
     counts: dict[str, dict[float, int]] = {}
+    quiet = not sys.stdout.isatty()
     # Each fit is small: a process per core does more than threads inside of one.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn"), _one_thread) as pool:
         for method, listed in offsets.items():
             counts[method] = {}
-            for offset in track(listed, f"{method:10}", transient=True):
+            for offset in track(listed, f"{method:10}", transient=True, disable=quiet):
                 fit = partial(converged, method, offset)
                 counts[method][offset] = sum(pool.map(fit, range(1, seeds + 1)))
                 if counts[method][offset] < seeds / 4:
