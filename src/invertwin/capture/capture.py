@@ -70,11 +70,12 @@ class Capture:
         Raises:
             InputError: real samples, or a shape that the radar does not have.
         """
-        samples = torch.as_tensor(beat)
-        if not samples.is_complex():
+        samples = torch.from_numpy(beat) if isinstance(beat, np.ndarray) else beat
+        if not isinstance(samples, Tensor) or not samples.is_complex():
+            got = samples.dtype if isinstance(samples, Tensor) else type(samples).__name__
             raise InputError(
-                f"expected complex (I/Q) beat samples, got {samples.dtype}; of real ADC samples "
-                "take the analytic signal (scipy.signal.hilbert) along the last axis first"
+                f"expected complex (I/Q) beat samples, got {got}; of real ADC samples take the "
+                "analytic signal (scipy.signal.hilbert) along the last axis first"
             )
         variables = {"beat": labelled(BEAT_DIMS, samples, "1")}
         return cls._assembled(variables, radar, times)
