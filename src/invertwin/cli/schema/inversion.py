@@ -1,0 +1,318 @@
+"""The tables of the data and of what is sought in them."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, Tag, model_validator
+
+from invertwin.cli.schema.section import (
+    TAG_MARK,
+    Count,
+    InputPath,
+    Interval,
+    NonNegative,
+    Positive,
+    Section,
+    Seed,
+    Vector,
+    WorldAxes,
+    check_presence,
+    fail,
+    tag_by,
+)
+
+
+class SimulatedData(Section):
+    """Exact signals of the true scene, with noise."""
+
+    kind: Literal["simulated"]
+    density: Positive
+    """rough points per m²"""
+    samples: Count = 200_000
+    """coherent paths"""
+    snr_db: float | None = None
+    """signal to noise per sample; without it no noise"""
+    noise_figure_db: float | None = None
+    """thermal noise of a receiver instead of snr_db"""
+    seed: Seed | None = None
+    """without it the run's"""
+
+    @model_validator(mode="after")
+    def _one_noise_level(self) -> "SimulatedData":
+        if self.snr_db is not None and self.noise_figure_db is not None:
+            fail("expected snr_db or noise_figure_db, got both; remove one")
+        return self
+
+
+class CaptureData(Section):
+    """A capture saved by the library (NetCDF)."""
+
+    kind: Literal["capture"]
+    file: InputPath
+    """path, from the run file's folder"""
+
+
+class RailSarData(Section):
+    """The public recording of an ultra-wideband radar on a rail."""
+
+    kind: Literal["rail_sar"]
+    folder: InputPath
+    """path, from the run file's folder, then from INVERTWIN_DATA"""
+
+
+Data = Annotated[
+    Annotated[SimulatedData, Tag(TAG_MARK + "simulated")]
+    | Annotated[CaptureData, Tag(TAG_MARK + "capture")]
+    | Annotated[RailSarData, Tag(TAG_MARK + "rail_sar")],
+    tag_by("kind"),
+]
+
+
+class TranslationParameter(Section):
+    """Moves an object along the given world axes."""
+
+    kind: Literal["translation"]
+    object: str
+    """name in the scene"""
+    axes: WorldAxes = ["x", "y", "z"]
+    """of the world"""
+
+
+class PoseParameter(Section):
+    """Moves an object and turns it about its centre, along and about the given world axes."""
+
+    kind: Literal["pose"]
+    object: str
+    """name in the scene"""
+    axes: WorldAxes = ["x", "y", "z"]
+    """of the world"""
+    rotation_axes: WorldAxes = ["x", "y", "z"]
+    """of the world"""
+
+
+class ScaleParameter(Section):
+    kind: Literal["scale"]
+    object: str
+    """name in the scene"""
+
+
+class VerticesParameter(Section):
+    """Free vertices, held together by a Laplacian term of this weight."""
+
+    kind: Literal["vertices"]
+    object: str
+    """name in the scene"""
+    laplacian: NonNegative = 0.0
+    """weight; 0 = free"""
+
+
+class MaterialParameter(Section):
+    """Material values that are sought, from the values of the scene table."""
+
+    kind: Literal["material"]
+    object: str
+    """name in the scene"""
+    values: Annotated[list[Literal["permittivity", "conductivity", "diffuse"]], Field(min_length=1)]
+    """which are sought"""
+
+
+class RadarParameter(Section):
+    kind: Literal["radar_pose"]
+
+
+Parameter = Annotated[
+    Annotated[TranslationParameter, Tag(TAG_MARK + "translation")]
+    | Annotated[PoseParameter, Tag(TAG_MARK + "pose")]
+    | Annotated[ScaleParameter, Tag(TAG_MARK + "scale")]
+    | Annotated[VerticesParameter, Tag(TAG_MARK + "vertices")]
+    | Annotated[MaterialParameter, Tag(TAG_MARK + "material")]
+    | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")],
+    tag_by("kind"),
+]
+
+
+class Starts(Section):
+    """Random starting poses about the true pose of one object."""
+
+    object: str
+    """name in the scene"""
+    count: Count = 1
+    """of starts"""
+    distance: Interval
+    """m, least and most"""
+    angle_deg: Interval = [0.0, 0.0]
+    """least and most"""
+    axes: WorldAxes = ["x", "y", "z"]
+    """of the offset"""
+    rotation_axis: Vector | None = None
+    """without it any axis"""
+    seed: Seed | None = None
+    """without it the run's"""
+
+
+class Surrogate(Section):
+    """Kernels of the smooth model; the extra widths anneal to zero, in cells."""
+
+    range_kernel: Literal["response", "gaussian"] = "response"
+    """response = that of waveform and window"""
+    angle_kernel: Literal["response", "airy"] = "response"
+    """response = that of arrays and window"""
+    range_width: NonNegative = 0.0
+    """extra blur at the first step, in range cells; falls to 0"""
+    angle_width: NonNegative = 0.0
+    """extra blur at the first step, in beamwidths; falls to 0"""
+
+
+class Loss(Section):
+    """How measured and simulated maps are compared."""
+
+    kind: Literal["mse", "likelihood"] = "mse"
+    """mse = squared difference; likelihood = of speckle, for a dim object before a bright wall"""
+    levels: Count = 3
+    """resolutions that are compared"""
+    gain: Literal["fitted", "one"] = "fitted"
+    """fitted = the unknown overall gain is divided out"""
+    background: Literal["none", "level", "static"] = "none"
+    """taken out of both, mse only"""
+    floor: Positive | None = None
+    """over the mean measured power, likelihood only"""
+
+    @model_validator(mode="after")
+    def _fits_the_kind(self) -> "Loss":
+        if self.kind == "likelihood" and self.background != "none":
+            fail(
+                f'expected background = "none" with kind = "likelihood", got "{self.background}"; '
+                "the floor stands for a background"
+            )
+        if self.kind == "mse" and self.floor is not None:
+            fail('expected no `floor` with kind = "mse", got one; remove it')
+        return self
+
+
+class Optimizer(Section):
+    kind: Literal["adam", "sgd"] = "adam"
+    """how a gradient becomes a step"""
+    rate: Positive = 0.03
+    """m, and rad without rotation_rate"""
+    rotation_rate: Positive | None = None
+    """rad"""
+    final_rate: NonNegative | None = None
+    """on the last step; without it rate / 20"""
+    momentum: Annotated[float, Field(ge=0, lt=1)] = 0.9
+    """of sgd"""
+
+
+class Reconstruct(Section):
+    steps: Count
+    """budget"""
+    samples: Count = 400_000
+    """rays a step"""
+    boundary_samples: Count = 50_000
+    """silhouette samples a step"""
+    annealing: Annotated[float, Field(gt=0, le=1)] = 0.7
+    """share of the steps with extra width"""
+    frames_per_step: Count | None = None
+    """random frames a step; without it all"""
+    tolerance: NonNegative = 0.0
+    """stop when the loss falls by less than this share; 0 = use all steps"""
+    checkpoint_every: Count = 10
+    """steps"""
+    nuisances: list[Literal["range_bias", "clock_offset"]] = []
+    """fitted along"""
+    boundary: bool = True
+    """with boundary terms (silhouettes)"""
+    also_interior_only: bool = False
+    """fit again without boundary terms, to compare"""
+    position_limit: Positive = 0.03
+    """m, of a success"""
+    rotation_limit_deg: Positive = 3.0
+    """of a success"""
+
+
+class Calibration(Section):
+    """Range bias and clock offset from one object whose place is known, before the fit.
+
+    With `method = "fit"` by a reconstruction of these two numbers, all else as in the main fit;
+    with `"backprojection"` by what focuses the object best.
+    """
+
+    object: str
+    """name of the known object"""
+    method: Literal["fit", "backprojection"] = "fit"
+    """a fit of the two numbers, or what focuses the object best"""
+    steps: Count | None = None
+    """without it those of the main fit"""
+    rate: Positive | None = None
+    """without it that of the main fit"""
+
+
+class Landscape(Section):
+    """Losses along a line through the truth: exact signal beside surrogate."""
+
+    object: str
+    """name in the scene"""
+    axis: Vector
+    """direction of the line"""
+    span: Positive = 0.4
+    """m on either side, surrogate"""
+    points: Annotated[int, Field(ge=3)] = 41
+    """on the line"""
+    exact_span: Positive = 0.01
+    """m on either side, exact signal"""
+    exact_points: Annotated[int, Field(ge=3)] = 201
+    """on the line"""
+
+
+class GradientParameter(Section):
+    """The scalar θ of a gradient check; θ = 0 is the scene as written."""
+
+    kind: Literal[
+        "translation", "rotation", "scale", "material", "radar_translation", "radar_rotation"
+    ]
+    object: str | None = None
+    """name in the scene; none for the radar's"""
+    axis: Vector | None = None
+    """direction, or axis of the turn"""
+    value: Literal["permittivity", "conductivity", "diffuse"] | None = None
+    """for kind material"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> "GradientParameter":
+        wanted = {
+            "object": not self.kind.startswith("radar"),
+            "axis": self.kind.endswith(("translation", "rotation")),
+            "value": self.kind == "material",
+        }
+        check_presence(self, wanted, f"with kind = {self.kind}")
+        return self
+
+
+class Gradcheck(Section):
+    """Derivative of the map against central differences."""
+
+    parameter: GradientParameter
+    """the scalar θ"""
+    step: Positive | None = None
+    """of the differences: m, or relative for scale"""
+    step_deg: Positive | None = None
+    """the same for rotations"""
+    noise: Positive = 0.007
+    """‖standard error‖₁/‖g_FD‖₁ at which repeating stops"""
+    max_pairs: Count = 64
+    """of differences, at most"""
+    samples: Count = 4_000_000
+    """rays of one derivative"""
+    boundary_samples: Count = 1_000_000
+    """silhouette samples of one derivative"""
+    repeats: Count = 4
+    """derivatives averaged"""
+    difference_samples: Count = 8_000_000
+    """samples of one end of a pair"""
+    sampling: Literal["rays", "area"] = "rays"
+    """of the differences"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> "Gradcheck":
+        turns = self.parameter.kind.endswith("rotation")
+        wanted = {"step_deg": turns, "step": not turns}
+        check_presence(self, wanted, f"with kind = {self.parameter.kind}")
+        return self

@@ -1,0 +1,92 @@
+"""A whole run file."""
+
+from typing import Literal
+
+from pydantic import model_validator
+from pydantic_core import PydanticCustomError
+
+from invertwin.cli.schema.inversion import (
+    Calibration,
+    Data,
+    Gradcheck,
+    Landscape,
+    Loss,
+    Optimizer,
+    Parameter,
+    RadarParameter,
+    Reconstruct,
+    Starts,
+    Surrogate,
+)
+from invertwin.cli.schema.objects import SceneFile, SceneObject, Truth
+from invertwin.cli.schema.section import Section, Seed, fail
+from invertwin.cli.schema.sensor import Grid, Radar
+
+
+class RunFile(Section):
+    """A whole run file; which sections a command needs is checked by the command."""
+
+    task: Literal["simulate", "reconstruct", "gradcheck", "demo"]
+    """what the file is for"""
+    title: str = ""
+    """heading of the report"""
+    note: str = ""
+    """shown in the report"""
+    seed: Seed = 0
+    """of everything random"""
+    scene: dict[str, SceneObject] = {}
+    """[scene.<name>]: an object each"""
+    scene_file: SceneFile | None = None
+    """objects from a file"""
+    truth: dict[str, Truth] = {}
+    """[truth.<name>]: where an object really is"""
+    radar: Radar | None = None
+    """what measures; not with a capture"""
+    grid: Grid | None = None
+    """the map that is compared"""
+    data: Data | None = None
+    """what is fitted"""
+    parameters: list[Parameter] = []
+    """[[parameters]]: what is sought"""
+    starts: Starts | None = None
+    """where fits start; without it where the scene says"""
+    surrogate: Surrogate = Surrogate()
+    """kernels of the smooth model"""
+    loss: Loss = Loss()
+    """how maps are compared"""
+    optimizer: Optimizer = Optimizer()
+    """how a gradient becomes a step"""
+    reconstruct: Reconstruct | None = None
+    """the fit"""
+    calibration: Calibration | None = None
+    """before the fit"""
+    landscape: Landscape | None = None
+    """losses along a line"""
+    gradcheck: Gradcheck | None = None
+    """the gradient check"""
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> "RunFile":
+        if self.scene_file is None:
+            if not self.scene:
+                fail("expected at least 1 object, got none; add [scene.<name>]", "scene")
+            # The names of a scene file are known once it is read.
+            for path, name in self.references():
+                if name not in self.scene:
+                    raise PydanticCustomError(
+                        "unknown_object", "unknown object", {"path": path, "name": name}
+                    )
+        return self
+
+    def references(self) -> list[tuple[str, str]]:
+        """Where the run file names an object of the scene: path and name."""
+        used = [(f"truth.{name}", name) for name in self.truth]
+        for i, parameter in enumerate(self.parameters):
+            if not isinstance(parameter, RadarParameter):
+                used.append((f"parameters[{i}].object", parameter.object))
+        for section in ("starts", "landscape", "calibration"):
+            if getattr(self, section) is not None:
+                used.append((f"{section}.object", getattr(self, section).object))
+        if self.gradcheck is not None and self.gradcheck.parameter.object is not None:
+            used.append(("gradcheck.parameter.object", self.gradcheck.parameter.object))
+        return used
