@@ -1,5 +1,6 @@
 """The commands end to end, on scenes small enough for seconds."""
 
+import math
 import os
 import signal
 import subprocess
@@ -157,7 +158,9 @@ def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT])
 def test_ended_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypatch, ending):
-    run_file.write_text(RUN.replace("steps = 8", "steps = 40") + STARTS)
+    # At a rate this low no step overshoots: what atomic additions reorder is not amplified.
+    slow = "[optimizer]\nrate = 0.004\n"
+    run_file.write_text(RUN.replace("steps = 8", "steps = 60") + STARTS + slow)
     assert call(monkeypatch, "reconstruct", run_file, "-o", "whole") == 0
     whole = read_metrics(run_file.parent / "whole")
 
@@ -185,9 +188,9 @@ def test_ended_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypa
     assert call(monkeypatch, "reconstruct", run_file, "-o", "cut", "--resume") == 0
     resumed = read_metrics(run_file.parent / "cut")
     for a, b in zip(resumed["starts"], whole["starts"], strict=True):
-        assert a["values"]["plate.translation"] == pytest.approx(
-            b["values"]["plate.translation"], rel=1e-4
-        )
+        # Relative to the length of the vector: one of its components may be next to zero.
+        found, expected = a["values"]["plate.translation"], b["values"]["plate.translation"]
+        assert math.dist(found, expected) <= 1e-4 * math.hypot(*expected)
 
 
 def test_interruption_says_how_to_go_on(run_file, monkeypatch, capsys):

@@ -2,10 +2,14 @@
 
 import math
 import shutil
+import signal
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -284,15 +288,50 @@ def _reconstruct(
         "checkpoint_every": settings.checkpoint_every,
         "resume": True,  # from its own unfinished part; open_run has settled what may be there
     }
-    with bar:
+    with bar, _interrupted_between_steps() as heed:
+
+        def advance(row: dict[str, Any]) -> None:
+            bar.advance(row)
+            heed()
+
         return reconstruct(
             scene,
             problem.radar,
             problem.capture,
             modules,
-            progress=bar.advance,
+            progress=advance,
             **(options | changes),
         )
+
+
+@contextmanager
+def _interrupted_between_steps() -> Iterator[Callable[[], None]]:
+    """Ctrl-C waits for the end of the step, when nothing is half done; a second one does not.
+
+    Gives a function that raises KeyboardInterrupt if one is due.
+    """
+    due = False
+
+    def heed() -> None:
+        if due:
+            raise KeyboardInterrupt
+
+    def note(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal due
+        heed()
+        due = True
+
+    # Another handler, or another thread than the main one, is not ours to change.
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not ours or threading.current_thread() is not threading.main_thread():
+        yield heed
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield heed
+        heed()
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class _Bar:
