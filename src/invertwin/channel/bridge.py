@@ -15,6 +15,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin import doctor
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.scene import Object, Scene
 
@@ -182,8 +183,6 @@ def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geom
         faces.append(item.mesh.faces + offset)
         owners.append(torch.full((len(item.mesh.faces),), index))
         offset += len(item.mesh.vertices)
-    from invertwin.constants import SPEED_OF_LIGHT
-
     surfaces = [item.material.surface(SPEED_OF_LIGHT / wavelength) for item in objects]
     vertices = torch.cat([item.vertices for item in objects])
     key = (_VARIANTS[backend()], *(id(item.mesh.faces) for item in objects))

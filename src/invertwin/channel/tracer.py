@@ -21,7 +21,7 @@ from invertwin.channel.boundary import (
     shadow_speed,
     silhouettes_move,
 )
-from invertwin.channel.bridge import Geometry, flatten, to_torch, use_backend
+from invertwin.channel.bridge import Geometry, flatten, to_torch, tracer, use_backend
 from invertwin.channel.paths import Link, Paths
 from invertwin.channel.sampling import RaySampler, Shot, face_areas, visible
 from invertwin.constants import SPEED_OF_LIGHT
@@ -399,8 +399,6 @@ def _boundary_paths(
 
 def _drawn(sampler: Any) -> _Points:
     import drjit as dr
-
-    from invertwin.channel.bridge import tracer
 
     drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size))
     frame, face, b1, b2, weight = (to_torch(column) for column in vars(drawn).values())
