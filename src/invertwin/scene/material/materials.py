@@ -1,22 +1,6 @@
-"""Materials: what fraction of the incident power a surface sends where.
-
-Every material hands the ray kernel the same small set of numbers, a `Surface`, so that a new
-material needs no kernel code. The reflectance distribution that a `Surface` stands for is
-
-    f_r(ωi, ωo) = A(cosθi) A(cosθo) [ diffuse/π + lobe ((1 + cosψ)/2)^exponent ],
-
-with A the tabulated amplitude, ψ the angle between ωo and the mirror direction of ωi:
-cosψ = 2 (n·ωi)(n·ωo) − ωi·ωo, both directions pointing away from the surface. It is reciprocal,
-and reflects at most what came in: `lobe` is the lobe's share of the power divided by its integral
-at normal incidence, where the integral is largest (the lobe and the cosine share their axis).
-
-Differs from the source: the paper leaves the scattering model open. Here the Fresnel reflectance
-R of the mean plane enters as sqrt(R(θi) R(θo)), which keeps reciprocity, so that a surface sends
-back R on average and R exactly where both angles agree.
-"""
+"""Materials that come with the library."""
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -26,44 +10,10 @@ from torch import Tensor
 
 from invertwin.constants import VACUUM_PERMITTIVITY
 from invertwin.scene.checks import checked_number
-
-ANGLE_COUNT = 256
-"""Nodes of the amplitude table, at cosθ = linspace(0, 1, 256)."""
-
+from invertwin.scene.material.surface import ANGLE_COUNT, LOBE_COUNT, Material, Surface
 
 MIRROR_LOBE_WIDTH = math.radians(5.0)
 ROUGH_LOBE_WIDTH = math.radians(20.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """What the ray kernel needs to know of a material at one frequency (see the module text).
-
-    Attributes:
-        amplitude: square root of the Fresnel power reflectance at cosθ = linspace(0, 1, 256).
-        diffuse: weight of the Lambertian part.
-        lobe: weight of the specular lobe, already divided by the lobe's integral.
-        exponent: exponent of the specular lobe.
-    """
-
-    amplitude: Float64[Tensor, "256"]
-    diffuse: Float64[Tensor, ""]
-    lobe: Float64[Tensor, ""]
-    exponent: Float64[Tensor, ""]
-
-
-class Material(ABC):
-    """What an object's surface does to the waves.
-
-    Attributes:
-        coherent: True if field paths follow physical optics, False if the surface is rough.
-    """
-
-    coherent: ClassVar[bool]
-
-    @abstractmethod
-    def surface(self, frequency: float) -> Surface:
-        """The reflectance at `frequency` [Hz]; differentiable in the material's values."""
 
 
 def complex_permittivity(
@@ -165,11 +115,11 @@ class PerfectConductor(Material):
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         exponent = lobe_exponent(self.lobe_width)
-        return Surface(
-            amplitude=torch.ones(ANGLE_COUNT, dtype=torch.float64),
-            diffuse=torch.zeros((), dtype=torch.float64),
-            lobe=1 / lobe_integral(exponent),
-            exponent=exponent,
+        return Surface.opaque(
+            torch.ones(ANGLE_COUNT, dtype=torch.float64),
+            torch.zeros((), dtype=torch.float64),
+            _specular_only(1 / lobe_integral(exponent)),
+            _specular_only(exponent),
         )
 
 
@@ -209,13 +159,18 @@ class RoughDielectric(Material):
         epsilon = complex_permittivity(self.permittivity, self.conductivity, frequency)
         diffuse = _float64(self.diffuse)
         exponent = lobe_exponent(self.lobe_width)
-        return Surface(
-            amplitude=fresnel_amplitude(epsilon, cosine),
-            diffuse=diffuse,
-            lobe=(1 - diffuse) / lobe_integral(exponent),
-            exponent=exponent,
+        return Surface.opaque(
+            fresnel_amplitude(epsilon, cosine),
+            diffuse,
+            _specular_only((1 - diffuse) / lobe_integral(exponent)),
+            _specular_only(exponent),
         )
 
 
 def _float64(value: float | Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=torch.float64)
+
+
+def _specular_only(value: Tensor) -> Tensor:
+    """A row of values of the lobes in which all but the first are zero."""
+    return torch.cat([value[..., None], value.new_zeros((*value.shape, LOBE_COUNT - 1))], dim=-1)

@@ -1,0 +1,112 @@
+"""What a surface does to the power that meets it: the one thing the ray kernel knows of a material.
+
+Every material hands the ray kernel the same small set of numbers, a `Surface`, so that a new
+material needs no kernel code. What is reflected follows the distribution
+
+    f_r(ωi, ωo) = A(cosθi) A(cosθo) [ diffuse/π + Σ_l lobes_l ((1 + cosψ_l)/2)^exponents_l ],
+
+with A the tabulated amplitude. The lobes are a specular one and a directive one about the mirror
+direction of ωi, cosψ = 2 (n·ωi)(n·ωo) − ωi·ωo, and a backscattering one about ωi itself,
+cosψ = ωi·ωo; all directions point away from the surface. The distribution is reciprocal, and
+reflects at most what came in: each weight is the lobe's share of the power divided by its integral
+at normal incidence, where the integral is largest (the lobe and the cosine share their axis).
+
+What passes goes straight through a sheet (`transmittance`, longer by `excess`) or is refracted
+into a solid body (`refraction`, `index`, `attenuation`).
+
+Differs from the source: the paper leaves the scattering model open. Here the reflectance R of the
+mean plane enters as sqrt(R(θi) R(θo)), which keeps reciprocity, so that a surface sends back R on
+average and R exactly where both angles agree.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+ANGLE_COUNT = 256
+"""Nodes of the tables over the angle of incidence, at cosθ = linspace(0, 1, 256)."""
+LOBE_COUNT = 3
+"""Lobes of a surface: specular, directive, backscattering."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What the ray kernel needs to know of a material at one frequency (see the module text).
+
+    Tables run over cosθ = linspace(0, 1, 256) of the angle of incidence from outside. `*row` is
+    empty for one value per object, or the number of triangles for values per triangle.
+
+    Attributes:
+        amplitude: square root of the power reflectance, mean of both polarisations.
+        diffuse: weight of the Lambertian part.
+        lobes: weights of the specular, directive and backscattering lobe, each already divided by
+            the lobe's integral.
+        exponents: their exponents.
+        transmittance: share of the power that passes straight through a sheet; 0 if opaque.
+        excess: length [m] that passing adds to the straight path through air.
+        refraction: share of the power that one interface lets into a solid body; 0 if the surface
+            is not the skin of a refracting body.
+        index: real refractive index of that body, else 1.
+        attenuation: power attenuation in that body [1/m], else 0.
+    """
+
+    amplitude: Float64[Tensor, "*row 256"]
+    diffuse: Float64[Tensor, "*row"]
+    lobes: Float64[Tensor, "*row 3"]
+    exponents: Float64[Tensor, "*row 3"]
+    transmittance: Float64[Tensor, "*row 256"]
+    excess: Float64[Tensor, "*row 256"]
+    refraction: Float64[Tensor, "*row 256"]
+    index: Float64[Tensor, "*row"]
+    attenuation: Float64[Tensor, "*row"]
+
+    @classmethod
+    def opaque(
+        cls,
+        amplitude: Float64[Tensor, "*row 256"],
+        diffuse: Float64[Tensor, "*row"],
+        lobes: Float64[Tensor, "*row 3"] | None = None,
+        exponents: Float64[Tensor, "*row 3"] | None = None,
+    ) -> "Surface":
+        """A surface that lets nothing through; without lobes it is Lambertian."""
+        row = diffuse.shape
+        none, dark = diffuse.new_zeros((*row, LOBE_COUNT)), torch.zeros_like(amplitude)
+        return cls(
+            amplitude=amplitude,
+            diffuse=diffuse,
+            lobes=none if lobes is None else lobes,
+            exponents=none if exponents is None else exponents,
+            transmittance=dark,
+            excess=dark,
+            refraction=dark,
+            index=diffuse.new_ones(row),
+            attenuation=diffuse.new_zeros(row),
+        )
+
+    @property
+    def lobe(self) -> Float64[Tensor, "*row"]:
+        """Weight of the specular lobe."""
+        return self.lobes[..., 0]
+
+    @property
+    def exponent(self) -> Float64[Tensor, "*row"]:
+        """Exponent of the specular lobe."""
+        return self.exponents[..., 0]
+
+
+class Material(ABC):
+    """What an object's surface does to the waves.
+
+    Attributes:
+        coherent: True if field paths follow physical optics, False if the surface is rough.
+    """
+
+    coherent: ClassVar[bool]
+
+    @abstractmethod
+    def surface(self, frequency: float) -> Surface:
+        """What it does at `frequency` [Hz]; differentiable in the material's values."""
