@@ -1,14 +1,16 @@
 """The fused deposit, differentiated by Dr.Jit from end to end: no hand-written adjoint."""
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 from torch import Tensor
 
-from invertwin.channel import kernel
+from invertwin.channel import replay
+from invertwin.channel.bins import Contribution
 from invertwin.channel.bridge import backend, flatten, to_float, to_torch, tracer
 from invertwin.channel.deposit import _Settings, _Trace
-from invertwin.channel.kernel import DIFFERENTIABLE, Contribution
+from invertwin.channel.kernel import DIFFERENTIABLE
 from invertwin.channel.paths import Grid, Link
 from invertwin.scene import Scene
 
@@ -27,17 +29,31 @@ def gradients(
         seed=seed,
         sampling="rays",
         reference=None,
+        depth=1,
+        interior_edges=True,
         chunk=1 << 30,
         backend=backend(),
     )
     trace = _Trace(settings)
-    tables = {name: mi.Float(getattr(trace.inputs(), name)) for name in DIFFERENTIABLE}
+    tables = {name: mi.Float(getattr(trace.fixed, name)) for name in DIFFERENTIABLE}
     dr.enable_grad(list(tables.values()))
     inputs, out = trace.inputs(tables), mi.Float(0)
-    for samples_ in trace.interior(keep=False):
-        out += _weighted(grid, weights, kernel.interior(inputs, samples_))
-    for found in trace.boundary(inputs):
-        out += _weighted(grid, weights, found)
+    for records in trace.chains(record=True):
+        vertex = replay._vertex(inputs, records, mi.UInt32(0))
+        path, arriving = vertex.path(), vertex.arriving
+        power = dr.select(vertex.seen, path.power * (arriving / dr.detach(arriving)), 0)
+        length = 0.5 * (vertex.leg + vertex.connection.distance)
+        out += _weighted(grid, weights, replace(path, power=power, range=length))
+    for chains in trace.boundary(inputs):
+
+        def visit(_: Any, path: Contribution, exists: Any, speed: Any = chains.speed) -> None:
+            nonlocal out
+            amount = dr.select(exists, path.power, 0) * speed
+            zero = dr.zeros(mi.Float, dr.width(amount))
+            boundary = replace(path, power=dr.replace_grad(zero, amount))
+            out += _weighted(grid, weights, boundary)
+
+        chains.run(dict(chains.state), visit)
     dr.backward(out)
     return {name: to_torch(dr.grad(table)) for name, table in tables.items()}
 

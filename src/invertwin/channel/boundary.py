@@ -8,7 +8,8 @@ from torch import Tensor
 
 from invertwin.channel.bridge import Geometry, differentiated, to_torch, tracer
 from invertwin.channel.paths import Link
-from invertwin.channel.sampling import EdgeSampler, Shot, visible
+from invertwin.channel.edges import EdgeSampler
+from invertwin.channel.rays import Shot, visible
 from invertwin.errors import InputError
 
 
@@ -71,7 +72,7 @@ def edge_points(shot: Shot, centre: str, samples: int, seed: int) -> EdgePoints:
         none, nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
         return EdgePoints(none, none, none, none, nothing, none, nothing)
     drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size))
-    columns = {name: to_torch(column) for name, column in vars(drawn).items()}
+    columns = {n: to_torch(column) for n, column in vars(drawn).items() if n != "index"}
     return EdgePoints(
         **{n: c.double() if n in ("along", "weight") else c.long() for n, c in columns.items()}
     )

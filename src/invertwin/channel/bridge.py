@@ -4,7 +4,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
 
@@ -17,6 +17,7 @@ from torch import Tensor
 from invertwin import doctor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.scene.material import Surface
 from invertwin.scene.scene import Object, Scene
 
 _VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
@@ -123,9 +124,12 @@ class Geometry:
         vertices: World positions of all objects, concatenated [m].
         faces: Vertex indices of all triangles.
         face_object: Index of the object of each triangle.
-        amplitude: Per object, square root of the Fresnel reflectance over cosθ in [0, 1].
-        diffuse, lobe, exponent: Per object, the weights of ``scene.material.Surface``.
-        has_lobe: Whether any lobe has weight, or a derivative that could give it some.
+        face_surface: Row of each triangle in the tables of surfaces.
+        amplitude, diffuse, lobes, exponents, transmittance, excess, refraction, index,
+            attenuation: Rows of ``scene.material.Surface``, one per object or per triangle.
+        lobed: Which lobes have weight, or a derivative that could give them some.
+        sheets: Whether something passes straight through any surface.
+        bodies: Whether any surface is the skin of a refracting body.
         coherent: Per object, whether its field paths have a deterministic phase.
         topology: What depends on the connectivity only.
         velocities: World velocities of the vertices [m/s]; None = all at rest.
@@ -134,11 +138,19 @@ class Geometry:
     vertices: Float64[Tensor, "v 3"]
     faces: Int64[Tensor, "f 3"]
     face_object: Int64[Tensor, " f"]
-    amplitude: Float64[Tensor, "object cos"]
-    diffuse: Float64[Tensor, " object"]
-    lobe: Float64[Tensor, " object"]
-    exponent: Float64[Tensor, " object"]
-    has_lobe: bool
+    face_surface: Int64[Tensor, " f"]
+    amplitude: Float64[Tensor, "row cos"]
+    diffuse: Float64[Tensor, " row"]
+    lobes: Float64[Tensor, "row 3"]
+    exponents: Float64[Tensor, "row 3"]
+    transmittance: Float64[Tensor, "row cos"]
+    excess: Float64[Tensor, "row cos"]
+    refraction: Float64[Tensor, "row cos"]
+    index: Float64[Tensor, " row"]
+    attenuation: Float64[Tensor, " row"]
+    lobed: tuple[bool, bool, bool]
+    sheets: bool
+    bodies: bool
     coherent: tuple[bool, ...]
     topology: "Topology"
     velocities: Float64[Tensor, "v 3"] | None = None
@@ -183,26 +195,52 @@ def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geom
         faces.append(item.mesh.faces + offset)
         owners.append(torch.full((len(item.mesh.faces),), index))
         offset += len(item.mesh.vertices)
-    surfaces = [item.material.surface(SPEED_OF_LIGHT / wavelength) for item in objects]
     vertices = torch.cat([item.vertices for item in objects])
     key = (_VARIANTS[backend()], *(id(item.mesh.faces) for item in objects))
     # In the objects' own frames, where equal positions are equal to the last bit.
     shapes = torch.cat([item.mesh.vertices.detach() for item in objects])
     topology = _topology(key, [item.mesh.faces for item in objects], faces, owners, shapes)
-    lobe = torch.stack([s.lobe for s in surfaces])
+    rows, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength)
+    weights = rows["lobes"]
+    free = differentiated(weights)
     return Geometry(
         vertices=vertices,
         faces=topology.faces,
         face_object=topology.face_object,
-        amplitude=torch.stack([s.amplitude for s in surfaces]),
-        diffuse=torch.stack([s.diffuse for s in surfaces]),
-        lobe=lobe,
-        exponent=torch.stack([s.exponent for s in surfaces]),
-        has_lobe=bool(lobe.any()) or differentiated(lobe),
+        face_surface=face_surface,
+        **rows,
+        lobed=(
+            free or bool(weights[:, 0].any()),
+            free or bool(weights[:, 1].any()),
+            free or bool(weights[:, 2].any()),
+        ),
+        sheets=bool(rows["transmittance"].any()),
+        bodies=bool(rows["refraction"].any()),
         coherent=tuple(item.material.coherent for item in objects),
         topology=topology,
         velocities=torch.cat([_velocities(item) for item in objects]) if moving else None,
     )
+
+
+def _surfaces(objects: list[Object], frequency: float) -> tuple[dict[str, Tensor], Tensor]:
+    """The rows of all surfaces, and the row of every triangle."""
+    columns: dict[str, list[Tensor]] = {field.name: [] for field in fields(Surface)}
+    face_surface, offset = [], 0
+    for item in objects:
+        surface, count = item.material.surface(frequency), len(item.mesh.faces)
+        per_face = surface.diffuse.ndim == 1
+        if per_face and len(surface.diffuse) != count:
+            raise InputError(
+                f"expected one value of a material per triangle ({count}), got "
+                f"{len(surface.diffuse)}; give as many, or a single one"
+            )
+        for name, column in columns.items():
+            value = getattr(surface, name)
+            column.append(value if per_face else value[None])
+        numbers = torch.arange(count) if per_face else torch.zeros(count, dtype=torch.int64)
+        face_surface.append(numbers + offset)
+        offset += count if per_face else 1
+    return {name: torch.cat(column) for name, column in columns.items()}, torch.cat(face_surface)
 
 
 def _moves(item: Object) -> bool:

@@ -1,11 +1,10 @@
-"""Power paths straight into the bins of a map, and the hand-written adjoint of doing so.
+"""Power paths straight into the bins of a map, with derivatives in both modes.
 
-A path falls on the grid with quadratic B-spline weights, three taps an axis (derivations §5);
-the radar's point spread is a convolution of the grid afterwards. The B-spline is C¹, so the
-map has continuous derivatives in range and direction. No path is ever stored for torch.
+No path is ever stored for torch: chains are walked, deposited and forgotten, or kept as records
+while these fit the memory budget, and replayed for the derivative.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -14,8 +13,9 @@ from jaxtyping import Float32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from invertwin.channel import bridge, kernel
+from invertwin.channel import bins, bridge, kernel, replay, walk
 from invertwin.channel.boundary import require_edges
+from invertwin.channel.boundary_walk import BoundaryChains, boundary_chains
 from invertwin.channel.bridge import (
     Geometry,
     differentiated,
@@ -27,13 +27,16 @@ from invertwin.channel.bridge import (
     tracer,
     use_backend,
 )
-from invertwin.channel.kernel import DIFFERENTIABLE, Contribution, Inputs
+from invertwin.channel.kernel import DIFFERENTIABLE, Inputs, Place
 from invertwin.channel.paths import Grid, Link
-from invertwin.channel.sampling import AreaSampler, EdgeSampler, RaySampler, Samples, Shot
+from invertwin.channel.rays import Shot
+from invertwin.channel.sampling import AreaSampler, RaySampler
+from invertwin.channel.walk import Records, State, Walk
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
-_BYTES_PER_SAMPLE = 20  # one record: frame, triangle, two barycentrics, weight
+_BYTES_PER_VERTEX = 21  # one record: triangle, two barycentrics, throughput, length, seen
+_DEEPEST = 16
 
 
 def deposit_power(
@@ -44,16 +47,19 @@ def deposit_power(
     samples: int,
     boundary_samples: int,
     seed: int,
+    depth: int = 1,
     sampling: Literal["rays", "area"] = "rays",
     reference: tuple[Scene, Link] | None = None,
     boundary: bool = True,
+    interior_edges: bool = True,
     memory_budget: float = 0.5e9,
     backend: str | None = None,
 ) -> Float32[Tensor, "frame range u v"]:
     """Expected received over transmitted power in every bin of a map, per frame.
 
-    One bounce: ``∫ f dA`` over what both antennas see, with ``f`` the bistatic radar equation
-    times the reflectance distribution of the material (``channel.kernel.scattered``).
+    ``∫ f dA₁ … dAₙ`` over all chains of up to ``depth`` surface points that see each other in
+    turn, with ``f`` the radar equation of the chain: 1/R² for every leg, the scattering
+    distribution of the material and both cosines for every point.
     Differentiable in both modes with respect to vertices, material values and radar poses;
     moving silhouettes included unless ``boundary`` is off.
 
@@ -64,16 +70,20 @@ def deposit_power(
         samples: Interior samples over all frames.
         boundary_samples: Silhouette samples over all frames and antennas; used by derivatives
             only, since boundary paths are zero in value.
+        depth: Most bounces of a path.
         seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
         sampling: ``rays`` from the antenna into the caps around the objects, or ``area``.
         reference: The scene and link that fix the density (caps around objects, enlarged by a
             tenth, or triangle areas), so that differences in θ have common random numbers.
         boundary: Off leaves the interior term alone, for ablation.
+        interior_edges: Off leaves out the shadows that surfaces cast on each other (family 2),
+            for ablation.
         memory_budget: Bytes of samples alive at a time; more samples go in chunks, and the
             derivative traces them again instead of keeping them.
         backend: ``cpu``, ``cuda``, ``auto``; by default the one in force.
 
-    Source: Eq. 7–8 of the paper in material form, derivations §2–3 and §5.
+    Source: Eq. 7–8 of the paper in material form, derivations §2–3 and §5; interior segments
+    §3.3.3.
     Differs from the source: the boundary term carries a plain line integral over silhouettes,
     not the divergence of Eq. 14.
 
@@ -85,6 +95,10 @@ def deposit_power(
         raise InputError(
             f"expected samples >= 1 and boundary_samples >= 0, got {samples} and "
             f"{boundary_samples}; give the number of rays over all frames"
+        )
+    if not 1 <= depth <= _DEEPEST:
+        raise InputError(
+            f"expected a depth from 1 to {_DEEPEST}, got {depth}; give the most bounces of a path"
         )
     if sampling not in ("rays", "area"):
         raise InputError(f"expected sampling 'rays' or 'area', got {sampling!r}; choose one")
@@ -99,7 +113,9 @@ def deposit_power(
             seed=seed,
             sampling=sampling,
             reference=(flatten(reference[0], link.wavelength), reference[1]) if reference else None,
-            chunk=max(1, int(memory_budget) // _BYTES_PER_SAMPLE),
+            depth=depth,
+            interior_edges=interior_edges,
+            chunk=max(1, int(memory_budget) // (_BYTES_PER_VERTEX * depth)),
             backend=bridge.backend(),
         )
         if boundary:
@@ -122,6 +138,8 @@ class _Settings:
     seed: int
     sampling: str
     reference: tuple[Geometry, Link] | None
+    depth: int
+    interior_edges: bool
     chunk: int
     backend: str
 
@@ -136,20 +154,16 @@ class _Settings:
 
 
 class _Trace:
-    """The detached half of a call: samplers, and the samples while they fit the budget."""
+    """The detached half of a call: chains, and their records while they fit the budget."""
 
     def __init__(self, settings: _Settings) -> None:
         self.settings = settings
         self.shot = Shot(settings.geometry, settings.link)
-        if settings.sampling == "rays":
-            self.sampler = RaySampler(
-                self.shot, settings.samples, settings.seed, settings.reference
-            )
-        else:
-            self.sampler = AreaSampler(
-                self.shot, settings.samples, settings.seed, settings.reference
-            )
-        self._kept: Samples | None = None
+        sampler = RaySampler if settings.sampling == "rays" else AreaSampler
+        self.sampler = sampler(self.shot, settings.samples, settings.seed, settings.reference)
+        self.fixed = self.inputs()
+        self._walk = Walk(self.shot, self.fixed, settings.seed)
+        self._kept: Records | None = None
 
     @property
     def bins(self) -> int:
@@ -167,41 +181,76 @@ class _Trace:
         made = Inputs.of(self.settings.geometry, link, self.shot, monostatic)
         return replace(made, **(tables or {}))
 
-    def interior(self, keep: bool) -> Iterator[Samples]:
-        """Chunks of interior samples; ``keep`` stores them if all fit in one chunk."""
-        if self._kept is not None:
+    def chains(self, out: Any = None, *, record: bool = False) -> Iterator[Records | None]:
+        """Walk all chains, a chunk at a time: into the bins, into records, or both."""
+        if self._kept is not None and out is None:
             yield self._kept
             return
+        import drjit as dr
+
+        depth = self.settings.depth
+        whole = self.sampler.size <= self.settings.chunk
         for index in _chunks(self.sampler.size, self.settings.chunk):
-            drawn = self.sampler.draw(index)
-            if keep and self.sampler.size <= self.settings.chunk:
-                self._kept = drawn
-                self._schedule(drawn)
-            yield drawn
+            keep = record and (whole or out is None)
+            state = self._started(index)
+            records = None
+            if keep and depth > 1:
+                state["lane"] = dr.arange(tracer().UInt32, dr.width(index))
+                records = Records.empty(state, depth, self.shot.sound_face)
+            single: list[Records] = []
 
-    def boundary(self, inputs: Inputs) -> Iterator[Contribution]:
-        """Boundary paths of each antenna segment."""
+            def visit(state: State, point: Place, records: Any = records, kept: Any = single) -> None:
+                link = self.settings.link
+                one_place = depth == 1 and self.fixed.monostatic
+                found, exists = walk.connect(
+                    self.shot, self.fixed, state, point, True,
+                    shared=link.shared_visibility, one_place=one_place,
+                )  # fmt: skip
+                if out is not None:
+                    bins.scatter(out, self.settings.grid, found, exists)
+                if records is not None:
+                    records.write(state, exists)
+                elif depth == 1:
+                    kept.append(Records.single(state, exists))
+
+            self._walk.run(state, depth, visit)
+            records = single[0] if single else records
+            if keep and records is not None and out is not None:
+                self._kept = records
+                dr.schedule(*(c for c in vars(records).values() if not isinstance(c, int)))
+            if out is not None:
+                dr.eval(out)
+            yield records
+
+    def _started(self, index: Any) -> State:
+        """Chains at their first vertex."""
         import drjit as dr
 
-        link, settings = self.settings.link, self.settings
-        centres = ("tx",) if link.shared_visibility else ("tx", "rx")
-        for stream, centre in enumerate(centres):
-            sampler = EdgeSampler(
+        drawn = self.sampler.draw(index)
+        tx = self.fixed.antenna(drawn.frame, False)
+        point = kernel.place(self.fixed, drawn.face, drawn.b1, drawn.b2)
+        back, distance = kernel.leg(point.position, tx)
+        gain = self.fixed.gain(drawn.frame, False, kernel.to_radar(self.fixed, drawn.frame, -back))
+        weight = drawn.weight * self.fixed.scale * gain / dr.square(distance)
+        throughput = dr.select(drawn.weight > 0, weight, 0.0)
+        return walk.start(
+            index, drawn.frame, drawn.face, drawn.b1, drawn.b2, back, throughput, distance
+        )
+
+    def boundary(self, inputs: Inputs) -> Iterator[BoundaryChains]:
+        """Boundary paths of all segments, a chunk at a time."""
+        settings = self.settings
+        if settings.boundary_samples:
+            yield from boundary_chains(
                 self.shot,
-                getattr(self.shot, centre),
-                settings.boundary_samples // len(centres),
-                settings.seed + stream,
+                inputs,
+                self._walk,
+                samples=settings.boundary_samples,
+                depth=settings.depth,
+                seed=settings.seed,
+                interior=settings.interior_edges,
+                chunks=lambda size: _chunks(size, settings.chunk),
             )
-            for index in _chunks(sampler.size, settings.chunk):
-                drawn = sampler.draw(index)
-                if dr.width(drawn.face):
-                    yield kernel.boundary(inputs, drawn, centre, self.shot)
-
-    @staticmethod
-    def _schedule(samples: Samples) -> None:
-        import drjit as dr
-
-        dr.schedule(*vars(samples).values())
 
 
 def _chunks(size: int, chunk: int) -> Iterator[Any]:
@@ -216,22 +265,18 @@ def _chunks(size: int, chunk: int) -> Iterator[Any]:
 class _Deposit(torch.autograd.Function):
     """∂map/∂(vertices, poses, materials), forward and backward.
 
-    The derivative of the deposit itself is written out; Dr.Jit differentiates the smooth
-    geometry in front of it. Both end in one fused kernel that stores no path.
+    The derivative of the deposit itself is written out, and that of a chain replayed from its
+    records; Dr.Jit differentiates the smooth geometry at one vertex.
     """
 
     @staticmethod
     def forward(ctx: Any, settings: _Settings, *tables: Tensor) -> Tensor:
         import drjit as dr
 
-        mi = tracer()
         trace = _Trace(settings)
-        inputs = trace.inputs()
-        out = dr.zeros(mi.Float, trace.bins)
-        keep = any(ctx.needs_input_grad)
-        for samples in trace.interior(keep):
-            _scatter(out, trace, kernel.interior(inputs, samples))
-            dr.eval(out)
+        out = dr.zeros(tracer().Float, trace.bins)
+        for _ in trace.chains(out, record=any(ctx.needs_input_grad)):
+            pass
         ctx.trace = trace
         return to_torch(out).reshape(settings.link.frame_count, *settings.grid.shape)
 
@@ -241,24 +286,21 @@ class _Deposit(torch.autograd.Function):
         import drjit as dr
 
         trace: _Trace = ctx.trace
+        grid = trace.settings.grid
         with use_backend(trace.settings.backend), one_torch_thread():
             wanted = [n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[1:], strict=True) if w]
-            plain = trace.inputs()
-            tables = {name: type(plain.tx)(getattr(plain, name)) for name in wanted}
+            tables = {name: type(trace.fixed.tx)(getattr(trace.fixed, name)) for name in wanted}
             dr.enable_grad(list(tables.values()))
             inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
             seed = to_float(grad)
-
-            def pull(found: Contribution) -> None:
-                bars = _gather(seed, trace, found)
-                for value, bar in zip(found.attached, bars, strict=True):
-                    if dr.grad_enabled(value):
-                        dr.set_grad(value, bar)
-                        dr.enqueue(dr.ADMode.Backward, value)
-                dr.traverse(dr.ADMode.Backward)
-                dr.eval([dr.grad(t) for t in tables.values()])
-
-            _over_paths(trace, inputs, pull)
+            for records in trace.chains(record=True):
+                replay.pull(inputs, records, lambda *path: bins.gather(seed, grid, *path))
+                dr.eval([dr.grad(table) for table in tables.values()])
+            for chains in trace.boundary(inputs):
+                total = chains.weighted(lambda *path: bins.gather(seed, grid, *path)[0])
+                if dr.grad_enabled(chains.speed):
+                    dr.backward_from(chains.speed * total)
+                dr.eval([dr.grad(table) for table in tables.values()])
             results: list[Tensor | None] = [None]
             for name, source in zip(DIFFERENTIABLE, trace.settings.tables, strict=True):
                 results.append(
@@ -272,30 +314,33 @@ class _Deposit(torch.autograd.Function):
     def jvp(ctx: Any, _: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         import drjit as dr
 
-        mi = tracer()
         trace: _Trace = ctx.trace
+        grid = trace.settings.grid
         with use_backend(trace.settings.backend), one_torch_thread():
-            plain = trace.inputs()
             given = {
                 name: tangent
                 for name, tangent in zip(DIFFERENTIABLE, tangents, strict=True)
                 if tangent is not None
             }
-            tables = {name: type(plain.tx)(getattr(plain, name)) for name in given}
+            tables = {name: type(trace.fixed.tx)(getattr(trace.fixed, name)) for name in given}
             dr.enable_grad(list(tables.values()))
             inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
-            out = dr.zeros(mi.Float, trace.bins)
+            out = dr.zeros(tracer().Float, trace.bins)
 
-            def push(found: Contribution) -> None:
+            def point_tangents() -> None:
                 for name, table in tables.items():
                     dr.set_grad(table, to_float(given[name]))
-                # u and v also feed the pattern, so that by default their derivatives would be
-                # cleared once passed on.
-                dots = dr.forward_to(*found.attached, flags=dr.ADFlag.ClearEdges)
-                _scatter_derivative(out, trace, found, dots)
-                dr.eval(out)
 
-            _over_paths(trace, inputs, push)
+            for records in trace.chains(record=True):
+                point_tangents()
+                replay.push(
+                    inputs, records, lambda *path: bins.scatter_derivative(out, grid, *path)
+                )
+                dr.eval(out)
+            for chains in trace.boundary(inputs):
+                point_tangents()
+                chains.deposit(dr.forward_to(chains.speed), lambda *path: bins.scatter(out, grid, *path))
+                dr.eval(out)
             return to_torch(out).reshape(
                 trace.settings.link.frame_count, *trace.settings.grid.shape
             )
@@ -305,108 +350,3 @@ def _equal(first: Tensor | None, second: Tensor | None) -> bool:
     if first is None or second is None:
         return first is second
     return torch.equal(first, second)
-
-
-def _over_paths(trace: _Trace, inputs: Inputs, act: Callable[[Contribution], None]) -> None:
-    for samples in trace.interior(keep=False):
-        act(kernel.interior(inputs, samples))
-    if trace.settings.boundary_samples:
-        for found in trace.boundary(inputs):
-            act(found)
-
-
-def _axis(position: Any, start: float, step: float, count: int) -> tuple[Any, list, list]:
-    """First bin, weights and weights' derivatives of the quadratic B-spline along one axis."""
-    import drjit as dr
-
-    mi = tracer()
-    if count == 1:
-        return mi.Int32(0), [mi.Float(1.0)], [mi.Float(0.0)]
-    t = (position - start) * (1 / step)
-    nearest = dr.round(t)
-    d = t - nearest
-    weights = [0.5 * dr.square(0.5 - d), 0.75 - dr.square(d), 0.5 * dr.square(0.5 + d)]
-    slopes = [(d - 0.5) / step, -2 * d / step, (d + 0.5) / step]
-    return mi.Int32(nearest) - 1, weights, slopes
-
-
-@dataclass(frozen=True)
-class _Taps:
-    """Where a path falls: first bins, weights and slopes of the three axes (all detached)."""
-
-    base: Any
-    axes: tuple[tuple[Any, list, list], ...]
-    counts: tuple[int, int, int]
-
-    @staticmethod
-    def of(trace: _Trace, found: Contribution) -> "_Taps":
-        import drjit as dr
-
-        mi = tracer()
-        g = trace.settings.grid
-        axes = (
-            _axis(dr.detach(found.range), g.range_start, g.range_step, g.range_count),
-            _axis(dr.detach(found.u), g.u_start, g.u_step, g.u_count),
-            _axis(dr.detach(found.v), g.v_start, g.v_step, g.v_count),
-        )
-        base = mi.Int32(found.frame) * (g.range_count * g.u_count * g.v_count)
-        return _Taps(base, axes, g.shape)
-
-    def __iter__(self) -> Iterator[tuple[Any, Any, tuple[int, int, int]]]:
-        """Bin index, whether it is on the grid, and the tap along each axis."""
-        (r0, rw, _), (u0, uw, _), (v0, vw, _) = self.axes
-        nr, nu, nv = self.counts
-        for i in range(len(rw)):
-            ok_r = (r0 + i >= 0) & (r0 + i < nr)
-            for j in range(len(uw)):
-                ok_u = ok_r & (u0 + j >= 0) & (u0 + j < nu)
-                line = self.base + ((r0 + i) * nu + (u0 + j)) * nv + v0
-                for k in range(len(vw)):
-                    yield line + k, ok_u & (v0 + k >= 0) & (v0 + k < nv), (i, j, k)
-
-
-def _scatter(out: Any, trace: _Trace, found: Contribution) -> None:
-    """Add the paths to the bins."""
-    import drjit as dr
-
-    taps = _Taps.of(trace, found)
-    (_, rw, _), (_, uw, _), (_, vw, _) = taps.axes
-    for index, ok, (i, j, k) in taps:
-        weight = found.power * rw[i] * uw[j] * vw[k]
-        dr.scatter_add(out, weight, tracer().UInt32(index), ok)
-
-
-def _scatter_derivative(out: Any, trace: _Trace, found: Contribution, dots: tuple) -> None:
-    """Add the derivative of the paths' deposit, given those of power, range, u and v."""
-    import drjit as dr
-
-    taps = _Taps.of(trace, found)
-    (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
-    power = dr.detach(found.power)
-    dot_a, dot_r, dot_u, dot_v = dots
-    for index, ok, (i, j, k) in taps:
-        value = (
-            dot_a * rw[i] * uw[j] * vw[k]
-            + power * dot_r * rs[i] * uw[j] * vw[k]
-            + power * dot_u * rw[i] * us[j] * vw[k]
-            + power * dot_v * rw[i] * uw[j] * vs[k]
-        )
-        dr.scatter_add(out, value, tracer().UInt32(index), ok)
-
-
-def _gather(seed: Any, trace: _Trace, found: Contribution) -> tuple[Any, Any, Any, Any]:
-    """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path."""
-    import drjit as dr
-
-    mi = tracer()
-    taps = _Taps.of(trace, found)
-    (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
-    bars = [mi.Float(0.0) for _ in range(4)]
-    for index, ok, (i, j, k) in taps:
-        g = dr.gather(mi.Float, seed, mi.UInt32(index), ok)
-        bars[0] += g * (rw[i] * uw[j] * vw[k])
-        bars[1] += g * (rs[i] * uw[j] * vw[k])
-        bars[2] += g * (rw[i] * us[j] * vw[k])
-        bars[3] += g * (rw[i] * uw[j] * vs[k])
-    power = dr.detach(found.power)
-    return bars[0], bars[1] * power, bars[2] * power, bars[3] * power

@@ -1,6 +1,7 @@
-"""What one sample contributes, in Dr.Jit: the attached part of the path integral.
+"""What one vertex of a path contributes, in Dr.Jit: the integrand of the path integral.
 
-The torch twin of these formulas, in float64, is ``channel/tracer.py``; tests hold them equal.
+Everything here is differentiable or not, as its ``Inputs`` are. The torch twin of these formulas,
+in float64, is ``channel/chains.py``; tests hold them equal.
 """
 
 from dataclasses import dataclass, replace
@@ -8,14 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from invertwin.channel.bridge import Geometry, to_float, tracer
+from invertwin.channel.bridge import Geometry, to_float, to_index, tracer
 from invertwin.channel.paths import Link, Pattern
-from invertwin.channel.sampling import EdgeSamples, Samples, Shot
+from invertwin.channel.rays import Shot
+
+#: Rows of surfaces among the differentiable inputs.
+SURFACE = (
+    "amplitude", "diffuse", "lobes", "exponents", "transmittance", "excess", "refraction",
+    "index", "attenuation",
+)  # fmt: skip
 
 #: The differentiable inputs of the kernel, in the order in which torch passes them.
-DIFFERENTIABLE = (
-    "vertices", "tx", "rx", "rotations", "amplitude", "diffuse", "lobe", "exponent",
-)  # fmt: skip
+DIFFERENTIABLE = ("vertices", "tx", "rx", "rotations", *SURFACE)
 
 
 @dataclass(frozen=True)
@@ -28,12 +33,19 @@ class Inputs:
     rotations: Any
     amplitude: Any
     diffuse: Any
-    lobe: Any
-    exponent: Any
+    lobes: Any
+    exponents: Any
+    transmittance: Any
+    excess: Any
+    refraction: Any
+    index: Any
+    attenuation: Any
     faces: Any
-    face_object: Any
+    face_surface: Any
     cosines: int
-    has_lobe: bool
+    lobed: tuple[bool, bool, bool]
+    sheets: bool
+    bodies: bool
     monostatic: bool
     tx_pattern: "PatternTable"
     rx_pattern: "PatternTable"
@@ -46,20 +58,18 @@ class Inputs:
         ``monostatic`` spares one leg where both antennas are one, derivatives included: what is
         due to ``rx`` is then due to ``tx``.
         """
-        topology = geometry.topology
         return Inputs(
             vertices=shot.vertices,
             tx=shot.tx,
             rx=shot.rx,
             rotations=to_float(link.rotations),
-            amplitude=to_float(geometry.amplitude),
-            diffuse=to_float(geometry.diffuse),
-            lobe=to_float(geometry.lobe),
-            exponent=to_float(geometry.exponent),
-            faces=topology.device_faces,
-            face_object=topology.device_face_object,
+            **{name: to_float(getattr(geometry, name)) for name in SURFACE},
+            faces=geometry.topology.device_faces,
+            face_surface=to_index(geometry.face_surface),
             cosines=geometry.amplitude.shape[1],
-            has_lobe=geometry.has_lobe,
+            lobed=geometry.lobed,
+            sheets=geometry.sheets,
+            bodies=geometry.bodies,
             monostatic=monostatic,
             tx_pattern=PatternTable.of(link.tx_pattern),
             rx_pattern=PatternTable.of(link.rx_pattern),
@@ -71,6 +81,25 @@ class Inputs:
         import drjit as dr
 
         return replace(self, **{name: dr.detach(getattr(self, name)) for name in DIFFERENTIABLE})
+
+    def antenna(self, frame: Any, receiver: Any, active: Any = True) -> Any:
+        """Position of the receiver or the transmitter (a Python bool, or one per lane)."""
+        if receiver is True or receiver is False:
+            table = self.rx if receiver and not self.monostatic else self.tx
+            return _rows(table, frame, active)
+        import drjit as dr
+
+        return dr.select(
+            receiver, self.antenna(frame, True, active), self.antenna(frame, False, active)
+        )
+
+    def gain(self, frame: Any, receiver: Any, seen: Any) -> Any:
+        """Linear power gain of the receiver or the transmitter towards a radar-frame direction."""
+        if receiver is True or receiver is False:
+            return (self.rx_pattern if receiver else self.tx_pattern).gain(seen)
+        import drjit as dr
+
+        return dr.select(receiver, self.rx_pattern.gain(seen), self.tx_pattern.gain(seen))
 
 
 @dataclass(frozen=True)
@@ -130,142 +159,141 @@ class Contribution:
         return self.power, self.range, self.u, self.v
 
 
-def _rows(table: Any, index: Any) -> Any:
+def _rows(table: Any, index: Any, active: Any = True) -> Any:
     import drjit as dr
 
-    return dr.gather(tracer().Point3f, table, index)
+    return dr.gather(tracer().Point3f, table, index, active)
 
 
-def _corners(inputs: Inputs, face: Any) -> tuple[Any, Any, Any]:
+def corners(inputs: Inputs, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    """Corners of triangles, attached."""
     import drjit as dr
 
-    index = dr.gather(tracer().Vector3u, inputs.faces, face)
-    return tuple(_rows(inputs.vertices, i) for i in index)  # type: ignore[return-value]
+    index = dr.gather(tracer().Vector3u, inputs.faces, face, active)
+    return tuple(_rows(inputs.vertices, i, active) for i in index)  # type: ignore[return-value]
 
 
-def _to_radar(inputs: Inputs, frame: Any, direction: Any) -> Any:
+def edge_ends(inputs: Inputs, first: Any, second: Any) -> tuple[Any, Any]:
+    """Ends of edges, attached."""
+    return _rows(inputs.vertices, first), _rows(inputs.vertices, second)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A material point: position and unit normal, attached, and the row of its surface.
+
+    ``jacobian`` is the area of its triangle over that area detached: one in value.
+    """
+
+    position: Any
+    normal: Any
+    jacobian: Any
+    surface: Any
+
+
+def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Place:
+    """Where a pair of barycentric coordinates lies now."""
+    import drjit as dr
+
+    p0, p1, p2 = corners(inputs, face, active)
+    normal = dr.cross(p1 - p0, p2 - p0)
+    double_area = dr.norm(normal)
+    return Place(
+        position=p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2,
+        normal=normal / double_area,
+        jacobian=double_area / dr.detach(double_area),
+        surface=dr.gather(tracer().UInt32, inputs.face_surface, face, active),
+    )
+
+
+def leg(start: Any, end: Any) -> tuple[Any, Any]:
+    """Unit direction and distance from one point to another."""
+    import drjit as dr
+
+    offset = end - start
+    distance = dr.norm(offset)
+    return offset / distance, distance
+
+
+def to_radar(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> Any:
     """World direction in the radar frame (the rotation's columns are the radar's axes)."""
     import drjit as dr
 
     mi = tracer()
-    rows = [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k) for k in range(3)]
+    rows = [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k, active) for k in range(3)]
     return mi.Vector3f(*(sum(rows[k][axis] * direction[k] for k in range(3)) for axis in range(3)))
 
 
-def _amplitude(inputs: Inputs, owner: Any, cosine: Any) -> Any:
-    """Square root of the Fresnel reflectance, linear between table entries."""
+def tabulated(inputs: Inputs, name: str, row: Any, cosine: Any, active: Any = True) -> Any:
+    """A table over cosθ, linear between its entries."""
     import drjit as dr
 
     mi = tracer()
+    table = getattr(inputs, name)
     t = dr.minimum(cosine, 1.0) * (inputs.cosines - 1)
     low = dr.minimum(mi.UInt32(dr.detach(t)), inputs.cosines - 2)
-    first = dr.gather(mi.Float, inputs.amplitude, owner * inputs.cosines + low)
-    second = dr.gather(mi.Float, inputs.amplitude, owner * inputs.cosines + low + 1)
+    first = dr.gather(mi.Float, table, row * inputs.cosines + low, active)
+    second = dr.gather(mi.Float, table, row * inputs.cosines + low + 1, active)
     return first + (second - first) * (t - mi.Float(low))
 
 
-def scattered(inputs: Inputs, frame: Any, face: Any, position: Any, normal: Any) -> Contribution:
-    """Power received per unit area from a surface point, by the bistatic radar equation.
+def reflected(
+    inputs: Inputs, row: Any, normal: Any, back: Any, on: Any, active: Any = True
+) -> Any:
+    """``f_r |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
 
-    ``P_r/P_t = λ²/(4π)² · G_t G_r / (R_t² R_r²) · f_r cosθ_t cosθ_r dA`` with the reflectance
-    distribution ``f_r`` of ``scene.material``. The point scatters only if both antennas are on
-    the same side of the surface.
+    ``f_r`` is the distribution of ``scene.material``; a surface scatters only to the side from
+    which it is lit. ``on`` is None where both directions are one.
     """
     import drjit as dr
 
     mi = tracer()
-    owner = dr.gather(mi.UInt32, inputs.face_object, face)
-    to_tx = _rows(inputs.tx, frame) - position
-    r_tx = dr.norm(to_tx)
-    w_tx = to_tx / r_tx
-    signed_tx = dr.dot(normal, w_tx)
-    if inputs.monostatic:
-        r_rx, w_rx, signed_rx = r_tx, w_tx, signed_tx
+    first = dr.dot(normal, back)
+    low = tabulated(inputs, "amplitude", row, dr.abs(first), active)
+    if on is None:
+        product, between, reflectance = dr.square(first), mi.Float(1.0), dr.square(low)
     else:
-        to_rx = _rows(inputs.rx, frame) - position
-        r_rx = dr.norm(to_rx)
-        w_rx = to_rx / r_rx
-        signed_rx = dr.dot(normal, w_rx)
-    cosines = signed_tx * signed_rx
-    seen = _to_radar(inputs, frame, -w_rx)
-    gain = inputs.rx_pattern.gain(seen)
-    if inputs.monostatic:
-        gain *= inputs.tx_pattern.gain(seen)
-        reflectance = dr.square(_amplitude(inputs, owner, dr.abs(signed_tx)))
-    else:
-        gain *= inputs.tx_pattern.gain(_to_radar(inputs, frame, -w_tx))
-        reflectance = _amplitude(inputs, owner, dr.abs(signed_tx)) * _amplitude(
-            inputs, owner, dr.abs(signed_rx)
-        )
-    shape = dr.gather(mi.Float, inputs.diffuse, owner) * dr.inv_pi
-    if inputs.has_lobe:
-        half = dr.maximum(0.5 * (1 + 2 * cosines - dr.dot(w_tx, w_rx)), 1e-7)
-        exponent = dr.gather(mi.Float, inputs.exponent, owner)
-        shape += dr.gather(mi.Float, inputs.lobe, owner) * dr.exp(exponent * dr.log(half))
-    power = inputs.scale * gain * reflectance * shape * cosines / dr.square(r_tx * r_rx)
-    power = dr.select(dr.detach(cosines) > 0, power, 0.0)
-    return Contribution(frame, power, 0.5 * (r_tx + r_rx), seen.x, seen.y)
+        second = dr.dot(normal, on)
+        product, between = first * second, dr.dot(back, on)
+        reflectance = low * tabulated(inputs, "amplitude", row, dr.abs(second), active)
+    shape = dr.gather(mi.Float, inputs.diffuse, row, active) * dr.inv_pi
+    for number, present in enumerate(inputs.lobed):
+        if present:
+            cosine = between if number == 2 else 2 * product - between
+            half = dr.maximum(0.5 * (1 + cosine), 1e-7)
+            exponent = dr.gather(mi.Float, inputs.exponents, row * 3 + number, active)
+            weight = dr.gather(mi.Float, inputs.lobes, row * 3 + number, active)
+            shape += weight * dr.exp(exponent * dr.log(half))
+    return dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
 
 
-def interior(inputs: Inputs, samples: Samples) -> Contribution:
-    """The interior term in material form: position, normal and Jacobian follow θ."""
+@dataclass(frozen=True)
+class Connection:
+    """The last leg of a path, from a surface point to an antenna."""
+
+    factor: Any  # f |cosθ| |cosθ'| G / R²
+    distance: Any
+    seen: Any  # direction of the point in the radar frame
+
+
+def connection(
+    inputs: Inputs,
+    frame: Any,
+    point: Place,
+    back: Any,
+    receiver: Any = True,
+    active: Any = True,
+    *,
+    same: bool = False,
+) -> Connection:
+    """Scatter what comes from ``back`` towards an antenna; ``same`` if it lies there."""
     import drjit as dr
 
-    p0, p1, p2 = _corners(inputs, samples.face)
-    position = p0 * (1 - samples.b1 - samples.b2) + p1 * samples.b1 + p2 * samples.b2
-    normal = dr.cross(p1 - p0, p2 - p0)
-    double_area = dr.norm(normal)
-    found = scattered(inputs, samples.frame, samples.face, position, normal / double_area)
-    jacobian = double_area / dr.detach(double_area)
-    return replace(found, power=found.power * jacobian * samples.weight)
-
-
-def boundary(inputs: Inputs, samples: EdgeSamples, centre: str, shot: Shot) -> Contribution:
-    """Boundary paths of one antenna segment (family 1): zero value, derivative f V_∂.
-
-    Source: derivations §3. Only ``power`` carries a derivative; where it falls does not.
-    """
-    import drjit as dr
-
-    mi = tracer()
-    fixed = inputs.detached()
-    c = _rows(getattr(inputs, centre), samples.frame)
-    y0, y1 = _rows(inputs.vertices, samples.first), _rows(inputs.vertices, samples.second)
-    y = y0 + (y1 - y0) * samples.along
-    p0, p1, p2 = _corners(inputs, samples.face)
-    plane = dr.cross(p1 - p0, p2 - p0)
-    moving = c + (y - c) * (dr.dot(plane, p0 - c) / dr.dot(plane, y - c))
-
-    f0, f1, f2 = _corners(fixed, samples.face)
-    shadow, normal = dr.detach(moving), dr.normalize(dr.cross(f1 - f0, f2 - f0))
-    b1, b2 = _barycentric(shadow, f0, f1, f2)
-    material = p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2
-
-    ray, edge = dr.detach(y - c), dr.detach(y1 - y0)
-    stretch = dr.norm(shadow - dr.detach(c)) / dr.norm(ray)
-    slope = 1 / dr.dot(normal, ray)
-
-    def projected(vector: Any) -> Any:
-        return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
-
-    covered = _rows(fixed.vertices, samples.opposite) - dr.detach(y)
-    tangent = dr.cross(normal, projected(edge))
-    tangent = dr.mulsign(tangent, dr.dot(tangent, projected(covered)))
-    found = scattered(fixed, samples.frame, samples.face, shadow, normal)
-    lit = found.power
-    if not shot.link.shared_visibility:
-        other = fixed.rx if centre == "tx" else fixed.tx
-        reached = shot.clear(mi.Point3f(shadow), _rows(other, samples.frame))
-        lit = dr.select(reached, lit, 0.0)
-    speed = dr.dot(tangent, moving - material)
-    power = lit * samples.weight * speed
-    return replace(found, power=dr.replace_grad(dr.zeros(mi.Float, dr.width(power)), power))
-
-
-def _barycentric(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
-    import drjit as dr
-
-    a, b, r = p1 - p0, p2 - p0, point - p0
-    aa, ab, bb, ra, rb = dr.dot(a, a), dr.dot(a, b), dr.dot(b, b), dr.dot(r, a), dr.dot(r, b)
-    determinant = dr.fma(aa, bb, -ab * ab)
-    return (bb * ra - ab * rb) / determinant, (aa * rb - ab * ra) / determinant
+    antenna = inputs.antenna(frame, receiver, active)
+    to_antenna, distance = leg(point.position, antenna)
+    seen = to_radar(inputs, frame, -to_antenna, active)
+    scattered = reflected(
+        inputs, point.surface, point.normal, back, None if same else to_antenna, active
+    )
+    gain = inputs.gain(frame, receiver, seen)
+    return Connection(scattered * gain / dr.square(distance), distance, seen)

@@ -23,7 +23,8 @@ from invertwin.channel.boundary import (
 )
 from invertwin.channel.bridge import Geometry, flatten, to_torch, tracer, use_backend
 from invertwin.channel.paths import Link, Paths
-from invertwin.channel.sampling import RaySampler, Shot, face_areas, visible
+from invertwin.channel.rays import Shot, face_areas, visible
+from invertwin.channel.sampling import RaySampler
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
@@ -63,16 +64,19 @@ def view(
     rotation = link.rotations[frame]
     gain = link.tx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -w_tx))
     gain = gain * link.rx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -w_rx))
-    owner = geometry.face_object[face]
-    reflectance = _amplitude(geometry, owner, cos_tx) * _amplitude(geometry, owner, cos_rx)
-    half = (0.5 * (1 + 2 * cos_tx * cos_rx - (w_tx * w_rx).sum(1))).clamp_min(1e-7)
-    shape = geometry.diffuse[owner] / torch.pi
-    shape = shape + geometry.lobe[owner] * half ** geometry.exponent[owner]
+    row = geometry.face_surface[face]
+    reflectance = _amplitude(geometry, row, cos_tx) * _amplitude(geometry, row, cos_rx)
+    between = (w_tx * w_rx).sum(1)
+    mirror, back = (0.5 * (1 + c) for c in (2 * cos_tx * cos_rx - between, between))
+    shape = geometry.diffuse[row] / torch.pi
+    for number, half in enumerate((mirror, mirror, back)):
+        lobe = half.clamp_min(1e-7) ** geometry.exponents[row, number]
+        shape = shape + geometry.lobes[row, number] * lobe
     spread = lit * gain / (r_tx * r_rx) ** 2
     power = (link.wavelength / (4 * torch.pi)) ** 2 * spread * reflectance * shape
     facing = 0.5 * (cos_tx + cos_rx).abs()
-    mirror = -1j / (4 * torch.pi) * spread.sqrt() * facing
-    return View(power * (cos_tx * cos_rx), mirror, r_tx + r_rx)
+    field = -1j / (4 * torch.pi) * spread.sqrt() * facing
+    return View(power * (cos_tx * cos_rx), field, r_tx + r_rx)
 
 
 def _amplitude(geometry: Geometry, owner: Tensor, cosine: Tensor) -> Tensor:
@@ -139,6 +143,9 @@ def trace_power(
         sampler = RaySampler(shot, samples, seed)
         points = _drawn(sampler)
         points = points.keep(points.weight > 0)
+        if not link.shared_visibility:
+            place, _, _ = points.place(geometry)
+            points = points.keep(visible(shot, place, link.rx[points.frame]))
         position, normal, jacobian = points.place(geometry)
         seen = view(geometry, link, points.frame, points.face, position, normal)
         power = seen.power * jacobian * points.weight

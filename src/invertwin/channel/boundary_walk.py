@@ -1,0 +1,195 @@
+"""Boundary paths of any length: a shadow's edge, and the rest of the chain on both sides of it.
+
+Their value is zero; their derivative is the speed of the shadow's edge (attached) times what the
+path would carry (detached). Delay and direction do not move with θ.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from invertwin.channel import kernel, walk
+from invertwin.channel.bins import Contribution
+from invertwin.channel.bridge import tracer
+from invertwin.channel.edges import (
+    EdgePoints,
+    EdgeSampler,
+    InteriorEdgeSampler,
+    TwoSided,
+    shadow_speed,
+)
+from invertwin.channel.kernel import Inputs, Place
+from invertwin.channel.rays import Shot
+from invertwin.channel.walk import State, Walk
+
+
+@dataclass(frozen=True)
+class BoundaryChains:
+    """Boundary paths that share the speeds of their shadow edges, one lane a speed.
+
+    Attributes:
+        speed: Area newly lit per unit of θ, over the sampling density; attached.
+        state: The chains at the shadow points, with unit speed.
+        visit: Adds, for one vertex, its path and whether it exists to a list.
+    """
+
+    speed: Any
+    state: State
+    run: Callable[[State, Callable[[State, Contribution, Any], None]], State]
+
+    def weighted(self, gather: Callable[[Contribution, Any], Any]) -> Any:
+        """Σ over a lane's paths of power × ``gather(path)``."""
+        import drjit as dr
+
+        def visit(state: State, path: Contribution, exists: Any) -> None:
+            amount = gather(path, exists) * path.power
+            state["total"] = state["total"] + dr.select(exists, amount, 0.0)
+
+        state = dict(self.state)
+        state["total"] = dr.zeros(tracer().Float, dr.width(self.speed))
+        with dr.suspend_grad():
+            return self.run(state, visit)["total"]
+
+    def deposit(self, rate: Any, scatter: Callable[[Contribution, Any], None]) -> None:
+        """Hand on every path with its power times a lane's rate."""
+        import drjit as dr
+
+        state = dict(self.state)
+        state["throughput"] = state["throughput"] * dr.detach(rate)
+        with dr.suspend_grad():
+            self.run(state, lambda _, path, exists: scatter(path, exists))
+
+
+def boundary_chains(
+    shot: Shot,
+    inputs: Inputs,
+    chain: Walk,
+    *,
+    samples: int,
+    depth: int,
+    seed: int,
+    interior: bool,
+    chunks: Callable[[int], Iterator[Any]],
+) -> Iterator[BoundaryChains]:
+    """All boundary paths: antenna segments first, then interior ones.
+
+    Where both antennas share one visibility, a path of one vertex has one segment, not two.
+
+    Args:
+        shot: Rays and antennas.
+        inputs: Attached.
+        chain: Continues paths.
+        samples: Edge points over all families.
+        depth: Most vertices of a path.
+        seed: Of the edge points.
+        interior: Whether to sample interior segments.
+        chunks: Splits a number of samples into index arrays.
+    """
+    import drjit as dr
+
+    shared = shot.link.shared_visibility
+    centres = ("tx",) if shared and depth == 1 else ("tx", "rx")
+    families = len(centres) + (1 if depth > 1 and interior else 0)
+    for stream, centre in enumerate(centres):
+        table = getattr(shot, centre)
+        sampler = EdgeSampler(shot, table, samples // families, seed + stream)
+        for index in chunks(sampler.size):
+            points = sampler.draw(index)
+            if dr.width(points.face):
+                yield _antenna_segment(shot, inputs, chain, points, centre, depth)
+    if families > len(centres):
+        sampler = InteriorEdgeSampler(shot, samples // families, seed + 2)
+        for index in chunks(sampler.size):
+            found = sampler.draw(index)
+            if dr.width(found.face):
+                yield _interior_segment(shot, inputs, chain, found, depth)
+
+
+def _antenna_segment(
+    shot: Shot, inputs: Inputs, chain: Walk, points: EdgePoints, centre: str, depth: int
+) -> BoundaryChains:
+    """Family 1: the shadow that an edge casts from an antenna, then the chain to the other one."""
+    import drjit as dr
+
+    at_receiver = centre == "rx"
+    fixed, frame = inputs.detached(), points.frame
+    shadow = shadow_speed(inputs, points, inputs.antenna(frame, at_receiver))
+    point = kernel.place(fixed, points.face, shadow.b1, shadow.b2)
+    back, distance = kernel.leg(point.position, fixed.antenna(frame, at_receiver))
+    seen = kernel.to_radar(fixed, frame, -back)
+    throughput = fixed.scale * fixed.gain(frame, at_receiver, seen) / dr.square(distance)
+    state = walk.start(
+        points.index, frame, points.face, shadow.b1, shadow.b2, back, throughput, distance
+    )
+    state["u"], state["v"] = seen.x, seen.y
+    shared = shot.link.shared_visibility
+
+    def run(state: State, visit: Callable[[State, Contribution, Any], None]) -> State:
+        def connected(state: State, point: Place) -> None:
+            path, exists = walk.connect(
+                shot, fixed, state, point, not at_receiver,
+                shared=shared and not at_receiver, least=2 if shared and at_receiver else 1,
+            )  # fmt: skip
+            visit(state, path, exists)
+
+        return chain.run(state, depth, connected)
+
+    return BoundaryChains(shadow.speed, state, run)
+
+
+def _interior_segment(
+    shot: Shot, inputs: Inputs, chain: Walk, found: TwoSided, depth: int
+) -> BoundaryChains:
+    """Family 2: a shadow that one surface point casts past an edge on another surface.
+
+    The chain from the point behind has a drawn number of vertices; that from the shadow, all that
+    the depth leaves. Which of them ends at the receiver is drawn too: both orders are complete.
+    """
+    import drjit as dr
+
+    mi = tracer()
+    fixed, points = inputs.detached(), found.edge
+    attached = kernel.place(inputs, found.face, found.b1, found.b2)
+    shadow = shadow_speed(inputs, points, attached.position)
+    behind = kernel.place(fixed, found.face, found.b1, found.b2)
+    ahead = kernel.place(fixed, points.face, shadow.b1, shadow.b2)
+    to_behind, distance = kernel.leg(ahead.position, behind.position)
+    choices = depth - 1
+    count = 1 + (points.index // 2) % choices
+    ends_at_receiver = (points.index % 2) == 1
+    throughput = fixed.scale * choices / dr.square(distance)
+    lanes = dr.width(points.face)
+    zero = dr.zeros(mi.Float, lanes)
+    first = walk.start(
+        points.index, points.frame, found.face, found.b1, found.b2, -to_behind,
+        throughput, zero,
+    )  # fmt: skip
+    first |= {"u": zero, "v": zero, "amount": zero, "so_far": zero, "here": ends_at_receiver}
+
+    def ending(state: State, point: Place) -> None:
+        path, exists = walk.connect(shot, fixed, state, point, state["here"])
+        last = exists & (state["number"] == state["last"])
+        state["amount"] = dr.select(last, path.power, state["amount"])
+        state["so_far"] = dr.select(last, 2 * path.range, state["so_far"])
+        state["u"] = dr.select(last, path.u, state["u"])
+        state["v"] = dr.select(last, path.v, state["v"])
+
+    with dr.suspend_grad():
+        done = chain.run(first, count, ending)
+    state = walk.start(
+        points.index + _OTHER_SIDE, points.frame, points.face, shadow.b1, shadow.b2, to_behind,
+        done["amount"], done["so_far"] + distance,
+    )  # fmt: skip
+    state |= {"u": done["u"], "v": done["v"], "to_receiver": ~ends_at_receiver}
+
+    def run(state: State, visit: Callable[[State, Contribution, Any], None]) -> State:
+        def connected(state: State, point: Place) -> None:
+            path, exists = walk.connect(shot, fixed, state, point, state["to_receiver"])
+            visit(state, path, exists)
+
+        return chain.run(state, depth - count, connected)
+
+    return BoundaryChains(shadow.speed, state, run)
+
+
+_OTHER_SIDE = 1 << 30  # so that both sides of a segment draw their own numbers

@@ -1,0 +1,154 @@
+"""Where a path goes on from a surface: towards other objects, or along the lobes of the surface.
+
+Both ways are drawn from, and the density is that of their mixture, so that small bright objects
+and narrow lobes are both found. Detached.
+"""
+
+from typing import Any
+
+import torch
+
+from invertwin.channel.bridge import Geometry, to_float, tracer
+from invertwin.channel.kernel import Place
+from invertwin.channel.rays import Shot
+
+_TOWARDS = 0.5  # share of the directions that aim at other objects, where there are some
+
+
+class Directions:
+    """Draws directions on the side of a surface from which it is lit."""
+
+    def __init__(self, shot: Shot) -> None:
+        geometry = shot.geometry
+        centres, radii = _spheres(geometry)
+        self.objects = len(radii)
+        self.centres = to_float(centres - shot.origin)
+        self.radii = to_float(radii)
+        self.lobed = geometry.lobed
+        shares = _shares(geometry)
+        self.shares = to_float(shares)
+        self.width = shares.shape[1]
+        self.exponents = to_float(geometry.exponents)
+
+    def draw(self, point: Place, back: Any, numbers: list[Any]) -> tuple[Any, Any]:
+        """A unit direction from four uniform numbers, and its density per solid angle."""
+        import drjit as dr
+
+        mi = tracer()
+        caps, outside = self._caps(point)
+        count = sum((mi.Float(dr.select(away, 1, 0)) for away in outside), mi.Float(0))
+        towards = dr.select(count > 0, _TOWARDS, 0.0)
+        facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, back)))
+        aimed, rest = numbers[0] < towards, numbers[0]
+        # The object, counted among those that the point is outside of.
+        wanted = dr.minimum(dr.floor(rest / dr.maximum(towards, 1e-6) * count), count - 1)
+        axis, height, passed = mi.Vector3f(0, 0, 1), mi.Float(2.0), mi.Float(0)
+        for (direction, cap), away in zip(caps, outside, strict=True):
+            chosen = away & (passed == wanted)
+            axis, height = dr.select(chosen, direction, axis), dr.select(chosen, cap, height)
+            passed += dr.select(away, 1, 0)
+        omega = dr.select(
+            aimed, _in_cap(axis, height, numbers[2:]), self._scattered(point, back, facing, numbers)
+        )
+        density = (1 - towards) * self._density(point, back, facing, omega)
+        share = towards / dr.maximum(count, 1)
+        for (direction, cap), away in zip(caps, outside, strict=True):
+            inside = away & (dr.squared_norm(omega - direction) <= 2 * cap)
+            density += dr.select(inside, share / (2 * dr.pi * cap), 0.0)
+        return omega, density
+
+    def _caps(self, point: Place) -> tuple[list[tuple[Any, Any]], list[Any]]:
+        """Axis and height of every object's cap, and whether the point is outside its sphere."""
+        import drjit as dr
+
+        mi = tracer()
+        caps, outside = [], []
+        for number in range(self.objects):
+            index = mi.UInt32(number)
+            offset = dr.gather(mi.Point3f, self.centres, index) - point.position
+            radius = dr.gather(mi.Float, self.radii, index)
+            distance = dr.norm(offset)
+            sine2 = dr.minimum(dr.square(radius / distance), 1.0)
+            caps.append((mi.Vector3f(offset / distance), sine2 / (1 + dr.sqrt(1 - sine2))))
+            outside.append(distance > radius)
+        return caps, outside
+
+    def _scattered(self, point: Place, back: Any, facing: Any, numbers: list[Any]) -> Any:
+        import drjit as dr
+
+        mi = tracer()
+        omega = mi.Frame3f(facing).to_world(
+            mi.warp.square_to_cosine_hemisphere(mi.Point2f(numbers[2], numbers[3]))
+        )
+        mirror = 2 * dr.dot(back, facing) * facing - back
+        limit = self._share(point, 0)
+        for number, present in enumerate(self.lobed):
+            if not present:
+                continue
+            axis = mi.Vector3f(back if number == 2 else mirror)
+            exponent = dr.gather(mi.Float, self.exponents, point.surface * 3 + number)
+            # Height of the cap that a lobe ((1 + cosψ)/2)^p fills to the share of the number.
+            height = 2 * (1 - dr.exp(dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)))
+            lobe = _in_cap(axis, height, [mi.Float(1.0), numbers[3]])
+            share = self._share(point, number + 1)
+            chosen = (numbers[1] >= limit) & (numbers[1] < limit + share)
+            omega = dr.select(chosen, lobe, omega)
+            limit += share
+        return omega
+
+    def _density(self, point: Place, back: Any, facing: Any, omega: Any) -> Any:
+        import drjit as dr
+
+        mi = tracer()
+        cosine, between = dr.dot(facing, omega), dr.dot(back, omega)
+        density = self._share(point, 0) * dr.maximum(cosine, 0.0) * dr.inv_pi
+        product = cosine * dr.dot(facing, back)
+        for number, present in enumerate(self.lobed):
+            if present:
+                half = 0.5 * (1 + (between if number == 2 else 2 * product - between))
+                exponent = dr.gather(mi.Float, self.exponents, point.surface * 3 + number)
+                lobe = (exponent + 1) / (4 * dr.pi)
+                lobe *= dr.exp(exponent * dr.log(dr.maximum(half, 1e-7)))
+                density += self._share(point, number + 1) * lobe
+        return density
+
+    def _share(self, point: Place, number: int) -> Any:
+        import drjit as dr
+
+        return dr.gather(tracer().Float, self.shares, point.surface * self.width + number)
+
+
+def _in_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
+    """Uniform on the spherical cap of a height 1 − cos about an axis."""
+    import drjit as dr
+
+    mi = tracer()
+    depth = numbers[0] * height
+    sine = dr.sqrt(dr.maximum(depth * (2 - depth), 0.0))
+    s, c = dr.sincos(2 * dr.pi * numbers[1])
+    return dr.normalize(mi.Frame3f(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
+
+
+def _spheres(geometry: Geometry) -> tuple[torch.Tensor, torch.Tensor]:
+    """Centre and radius of a sphere around each object [m]."""
+    centres, radii = [], []
+    positions = geometry.vertices.detach()
+    for used in geometry.topology.object_vertices:
+        corners = positions[used]
+        centre = 0.5 * (corners.min(dim=0).values + corners.max(dim=0).values)
+        centres.append(centre)
+        radii.append(1.001 * (corners - centre).norm(dim=1).max())
+    return torch.stack(centres), torch.stack(radii)
+
+
+def _shares(geometry: Geometry) -> torch.Tensor:
+    """Share of each part of a surface in what it scatters; Lambertian if it scatters nothing."""
+    exponents = geometry.exponents.detach()
+    wide = 4 * torch.pi * (exponents + torch.exp2(-(exponents + 1)))
+    integrals = wide / ((exponents + 1) * (exponents + 2))
+    lobes = geometry.lobes.detach() * integrals
+    diffuse = geometry.diffuse.detach()[:, None]
+    total = diffuse + lobes.sum(1, keepdim=True)
+    # Something of the cosine stays in, so that the density never vanishes where f does not.
+    parts = torch.cat([diffuse + 0.05 * (total + (total == 0)), lobes], dim=1)
+    return parts / parts.sum(1, keepdim=True)

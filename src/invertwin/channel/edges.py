@@ -1,0 +1,352 @@
+"""Where shadows end: points on edges, what falls behind them, and how fast it moves.
+
+Family 1 looks from an antenna past its silhouettes; family 2 starts at an edge and looks both
+ways along a direction that is tangential there, so that no silhouette is ever searched per vertex
+(derivations §3). Places are detached, ``shadow_speed`` is attached.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from invertwin.channel import kernel
+from invertwin.channel.bridge import to_float, tracer
+from invertwin.channel.kernel import Inputs
+from invertwin.channel.rays import NEAR, Shot, scrambled, uniform_pair
+
+_GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
+_FEW_EDGES = 2000  # up to here float32 can place a sample along the edge by its rest in the CDF
+_FLAT = 1e-6  # least opening [rad] of an edge that can hide something
+
+
+@dataclass(frozen=True)
+class EdgePoints:
+    """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
+
+    ``weight`` is one over (samples × density along the edge parameter).
+    """
+
+    index: Any
+    frame: Any
+    first: Any
+    second: Any
+    opposite: Any
+    along: Any
+    face: Any
+    weight: Any
+
+
+@dataclass(frozen=True)
+class TwoSided:
+    """Points on edges with what lies on both sides of a tangential direction.
+
+    ``edge.face`` is where the shadow's edge runs; the point behind, from which it is cast, is
+    given by triangle and barycentric coordinates. The weight holds the change of measure from
+    directions to area there.
+    """
+
+    edge: EdgePoints
+    face: Any
+    b1: Any
+    b2: Any
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """A point on a shadow's edge: place, detached; area newly lit per unit of θ, attached."""
+
+    b1: Any
+    b2: Any
+    speed: Any
+
+
+def _compressed(valid: Any, *groups: Any) -> list[Any]:
+    """The valid lanes of dataclasses of arrays."""
+    import drjit as dr
+
+    dr.eval(valid, *groups)
+    kept: Any = dr.compress(valid)
+    return [
+        type(group)(*(dr.gather(type(c), c, kept) for c in vars(group).values()))
+        for group in groups
+    ]
+
+
+class EdgeSampler:
+    """Points on the silhouettes seen from one antenna, and where their shadows fall.
+
+    An edge is a silhouette if all its triangles lie, as seen from the antenna, on one side of
+    it: one triangle for an open edge, two for a fold, any number for a non-manifold edge. The
+    rule needs no consistent winding.
+    """
+
+    def __init__(self, shot: Shot, centre: Any, samples: int, seed: int) -> None:
+        import drjit as dr
+
+        mi = tracer()
+        topology = shot.geometry.topology
+        count = len(topology.edges)
+        self.shot, self.centre = shot, centre
+        index = dr.arange(mi.UInt32, shot.link.frame_count * count)
+        frame, edge = index // count, index % count
+        origin = shot.point(centre, frame)
+        y0, y1 = (
+            shot.point(shot.vertices, dr.gather(mi.UInt32, ends, edge))
+            for ends in topology.device_edges
+        )
+        one_sided = _one_sided(shot, edge, y0, dr.cross(y0 - origin, y1 - y0))
+        self.index: Any = dr.compress(one_sided)
+        self.size = samples if dr.width(self.index) else 0
+        if self.size:
+            length = dr.norm(y1 - y0) / dr.norm(0.5 * (y0 + y1) - origin)
+            weight = dr.gather(mi.Float, length, self.index)
+            self.distribution = mi.DiscreteDistribution(weight / dr.max(weight))
+        self.seed = scrambled(seed, 3)
+
+    def draw(self, index: Any) -> EdgePoints:
+        """The samples of the given indices below ``size``; those without a shadow are left out."""
+        import drjit as dr
+
+        mi = tracer()
+        shot, topology = self.shot, self.shot.geometry.topology
+        place, along, pmf = _along(self.distribution, index, self.size, self.seed, self.index)
+        entry = dr.gather(mi.UInt32, self.index, place)
+        frame, edge = entry // len(topology.edges), entry % len(topology.edges)
+        first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
+        y0 = shot.point(shot.vertices, first)
+        y = y0 + (shot.point(shot.vertices, second) - y0) * along
+        origin = shot.point(self.centre, frame)
+        away = y - origin
+        valid = shot.clear(origin, y)
+        hit = shot.scene.ray_intersect_preliminary(
+            mi.Ray3f(y + away * NEAR, away), coherent=True, active=valid
+        )
+        valid &= hit.is_valid() & _not_grazing(shot, hit.prim_index, away, hit.is_valid())
+        opposite = mi.UInt32(dr.gather(mi.Int32, topology.device_opposite[0], edge))
+        weight = 1 / (pmf * self.size)
+        found = EdgePoints(
+            index, frame, first, second, opposite, along, hit.prim_index, weight
+        )
+        return _compressed(valid, found)[0]
+
+
+class InteriorEdgeSampler:
+    """Points and tangential directions on all edges that can hide one surface from another.
+
+    Edges are weighted by their length, by the angle under which they hide (the opening between
+    their triangles' planes) and by how near they are to both antennas; directions are uniform
+    over those that are tangential. ``weighted=False`` takes edges by length alone and directions
+    from the whole sphere: what the benchmark compares with.
+    """
+
+    def __init__(self, shot: Shot, samples: int, seed: int, *, weighted: bool = True) -> None:
+        import drjit as dr
+
+        mi = tracer()
+        topology = shot.geometry.topology
+        self.shot, self.weighted = shot, weighted
+        self.frames = shot.link.frame_count
+        edge = dr.arange(mi.UInt32, len(topology.edges))
+        y0, y1 = (
+            shot.point(shot.vertices, dr.gather(mi.UInt32, ends, edge))
+            for ends in topology.device_edges
+        )
+        length = dr.norm(y1 - y0)
+        _, span = self._opening(edge, y0, y1)
+        weight = dr.select(span > _FLAT, length, 0.0)
+        if weighted:
+            middle = 0.5 * (y0 + y1)
+            near = mi.Float(0.0)
+            for frame in range(min(self.frames, 8)):
+                at = mi.UInt32(frame * self.frames // min(self.frames, 8))
+                legs = [dr.norm(middle - shot.point(t, at)) + length for t in (shot.tx, shot.rx)]
+                near += 1 / (legs[0] * legs[1])
+            weight *= span * near
+        self.index: Any = dr.compress(weight > 0)
+        self.per_frame = max(1, samples // self.frames)
+        self.size = self.per_frame * self.frames if dr.width(self.index) else 0
+        if self.size:
+            chosen = dr.gather(mi.Float, weight, self.index)
+            self.distribution = mi.DiscreteDistribution(chosen / dr.max(chosen))
+        self.seeds = scrambled(seed, 4), scrambled(seed, 5), scrambled(seed, 6)
+
+    def _opening(self, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
+        """Start and span of the tangential directions' azimuth about the edge, up to sign.
+
+        Azimuths count from the first triangle of the edge. Two triangles at azimuths 0 and α
+        leave (α, π); one triangle leaves all; more are left to the test of sides.
+        """
+        import drjit as dr
+
+        mi = tracer()
+        topology = self.shot.geometry.topology
+        along = dr.normalize(y1 - y0)
+        start, span = mi.Float(0.0), mi.Float(dr.pi)
+        if len(topology.device_opposite) < 2:
+            return start, span
+        x, y = self._azimuth_axes(edge, y0, along)
+        apex = dr.gather(mi.Int32, topology.device_opposite[1], edge)
+        offset = self.shot.point(self.shot.vertices, mi.UInt32(dr.maximum(apex, 0))) - y0
+        angle = dr.atan2(dr.dot(offset, y), dr.dot(offset, x))
+        turn = dr.abs(angle)
+        # Behind a fold the free azimuths are those beyond the second triangle, up to π.
+        start = dr.select(apex >= 0, dr.select(angle > 0, turn, 0.0), start)
+        span = dr.select(apex >= 0, dr.pi - turn, span)
+        for column in topology.device_opposite[2:]:
+            many = dr.gather(mi.Int32, column, edge) >= 0
+            start, span = dr.select(many, 0.0, start), dr.select(many, dr.pi, span)
+        return start, span
+
+    def _azimuth_axes(self, edge: Any, y0: Any, along: Any) -> tuple[Any, Any]:
+        import drjit as dr
+
+        mi = tracer()
+        topology = self.shot.geometry.topology
+        apex = mi.UInt32(dr.maximum(dr.gather(mi.Int32, topology.device_opposite[0], edge), 0))
+        offset = self.shot.point(self.shot.vertices, apex) - y0
+        x = dr.normalize(offset - along * dr.dot(along, offset))
+        return x, dr.cross(along, x)
+
+    def draw(self, index: Any) -> TwoSided:
+        """The samples of the given indices below ``size``; those that hide nothing are left out."""
+        import drjit as dr
+
+        mi = tracer()
+        shot, topology = self.shot, self.shot.geometry.topology
+        frame, within = index // self.per_frame, index % self.per_frame
+        place, along, pmf = _along(
+            self.distribution, within, self.per_frame, self.seeds[0], self.index, index
+        )
+        edge = dr.gather(mi.UInt32, self.index, place)
+        first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
+        y0, y1 = (shot.point(shot.vertices, end) for end in (first, second))
+        y = y0 + (y1 - y0) * along
+        omega, density = self._direction(index, edge, y0, y1)
+        valid = _one_sided(shot, edge, y0, dr.cross(omega, y1 - y0))
+        hits = []
+        for sign in (-1.0, 1.0):
+            ray = mi.Ray3f(mi.Point3f(y + omega * (sign * NEAR * dr.norm(y))), omega * sign)
+            hit = shot.scene.ray_intersect_preliminary(ray, active=valid)
+            valid &= hit.is_valid()
+            valid &= _not_grazing(shot, hit.prim_index, omega, hit.is_valid())
+            hits.append(hit)
+        behind, ahead = hits
+        p0, p1, p2 = shot.corners(behind.prim_index, valid)
+        b1, b2 = behind.prim_uv.x, behind.prim_uv.y
+        point = p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2
+        cosine = dr.abs(dr.dot(dr.normalize(dr.cross(p1 - p0, p2 - p0)), omega))
+        measure = dr.squared_norm(point - y) / cosine
+        weight = measure / (pmf * density * self.per_frame)
+        opposite = mi.UInt32(dr.maximum(dr.gather(mi.Int32, topology.device_opposite[0], edge), 0))
+        points = EdgePoints(index, frame, first, second, opposite, along, ahead.prim_index, weight)
+        other = _Behind(behind.prim_index, b1, b2)
+        points, other = _compressed(valid, points, other)
+        return TwoSided(points, other.face, other.b1, other.b2)
+
+    def _direction(self, index: Any, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
+        """A tangential direction and its density per solid angle."""
+        import drjit as dr
+
+        mi = tracer()
+        first, second = uniform_pair(index, self.seeds[1])
+        if not self.weighted:
+            sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(first, second))
+            return sphere, mi.Float(1 / (4 * dr.pi))
+        along = dr.normalize(y1 - y0)
+        x, y = self._azimuth_axes(edge, y0, along)
+        start, span = self._opening(edge, y0, y1)
+        sign = dr.select(second < 0.5, 1.0, -1.0)
+        azimuth = start + span * (2 * second - dr.select(second < 0.5, 0.0, 1.0))
+        s, c = dr.sincos(azimuth)
+        height = 2 * first - 1
+        across = sign * dr.sqrt(dr.maximum(1 - height * height, 0.0))
+        omega = along * height + (x * c + y * s) * across
+        return mi.Vector3f(dr.normalize(omega)), 1 / (4 * span)
+
+
+@dataclass(frozen=True)
+class _Behind:
+    face: Any
+    b1: Any
+    b2: Any
+
+
+def _along(
+    distribution: Any, index: Any, count: int, seed: Any, edges: Any, key: Any = None
+) -> tuple[Any, Any, Any]:
+    """Entry of the distribution, place along its edge and probability, stratified over count."""
+    import drjit as dr
+
+    jitter, along = uniform_pair(index if key is None else key, seed)
+    spread = (tracer().Float(index) + jitter) / count
+    if dr.width(edges) <= _FEW_EDGES:
+        return distribution.sample_reuse_pmf(spread)
+    place, pmf = distribution.sample_pmf(spread)
+    return place, along, pmf
+
+
+def _one_sided(shot: Shot, edge: Any, y0: Any, plane: Any) -> Any:
+    """Whether all triangles of an edge lie on one side of a plane through it."""
+    import drjit as dr
+
+    mi = tracer()
+    left, right = mi.Bool(False), mi.Bool(False)
+    for column in shot.geometry.topology.device_opposite:
+        apex = dr.gather(mi.Int32, column, edge)
+        here = apex >= 0
+        offset = shot.point(shot.vertices, mi.UInt32(dr.maximum(apex, 0))) - y0
+        side = dr.dot(plane, offset)
+        left |= here & (side > 0)
+        right |= here & (side < 0)
+    return left ^ right
+
+
+def _not_grazing(shot: Shot, face: Any, direction: Any, active: Any) -> Any:
+    """A ray in the plane of the triangle it meets has no shadow point there."""
+    import drjit as dr
+
+    p0, p1, p2 = shot.corners(face, active)
+    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    return active & (dr.abs(dr.dot(normal, direction)) > _GRAZING * dr.norm(direction))
+
+
+def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
+    """How fast the shadow that an edge casts from an attached centre sweeps a surface.
+
+    ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
+    x_m the material point under it; T is the edge's image turned to the shadowed side.
+    Source: derivations §3.
+    """
+    import drjit as dr
+
+    c, fixed = centre, inputs.detached()
+    y0, y1 = kernel.edge_ends(inputs, points.first, points.second)
+    y = y0 + (y1 - y0) * points.along
+    p0, p1, p2 = kernel.corners(inputs, points.face)
+    plane = dr.cross(p1 - p0, p2 - p0)
+    moving = c + (y - c) * (dr.dot(plane, p0 - c) / dr.dot(plane, y - c))
+
+    f0, f1, f2 = kernel.corners(fixed, points.face)
+    shadow, normal = dr.detach(moving), dr.normalize(dr.cross(f1 - f0, f2 - f0))
+    b1, b2 = _barycentric(shadow, f0, f1, f2)
+    material = p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2
+
+    ray, edge = dr.detach(y - c), dr.detach(y1 - y0)
+    stretch = dr.norm(shadow - dr.detach(c)) / dr.norm(ray)
+    slope = 1 / dr.dot(normal, ray)
+
+    def projected(vector: Any) -> Any:
+        return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
+
+    apex, _ = kernel.edge_ends(fixed, points.opposite, points.opposite)
+    tangent = dr.cross(normal, projected(edge))
+    tangent = dr.mulsign(tangent, dr.dot(tangent, projected(apex - dr.detach(y))))
+    return Shadow(b1, b2, dr.dot(tangent, moving - material) * points.weight)
+
+
+def _barycentric(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
+    import drjit as dr
+
+    a, b, r = p1 - p0, p2 - p0, point - p0
+    aa, ab, bb, ra, rb = dr.dot(a, a), dr.dot(a, b), dr.dot(b, b), dr.dot(r, a), dr.dot(r, b)
+    determinant = dr.fma(aa, bb, -ab * ab)
+    return (bb * ra - ab * rb) / determinant, (aa * rb - ab * ra) / determinant

@@ -1,0 +1,232 @@
+"""Chains of surface points, drawn vertex by vertex in one symbolic loop.
+
+The loop is compiled once for any depth, and keeps no vertex unless asked to: then it writes one
+`Records` row a vertex, from which derivatives are replayed (``channel/replay.py``). Detached.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from invertwin.channel import kernel
+from invertwin.channel.bins import Contribution
+from invertwin.channel.bridge import opaque, tracer
+from invertwin.channel.directions import Directions
+from invertwin.channel.kernel import Inputs, Place
+from invertwin.channel.rays import NEAR, Shot, scrambled
+
+_LEAST_SURVIVAL = 0.1  # of Russian roulette
+_STREAM = 0x9E3779B9  # seeds of successive vertices
+
+#: A chain at its latest vertex, one lane a path: what the loop carries.
+State = dict[str, Any]
+
+
+def start(
+    index: Any, frame: Any, face: Any, b1: Any, b2: Any, back: Any, throughput: Any, length: Any
+) -> State:
+    """The state at the first vertex.
+
+    ``back`` points to where the path comes from; ``throughput`` is everything up to arriving
+    here, one over the density of the samples included; ``length`` is that of the path so far.
+    """
+    import drjit as dr
+
+    mi = tracer()
+    count = dr.width(index)
+    return {
+        "index": index,
+        "number": dr.full(mi.UInt32, 1, count),
+        "active": throughput != 0,
+        "frame": frame,
+        "face": face,
+        "b1": b1,
+        "b2": b2,
+        "back": mi.Vector3f(back),
+        "throughput": throughput,
+        "length": length,
+    }
+
+
+class Walk:
+    """Continues chains, and shows every vertex to a visitor."""
+
+    def __init__(self, shot: Shot, inputs: Inputs, seed: int) -> None:
+        self.shot = shot
+        self.inputs = inputs
+        self.directions = Directions(shot)
+        self.seed = scrambled(seed, 7)
+
+    def run(self, state: State, depth: Any, visit: Callable[[State, Place], None]) -> State:
+        """Walk up to ``depth`` vertices (a number, or one per lane); returns the last state.
+
+        ``visit`` may change what it put into the state itself.
+        """
+        import drjit as dr
+
+        mi = tracer()
+        if isinstance(depth, int) and depth == 1:
+            visit(state, self._place(state))
+            return state
+        last = opaque(depth) if isinstance(depth, int) else depth
+        state = {**state, "last": mi.UInt32(last) + dr.zeros(mi.UInt32, dr.width(state["index"]))}
+
+        def body(state: State) -> tuple[State]:
+            state = dict(state)
+            point = self._place(state)
+            visit(state, point)
+            self._extend(state, point)
+            return (state,)
+
+        (state,) = dr.while_loop(
+            (state,), lambda state: state["active"], body, labels=("state",), mode="symbolic"
+        )
+        return state
+
+    def _place(self, state: State) -> Place:
+        return kernel.place(self.inputs, state["face"], state["b1"], state["b2"], state["active"])
+
+    def _extend(self, state: State, point: Place) -> None:
+        """Draw the next vertex into the state; chains that miss or are too long end."""
+        import drjit as dr
+
+        mi = tracer()
+        active = state["active"] & (state["number"] < state["last"])
+        back = state["back"]
+        omega, density = self.directions.draw(point, back, self._numbers(state))
+        scattered = kernel.reflected(
+            self.inputs, point.surface, point.normal, back, mi.Vector3f(omega), active
+        )
+        ratio = scattered / (density * dr.abs(dr.dot(point.normal, back)))
+        survival = dr.select(
+            state["number"] > 1, dr.minimum(dr.maximum(ratio, _LEAST_SURVIVAL), 1.0), 1.0
+        )
+        active &= (scattered > 0) & (self._numbers(state, 2)[0] < survival)
+        side = dr.mulsign(point.normal, dr.dot(point.normal, omega))
+        origin = point.position + side * (NEAR * dr.norm(point.position))
+        hit = self.shot.scene.ray_intersect_preliminary(
+            mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega)), active=active
+        )
+        active &= hit.is_valid()
+        found = kernel.place(self.inputs, hit.prim_index, hit.prim_uv.x, hit.prim_uv.y, active)
+        to_point, distance = kernel.leg(found.position, point.position)
+        cosine = dr.abs(dr.dot(found.normal, to_point))
+        active &= (cosine > 1e-6) & (distance > 0)
+        state["throughput"] = dr.select(
+            active, state["throughput"] * scattered / (density * survival * cosine), 0.0
+        )
+        state["face"] = dr.select(active, hit.prim_index, self.shot.sound_face)
+        state["b1"] = dr.select(active, hit.prim_uv.x, 0.25)
+        state["b2"] = dr.select(active, hit.prim_uv.y, 0.25)
+        state["back"] = mi.Vector3f(to_point)
+        state["length"] = state["length"] + distance
+        state["number"] = state["number"] + 1
+        state["active"] = active
+
+    def _numbers(self, state: State, pairs: int = 0) -> list[Any]:
+        """Uniform numbers of this vertex: four, or the two of a later stream."""
+        mi = tracer()
+        streams = (pairs,) if pairs else (0, 1)
+        numbers = []
+        for stream in streams:
+            seed = self.seed + (state["number"] * 4 + stream) * _STREAM
+            first, second = mi.sample_tea_32(state["index"], seed)
+            numbers += [mi.Float(first >> 8) * 2.0**-24, mi.Float(second >> 8) * 2.0**-24]
+        return numbers
+
+
+def connect(
+    shot: Shot,
+    inputs: Inputs,
+    state: State,
+    point: Place,
+    receiver: Any,
+    *,
+    least: int = 1,
+    shared: bool = False,
+    one_place: bool = False,
+) -> tuple[Contribution, Any]:
+    """The path that ends at the latest vertex, and whether it exists.
+
+    Args:
+        shot: Rays.
+        inputs: Detached.
+        state: The chain.
+        point: Its latest vertex.
+        receiver: Whether the path ends at the receiver (a bool, or one per lane). Where it ends at
+            the transmitter, the state knows the receiver's direction ``u``, ``v``.
+        least: Fewest vertices of a path.
+        shared: What the antenna at the start sees, the one at the end sees too.
+        one_place: Both are one.
+    """
+    import drjit as dr
+
+    found = kernel.connection(
+        inputs, state["frame"], point, state["back"], receiver, state["active"], same=one_place
+    )
+    u, v = found.seen.x, found.seen.y
+    if receiver is not True:
+        u, v = dr.select(receiver, u, state["u"]), dr.select(receiver, v, state["v"])
+    power = state["throughput"] * found.factor
+    exists = state["active"] & (power != 0) & (state["number"] >= least)
+    length = 0.5 * (state["length"] + found.distance)
+    contribution = Contribution(state["frame"], power, length, u, v)
+    if shared and "last" not in state:
+        return contribution, exists
+    tested = exists & (state["number"] > 1) if shared else exists
+    antenna = inputs.antenna(state["frame"], receiver, exists)
+    clear = shot.clear(point.position, antenna, tested)
+    return contribution, exists & (clear | ~tested)
+
+
+@dataclass(frozen=True)
+class Records:
+    """Vertices of chains as flat arrays, vertex after vertex: ``[vertex × lane]``.
+
+    ``throughput`` is zero where a chain has ended; ``seen`` says that the vertex is connected to
+    the receiver.
+    """
+
+    lanes: int
+    depth: int
+    frame: Any
+    face: Any
+    b1: Any
+    b2: Any
+    throughput: Any
+    length: Any
+    seen: Any
+
+    @staticmethod
+    def single(state: State, seen: Any) -> "Records":
+        """Records of chains of one vertex."""
+        import drjit as dr
+
+        names = ("frame", "face", "b1", "b2", "throughput", "length")
+        return Records(dr.width(state["index"]), 1, *(state[name] for name in names), seen)
+
+    @staticmethod
+    def empty(state: State, depth: int, sound_face: Any) -> "Records":
+        """Room for chains that start in this state."""
+        import drjit as dr
+
+        mi = tracer()
+        lanes = dr.width(state["index"])
+        size = lanes * depth
+        return Records(
+            lanes,
+            depth,
+            state["frame"],
+            dr.zeros(mi.UInt32, size) + sound_face,
+            *(dr.zeros(mi.Float, size) for _ in range(4)),
+            dr.zeros(mi.Bool, size),
+        )
+
+    def write(self, state: State, seen: Any) -> None:
+        """Store the latest vertex."""
+        import drjit as dr
+
+        at = (state["number"] - 1) * self.lanes + state["lane"]
+        values = {**state, "seen": seen}
+        for name in ("face", "b1", "b2", "throughput", "length", "seen"):
+            dr.scatter(getattr(self, name), values[name], at, state["active"])
