@@ -38,7 +38,7 @@ def gradients(
     tables = {name: mi.Float(getattr(trace.fixed, name)) for name in DIFFERENTIABLE}
     dr.enable_grad(list(tables.values()))
     inputs, out = trace.inputs(tables), mi.Float(0)
-    for records in trace.chains(record=True):
+    for records in trace.records():
         vertex = replay._vertex(inputs, records, mi.UInt32(0))
         path, arriving = vertex.path(), vertex.arriving
         power = dr.select(vertex.seen, path.power * (arriving / dr.detach(arriving)), 0)

@@ -90,9 +90,7 @@ def scatter(out: Any, grid: Grid, found: Contribution, active: Any) -> None:
         dr.scatter_add(out, weight, tracer().UInt32(index), ok & active)
 
 
-def scatter_derivative(
-    out: Any, grid: Grid, found: Contribution, dots: tuple, active: Any
-) -> None:
+def scatter_derivative(out: Any, grid: Grid, found: Contribution, dots: tuple, active: Any) -> None:
     """Add the derivative of the paths' deposit, given those of power, range, u and v."""
     import drjit as dr
 
@@ -110,9 +108,7 @@ def scatter_derivative(
         dr.scatter_add(out, value, tracer().UInt32(index), ok & active)
 
 
-def gather(
-    seed: Any, grid: Grid, found: Contribution, active: Any
-) -> tuple[Any, Any, Any, Any]:
+def gather(seed: Any, grid: Grid, found: Contribution, active: Any) -> tuple[Any, Any, Any, Any]:
     """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path."""
     import drjit as dr
 

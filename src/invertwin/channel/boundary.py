@@ -7,8 +7,8 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.bridge import Geometry, differentiated, to_torch, tracer
-from invertwin.channel.paths import Link
 from invertwin.channel.edges import EdgeSampler
+from invertwin.channel.paths import Link
 from invertwin.channel.rays import Shot, visible
 from invertwin.errors import InputError
 

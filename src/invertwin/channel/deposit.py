@@ -181,46 +181,51 @@ class _Trace:
         made = Inputs.of(self.settings.geometry, link, self.shot, monostatic)
         return replace(made, **(tables or {}))
 
-    def chains(self, out: Any = None, *, record: bool = False) -> Iterator[Records | None]:
-        """Walk all chains, a chunk at a time: into the bins, into records, or both."""
-        if self._kept is not None and out is None:
-            yield self._kept
-            return
+    def deposit(self, out: Any, *, record: bool) -> None:
+        """Walk all chains into the bins; ``record`` keeps them if all fit in one chunk."""
         import drjit as dr
 
-        depth = self.settings.depth
-        whole = self.sampler.size <= self.settings.chunk
+        record = record and self.sampler.size <= self.settings.chunk
         for index in _chunks(self.sampler.size, self.settings.chunk):
-            keep = record and (whole or out is None)
-            state = self._started(index)
-            records = None
-            if keep and depth > 1:
-                state["lane"] = dr.arange(tracer().UInt32, dr.width(index))
-                records = Records.empty(state, depth, self.shot.sound_face)
-            single: list[Records] = []
-
-            def visit(state: State, point: Place, records: Any = records, kept: Any = single) -> None:
-                link = self.settings.link
-                one_place = depth == 1 and self.fixed.monostatic
-                found, exists = walk.connect(
-                    self.shot, self.fixed, state, point, True,
-                    shared=link.shared_visibility, one_place=one_place,
-                )  # fmt: skip
-                if out is not None:
-                    bins.scatter(out, self.settings.grid, found, exists)
-                if records is not None:
-                    records.write(state, exists)
-                elif depth == 1:
-                    kept.append(Records.single(state, exists))
-
-            self._walk.run(state, depth, visit)
-            records = single[0] if single else records
-            if keep and records is not None and out is not None:
+            records = self._walked(index, out, record=record)
+            if record:
                 self._kept = records
-                dr.schedule(*(c for c in vars(records).values() if not isinstance(c, int)))
+                dr.schedule(*records.columns)
+            dr.eval(out)
+
+    def records(self) -> Iterator[Records]:
+        """The vertices of all chains, a chunk at a time."""
+        if self._kept is not None:
+            yield self._kept
+            return
+        for index in _chunks(self.sampler.size, self.settings.chunk):
+            yield self._walked(index, None, record=True)
+
+    def _walked(self, index: Any, out: Any, *, record: bool) -> Records:
+        """Walk some chains into the bins, if given, and into records, if asked (else empty)."""
+        import drjit as dr
+
+        depth, shared = self.settings.depth, self.settings.link.shared_visibility
+        one_place = depth == 1 and self.fixed.monostatic
+        state = self._started(index)
+        state["lane"] = dr.arange(tracer().UInt32, dr.width(index))
+        looped = record and depth > 1
+        records = Records.empty(state, depth if looped else 0, self.shot.sound_face)
+
+        def visit(state: State, point: Place) -> None:
+            nonlocal records
+            found, exists = walk.connect(
+                self.shot, self.fixed, state, point, True, shared=shared, one_place=one_place
+            )
             if out is not None:
-                dr.eval(out)
-            yield records
+                bins.scatter(out, self.settings.grid, found, exists)
+            if looped:
+                records.write(state, exists)
+            elif record:
+                records = Records.single(state, exists)
+
+        self._walk.run(state, depth, visit)
+        return records
 
     def _started(self, index: Any) -> State:
         """Chains at their first vertex."""
@@ -275,8 +280,7 @@ class _Deposit(torch.autograd.Function):
 
         trace = _Trace(settings)
         out = dr.zeros(tracer().Float, trace.bins)
-        for _ in trace.chains(out, record=any(ctx.needs_input_grad)):
-            pass
+        trace.deposit(out, record=any(ctx.needs_input_grad))
         ctx.trace = trace
         return to_torch(out).reshape(settings.link.frame_count, *settings.grid.shape)
 
@@ -293,7 +297,7 @@ class _Deposit(torch.autograd.Function):
             dr.enable_grad(list(tables.values()))
             inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
             seed = to_float(grad)
-            for records in trace.chains(record=True):
+            for records in trace.records():
                 replay.pull(inputs, records, lambda *path: bins.gather(seed, grid, *path))
                 dr.eval([dr.grad(table) for table in tables.values()])
             for chains in trace.boundary(inputs):
@@ -331,7 +335,7 @@ class _Deposit(torch.autograd.Function):
                 for name, table in tables.items():
                     dr.set_grad(table, to_float(given[name]))
 
-            for records in trace.chains(record=True):
+            for records in trace.records():
                 point_tangents()
                 replay.push(
                     inputs, records, lambda *path: bins.scatter_derivative(out, grid, *path)
@@ -339,7 +343,9 @@ class _Deposit(torch.autograd.Function):
                 dr.eval(out)
             for chains in trace.boundary(inputs):
                 point_tangents()
-                chains.deposit(dr.forward_to(chains.speed), lambda *path: bins.scatter(out, grid, *path))
+                chains.deposit(
+                    dr.forward_to(chains.speed), lambda *path: bins.scatter(out, grid, *path)
+                )
                 dr.eval(out)
             return to_torch(out).reshape(
                 trace.settings.link.frame_count, *trace.settings.grid.shape

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from invertwin.channel import kernel
-from invertwin.channel.bridge import to_float, tracer
+from invertwin.channel.bridge import tracer
 from invertwin.channel.kernel import Inputs
 from invertwin.channel.rays import NEAR, Shot, scrambled, uniform_pair
 
@@ -123,9 +123,7 @@ class EdgeSampler:
         valid &= hit.is_valid() & _not_grazing(shot, hit.prim_index, away, hit.is_valid())
         opposite = mi.UInt32(dr.gather(mi.Int32, topology.device_opposite[0], edge))
         weight = 1 / (pmf * self.size)
-        found = EdgePoints(
-            index, frame, first, second, opposite, along, hit.prim_index, weight
-        )
+        found = EdgePoints(index, frame, first, second, opposite, along, hit.prim_index, weight)
         return _compressed(valid, found)[0]
 
 

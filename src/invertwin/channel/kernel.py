@@ -237,9 +237,7 @@ def tabulated(inputs: Inputs, name: str, row: Any, cosine: Any, active: Any = Tr
     return first + (second - first) * (t - mi.Float(low))
 
 
-def reflected(
-    inputs: Inputs, row: Any, normal: Any, back: Any, on: Any, active: Any = True
-) -> Any:
+def reflected(inputs: Inputs, row: Any, normal: Any, back: Any, on: Any, active: Any = True) -> Any:
     """``f_r |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
 
     ``f_r`` is the distribution of ``scene.material``; a surface scatters only to the side from

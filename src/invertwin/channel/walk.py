@@ -213,14 +213,20 @@ class Records:
         mi = tracer()
         lanes = dr.width(state["index"])
         size = lanes * depth
+        face = dr.zeros(mi.UInt32, size)
         return Records(
             lanes,
             depth,
             state["frame"],
-            dr.zeros(mi.UInt32, size) + sound_face,
+            face + sound_face if size else face,
             *(dr.zeros(mi.Float, size) for _ in range(4)),
             dr.zeros(mi.Bool, size),
         )
+
+    @property
+    def columns(self) -> list[Any]:
+        """All arrays."""
+        return [column for column in vars(self).values() if not isinstance(column, int)]
 
     def write(self, state: State, seen: Any) -> None:
         """Store the latest vertex."""
