@@ -50,7 +50,7 @@ class CaptureData(Section):
     kind: Literal["capture"]
     file: InputPath
     """path, from the run file's folder"""
-    calibration: InputPath | None = None
+    channels: InputPath | None = None
     """channel calibration that `invertwin look --reflector` wrote; divided out"""
 
 

@@ -91,7 +91,7 @@ class Recording(Section):
     """m, of the radar in every frame, or one for all; without it the origin"""
     orientation: Orientation | None = None
     """look_at or rotation_deg; without it the axes of the world"""
-    calibration: InputPath | None = None
+    channels: InputPath | None = None
     """channel calibration that `invertwin look --reflector` wrote; divided out"""
 
 
