@@ -1,21 +1,55 @@
-"""Recordings of boards: raw files of any reader to chirps, elements and captures."""
+"""Measured data of run files: captures, raw chirps with their elements and poses."""
+
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from invertwin.capture import Capture, ChannelCalibration, ChirpData, described_arrays, ti
+from invertwin.capture import (
+    Capture,
+    ChannelCalibration,
+    ChirpData,
+    described_arrays,
+    rail_sar,
+    ti,
+)
 from invertwin.cli import schema
 from invertwin.cli.run_file import about
 from invertwin.cli.sensors import board_elements, rotations_of, track
+from invertwin.errors import InputError
 from invertwin.scene import AntennaArray
 
+_RAIL_SAR_ORIGINAL = "github.com/jjimmykang/bwsi-backprojection, trial 6"
 
-def measured(data: schema.Dca1000Data | schema.ArraysData) -> Capture:
-    """The capture of a `[data]` table that names raw chirps.
+
+def measured(data: schema.MeasuredData) -> Capture:
+    """The capture of a `[data]` table that names a recording.
 
     Raises:
         InputError: Files that are missing, damaged or contradict each other.
     """
+    match data:
+        case schema.CaptureData():
+            with about("data.file"):
+                capture = Capture.load(data.file)
+            return _calibrated(capture, data.channels)
+        case schema.RailSarData():
+            with about("data.folder"):
+                return _rail_sar(Path(data.folder))
+    return _of_chirps(data)
+
+
+def _rail_sar(folder: Path) -> Capture:
+    if not (folder / rail_sar.FILE).is_file():
+        raise InputError(
+            f"expected {rail_sar.FILE} in {folder}, got no such file; it is made from the public "
+            f"recording {_RAIL_SAR_ORIGINAL}: set INVERTWIN_DATA to the folder that holds "
+            f"{folder.name}/"
+        )
+    return rail_sar.read(folder)
+
+
+def _of_chirps(data: schema.Dca1000Data | schema.ArraysData) -> Capture:
     with about("data.file"):
         chirps = _chirps(data)
     with about("data.board"):
@@ -30,15 +64,11 @@ def measured(data: schema.Dca1000Data | schema.ArraysData) -> Capture:
             positions=positions,
             rotations=rotations,
         )
-    return calibrated(capture, data.channels)
+    return _calibrated(capture, data.channels)
 
 
-def calibrated(capture: Capture, file: str | None) -> Capture:
-    """The capture with a channel calibration divided out, where a file names one.
-
-    Raises:
-        InputError: A file that is none, or one of other channels.
-    """
+def _calibrated(capture: Capture, file: str | None) -> Capture:
+    """The capture with a channel calibration divided out, where a file names one."""
     if file is None:
         return capture
     with about("data.channels"):

@@ -1,24 +1,23 @@
 """What is to be fitted: scene, data, radar and grid of a run file."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from rich.console import Console
 from torch import nn
 
-from invertwin.capture import Capture, rail_sar
+from invertwin.capture import Capture
 from invertwin.channel.paths import Grid
 from invertwin.cli import build
+from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import CaptureData, RadarParameter, RailSarData, RunFile, SimulatedData
+from invertwin.cli.schema import RadarParameter, RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
 FULL, INTERIOR = "full", "interior_only"
-_RAIL_SAR_ORIGINAL = "github.com/jjimmykang/bwsi-backprojection, trial 6"
 
 
 @dataclass(frozen=True)
@@ -71,26 +70,12 @@ def problem_of(run: RunFile, console: Console) -> Problem:
                 f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
                 "remove it: a capture brings its radar along"
             )
-        capture = _measured(data)
+        capture = measured(data)
         radar = capture.radar()
         grid = build.grid(table, radar)
         known = frozenset(run.truth)
     target = run.starts.object if run.starts else next(iter(sought_objects(run)), None)
     return Problem(run, scene, truth, known, capture, radar, grid, target)
-
-
-def _measured(data: CaptureData | RailSarData) -> Capture:
-    if isinstance(data, CaptureData):
-        with build.about("data.file"):
-            return Capture.load(data.file)
-    with build.about("data.folder"):
-        if not (Path(data.folder) / rail_sar.FILE).is_file():
-            raise InputError(
-                f"expected {rail_sar.FILE} in {data.folder}, got no such file; it is made from the "
-                f"public recording {_RAIL_SAR_ORIGINAL}: set INVERTWIN_DATA to the folder that "
-                f"holds {Path(data.folder).name}/"
-            )
-        return rail_sar.read(data.folder)
 
 
 def sought_objects(run: RunFile) -> list[str]:

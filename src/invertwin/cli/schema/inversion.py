@@ -62,6 +62,8 @@ class RailSarData(Section):
     """path, from the run file's folder, then from INVERTWIN_DATA"""
 
 
+MeasuredData = CaptureData | Dca1000Data | ArraysData | RailSarData
+
 Data = Annotated[
     Annotated[SimulatedData, Tag(TAG_MARK + "simulated")]
     | Annotated[CaptureData, Tag(TAG_MARK + "capture")]
