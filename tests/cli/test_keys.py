@@ -6,6 +6,7 @@ from cli.small import call
 from invertwin.cli import schema
 from invertwin.cli.keys import key_tables
 from invertwin.errors import InputError
+from invertwin.radar.boards import BOARDS
 
 
 def test_every_key_of_every_section_is_listed_and_explained():
@@ -26,12 +27,23 @@ def test_units_limits_and_defaults_are_shown():
 
 
 def test_kinds_are_listed_apart_with_what_they_share_first():
-    titles = [table.title for table in key_tables("radar.waveform")]
-    assert titles == [
-        "[radar.waveform], all kinds",
-        '[radar.waveform] kind = "fmcw"',
-        '[radar.waveform] kind = "impulse"',
+    titles = [table.title for table in key_tables("radar.transmitters")]
+    assert titles[:2] == [
+        "[radar.transmitters], all kinds",
+        '[radar.transmitters] kind = "planar"',
     ]
+
+
+def test_what_a_board_owner_looks_for_is_listed():
+    """Boards, waveforms, readers, raw files and front ends that the library has."""
+    waveforms = {table.title.partition(" kind = ")[2] for table in key_tables("radar.waveform")}
+    assert waveforms == {'"fmcw"', '"stepped"', '"ofdm"', '"impulse"'}
+    kinds = {table.title.partition(" kind = ")[2].strip('"') for table in key_tables("data")}
+    assert kinds >= {"simulated", "capture", "dca1000", "arrays", "rail_sar"}
+    (name,) = [row for t in key_tables("radar.board") for row in t.rows if row[0] == "name"]
+    assert name[1].replace('"', "").split(", ") == list(BOARDS)
+    for section in ("chirps", "raw", "impairments"):
+        assert key_tables(section)
 
 
 def test_sections_repeated_elsewhere_are_referred_to():

@@ -211,7 +211,7 @@ def test_gradient_is_finite_in_vacuum():
         (lambda: RoughDielectric(0.9), r"relative permittivity in \[1, inf\), got 0.9"),
         (lambda: RoughDielectric(math.nan), "relative permittivity"),
         (lambda: RoughDielectric(torch.tensor(0.5)), "relative permittivity"),
-        (lambda: RoughDielectric(torch.ones(2)), "one real number"),
+        (lambda: RoughDielectric(torch.ones(2, 2)), r"shape \[any\], got shape \[2, 2\]"),
         (lambda: RoughDielectric(3.0, -0.1), "conductivity"),
         (lambda: RoughDielectric(3.0, math.inf), "conductivity"),
         (lambda: RoughDielectric(3.0, diffuse=1.1), r"diffuse fraction in \[0, 1\], got 1.1"),

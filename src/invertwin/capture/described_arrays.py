@@ -69,8 +69,25 @@ def read(
     Raises:
         InputError: what `read_chirps` and `ChirpData.capture` raise, or no elements.
     """
-    path = Path(path)
-    described = _description(path).get("radar", {})
+    data = read_chirps(path)
+    chosen = described_elements(path, data.settings, board, elevation, azimuth, arrays)
+    return data.capture(*chosen, chirps=chirps)
+
+
+def described_elements(
+    path: str | Path,
+    settings: ChirpSettings,
+    board: str | None = None,
+    elevation: int | None = None,
+    azimuth: int | None = None,
+    arrays: tuple[AntennaArray, AntennaArray] | None = None,
+) -> tuple[AntennaArray, AntennaArray]:
+    """TX and RX elements of described samples, see `read`.
+
+    Raises:
+        InputError: neither the arguments nor the description say which.
+    """
+    described = _description(Path(path)).get("radar", {})
     if board is None and arrays is None:
         board = described.get("board")
         tx, rx = described.get("tx_positions"), described.get("rx_positions")
@@ -78,10 +95,8 @@ def read(
             arrays = (_elements(tx, "TX"), _elements(rx, "RX"))
     elevation = described.get("elevation") if elevation is None else elevation
     azimuth = described.get("azimuth", 1) if azimuth is None else azimuth
-    data = read_chirps(path)
     assert azimuth is not None
-    chosen = elements(data.settings, board, elevation, azimuth, arrays)
-    return data.capture(*chosen, chirps=chirps)
+    return elements(settings, board, elevation, azimuth, arrays)
 
 
 def read_chirps(path: str | Path) -> ChirpData:
@@ -137,7 +152,12 @@ def read_chirps(path: str | Path) -> ChirpData:
     return found
 
 
-def write_chirps(path: str | Path, data: ChirpData, file: str) -> None:
+def write_chirps(
+    path: str | Path,
+    data: ChirpData,
+    file: str,
+    arrays: tuple[AntennaArray, AntennaArray] | None = None,
+) -> None:
     """Writes samples, bit for bit, and the description that `read_chirps` reads.
 
     Args:
@@ -145,6 +165,7 @@ def write_chirps(path: str | Path, data: ChirpData, file: str) -> None:
         data: what to write; real samples are written as real numbers.
         file: name of the data file beside it; its ending says the format: .npy, .npz, .h5, .hdf5
             or .mat (MATLAB 5).
+        arrays: TX and RX elements, written as positions; their patterns are not.
 
     Raises:
         InputError: the folder does not exist, or another ending.
@@ -191,6 +212,9 @@ def write_chirps(path: str | Path, data: ChirpData, file: str) -> None:
         f"transmit_order = {list(s.transmit_order)}",
         f"receivers = {list(s.receivers)}",
     ]
+    if arrays is not None:
+        tx, rx = (array.positions.tolist() for array in arrays)
+        lines += ["", "[radar]", f"tx_positions = {tx}", f"rx_positions = {rx}"]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -5,16 +5,14 @@ turn × 4 RX, 128 complex samples at 2.5 MS/s; people move at about 3 m. Nothing
 """
 
 import json
-import zipfile
-import zlib
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirps import ChirpData, ChirpSettings
 from invertwin.capture.elements import elements
+from invertwin.capture.npz import read_npz
 from invertwin.errors import InputError
 from invertwin.scene.antenna import AntennaArray
 
@@ -57,17 +55,7 @@ def read_chirps(folder: str | Path) -> ChirpData:
     Raises:
         InputError: no file, a damaged one, an array of another shape, or no settings.
     """
-    path = Path(folder) / FILE
-    if not path.is_file():
-        raise InputError(f"expected {FILE} in {path.parent}, got no such file; check the folder")
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"expected a whole npz file, got {path}, which cannot be read "
-            f"({type(error).__name__}); it is damaged or truncated, copy it again"
-        ) from error
+    arrays = read_npz(Path(folder) / FILE)
     frame = arrays.get("frame_2tx4rx")
     if frame is None or frame.ndim != 3 or frame.shape[1] != _TX * _RX or frame.dtype.kind != "c":
         got = "none" if frame is None else f"{frame.dtype} of shape {frame.shape}"

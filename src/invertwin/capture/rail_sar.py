@@ -6,8 +6,6 @@ of the radar.
 """
 
 import json
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +13,7 @@ import torch
 from scipy.signal import hilbert
 
 from invertwin.capture.capture import Capture
+from invertwin.capture.npz import read_npz
 from invertwin.capture.track import Track
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
@@ -94,17 +93,7 @@ def read(
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise InputError(f"expected {FILE} in {path.parent}, got no such file; check the folder")
-    try:
-        # Opened here, since np.load leaves a file open that it cannot read.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"expected a whole npz file, got {path}, which cannot be read "
-            f"({type(error).__name__}); it is damaged or truncated, copy it again"
-        ) from error
+    arrays = read_npz(path)
     for name, dimensions in _DIMENSIONS.items():
         if name not in arrays or arrays[name].ndim != dimensions:
             got = f"shape {arrays[name].shape}" if name in arrays else "none"

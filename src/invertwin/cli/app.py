@@ -1,4 +1,4 @@
-"""The command line `invertwin`: simulate, reconstruct, gradcheck, demo, doctor, keys."""
+"""The command line `invertwin`: simulate, reconstruct, look, gradcheck, demo, doctor, keys."""
 
 import os
 import sys
@@ -138,6 +138,70 @@ def demo(
     # In its own folder the demo replaces what it left there before.
     again = out is None and not resume
     _reconstruct(_demo_file(), out or Path("out/demo"), overwrite or again, resume, seed)
+
+
+@app.command()
+def look(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="Raw .bin or .setup.json, a .toml description of arrays, or a .nc capture.",
+            show_default=False,
+        ),
+    ],
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", "-c", help="Settings of a .bin: .cfg or .mmwave.json."),
+    ] = None,
+    board: Annotated[
+        str | None, typer.Option("--board", "-b", help="Preset that recorded, such as xWR1843.")
+    ] = None,
+    elevation: Annotated[
+        int | None, typer.Option(help="1: rows of the board grow upwards, -1: downwards.")
+    ] = None,
+    azimuth: Annotated[
+        int | None, typer.Option(help="1: columns grow to the right, -1: to the left.")
+    ] = None,
+    lanes: Annotated[
+        int | None, typer.Option(help="2 or 4 LVDS lanes, where the settings do not say.")
+    ] = None,
+    chirp: Annotated[
+        int | None, typer.Option(min=0, help="The one that the capture keeps; default: mean.")
+    ] = None,
+    frame: Annotated[int, typer.Option(min=0, help="The one that the pictures show.")] = 0,
+    range_min: Annotated[float | None, typer.Option(help="m; default: 3 range cells.")] = None,
+    range_max: Annotated[float | None, typer.Option(help="m; default: all.")] = None,
+    channels: Annotated[
+        Path | None, typer.Option(help="Channel calibration to divide out (channels.json).")
+    ] = None,
+    reflector: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="x y z in m of a reflector: calibrates the channels on it."),
+    ] = None,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Show a recording: range, range rate, direction; and write it as a capture."""
+    from invertwin.cli.run_look import Look, run_look
+
+    wanted = Look(
+        recording,
+        config,
+        board,
+        elevation,
+        azimuth,
+        lanes,
+        chirp,
+        frame,
+        range_min,
+        range_max,
+        channels,
+        reflector,
+    )
+    default = Path("out") / recording.name.split(".")[0]
+    with _folder(out or default, {}, overwrite, False) as folder:
+        tables = run_look(wanted, folder)
+        _print(tables)
 
 
 @app.command()

@@ -1,38 +1,29 @@
-"""From the tables of a run file to the library's values: scenes, radars, grids, parameters."""
+"""From the tables of a run file to the library's values: scenes, parameters, starts."""
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from invertwin.channel.paths import Grid
 from invertwin.cli import schema
+from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import unknown_object
+from invertwin.cli.sensors import grid as grid
+from invertwin.cli.sensors import radar as radar
 from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
 from invertwin.inversion.regularization import Laplacian
-from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
-from invertwin.radar.waveform import FMCW, Impulse
 from invertwin.scene import (
-    AntennaArray,
-    Cosine,
-    Isotropic,
     Material,
     Mesh,
     Object,
-    Pattern,
     PerfectConductor,
     RoughDielectric,
     Scene,
-    Table,
-    linear_array,
-    look_at,
-    planar_array,
     rigid,
     rotation_angle,
     rotation_from_vector,
@@ -47,8 +38,6 @@ from invertwin.scene.parameters import (
     Translation,
     Vertices,
 )
-
-_MOST_BINS = 1e9  # 4 GB a map
 
 
 def scene(run: schema.RunFile) -> Scene:
@@ -90,15 +79,6 @@ def true_scene(run: schema.RunFile) -> Scene:
             item = replace(item, mesh=mesh, pose=_pose(place))
         found = Scene({**found.objects, name: item})
     return found
-
-
-@contextmanager
-def about(path: str) -> Iterator[None]:
-    """Errors of the library with the key of the run file that they are about."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _from_file(table: schema.SceneFile) -> Scene:
@@ -156,119 +136,6 @@ def _material(table: schema.Material) -> Material:
     if table.lobe_width_deg is not None:
         values["lobe_width"] = math.radians(table.lobe_width_deg)
     return (RoughDielectric if table.kind == "rough_dielectric" else PerfectConductor)(**values)
-
-
-def radar(table: schema.Radar) -> Radar:
-    """The radar of the `[radar]` table, one frame per position.
-
-    Raises:
-        InputError: Values the radar refuses, or a target straight above a position.
-    """
-    wave = table.waveform
-    with about("radar.waveform"):
-        if isinstance(wave, schema.Fmcw):
-            waveform = FMCW(wave.start_frequency, wave.bandwidth, wave.duration, wave.samples)
-        else:
-            waveform = Impulse(wave.center_frequency, wave.bandwidth)
-    with about("radar.transmitters"):
-        transmitters = _array(table.transmitters)
-    with about("radar.receivers"):
-        receivers = _array(table.receivers)
-    positions = _track(table.positions)
-    rotations = _rotations(table.orientation, positions)
-    with about("radar"):
-        return Radar(
-            transmitters,
-            receivers,
-            waveform,
-            positions,
-            rotations,
-            window=table.window,
-            array_window=table.array_window,
-            shared_visibility=table.shared_visibility,
-        )
-
-
-def _array(table: schema.Array) -> AntennaArray:
-    pattern = _pattern(table.pattern)
-    match table:
-        case schema.PlanarArray():
-            array = planar_array(*table.count, *table.spacing, pattern=pattern)
-        case schema.LinearArray():
-            array = linear_array(table.count, table.spacing, table.axis, pattern=pattern)
-        case _:
-            array = AntennaArray(_float64(table.positions), pattern)
-    return replace(array, positions=array.positions + _float64(table.center))
-
-
-def _pattern(table: schema.Pattern) -> Pattern:
-    match table:
-        case schema.Cosine():
-            return Cosine(table.exponent)
-        case schema.TablePattern():
-            theta, phi = torch.deg2rad(_float64(table.theta_deg)), _float64(table.phi_deg)
-            return Table(theta, torch.deg2rad(phi), 10 ** (_float64(table.gain_db) / 10))
-    return Isotropic()
-
-
-def _track(table: schema.Track) -> Tensor:
-    match table:
-        case schema.LineTrack():
-            start, stop = _float64(table.start), _float64(table.stop)
-            return start + torch.linspace(0, 1, table.count, dtype=torch.float64)[:, None] * (
-                stop - start
-            )
-        case schema.ArcTrack():
-            angle = torch.deg2rad(
-                torch.linspace(table.start_deg, table.stop_deg, table.count, dtype=torch.float64)
-            )
-            around = torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
-            return _float64(table.center) + table.radius * around
-        case schema.GridTrack():
-            x, y = (
-                (torch.linspace(-0.5, 0.5, n, dtype=torch.float64) if n > 1 else torch.zeros(1))
-                * size
-                for n, size in zip(table.count, table.size, strict=True)
-            )
-            across, up = torch.meshgrid(x.double(), y.double(), indexing="ij")
-            offsets = torch.stack([across, up, torch.zeros_like(up)], dim=-1)
-            return _float64(table.center) + offsets.reshape(-1, 3)
-    return _float64(table)
-
-
-def _rotations(table: schema.Orientation, positions: Tensor) -> Tensor:
-    """Columns are the radar's right, up and boresight axes in the world."""
-    if isinstance(table, schema.Turned):
-        turn = rotation_from_vector(torch.deg2rad(_float64(table.rotation_deg)))
-        return turn.expand(len(positions), 3, 3).clone()
-    with about("radar.orientation.look_at"):
-        return look_at(positions, table.look_at)
-
-
-def grid(table: schema.Grid, radar: Radar) -> Grid:
-    """The bins of the `[grid]` table for a radar.
-
-    Raises:
-        InputError: Limits that the radar refuses or does not reach, or a map of a size that only
-            a wrong unit explains.
-    """
-    wave = radar.waveform
-    if isinstance(wave, FMCW) and table.range_max > wave.max_range:
-        raise InputError(
-            f"grid.range_max: expected at most the waveform's unambiguous range, "
-            f"{wave.max_range:.4g} m, got {table.range_max:g}; give metres, or more samples"
-        )
-    with about("grid"):
-        found = radar.grid(
-            table.range_min, table.range_max, table.u_max, table.v_max, oversample=table.oversample
-        )
-    bins = math.prod(found.shape) * radar.frame_count
-    if bins > _MOST_BINS:
-        raise InputError(
-            f"grid: expected a map of at most {_MOST_BINS:g} bins over all frames, got {bins:.3g}; "
-            "give limits in metres and direction cosines, or less oversampling"
-        )
-    return found
 
 
 def surrogate(table: schema.Surrogate) -> Surrogate:

@@ -113,7 +113,7 @@ def scene_picture(drawings: Mapping[str, Drawing], frame: NDArray | None = None)
         _draw_scene(axes, drawings[title], nearest, view, windows[view])
         axes.set_title(f"{title}, {view}", fontsize=9)
     _legend(figure, drawings)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 @dataclass(frozen=True)
@@ -314,7 +314,7 @@ def spectra_picture(spectra: Mapping[str, NDArray], axes: Axes) -> bytes:
             grid[r, c].tick_params(labelsize=7)
     if image is not None:
         figure.colorbar(image, ax=grid, label="power [dB below peak]", shrink=0.8)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def loss_picture(
@@ -349,7 +349,7 @@ def loss_picture(
     axes.grid(alpha=0.3)
     if losses:
         axes.legend(fontsize=8)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def landscape_picture(exact: Curve, surrogates: Mapping[str, Curve], along: str) -> bytes:
@@ -375,7 +375,7 @@ def landscape_picture(exact: Curve, surrogates: Mapping[str, Curve], along: str)
         axes.axvline(0, color="black", linewidth=0.6, linestyle=":")
         axes.set_ylabel("loss")
         axes.grid(alpha=0.3)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def count_minima(values: NDArray) -> int:
@@ -425,10 +425,11 @@ def gradient_picture(
                 "own scale, same unit", fontsize=8
             )
     grid[0].set_ylabel("range [m]", fontsize=8)
-    return _png(figure)
+    return png_bytes(figure)
 
 
-def _png(figure: Figure) -> bytes:
+def png_bytes(figure: Figure) -> bytes:
+    """The figure as PNG."""
     FigureCanvasAgg(figure)
     buffer = io.BytesIO()
     # No time stamp: the same run gives the same bytes.

@@ -73,6 +73,15 @@ def about_file(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from None
 
 
+@contextmanager
+def about(path: str) -> Iterator[None]:
+    """Errors of the library with the key of the run file that they are about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
 def validate(raw: dict[str, Any], source: Path) -> RunFile:
     """The run file of parsed TOML; `source` names it in errors and anchors relative paths.
 

@@ -2,34 +2,44 @@
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 import torch
 
-from invertwin.capture import Capture
+from invertwin.capture import Capture, described_arrays
 from invertwin.channel.paths import Grid
-from invertwin.cli import build, pictures
+from invertwin.cli import build, pictures, sensors
+from invertwin.cli.doppler_maps import DOPPLER_NOTE, doppler_maps, panels, panels_picture
+from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw
 from invertwin.cli.report import Again, Picture, Table, report_html
-from invertwin.cli.run_file import need, to_toml
+from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema import Chirps, RunFile, SimulatedData
 from invertwin.errors import InputError
+from invertwin.radar import FMCW, add_noise, exact_spectrum, velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
-from invertwin.simulation import Simulation, simulate
+from invertwin.simulation import Simulation, simulate, simulate_chirps
 
 _SURROGATE_SAMPLES = 2_000_000
 _LABELS = {
     "frames": "frames",
     "channels": "virtual channels",
+    "chirps": "chirps of each transmitter in a frame",
     "paths": "paths",
     "bins": "bins of range, u, v",
     "peak_power_db": "strongest bin of a frame, received over sent [dB]",
     "peak_range_m": "strongest bin over all frames, range [m]",
     "peak_u": "strongest bin over all frames, u",
     "peak_v": "strongest bin over all frames, v",
+    "peak_velocity_m_s": "strongest bin, range rate, away > 0 [m/s]",
+    "mover_range_m": "strongest bin that moves, range [m]",
+    "mover_velocity_m_s": "strongest bin that moves, range rate [m/s]",
+    "mover_azimuth_deg": "strongest bin that moves, azimuth [°]",
+    "raw_bytes": "raw samples [bytes]",
     "correlation_with_surrogate": "correlation with the surrogate's map",
     "wall_seconds": "time of the exact simulation [s]",
 }
@@ -41,31 +51,47 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
     Raises:
         InputError: The run file's data are measured, not simulated.
     """
+    data = _simulated(run)
+    seed = run.seed if data.seed is None else data.seed
+    front = None if run.impairments is None else sensors.impairments(run.impairments, data)
+    with torch.no_grad():
+        found = simulate(
+            scene,
+            radar,
+            grid,
+            seed=seed,
+            samples=data.samples,
+            density=data.density,
+            snr_db=None if front else data.snr_db,
+            noise_figure_db=None if front else data.noise_figure_db,
+        )
+        if front is None:
+            return found
+        assert found.paths is not None
+        beat = front.record(found.paths, radar, seed=seed)
+        return Simulation(exact_spectrum(beat, radar, grid), found.paths, beat)
+
+
+def _simulated(run: RunFile) -> SimulatedData:
     data = need(run, "data", "a simulation")
     if not isinstance(data, SimulatedData):
         raise InputError(
             f'data.kind: expected "simulated" to simulate a scene, got "{data.kind}"; '
             "give density and snr_db instead of a capture"
         )
-    with torch.no_grad():
-        return simulate(
-            scene,
-            radar,
-            grid,
-            seed=run.seed if data.seed is None else data.seed,
-            samples=data.samples,
-            density=data.density,
-            snr_db=data.snr_db,
-            noise_figure_db=data.noise_figure_db,
-        )
+    return data
 
 
 def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
     """Simulates the true scene of a run file, writes the folder, returns the tables to print."""
-    begin = time.perf_counter()
     scene = build.true_scene(run)
     radar = build.radar(need(run, "radar", "simulate"))
     grid = build.grid(need(run, "grid", "simulate"), radar)
+    if run.raw is not None:
+        settings_of_run(run, radar)  # its errors come before any work
+    if run.chirps is not None:
+        return _chirp_train(run, folder, scene, radar, grid, run.chirps)
+    begin = time.perf_counter()
     found = exact(run, scene, radar, grid)
     seconds = time.perf_counter() - begin
     assert found.beat is not None
@@ -75,7 +101,6 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
             scene, radar, grid, seed=run.seed, surrogate=Surrogate(), samples=_SURROGATE_SAMPLES
         ).spectrum
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
-    save_mesh(folder.file("twin.ply"), scene)
     metrics = {
         "task": "simulate",
         "frames": radar.frame_count,
@@ -86,30 +111,115 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
         "correlation_with_surrogate": _correlation(found.spectrum, smooth),
         "wall_seconds": seconds,
     }
+    if run.raw is not None:
+        metrics |= write_raw(run, radar, found.beat, folder)
+    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
+    maps = {"exact signal": found.spectrum.numpy(), "surrogate": smooth.numpy()}
+    folder.write_bytes("spectra.png", pictures.spectra_picture(maps, axes))
+    shown = Picture(
+        "Spectra",
+        (folder.path / "spectra.png").read_bytes(),
+        note="The surrogate is the mean of the exact spectrum over random phases.",
+    )
+    status = f"{len(found.paths)} paths, {radar.frame_count} frames."
+    return _finish(run, folder, scene, radar, metrics, shown, status)
+
+
+def _chirp_train(
+    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: Chirps
+) -> list[Table]:
+    """The same for several ramps a frame, between which objects move."""
+    data, chirps = _simulated(run), sensors.chirps(table)
+    seed = run.seed if data.seed is None else data.seed
+    begin = time.perf_counter()
+    with about("chirps"), torch.no_grad():
+        beat = simulate_chirps(
+            scene,
+            radar,
+            chirps,
+            seed=seed,
+            retrace=table.retrace,
+            samples=data.samples,
+            density=data.density,
+        )
+        beat = _received(run, data, beat, radar, seed)
+    seconds = time.perf_counter() - begin
+    maps = doppler_maps(beat, radar, grid, chirps)
+    if table.tdm and isinstance(radar.waveform, FMCW):
+        arrays = (radar.transmitters, radar.receivers)
+        folder.file("chirps.npy")
+        with about("chirps"):
+            described_arrays.write_chirps(
+                folder.file("chirps.toml"), chirp_data(run, radar, beat), "chirps.npy", arrays
+            )
+    metrics = {
+        "task": "simulate",
+        "frames": radar.frame_count,
+        "channels": len(radar.virtual_positions),
+        "chirps": chirps.count,
+        "bins": list(grid.shape),
+        "velocity_span_m_s": velocity_span(radar, chirps),
+        **maps.strongest.metrics("peak"),
+        **({} if maps.mover is None else maps.mover.metrics("mover")),
+        "wall_seconds": seconds,
+    }
+    if run.raw is not None:
+        metrics |= write_raw(run, radar, beat, folder)
+    folder.write_bytes("doppler.png", panels_picture(panels(maps)))
+    shown = Picture(
+        "First frame",
+        (folder.path / "doppler.png").read_bytes(),
+        note=DOPPLER_NOTE,
+    )
+    status = f"{chirps.count} chirps a frame, {radar.frame_count} frames."
+    return _finish(run, folder, scene, radar, metrics, shown, status)
+
+
+def _received(
+    run: RunFile, data: SimulatedData, beat: torch.Tensor, radar: Radar, seed: int
+) -> torch.Tensor:
+    """Chirps as the front end of the run file hands them on."""
+    if run.impairments is not None:
+        raise InputError(
+            "impairments: expected no [impairments] with [chirps], got both; remove one"
+        )
+    if data.snr_db is None and data.noise_figure_db is None:
+        return beat
+    noisy = add_noise(
+        beat.flatten(0, 1),
+        radar,
+        seed=seed,
+        snr_db=data.snr_db,
+        noise_figure_db=data.noise_figure_db,
+    )
+    return noisy.unflatten(0, beat.shape[:2])
+
+
+def _finish(
+    run: RunFile,
+    folder: RunFolder,
+    scene: Scene,
+    radar: Radar,
+    metrics: dict[str, Any],
+    shown: Picture,
+    status: str,
+) -> list[Table]:
+    """Numbers, scene and report of either kind of simulation."""
+    save_mesh(folder.file("twin.ply"), scene)
     folder.write_json("metrics.json", metrics)
-    rows = [[label, metrics[key]] for key, label in _LABELS.items()]
+    rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
     table = Table("Simulation", ["quantity", "value"], rows)
     drawing = pictures.Drawing(
         pictures.meshes_of(scene), sought=list(run.truth), radar=radar.positions.numpy()
     )
-    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
-    maps = {"exact signal": found.spectrum.numpy(), "surrogate": smooth.numpy()}
     folder.write_bytes(
         "scene.png", pictures.scene_picture({"scene": drawing}, pictures.frame_of(radar))
     )
-    folder.write_bytes("spectra.png", pictures.spectra_picture(maps, axes))
-    shown = [
-        Picture("Scene", (folder.path / "scene.png").read_bytes()),
-        Picture(
-            "Spectra",
-            (folder.path / "spectra.png").read_bytes(),
-            note="The surrogate is the mean of the exact spectrum over random phases.",
-        ),
-    ]
-    title = run.title or "Simulation"
-    status = f"{len(found.paths)} paths, {radar.frame_count} frames."
+    seen = Picture("Scene", (folder.path / "scene.png").read_bytes())
     again = Again("simulate run.toml", {"run.toml": to_toml(run)})
-    folder.write_text("report.html", report_html(title, status, run.note, [table, *shown], again))
+    title = run.title or "Simulation"
+    parts = [table, seen, shown]
+    folder.write_text("report.html", report_html(title, status, run.note, parts, again))
     return [table]
 
 

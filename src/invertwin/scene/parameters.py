@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.scene.material.values import RANGES, Texture, Value, checked_value, evaluated
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import (
     compose,
@@ -218,75 +219,89 @@ class Vertices(nn.Module):
 class MaterialValues(nn.Module):
     """Replaces values of an object's material; they cannot leave their physical range.
 
+    A value that starts as one number is fitted as one, one that starts as a number per triangle
+    or as a `Texture` is fitted triangle by triangle or pixel by pixel.
+
     Attributes:
-        raw: unbounded parameters by field: log(ε' − 1), log σ, logit of the diffuse fraction,
-            logit of the lobe width over π.
+        raw: unbounded parameters by field: for values with one limit, such as the permittivity,
+            the logarithm of what is above it; for values between two, the logit of their place.
     """
 
     applies_to = "scene"
 
-    def __init__(
-        self,
-        object: str,
-        *,
-        permittivity: float | None = None,
-        conductivity: float | None = None,
-        diffuse: float | None = None,
-        lobe_width: float | None = None,
-    ) -> None:
+    def __init__(self, object: str, *, layer: int | None = None, **start: Value | None) -> None:
         """Fit the given values of the material of `object`, from these values at the start.
 
         Args:
             object: name of the object.
-            permittivity: relative permittivity > 1.
-            conductivity: [S/m] > 0.
-            diffuse: fraction between 0 and 1, both excluded.
-            lobe_width: [rad] between 0 and π, both excluded.
+            layer: of a `Multilayer`, the layer whose values are meant; None for values of the
+                material itself.
+            start: by the names of `invertwin.scene.material.RANGES`, inside their ranges, ends
+                excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
+                lobe_width [rad], scattering, rms_slope, lambertian, forward, directive_exponent,
+                backscatter_exponent.
 
         Raises:
-            InputError: none given, or a value at or beyond the end of its range.
+            InputError: none given, an unknown name, or a value at or beyond the end of its range.
         """
         super().__init__()
         self.object = object
-        given = {
-            "permittivity": permittivity,
-            "conductivity": conductivity,
-            "diffuse": diffuse,
-            "lobe_width": lobe_width,
-        }
-        self.raw = nn.ParameterDict(
-            {
-                name: nn.Parameter(_unbounded(name, value))
-                for name, value in given.items()
-                if value is not None
-            }
-        )
-        if not self.raw:
-            raise InputError(f"expected at least one of {', '.join(given)}, got none; give one")
+        self.layer = None if layer is None else checked_count(layer, "number of a layer", 0)
+        given = {name: value for name, value in start.items() if value is not None}
+        unknown = [name for name in given if name not in RANGES]
+        if unknown or not given:
+            got = ", ".join(unknown) or "none"
+            raise InputError(f"expected at least one of {', '.join(RANGES)}, got {got}; give one")
+        self.raw = nn.ParameterDict()
+        self._textures: dict[str, Texture] = {}
+        for name, value in given.items():
+            checked = checked_value(value, name)
+            if isinstance(checked, Texture):
+                self._textures[name] = checked
+                checked = checked.image
+            self.raw[name] = nn.Parameter(_unbounded(name, evaluated(checked).detach()))
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the material's values replaced.
 
         Raises:
-            InputError: the object's material has no such value.
+            InputError: the object's material has no such value, or no such layer.
         """
         material: Any = scene[self.object].material
-        fields = getattr(material, "__dataclass_fields__", {})
-        missing = [name for name in self.raw if name not in fields]
-        if missing:
+        values = self._bounded()
+        if self.layer is None:
+            self._check(material, f"a material with {', '.join(self.raw)}", "the object")
+            return scene.replace(self.object, material=replace(material, **values))
+        layers = list(getattr(material, "layers", ()))
+        if self.layer >= len(layers):
             raise InputError(
-                f"expected a material with {', '.join(missing)} for {self.object!r}, "
-                f"got {type(material).__name__}; give the object another material"
+                f"expected a layer below {len(layers)} of {self.object!r}, got {self.layer}; "
+                "count layers from 0, and give `layer` for a Multilayer only"
             )
-        return scene.replace(self.object, material=replace(material, **self._bounded()))
+        self._check(layers[self.layer], f"a layer with {', '.join(self.raw)}", "the layer")
+        layers[self.layer] = replace(layers[self.layer], **values)
+        return scene.replace(self.object, material=replace(material, layers=layers))
 
     def values(self) -> dict[str, Tensor]:
-        """Material values in their own units by name, for progress and reports."""
-        bounded = self._bounded()
-        return {f"{self.object}.{name}": value.detach() for name, value in bounded.items()}
+        """Material values in their own units by name, for progress and reports.
 
-    def _bounded(self) -> dict[str, Tensor]:
-        return {name: _BOUNDED[name](raw) for name, raw in self.raw.items()}
+        A texture is its image.
+        """
+        where = self.object if self.layer is None else f"{self.object}.layers[{self.layer}]"
+        return {f"{where}.{name}": _bounded(name, raw).detach() for name, raw in self.raw.items()}
+
+    def _bounded(self) -> dict[str, Tensor | Texture]:
+        values = {name: _bounded(name, raw) for name, raw in self.raw.items()}
+        textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
+        return {**values, **textures}
+
+    def _check(self, holder: Any, what: str, where: str) -> None:
+        fields = getattr(holder, "__dataclass_fields__", {})
+        if any(name not in fields for name in self.raw):
+            raise InputError(
+                f"expected {what} for {self.object!r}, got {type(holder).__name__}; "
+                f"give {where} another material"
+            )
 
 
 @runtime_checkable
@@ -384,32 +399,26 @@ class Compose(nn.Module):
         return merged
 
 
-_BOUNDED: dict[str, Callable[[Tensor], Tensor]] = {
-    "permittivity": lambda raw: 1 + raw.exp(),
-    "conductivity": torch.exp,
-    "diffuse": torch.sigmoid,
-    "lobe_width": lambda raw: math.pi * torch.sigmoid(raw),
-}
-
-_LIMITS = {
-    "permittivity": (1.0, math.inf),
-    "conductivity": (0.0, math.inf),
-    "diffuse": (0.0, 1.0),
-    "lobe_width": (0.0, math.pi),
-}
+def _bounded(name: str, raw: Tensor) -> Tensor:
+    """The value inside its range that an unbounded parameter stands for."""
+    span = RANGES[name]
+    if math.isinf(span.high):
+        return span.low + raw.exp()
+    return span.low + (span.high - span.low) * torch.sigmoid(raw)
 
 
-def _unbounded(name: str, value: float) -> Tensor:
-    """The parameter that `_BOUNDED` maps to `value`."""
-    low, high = _LIMITS[name]
-    number = checked_number(value, f"initial {name}", low, high)
-    if number in (low, high):
+def _unbounded(name: str, value: Tensor) -> Tensor:
+    """The parameter that `_bounded` maps to `value`."""
+    span = RANGES[name]
+    ends = (value == span.low) | (value == span.high)
+    if bool(ends.any()):
         raise InputError(
-            f"expected an initial {name} inside ({low:g}, {high:g}), got {number:g}; "
+            f"expected an initial {name} inside ({span.low:g}, {span.high:g}), "
+            f"got {float(value[ends].flatten()[0]):g}; "
             "start away from the end of the range, where the gradient vanishes"
         )
-    above = torch.tensor(number - low, dtype=torch.float64)
-    return above.log() if math.isinf(high) else torch.logit(above / (high - low))
+    above = value - span.low
+    return above.log() if math.isinf(span.high) else torch.logit(above / (span.high - span.low))
 
 
 def _applies_to(module: nn.Module) -> str:

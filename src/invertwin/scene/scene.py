@@ -47,6 +47,12 @@ class Object:
                 f"expected a Material, got {type(self.material).__name__}; "
                 "give a PerfectConductor or a RoughDielectric"
             )
+        faces = self.material.faces
+        if faces is not None and faces != len(self.mesh.faces):
+            raise InputError(
+                f"expected material values for the mesh's {len(self.mesh.faces)} triangles, "
+                f"got {faces}; give one number per triangle, or one for all"
+            )
         if self.pose is not None:
             object.__setattr__(self, "pose", _checked_pose(self.pose))
         if self.velocity is not None:

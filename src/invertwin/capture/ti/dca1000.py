@@ -59,16 +59,34 @@ def read(
     Raises:
         InputError: what `read_samples` and `ChirpData.capture` raise, or no board.
     """
+    data = read_recording(path, settings, lanes)
+    transmitters, receivers = elements(data.settings, board, elevation, azimuth, arrays)
+    return data.capture(
+        transmitters, receivers, chirps=chirps, positions=positions, rotations=rotations
+    )
+
+
+def read_recording(
+    path: str | Path,
+    settings: str | Path | ChirpSettings | None = None,
+    lanes: int | None = None,
+) -> ChirpData:
+    """Every chirp of a recording, with the settings it was made with.
+
+    Args:
+        path: `.bin` file, or a `.setup.json` that names the files.
+        settings: as for `read`.
+        lanes: of the LVDS link, where the settings do not say.
+
+    Raises:
+        InputError: no settings, or what `read_settings` and `read_samples` raise.
+    """
     if settings is None:
         settings = path
     known = settings if isinstance(settings, ChirpSettings) else read_settings(settings)
     if lanes is not None:
         known = replace(known, lanes=lanes)
-    transmitters, receivers = elements(known, board, elevation, azimuth, arrays)
-    data = read_samples(recorded_files(path), known)
-    return data.capture(
-        transmitters, receivers, chirps=chirps, positions=positions, rotations=rotations
-    )
+    return read_samples(recorded_files(path), known)
 
 
 def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSettings) -> ChirpData:

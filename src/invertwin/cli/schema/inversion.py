@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Tag, model_validator
 
+from invertwin.cli.schema.recording import ArraysData, Dca1000Data
 from invertwin.cli.schema.section import (
     TAG_MARK,
     Count,
@@ -49,6 +50,8 @@ class CaptureData(Section):
     kind: Literal["capture"]
     file: InputPath
     """path, from the run file's folder"""
+    channels: InputPath | None = None
+    """channel calibration that `invertwin look --reflector` wrote; divided out"""
 
 
 class RailSarData(Section):
@@ -59,9 +62,13 @@ class RailSarData(Section):
     """path, from the run file's folder, then from INVERTWIN_DATA"""
 
 
+MeasuredData = CaptureData | Dca1000Data | ArraysData | RailSarData
+
 Data = Annotated[
     Annotated[SimulatedData, Tag(TAG_MARK + "simulated")]
     | Annotated[CaptureData, Tag(TAG_MARK + "capture")]
+    | Annotated[Dca1000Data, Tag(TAG_MARK + "dca1000")]
+    | Annotated[ArraysData, Tag(TAG_MARK + "arrays")]
     | Annotated[RailSarData, Tag(TAG_MARK + "rail_sar")],
     tag_by("kind"),
 ]

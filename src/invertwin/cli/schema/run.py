@@ -19,6 +19,7 @@ from invertwin.cli.schema.inversion import (
     Surrogate,
 )
 from invertwin.cli.schema.objects import SceneFile, SceneObject, Truth
+from invertwin.cli.schema.recording import Chirps, Impairments, Raw
 from invertwin.cli.schema.section import Section, Seed, fail
 from invertwin.cli.schema.sensor import Grid, Radar
 
@@ -44,6 +45,12 @@ class RunFile(Section):
     """what measures; not with a capture"""
     grid: Grid | None = None
     """the map that is compared"""
+    chirps: Chirps | None = None
+    """several ramps a frame, for simulate"""
+    impairments: Impairments | None = None
+    """what the front end of simulated data adds"""
+    raw: Raw | None = None
+    """raw files that simulate writes beside the capture"""
     data: Data | None = None
     """what is fitted"""
     parameters: list[Parameter] = []

@@ -11,6 +11,7 @@ from invertwin.cli.schema.section import (
     Positive,
     Section,
     Vector,
+    check_presence,
     fail,
     tag_by,
 )
@@ -28,7 +29,35 @@ class Fmcw(Section):
     """of one ramp"""
 
 
+class SteppedFrequency(Section):
+    """Tones one after the other."""
+
+    kind: Literal["stepped"]
+    start_frequency: Positive
+    """Hz, of the first tone"""
+    step: Positive
+    """Hz, from tone to tone"""
+    samples: Count
+    """tones"""
+    dwell: Positive
+    """s, on each tone"""
+
+
+class Ofdm(Section):
+    """Subcarriers sent at once."""
+
+    kind: Literal["ofdm"]
+    start_frequency: Positive
+    """Hz, of the lowest subcarrier"""
+    spacing: Positive
+    """Hz, between subcarriers"""
+    subcarriers: Count
+    """how many"""
+
+
 class Impulse(Section):
+    """A pulse; its range profile is measured directly, so only the surrogate models it."""
+
     kind: Literal["impulse"]
     center_frequency: Positive
     """Hz"""
@@ -37,7 +66,10 @@ class Impulse(Section):
 
 
 Waveform = Annotated[
-    Annotated[Fmcw, Tag(TAG_MARK + "fmcw")] | Annotated[Impulse, Tag(TAG_MARK + "impulse")],
+    Annotated[Fmcw, Tag(TAG_MARK + "fmcw")]
+    | Annotated[SteppedFrequency, Tag(TAG_MARK + "stepped")]
+    | Annotated[Ofdm, Tag(TAG_MARK + "ofdm")]
+    | Annotated[Impulse, Tag(TAG_MARK + "impulse")],
     tag_by("kind"),
 ]
 
@@ -126,6 +158,55 @@ Array = Annotated[
 ]
 
 
+Sign = Literal[-1, 1]
+Numbers = Annotated[list[Count], Field(min_length=1)]
+Places = Annotated[
+    list[Annotated[list[float], Field(min_length=2, max_length=2)]], Field(min_length=1)
+]
+
+
+class BoardSection(Section):
+    """Elements on a board's grid of half wavelengths."""
+
+    elevation: Sign | None = None
+    """1 = rows grow upwards, -1 = downwards; required where there are several rows"""
+    azimuth: Sign = 1
+    """1 = columns grow to the right, -1 = to the left"""
+    transmitters: Numbers | None = None
+    """numbers from 1 in the order of sending; without it all, or those of the recording"""
+    receivers: Numbers | None = None
+    """numbers from 1, ascending; without it all, or those of the recording"""
+    pattern: Pattern = Isotropic(kind="isotropic")
+    """of every element"""
+
+
+class PresetBoard(BoardSection):
+    name: Literal[
+        "xWR1443", "xWR1642", "xWR1843", "IWR6843ISK", "IWR6843AOP", "AWR2944", "MMWCAS-RF"
+    ]
+    """of a preset; xWR serves AWR and IWR"""
+    design_frequency: Positive | None = None
+    """Hz, whose half wavelength is the unit; without it the preset's"""
+
+
+class OwnBoard(BoardSection):
+    """A board of one's own: a table of places."""
+
+    tx_places: Places
+    """column, row of TX1, TX2, … in half wavelengths"""
+    rx_places: Places
+    """column, row of RX1, RX2, … in half wavelengths"""
+    design_frequency: Positive
+    """Hz, whose half wavelength is the unit"""
+
+
+Board = Annotated[
+    Annotated[PresetBoard, Tag(TAG_MARK + "name")]
+    | Annotated[OwnBoard, Tag(TAG_MARK + "tx_places")],
+    tag_by("name", "tx_places"),
+]
+
+
 class LineTrack(Section):
     kind: Literal["line"]
     start: Vector
@@ -197,9 +278,11 @@ class Radar(Section):
 
     waveform: Waveform
     """what is sent"""
-    transmitters: Array
+    board: Board | None = None
+    """antenna elements of a board, or:"""
+    transmitters: Array | None = None
     """antenna elements"""
-    receivers: Array
+    receivers: Array | None = None
     """antenna elements"""
     window: Window = "hamming"
     """over the samples of a ramp"""
@@ -211,6 +294,13 @@ class Radar(Section):
     """look_at or rotation_deg"""
     shared_visibility: bool | None = None
     """what the transmitter sees, the receiver sees; default: when both are within 0.1 m"""
+
+    @model_validator(mode="after")
+    def _elements(self) -> "Radar":
+        arrays = self.board is None
+        wanted = {"transmitters": arrays, "receivers": arrays}
+        check_presence(self, wanted, f"with{'out' if arrays else ''} `board`")
+        return self
 
 
 class Grid(Section):

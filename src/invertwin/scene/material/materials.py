@@ -1,98 +1,110 @@
-"""Materials that come with the library."""
+"""The materials that come with the library.
 
-import math
-from dataclasses import dataclass
-from typing import ClassVar
+Every value may be a number, one number per triangle of the mesh, or a `Texture`, and may carry
+gradients; permittivity and conductivity may also follow the ITU table (`Itu`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import ClassVar, TypeVar
 
 import torch
-from jaxtyping import Float, Float64, Shaped
+from jaxtyping import Float64, Shaped
 from torch import Tensor
 
-from invertwin.constants import VACUUM_PERMITTIVITY
+from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number
-from invertwin.scene.material.surface import ANGLE_COUNT, LOBE_COUNT, Material, Surface
+from invertwin.scene.material.fresnel import (
+    attenuation,
+    complex_permittivity,
+    fresnel_amplitude,
+    fresnel_transmittance,
+    refractive_index,
+)
+from invertwin.scene.material.itu import Itu
+from invertwin.scene.material.roughness import (
+    MIRROR_LOBE_WIDTH,
+    ROUGH_LOBE_WIDTH,
+    EffectiveRoughness,
+    Weights,
+    lobe_exponent,
+    specular_weights,
+)
+from invertwin.scene.material.slab import Sheet, slab_tables
+from invertwin.scene.material.surface import ANGLE_COUNT, Material, Surface
+from invertwin.scene.material.values import RANGES, Value, checked_value, evaluated, row_count
 
-MIRROR_LOBE_WIDTH = math.radians(5.0)
-ROUGH_LOBE_WIDTH = math.radians(20.0)
-
-
-def complex_permittivity(
-    permittivity: float | Tensor, conductivity: float | Tensor, frequency: float
-) -> Shaped[Tensor, ""]:
-    """Relative complex permittivity ε = ε' − jσ/(ωε0) for exp(+jωt).
-
-    Args:
-        permittivity: real part ε' ≥ 1.
-        conductivity: σ [S/m].
-        frequency: [Hz].
-
-    Raises:
-        InputError: ε' < 1, σ < 0, or a frequency that is not positive.
-    """
-    checked_number(permittivity, "relative permittivity", 1.0)
-    checked_number(conductivity, "conductivity [S/m]", 0.0)
-    checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-    loss = _float64(conductivity) / (2 * math.pi * frequency * VACUUM_PERMITTIVITY)
-    return torch.complex(_float64(permittivity), -loss)
+AnyMedium = TypeVar("AnyMedium", bound="Medium")
+_SAFE_POWER = 1e-30  # below it a reflectance is zero, and its root has no derivative
 
 
-def fresnel_amplitude(
-    permittivity: Shaped[Tensor, ""], cos_theta: Float[Tensor, "*angle"]
-) -> Float[Tensor, "*angle"]:
-    """Square root of the unpolarised Fresnel power reflectance of a half space.
+class _Values:
+    """Checks the fields of a dataclass by name, and knows for how many triangles they are."""
 
-    The textbook coefficients, multiplied out so that the factor ε − 1 stands alone:
-    r_s = −(ε−1)/(c+s)² and r_p = (ε−1)((ε+1)c² − 1)/(εc+s)² with c = cosθ, s² = ε − 1 + c².
-    The amplitude and its gradient then stay finite at grazing incidence and for ε → 1.
+    def __post_init__(self) -> None:
+        for name in _value_names(self):
+            value = getattr(self, name)
+            if not (isinstance(value, Itu) and name in ("permittivity", "conductivity")):
+                object.__setattr__(self, name, checked_value(value, name))
+        _ = self.faces
 
-    Args:
-        permittivity: complex relative permittivity, 0-d.
-        cos_theta: cosine of the angle of incidence, in [0, 1].
-
-    Returns:
-        sqrt((|r_s|² + |r_p|²)/2), in [0, 1].
-    """
-    # At c = 0 and ε = 1 both denominators vanish; the shift is far below rounding elsewhere.
-    cosine = cos_theta.clamp(min=1e-9)
-    sine = torch.sqrt(permittivity - 1 + cosine**2)
-    perpendicular = 1 / (cosine + sine) ** 2
-    parallel = ((permittivity + 1) * cosine**2 - 1) / (permittivity * cosine + sine) ** 2
-    mean = (perpendicular.abs() ** 2 + parallel.abs() ** 2) / 2
-    return (permittivity - 1).abs() * torch.sqrt(mean)
-
-
-def fresnel_reflectance(
-    permittivity: Shaped[Tensor, ""], cos_theta: Float[Tensor, "*angle"]
-) -> Float[Tensor, "*angle"]:
-    """Unpolarised Fresnel power reflectance (|r_s|² + |r_p|²)/2 of a half space.
-
-    Args:
-        permittivity: complex relative permittivity, 0-d.
-        cos_theta: cosine of the angle of incidence, in [0, 1].
-    """
-    return fresnel_amplitude(permittivity, cos_theta) ** 2
-
-
-def lobe_exponent(width: float | Tensor) -> Float64[Tensor, ""]:
-    """Exponent p of a lobe ((1 + cosψ)/2)^p with the given full width at half maximum [rad].
-
-    From cos^2p(width/4) = 1/2; log1p keeps narrow lobes accurate.
-
-    Raises:
-        InputError: a width outside (0, π].
-    """
-    checked_number(width, "lobe width [rad]", 0.0, math.pi, open_low=True)
-    return -math.log(2) / (2 * torch.log1p(-2 * torch.sin(_float64(width) / 8) ** 2))
-
-
-def lobe_integral(exponent: Float64[Tensor, ""]) -> Float64[Tensor, ""]:
-    """∫ ((1 + cosθ)/2)^p cosθ dω over the half space: the lobe's power at normal incidence."""
-    p = exponent
-    return 4 * math.pi * (p + torch.exp2(-(p + 1))) / ((p + 1) * (p + 2))
+    @property
+    def faces(self) -> int | None:
+        """The number of triangles that the values are for; None if they hold for any."""
+        return row_count({name: getattr(self, name) for name in _value_names(self)})
 
 
 @dataclass(frozen=True)
-class PerfectConductor(Material):
+class Medium(_Values):
+    """A dielectric, by numbers or from the ITU table.
+
+    Attributes:
+        permittivity: relative permittivity ε' ≥ 1.
+        conductivity: σ [S/m] ≥ 0.
+        loss_tangent: tanδ ≥ 0 of other losses: ε = ε' (1 − j tanδ) − jσ/(ωε0).
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    permittivity: Value | Itu
+    conductivity: Value | Itu = 0.0
+    loss_tangent: Value = field(default=0.0, kw_only=True)
+
+    @classmethod
+    def itu(cls: type[AnyMedium], name: str, **values: object) -> AnyMedium:
+        """Permittivity and conductivity of ITU-R P.2040 at the frequency of the radar.
+
+        Args:
+            name: e.g. "concrete"; all are in `ITU_MATERIALS`.
+            values: the other fields, by name.
+
+        Raises:
+            InputError: an unknown name (the nearest ones are named), or a value out of range.
+        """
+        return cls(permittivity=Itu(name), conductivity=Itu(name), **values)  # type: ignore[arg-type]
+
+    def complex_permittivity(self, frequency: float) -> Shaped[Tensor, "*row"]:
+        """ε at `frequency` [Hz]. Warns (`OutsideTableWarning`) outside the ITU table."""
+        return self._epsilon(frequency)[0]
+
+    def _epsilon(self, frequency: float) -> tuple[Tensor, Tensor]:
+        """ε and its dispersion ω dε/dω."""
+        # A power law f^b has the logarithmic slope b; σ/ω falls by one order more.
+        real, real_slope = self.permittivity, 0.0
+        if isinstance(real, Itu):
+            real, real_slope = real.permittivity(frequency), real.coefficients(frequency).b
+        sigma, sigma_slope = self.conductivity, 0.0
+        if isinstance(sigma, Itu):
+            sigma, sigma_slope = sigma.conductivity(frequency), sigma.coefficients(frequency).d
+        epsilon = complex_permittivity(real, sigma, frequency, self.loss_tangent)
+        polarised = evaluated(real) * (1 - 1j * evaluated(self.loss_tangent))
+        dispersion = real_slope * polarised + (sigma_slope - 1) * (epsilon - polarised)
+        return epsilon, dispersion
+
+
+@dataclass(frozen=True)
+class PerfectConductor(_Values, Material):
     """A smooth perfect conductor: nothing is absorbed, nothing is scattered diffusely.
 
     Field paths treat it with physical optics. Power paths cannot see a mirror from a point
@@ -105,72 +117,247 @@ class PerfectConductor(Material):
         InputError: a width outside its range.
     """
 
-    lobe_width: float | Tensor = MIRROR_LOBE_WIDTH
+    lobe_width: Value = MIRROR_LOBE_WIDTH
     coherent: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        lobe_exponent(self.lobe_width)
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-        exponent = lobe_exponent(self.lobe_width)
-        return Surface.opaque(
-            torch.ones(ANGLE_COUNT, dtype=torch.float64),
-            torch.zeros((), dtype=torch.float64),
-            _specular_only(1 / lobe_integral(exponent)),
-            _specular_only(exponent),
-        )
+        nothing = torch.zeros((), dtype=torch.float64)
+        return _opaque(_mirror(), specular_weights(nothing, lobe_exponent(self.lobe_width)))
 
 
 @dataclass(frozen=True)
-class RoughDielectric(Material):
-    """A rough half space: Fresnel reflectance, spread diffusely and into a lobe.
+class RoughConductor(_Values, EffectiveRoughness, Material):
+    """A perfect conductor with a rough surface: all power comes back, spread by the roughness.
 
-    Attributes:
-        permittivity: relative permittivity ε' ≥ 1.
-        conductivity: σ [S/m] ≥ 0.
-        diffuse: fraction of the reflected power in the Lambertian part, in [0, 1]; the rest goes
-            into the lobe.
-        lobe_width: full width at half maximum of the lobe around the mirror direction [rad],
-            in (0, π].
-
-    All may be floats or 0-d tensors with gradients.
+    Its fields are those of `EffectiveRoughness`.
 
     Raises:
         InputError: a value outside its range.
     """
 
-    permittivity: float | Tensor
-    conductivity: float | Tensor = 0.0
-    diffuse: float | Tensor = 1.0
-    lobe_width: float | Tensor = ROUGH_LOBE_WIDTH
     coherent: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
-        checked_number(self.permittivity, "relative permittivity", 1.0)
-        checked_number(self.conductivity, "conductivity [S/m]", 0.0)
-        checked_number(self.diffuse, "diffuse fraction", 0.0, 1.0)
-        lobe_exponent(self.lobe_width)
+    def surface(self, frequency: float) -> Surface:
+        """The reflectance at `frequency` [Hz], here the same at every frequency."""
+        checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+        return _opaque(_mirror(), self.weights())
+
+
+@dataclass(frozen=True)
+class RoughDielectric(Medium, Material):
+    """A rough half space in two values: Fresnel reflectance, spread diffusely and into a lobe.
+
+    Attributes:
+        permittivity, conductivity, loss_tangent: see `Medium`.
+        diffuse: fraction of the reflected power in the Lambertian part, in [0, 1]; the rest goes
+            into the lobe.
+        lobe_width: full width at half maximum of the lobe around the mirror direction [rad],
+            in (0, π].
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    diffuse: Value = 1.0
+    lobe_width: Value = ROUGH_LOBE_WIDTH
+    coherent: ClassVar[bool] = False
 
     def surface(self, frequency: float) -> Surface:
-        """The reflectance at `frequency` [Hz]; differentiable in all four values."""
-        cosine = torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
-        epsilon = complex_permittivity(self.permittivity, self.conductivity, frequency)
-        diffuse = _float64(self.diffuse)
-        exponent = lobe_exponent(self.lobe_width)
-        return Surface.opaque(
-            fresnel_amplitude(epsilon, cosine),
-            diffuse,
-            _specular_only((1 - diffuse) / lobe_integral(exponent)),
-            _specular_only(exponent),
+        """The reflectance at `frequency` [Hz]; differentiable in all values."""
+        epsilon = self.complex_permittivity(frequency)
+        weights = specular_weights(evaluated(self.diffuse), lobe_exponent(self.lobe_width))
+        return _opaque(fresnel_amplitude(epsilon[..., None], _cosines()), weights)
+
+
+@dataclass(frozen=True)
+class Dielectric(Medium, EffectiveRoughness, Material):
+    """A half space with effective roughness: what enters it does not come back.
+
+    Attributes:
+        permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
+            `EffectiveRoughness`.
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    coherent: ClassVar[bool] = False
+
+    def surface(self, frequency: float) -> Surface:
+        """The reflectance at `frequency` [Hz]; differentiable in all values."""
+        epsilon = self.complex_permittivity(frequency)
+        return _opaque(fresnel_amplitude(epsilon[..., None], _cosines()), self.weights())
+
+
+@dataclass(frozen=True)
+class RefractingBody(Medium, EffectiveRoughness, Material):
+    """A solid body with a closed mesh, which rays enter and leave by Snell's law.
+
+    Each face lets in what it does not reflect; on the way through, power is lost by absorption.
+    The direction follows the real part of √ε, which holds where losses per wavelength are small.
+
+    Attributes:
+        permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
+            `EffectiveRoughness`, of what the outside reflects.
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    coherent: ClassVar[bool] = False
+
+    def surface(self, frequency: float) -> Surface:
+        """What one face does at `frequency` [Hz]; differentiable in all values."""
+        epsilon, cosine = self.complex_permittivity(frequency), _cosines()
+        return _surface(
+            fresnel_amplitude(epsilon[..., None], cosine),
+            self.weights(),
+            refraction=fresnel_transmittance(epsilon[..., None], cosine),
+            index=refractive_index(epsilon),
+            attenuation=attenuation(epsilon, frequency),
         )
 
 
-def _float64(value: float | Tensor) -> Tensor:
+@dataclass(frozen=True)
+class Layer(Medium):
+    """One layer of a slab.
+
+    Attributes:
+        permittivity, conductivity, loss_tangent: see `Medium`.
+        thickness: [m] ≥ 0.
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    thickness: Value = field(kw_only=True)
+
+    def sheet(self, frequency: float) -> Sheet:
+        """The layer as numbers at `frequency` [Hz], for `slab_tables`."""
+        epsilon, dispersion = self._epsilon(frequency)
+        return Sheet(
+            epsilon[..., None], dispersion[..., None], evaluated(self.thickness)[..., None]
+        )
+
+
+@dataclass(frozen=True)
+class Slab(Layer, EffectiveRoughness, Material):
+    """A thin sheet of one layer in air, meshed as an open surface: it reflects and lets through.
+
+    Reflections within the sheet are part of its coefficients, at the radar's centre frequency. What
+    passes goes straight on and is late by the sheet's group delay.
+
+    Attributes:
+        permittivity, conductivity, loss_tangent, thickness: see `Layer`; the other fields are
+            those of `EffectiveRoughness`, of what it reflects.
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    coherent: ClassVar[bool] = False
+
+    def surface(self, frequency: float) -> Surface:
+        """What it does at `frequency` [Hz]; differentiable in all values."""
+        return _slab_surface([self], self.weights(), frequency)
+
+
+@dataclass(frozen=True)
+class Multilayer(_Values, EffectiveRoughness, Material):
+    """A thin sheet of several layers in air, meshed as an open surface.
+
+    Attributes:
+        layers: from the first face to the last. Both sides of the mesh reflect as the first face
+            does, which is exact for stacks without losses and for symmetric ones; what passes is
+            the same from both sides.
+        scattering, rms_slope, lambertian, forward, directive_exponent, backscatter_exponent: see
+            `EffectiveRoughness`.
+
+    Raises:
+        InputError: no layers, or a value outside its range.
+    """
+
+    layers: Sequence[Layer]
+    coherent: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        layers = tuple(self.layers)
+        if not layers or not all(isinstance(layer, Layer) for layer in layers):
+            got = ", ".join(type(layer).__name__ for layer in layers) or "none"
+            raise InputError(
+                f"expected at least one Layer, got {got}; give layers=[Layer(...), ...]"
+            )
+        object.__setattr__(self, "layers", layers)
+        super().__post_init__()
+
+    @property
+    def faces(self) -> int | None:
+        """The number of triangles that the values are for; None if they hold for any."""
+        named = {name: getattr(self, name) for name in _value_names(self)}
+        for k, layer in enumerate(self.layers):
+            named |= {f"layers[{k}].{name}": getattr(layer, name) for name in _value_names(layer)}
+        return row_count(named)
+
+    def surface(self, frequency: float) -> Surface:
+        """What it does at `frequency` [Hz]; differentiable in all values."""
+        return _slab_surface(self.layers, self.weights(), frequency)
+
+
+def _value_names(holder: object) -> list[str]:
+    return [entry.name for entry in fields(holder) if entry.name in RANGES]  # type: ignore[arg-type]
+
+
+def _cosines() -> Float64[Tensor, "256"]:
+    return torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
+
+
+def _mirror() -> Tensor:
+    return torch.ones(ANGLE_COUNT, dtype=torch.float64)
+
+
+def _slab_surface(layers: Sequence[Layer], weights: Weights, frequency: float) -> Surface:
+    tables = slab_tables([layer.sheet(frequency) for layer in layers], _cosines(), frequency)
+    # The root's derivative is infinite at zero, where the amplitude has none.
+    seen = tables.reflectance > _SAFE_POWER
+    amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
+    return _surface(amplitude, weights, transmittance=tables.transmittance, excess=tables.excess)
+
+
+def _opaque(amplitude: Tensor, weights: Weights) -> Surface:
+    return _surface(amplitude, weights)
+
+
+def _surface(
+    amplitude: Tensor,
+    weights: Weights,
+    *,
+    transmittance: Tensor | float = 0.0,
+    excess: Tensor | float = 0.0,
+    refraction: Tensor | float = 0.0,
+    index: Tensor | float = 1.0,
+    attenuation: Tensor | float = 0.0,
+) -> Surface:
+    """All fields with the same rows: none, or one for each triangle."""
+    tables = [_tensor(t) for t in (amplitude, transmittance, excess, refraction)]
+    scalars = [_tensor(t) for t in (weights.diffuse, index, attenuation)]
+    shapes = [t.shape[:-1] for t in tables] + [t.shape for t in scalars]
+    row = torch.broadcast_shapes(*shapes)
+    amplitude, transmittance, excess, refraction = (t.expand(*row, ANGLE_COUNT) for t in tables)
+    diffuse, index, attenuation = (t.expand(row) for t in scalars)
+    return Surface(
+        amplitude=amplitude,
+        diffuse=diffuse,
+        lobes=weights.lobes.expand(*row, -1),
+        exponents=weights.exponents.expand(*row, -1),
+        transmittance=transmittance,
+        excess=excess,
+        refraction=refraction,
+        index=index,
+        attenuation=attenuation,
+    )
+
+
+def _tensor(value: Tensor | float) -> Tensor:
     return torch.as_tensor(value, dtype=torch.float64)
-
-
-def _specular_only(value: Tensor) -> Tensor:
-    """A row of values of the lobes in which all but the first are zero."""
-    return torch.cat([value[..., None], value.new_zeros((*value.shape, LOBE_COUNT - 1))], dim=-1)

@@ -107,6 +107,11 @@ class Material(ABC):
 
     coherent: ClassVar[bool]
 
+    @property
+    def faces(self) -> int | None:
+        """The number of triangles that its values are for; None if they hold for any."""
+        return None
+
     @abstractmethod
     def surface(self, frequency: float) -> Surface:
         """What it does at `frequency` [Hz]; differentiable in the material's values."""

@@ -1,0 +1,220 @@
+"""Range, range rate and direction of chirp trains: the maps and pictures of a board's owner."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Float
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from invertwin.channel.paths import Grid
+from invertwin.cli.pictures import DYNAMIC_RANGE_DB, U_LABEL, V_LABEL, png_bytes
+from invertwin.radar import (
+    Chirps,
+    Radar,
+    beamform,
+    compensate_tdm,
+    range_doppler,
+    velocity_axis,
+)
+
+# Bins of range rate on either side of zero that a window spreads what stands still over.
+_STILL_BINS = 2
+_BINS_AT_ONCE = 2e7  # of range rate, range, u, v
+
+DOPPLER_NOTE = (
+    "Range rates are modulo the unambiguous span; phases that transmitters in turn add to movers "
+    "are taken out for range rates within it. Directions show the strongest of the other axis."
+)
+
+
+@dataclass(frozen=True)
+class Peak:
+    """The strongest cell of a map.
+
+    Attributes:
+        range: [m].
+        velocity: Range rate, positive moves away [m/s].
+        u, v: Direction cosines to the right and up; 0 where not resolved.
+        power: Received over sent, or in squared counts.
+    """
+
+    range: float
+    velocity: float
+    u: float
+    v: float
+    power: float
+
+    def metrics(self, name: str) -> dict[str, float]:
+        """Numbers for `metrics.json` whose keys start with a name."""
+        return {
+            f"{name}_range_m": self.range,
+            f"{name}_velocity_m_s": self.velocity,
+            f"{name}_u": self.u,
+            f"{name}_v": self.v,
+            f"{name}_azimuth_deg": math.degrees(math.asin(max(-1.0, min(1.0, self.u)))),
+            f"{name}_power_db": 10 * math.log10(self.power) if self.power > 0 else -math.inf,
+        }
+
+
+@dataclass(frozen=True)
+class DopplerMaps:
+    """One frame of a chirp train.
+
+    Attributes:
+        grid: Ranges and directions.
+        velocities: Range rates [m/s].
+        range_doppler: Mean power of the channels [velocity, range].
+        everything: Power over range and direction, all range rates summed [range, u, v].
+        movers: The same without what stands still; None = too few chirps.
+        strongest: The strongest cell of all.
+        mover: The strongest cell that moves.
+    """
+
+    grid: Grid
+    velocities: NDArray
+    range_doppler: NDArray
+    everything: NDArray
+    movers: NDArray | None
+    strongest: Peak
+    mover: Peak | None
+
+
+def doppler_maps(
+    beat: Complex[Tensor, "frame chirp tx rx sample"],
+    radar: Radar,
+    grid: Grid,
+    chirps: Chirps,
+    frame: int = 0,
+) -> DopplerMaps:
+    """Range-Doppler and range-direction maps of one frame, transmitters' turns compensated.
+
+    Range rates are those of the unambiguous span.
+
+    Raises:
+        InputError: As ``range_doppler`` and ``beamform``.
+    """
+    radar = radar.frames([frame])
+    cube = range_doppler(beat[frame : frame + 1], radar, grid, chirps)
+    flat = cube.abs().square().mean((2, 3))[0]
+    cube = compensate_tdm(cube, radar, chirps)[0]
+    velocities = velocity_axis(radar, chirps)
+    still = (torch.arange(chirps.count) - chirps.count // 2).abs() <= _STILL_BINS
+    chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
+    sums = [torch.zeros(grid.shape, dtype=torch.float64) for _ in range(2)]
+    peaks: list[Peak | None] = [None, None]
+    seen = (grid.u[:, None].square() + grid.v.square()) <= 1
+    for rows in torch.arange(chirps.count).split(chunk):
+        power = beamform(cube[rows], radar.frames([0] * len(rows)), grid).double() * seen
+        for kind, kept in enumerate((torch.ones_like(still), ~still)):
+            chosen = rows[kept[rows]]
+            if len(chosen) == 0:
+                continue
+            part = power[kept[rows]]
+            sums[kind] += part.sum(0)
+            best, place = float(part.max()), int(part.argmax())
+            known = peaks[kind]
+            if known is None or best > known.power:
+                cell = np.unravel_index(place, part.shape)
+                peaks[kind] = _peak(best, float(velocities[chosen[int(cell[0])]]), cell[1:], grid)
+    strongest = peaks[0]
+    assert strongest is not None
+    moving = peaks[1] is not None
+    return DopplerMaps(
+        grid,
+        velocities.numpy(),
+        flat.numpy(),
+        sums[0].numpy(),
+        sums[1].numpy() if moving else None,
+        strongest,
+        peaks[1],
+    )
+
+
+def still_peak(spectrum: Float[Tensor, "range u v"], grid: Grid) -> Peak:
+    """The strongest cell of a map without range rates."""
+    cell = np.unravel_index(int(spectrum.argmax()), spectrum.shape)
+    return _peak(float(spectrum.max()), 0.0, cell, grid)
+
+
+def _peak(power: float, velocity: float, cell: Sequence[Any], grid: Grid) -> Peak:
+    r, u, v = (int(index) for index in cell)
+    return Peak(float(grid.ranges[r]), velocity, float(grid.u[u]), float(grid.v[v]), power)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A map for a picture: rows are ranges.
+
+    Attributes:
+        power: [range, across].
+        ranges: [m].
+        across: Places of the columns.
+        label: Of the columns.
+    """
+
+    power: NDArray
+    ranges: NDArray
+    across: NDArray
+    label: str
+
+
+def panels(maps: DopplerMaps) -> dict[str, Panel]:
+    """What `panels_picture` shows of the maps."""
+    ranges = maps.grid.ranges.numpy()
+    found = {
+        "range and range rate": Panel(
+            maps.range_doppler.T, ranges, maps.velocities, "range rate [m/s], away > 0"
+        )
+    }
+    found |= direction_panels("everything", maps.everything, maps.grid)
+    if maps.movers is not None:
+        found |= direction_panels("what moves", maps.movers, maps.grid)
+    return found
+
+
+def direction_panels(title: str, power: NDArray, grid: Grid) -> dict[str, Panel]:
+    """Range × azimuth and range × elevation, the strongest of the other direction."""
+    ranges, found = grid.ranges.numpy(), {}
+    if grid.u_count > 1:
+        found[title] = Panel(power.max(axis=2), ranges, grid.u.numpy(), U_LABEL)
+    if grid.v_count > 1:
+        name = f"{title}, elevation" if found else title
+        found[name] = Panel(power.max(axis=1), ranges, grid.v.numpy(), V_LABEL)
+    return found
+
+
+def panels_picture(panels: Mapping[str, Panel]) -> bytes:
+    """Maps side by side as PNG bytes, each in dB below its own peak."""
+    figure = Figure(figsize=(3.9 * len(panels), 3.6), layout="constrained")
+    cells = figure.subplots(1, len(panels), squeeze=False)[0]
+    image = None
+    for cell, (title, panel) in zip(cells, panels.items(), strict=True):
+        peak = panel.power.max()
+        level = 10 * np.log10(np.maximum(panel.power / (peak if peak > 0 else 1.0), 1e-12))
+        image = cell.imshow(
+            level,
+            origin="lower",
+            aspect="auto",
+            extent=(*_edges(panel.across), *_edges(panel.ranges)),
+            vmin=-DYNAMIC_RANGE_DB,
+            vmax=0,
+            cmap="viridis",
+        )
+        cell.set_title(title, fontsize=9)
+        cell.set_xlabel(panel.label, fontsize=8)
+        cell.tick_params(labelsize=7)
+    cells[0].set_ylabel("range [m]", fontsize=8)
+    assert image is not None
+    figure.colorbar(image, ax=cells, label="power [dB below peak]", shrink=0.9)
+    return png_bytes(figure)
+
+
+def _edges(places: NDArray) -> tuple[float, float]:
+    half = 0.5 * float(places[1] - places[0]) if len(places) > 1 else 0.5
+    return float(places[0]) - half, float(places[-1]) + half

@@ -1,0 +1,1 @@
+"""The pages of `invertwin reconstruct`: problem, fitting, scores, writing."""

@@ -1,0 +1,112 @@
+"""How good a fit is: distances to the truth, held-out objects, losses without blur."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from invertwin.capture import calibrate, locate
+from invertwin.cli import build
+from invertwin.cli.fits.problem import INTERIOR, Problem
+from invertwin.cli.run_file import need
+from invertwin.cli.schema import RunFile
+from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
+from invertwin.radar.surrogate import surrogate_spectrum
+from invertwin.scene import Scene
+
+
+def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
+    """How far start and twin are from the truth, where it is known."""
+    name = problem.target
+    if name is None:
+        return {}
+    place = twin[name].center.detach().tolist()
+    if name not in problem.known:
+        return {"position": place}
+    settings = need(problem.run, "reconstruct", "reconstruct")
+    before = build.residual(start[name], problem.truth[name])
+    after = build.residual(twin[name], problem.truth[name])
+    rows: dict[str, Any] = {
+        "start_distance_m": before.distance,
+        "position_error_m": after.distance,
+        "success": after.distance <= settings.position_limit,
+        "position": place,
+    }
+    kinds = {p.kind for p in problem.run.parameters}
+    if "pose" in kinds:
+        angle = math.degrees(after.angle)
+        rows |= {"start_angle_deg": math.degrees(before.angle), "rotation_error_deg": angle}
+        rows["success"] &= angle <= settings.rotation_limit_deg
+    if "scale" in kinds:
+        rows |= {"scale_error": abs(after.scale - 1)}
+    return rows
+
+
+def summary(
+    problem: Problem, rows: dict[str, list[dict[str, Any]]], modes: Sequence[str]
+) -> dict[str, Any]:
+    """Successes with and, where asked for, without boundary terms."""
+    if problem.target not in problem.known:
+        return {}
+    counts = {mode: sum(row["success"] for row in rows[mode]) for mode in modes}
+    found = {"successes": counts[modes[0]], "starts_count": len(rows[modes[0]])}
+    if INTERIOR in counts:
+        found["successes_interior_only"] = counts[INTERIOR]
+    return found
+
+
+def heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) -> dict[str, Any]:
+    """For calibrated captures: the error on an object that took no part in the calibration."""
+    table = problem.run.calibration
+    name = problem.target
+    if table is None or name is None or name not in problem.known or name == table.object:
+        return {}
+    truth, known = problem.truth[name].center, problem.truth[table.object].center
+    focused = calibrate(problem.capture, known)
+    peak = locate(focused, truth)
+    places = torch.tensor([row["position"] for row in rows], dtype=torch.float64)
+    spread = (places - places.mean(0)).norm(dim=1).max()
+    return {
+        "heldout_error_m": best["position_error_m"],
+        "heldout_error_worst_m": max(row["position_error_m"] for row in rows),
+        "backprojection_error_m": float((peak - truth).norm()),
+        "spread_m": float(spread),
+        # Between the two objects. That these differ is no matter of the fit.
+        "backprojection_distance_m": float((peak - locate(focused, known)).norm()),
+        "surveyed_distance_m": float((truth - known).norm()),
+    }
+
+
+def without_history(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of the fits as metrics keep them."""
+    return [{k: v for k, v in row.items() if k not in ("losses", "checkpoint")} for row in rows]
+
+
+def sharp_spectrum(
+    problem: Problem, scene: Scene, radar: Radar, offset: torch.Tensor | None
+) -> torch.Tensor:
+    """The surrogate's map of a scene without extra widths."""
+    settings = need(problem.run, "reconstruct", "reconstruct")
+    sharp = replace(build.surrogate(problem.run.surrogate), range_width=0.0, angle_width=0.0)
+    with torch.no_grad():
+        return surrogate_spectrum(
+            scene,
+            radar,
+            problem.grid,
+            sharp,
+            samples=4 * settings.samples,
+            boundary_samples=0,
+            seed=problem.run.seed,
+            range_offset=offset,
+        )
+
+
+def misfit(run: RunFile, simulated: torch.Tensor, measured: torch.Tensor) -> float | None:
+    """The loss of two maps; None where a map without power has none."""
+    try:
+        return float(build.loss(run.loss)(simulated, measured))
+    except InputError:
+        return None

@@ -1,0 +1,102 @@
+"""Simulated samples as the files that boards and their tools write."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Complex
+from torch import Tensor
+
+from invertwin.capture import ChirpData, ChirpSettings, adc_counts, settings_of, ti
+from invertwin.cli.run_file import about
+from invertwin.cli.runs import RunFolder
+from invertwin.cli.schema import Raw, RunFile
+from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
+from invertwin.radar.waveform import FMCW
+
+# A largest sample at this part of the full scale leaves room for those of other seeds.
+_HEADROOM = 1.25
+
+
+def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
+    """Settings that would record what the run file simulates.
+
+    Raises:
+        InputError: A radar that sends no ramps, transmitters that send at once, or ramps that
+            do not fit their interval.
+    """
+    if not isinstance(radar.waveform, FMCW):
+        raise InputError(
+            f'raw: expected radar.waveform.kind = "fmcw", got {type(radar.waveform).__name__}; '
+            "raw files are those of FMCW boards: remove [raw]"
+        )
+    idle = 0.0
+    if run.chirps is not None:
+        if not run.chirps.tdm:
+            raise InputError(
+                "raw: expected transmitters that take turns, got chirps.tdm = false; "
+                "raw files of transmitters that send at once cannot be separated"
+            )
+        idle = run.chirps.interval - radar.waveform.duration
+        if idle < -1e-12:
+            raise InputError(
+                f"chirps.interval: expected at least the ramp's {radar.waveform.duration:g} s, "
+                f"got {run.chirps.interval:g}; idle time comes on top"
+            )
+    raw = run.raw or Raw()
+    with about("raw"):
+        found = settings_of(
+            radar.waveform,
+            len(radar.transmitters.positions),
+            len(radar.receivers.positions),
+            loops=1 if run.chirps is None else run.chirps.count,
+            frames=radar.frame_count,
+            frame_period=raw.frame_period,
+            # To the nanosecond, as settings files have it.
+            idle_time=round(max(idle, 0.0), 9),
+            lanes=raw.lanes,
+        )
+        board = None if run.radar is None else run.radar.board
+        if board is not None and board.transmitters is not None:
+            found = replace(found, transmit_order=tuple(board.transmitters))
+        if board is not None and board.receivers is not None:
+            found = replace(found, receivers=tuple(board.receivers))
+        return replace(found, real=raw.real, bits=raw.bits)
+
+
+def write_raw(
+    run: RunFile,
+    radar: Radar,
+    beat: Complex[Tensor, "frame chirp tx rx sample"] | Complex[Tensor, "frame tx rx sample"],
+    folder: RunFolder,
+) -> dict[str, float]:
+    """Writes raw/capture.bin with .cfg, .mmwave.json and .setup.json beside it.
+
+    Returns:
+        What became of the samples, for `metrics.json`.
+
+    Raises:
+        InputError: What no such file can hold.
+    """
+    assert run.raw is not None
+    settings = settings_of_run(run, radar)
+    full_scale = run.raw.full_scale
+    if full_scale is None:
+        largest = float(torch.view_as_real(beat.resolve_conj()).abs().max())
+        full_scale = _HEADROOM * largest if largest > 0 else 1.0
+    with about("raw"):
+        data = adc_counts(beat, settings, full_scale)
+        samples = folder.file("raw/capture.bin")
+        ti.write_samples(samples, data)
+        ti.write_cfg(folder.file("raw/capture.cfg"), settings)
+        studio = folder.file("raw/capture.mmwave.json")
+        ti.write_studio(studio, settings)
+        ti.write_setup(folder.file("raw/capture.setup.json"), studio, [samples])
+    return {"raw_full_scale": full_scale, "raw_bytes": samples.stat().st_size}
+
+
+def chirp_data(
+    run: RunFile, radar: Radar, beat: Complex[Tensor, "frame chirp tx rx sample"]
+) -> ChirpData:
+    """Simulated chirps as they are, not rounded to counts."""
+    return ChirpData(beat, replace(settings_of_run(run, radar), real=False))

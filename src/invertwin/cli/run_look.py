@@ -1,0 +1,293 @@
+"""`invertwin look`: pictures of a recording as it is, and the recording as a capture."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from invertwin.capture import (
+    Capture,
+    ChannelCalibration,
+    ChirpData,
+    described_arrays,
+    estimate_channels,
+    openradar,
+    rail_sar,
+    ti,
+)
+from invertwin.capture.elements import elements
+from invertwin.channel.paths import Grid
+from invertwin.cli.doppler_maps import (
+    DOPPLER_NOTE,
+    Panel,
+    direction_panels,
+    doppler_maps,
+    panels,
+    panels_picture,
+    still_peak,
+)
+from invertwin.cli.report import Again, Picture, Table, report_html
+from invertwin.cli.runs import RunFolder
+from invertwin.errors import InputError
+from invertwin.radar import Radar, SampledWaveform, velocity_span
+from invertwin.scene import AntennaArray
+
+_ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"
+# Leakage from transmitters to receivers outshines what is nearer than this many range cells.
+_NEAREST_CELLS = 3
+_LABELS = {
+    "reader": "read as",
+    "frames": "frames",
+    "chirps": "chirps of each transmitter in a frame",
+    "channels": "virtual channels",
+    "samples": "samples",
+    "frequency_ghz": "centre frequency [GHz]",
+    "range_cell_m": "range cell [m]",
+    "max_range_m": "unambiguous range [m]",
+    "velocity_span_m_s": "unambiguous span of range rates [m/s]",
+    "peak_range_m": "strongest bin, range [m]",
+    "peak_velocity_m_s": "strongest bin, range rate, away > 0 [m/s]",
+    "peak_azimuth_deg": "strongest bin, azimuth [°]",
+    "mover_range_m": "strongest bin that moves, range [m]",
+    "mover_velocity_m_s": "strongest bin that moves, range rate [m/s]",
+    "mover_azimuth_deg": "strongest bin that moves, azimuth [°]",
+    "channel_spread_db": "gains of the channels, largest over smallest [dB]",
+}
+
+
+@dataclass(frozen=True)
+class Look:
+    """What to look at, as the command line says it.
+
+    Attributes:
+        recording: File or folder.
+        config: Settings file of a raw recording.
+        board: Preset whose elements recorded.
+        elevation, azimuth: Its signs.
+        lanes: Of the LVDS link.
+        chirp: The one that the capture keeps; None = the mean.
+        frame: The one that the pictures show.
+        range_min, range_max: [m].
+        channels: Channel calibration to divide out.
+        reflector: Known place of a reflector [m], to calibrate the channels on.
+    """
+
+    recording: Path
+    config: Path | None = None
+    board: str | None = None
+    elevation: int | None = None
+    azimuth: int | None = None
+    lanes: int | None = None
+    chirp: int | None = None
+    frame: int = 0
+    range_min: float | None = None
+    range_max: float | None = None
+    channels: Path | None = None
+    reflector: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """A recording that has been read.
+
+    Attributes:
+        reader: Who read it.
+        capture: One signal per frame.
+        chirps: Every chirp, complex, where there are several.
+        farthest: Range up to which samples mean something [m].
+    """
+
+    reader: str
+    capture: Capture
+    chirps: ChirpData | None
+    farthest: float
+
+
+def run_look(look: Look, folder: RunFolder) -> list[Table]:
+    """Reads a recording, writes capture, pictures and numbers, returns the tables to print.
+
+    Raises:
+        InputError: A recording or options that do not fit each other; nothing has been written.
+    """
+    recording = _read(look)
+    recording, spread = _calibrated(look, recording, folder)
+    radar = recording.capture.radar()
+    if not 0 <= look.frame < radar.frame_count:
+        raise InputError(
+            f"expected a --frame from 0 to {radar.frame_count - 1}, got {look.frame}; choose one "
+            "of the recording"
+        )
+    grid = _grid(look, radar, recording)
+    metrics: dict[str, Any] = {
+        "task": "look",
+        "reader": recording.reader,
+        "frames": radar.frame_count,
+        "channels": len(radar.virtual_positions),
+        "frequency_ghz": radar.waveform.center_frequency / 1e9,
+        "range_cell_m": radar.waveform.range_resolution,
+        **spread,
+    }
+    if isinstance(radar.waveform, SampledWaveform):
+        metrics |= {"samples": radar.waveform.samples, "max_range_m": recording.farthest}
+    shown, found = _maps(recording, radar, grid, look.frame)
+    metrics |= found
+    if radar.frame_count > 1:
+        profiles = recording.capture.spectrum(replace(grid, u_count=1, v_count=1))
+        power = profiles[:, :, 0, 0].T.double().numpy()
+        times = torch.arange(radar.frame_count).numpy()
+        shown["all frames"] = Panel(power, grid.ranges.numpy(), times, "frame")
+    recording.capture.save(folder.file("capture.nc"))
+    folder.write_json("metrics.json", metrics)
+    folder.write_bytes("look.png", panels_picture(shown))
+    rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
+    table = Table(look.recording.name, ["quantity", "value"], rows)
+    picture = Picture(f"Frame {look.frame}", (folder.path / "look.png").read_bytes(), DOPPLER_NOTE)
+    text = report_html(
+        look.recording.name,
+        f"{radar.frame_count} frames, read as {recording.reader}.",
+        "capture.nc beside this report is the recording as `reconstruct` takes it: "
+        'data = { kind = "capture", file = "capture.nc" }.',
+        [table, picture],
+        Again("look capture.nc", {}),
+    )
+    folder.write_text("report.html", text)
+    return [table]
+
+
+def _read(look: Look) -> _Recording:
+    path = look.recording
+    if not path.exists():
+        raise InputError(f"expected a recording, got no file {path}; check the path")
+    ending = path.suffix.lower()
+    if path.is_dir() or ending == ".npz":
+        return _read_public(look, path if path.is_dir() else path.parent)
+    if ending == ".nc":
+        return _whole("netcdf", Capture.load(path))
+    if ending == ".toml":
+        data = described_arrays.read_chirps(path)
+        arrays = described_arrays.described_elements(
+            path, data.settings, look.board, look.elevation, look.azimuth
+        )
+        return _of_chirps("arrays", data, arrays, look)
+    if ending in (".bin", ".json"):
+        data = ti.read_recording(path, look.config, look.lanes)
+        return _of_chirps("dca1000", data, _preset(look, data, look.board), look)
+    raise InputError(f"expected a recording that ends in {_ENDINGS}, got {path.name}; convert it")
+
+
+def _read_public(look: Look, folder: Path) -> _Recording:
+    readers: dict[str, Callable[[], _Recording]] = {
+        openradar.FILE: lambda: _read_openradar(look, folder),
+        rail_sar.FILE: lambda: _whole("rail_sar", rail_sar.read(folder)),
+    }
+    for file, reader in readers.items():
+        if (folder / file).is_file() and look.recording.name in (file, folder.name):
+            return reader()
+    raise InputError(
+        f"expected a folder with {' or '.join(readers)}, got {look.recording}; of other arrays "
+        "name the TOML description"
+    )
+
+
+def _read_openradar(look: Look, folder: Path) -> _Recording:
+    data = openradar.read_chirps(folder)
+    return _of_chirps("openradar", data, _preset(look, data, look.board or "xWR1642"), look)
+
+
+def _preset(look: Look, data: ChirpData, board: str | None) -> tuple[AntennaArray, AntennaArray]:
+    if board is None:
+        raise InputError(
+            "expected a --board, got none; name the preset that recorded, and its --elevation"
+        )
+    azimuth = 1 if look.azimuth is None else look.azimuth
+    return elements(data.settings, board, look.elevation, azimuth, None)
+
+
+def _of_chirps(
+    reader: str, data: ChirpData, arrays: tuple[AntennaArray, AntennaArray], look: Look
+) -> _Recording:
+    capture = data.capture(*arrays, chirps="mean" if look.chirp is None else look.chirp)
+    waveform = data.settings.waveform
+    # The analytic signal of real samples holds up to half of the range.
+    farthest = waveform.max_range / (2 if data.settings.real else 1)
+    chirps = None
+    if data.settings.loops > 1:
+        chirps = ChirpData(data.beat, replace(data.settings, real=False))
+    return _Recording(reader, capture, chirps, farthest)
+
+
+def _whole(reader: str, capture: Capture) -> _Recording:
+    if "beat" not in capture.dataset:
+        return _Recording(reader, capture, None, float(capture.ranges[-1]))
+    waveform = capture.radar().waveform
+    assert isinstance(waveform, SampledWaveform)
+    return _Recording(reader, capture, None, waveform.max_range)
+
+
+def _calibrated(
+    look: Look, recording: _Recording, folder: RunFolder
+) -> tuple[_Recording, dict[str, float]]:
+    """The recording with its channels calibrated, and how far they were apart."""
+    if look.channels is not None and look.reflector is not None:
+        raise InputError("expected --channels or --reflector, got both; choose one")
+    if look.channels is not None:
+        calibration = ChannelCalibration.load(look.channels)
+    elif look.reflector is not None:
+        calibration = estimate_channels(recording.capture, list(look.reflector))
+        calibration.save(folder.file("channels.json"))
+    else:
+        return recording, {}
+    chirps = recording.chirps
+    gains = calibration.gains.abs()
+    spread = 20 * torch.log10(gains.max() / gains.min())
+    return replace(
+        recording,
+        capture=calibration.apply(recording.capture),
+        chirps=None if chirps is None else calibration.apply_to_chirps(chirps),
+    ), {"channel_spread_db": float(spread)}
+
+
+def _grid(look: Look, radar: Radar, recording: _Recording) -> Grid:
+    cell = radar.waveform.range_resolution
+    nearest = _NEAREST_CELLS * cell
+    if "range_profile" in recording.capture.dataset:
+        nearest = float(recording.capture.ranges[0])
+    low = nearest if look.range_min is None else look.range_min
+    high = recording.farthest if look.range_max is None else look.range_max
+    if high > recording.farthest * (1 + 1e-9):
+        raise InputError(
+            f"expected a --range-max within {recording.farthest:.4g} m, got {high:g}; samples "
+            "do not tell ranges beyond it"
+        )
+    if "range_profile" in recording.capture.dataset:
+        # Inside the first and last samples.
+        step = cell / 2
+        first, count = low, int((high - low) / step)
+        return Grid(range_start=first, range_step=step, range_count=max(count, 1))
+    return radar.grid(low, high)
+
+
+def _maps(
+    recording: _Recording, radar: Radar, grid: Grid, frame: int
+) -> tuple[dict[str, Panel], dict[str, Any]]:
+    """Pictures and numbers of one frame."""
+    if recording.chirps is not None:
+        chirps = recording.chirps.settings.chirps
+        maps = doppler_maps(recording.chirps.beat, radar, grid, chirps, frame)
+        return panels(maps), {
+            "chirps": chirps.count,
+            "velocity_span_m_s": velocity_span(radar, chirps),
+            **maps.strongest.metrics("peak"),
+            **({} if maps.mover is None else maps.mover.metrics("mover")),
+        }
+    spectrum = recording.capture.frames([frame]).spectrum(grid)[0].double()
+    shown = direction_panels("range and direction", spectrum.numpy(), grid)
+    numbers = still_peak(spectrum, grid).metrics("peak")
+    del numbers["peak_velocity_m_s"]
+    if not shown:
+        del numbers["peak_azimuth_deg"]
+        line = spectrum[:, :, 0].numpy()
+        shown["range"] = Panel(line, grid.ranges.numpy(), torch.zeros(1).numpy(), "one channel")
+    return shown, numbers

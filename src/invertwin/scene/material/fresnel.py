@@ -1,0 +1,134 @@
+"""Half spaces: complex permittivity, and what one interface reflects and lets through."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex128, Float, Float64, Shaped
+from torch import Tensor
+
+from invertwin.constants import SPEED_OF_LIGHT, VACUUM_PERMITTIVITY
+from invertwin.scene.checks import checked_number
+from invertwin.scene.material.values import Value, checked_value, evaluated
+
+LEAST_COSINE = 1e-9
+"""Grazing incidence on ε = 1 is 0/0; this shift is far below rounding elsewhere."""
+
+
+class FieldCoefficients(NamedTuple):
+    """Reflected and transmitted over incident electric field, for exp(+jωt), by polarisation.
+
+    Perpendicular (s, TE): E normal to the plane of incidence. Parallel (p, TM): E within it, with
+    the sign by which both reflection coefficients of a conductor are opposite, −1 and +1.
+    """
+
+    reflection_s: Complex128[Tensor, "*angle"]
+    reflection_p: Complex128[Tensor, "*angle"]
+    transmission_s: Complex128[Tensor, "*angle"]
+    transmission_p: Complex128[Tensor, "*angle"]
+
+
+def complex_permittivity(
+    permittivity: Value, conductivity: Value, frequency: float, loss_tangent: Value = 0.0
+) -> Shaped[Tensor, "*row"]:
+    """Relative complex permittivity ε = ε' (1 − j tanδ) − jσ/(ωε0) for exp(+jωt).
+
+    Args:
+        permittivity: real part ε' ≥ 1.
+        conductivity: σ [S/m].
+        frequency: [Hz].
+        loss_tangent: tanδ of losses other than by σ, taken as independent of frequency.
+
+    Raises:
+        InputError: ε' < 1, σ < 0, tanδ < 0, or a frequency that is not positive.
+    """
+    checked_value(permittivity, "permittivity")
+    checked_value(conductivity, "conductivity")
+    checked_value(loss_tangent, "loss_tangent")
+    checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+    real = evaluated(permittivity)
+    loss = evaluated(conductivity) / (2 * math.pi * frequency * VACUUM_PERMITTIVITY)
+    real, loss = torch.broadcast_tensors(real, loss + real * evaluated(loss_tangent))
+    return torch.complex(real, -loss)
+
+
+def fresnel_coefficients(
+    permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
+) -> FieldCoefficients:
+    """Complex field coefficients of the surface of a half space, for waves from air.
+
+    r_s = (c − s)/(c + s), r_p = (εc − s)/(εc + s), t_s = 2c/(c + s), t_p = 2√ε c/(εc + s), with
+    c = cosθ and s² = ε − 1 + c². Source: Fresnel.
+
+    Args:
+        permittivity: complex relative permittivity; broadcasts with the angles.
+        cos_theta: cosine of the angle of incidence, in [0, 1].
+    """
+    epsilon = permittivity.to(torch.complex128)
+    cosine = cos_theta.double().clamp(min=LEAST_COSINE)
+    sine = torch.sqrt(epsilon - 1 + cosine**2)
+    return FieldCoefficients(
+        (cosine - sine) / (cosine + sine),
+        (epsilon * cosine - sine) / (epsilon * cosine + sine),
+        2 * cosine / (cosine + sine),
+        2 * torch.sqrt(epsilon) * cosine / (epsilon * cosine + sine),
+    )
+
+
+def fresnel_amplitude(
+    permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
+) -> Float[Tensor, "*angle"]:
+    """Square root of the unpolarised Fresnel power reflectance of a half space.
+
+    The textbook coefficients, multiplied out so that the factor ε − 1 stands alone:
+    r_s = −(ε−1)/(c+s)² and r_p = (ε−1)((ε+1)c² − 1)/(εc+s)² with c = cosθ, s² = ε − 1 + c².
+    The amplitude and its gradient then stay finite at grazing incidence and for ε → 1.
+
+    Args:
+        permittivity: complex relative permittivity; broadcasts with the angles.
+        cos_theta: cosine of the angle of incidence, in [0, 1].
+
+    Returns:
+        sqrt((|r_s|² + |r_p|²)/2), in [0, 1].
+    """
+    cosine = cos_theta.clamp(min=LEAST_COSINE)
+    sine = torch.sqrt(permittivity - 1 + cosine**2)
+    perpendicular = 1 / (cosine + sine) ** 2
+    parallel = ((permittivity + 1) * cosine**2 - 1) / (permittivity * cosine + sine) ** 2
+    mean = (perpendicular.abs() ** 2 + parallel.abs() ** 2) / 2
+    return (permittivity - 1).abs() * torch.sqrt(mean)
+
+
+def fresnel_reflectance(
+    permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
+) -> Float[Tensor, "*angle"]:
+    """Unpolarised Fresnel power reflectance (|r_s|² + |r_p|²)/2 of a half space.
+
+    Args:
+        permittivity: complex relative permittivity; broadcasts with the angles.
+        cos_theta: cosine of the angle of incidence, in [0, 1].
+    """
+    return fresnel_amplitude(permittivity, cos_theta) ** 2
+
+
+def fresnel_transmittance(
+    permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
+) -> Float[Tensor, "*angle"]:
+    """Unpolarised share of the power that the surface of a half space lets in: what it does not
+    reflect. The same share passes the other way, at the angle that Snell's law gives.
+
+    Args:
+        permittivity: complex relative permittivity; broadcasts with the angles.
+        cos_theta: cosine of the angle of incidence from air, in [0, 1].
+    """
+    return 1 - fresnel_reflectance(permittivity, cos_theta)
+
+
+def refractive_index(permittivity: Shaped[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
+    """Real part n of √ε, by which rays bend: sinθ = n sinθ'."""
+    return torch.sqrt(permittivity).real
+
+
+def attenuation(permittivity: Shaped[Tensor, "*row"], frequency: float) -> Float64[Tensor, "*row"]:
+    """Power lost per metre [1/m] inside a medium: −2 (ω/c₀) Im √ε."""
+    return -4 * math.pi * frequency / SPEED_OF_LIGHT * torch.sqrt(permittivity).imag

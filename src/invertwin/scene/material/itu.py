@@ -1,0 +1,112 @@
+"""Building materials and grounds of Recommendation ITU-R P.2040-3."""
+
+import difflib
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import checked_number
+
+
+class OutsideTableWarning(UserWarning):
+    """A material at a frequency for which its table states no values."""
+
+
+class Coefficients(NamedTuple):
+    """ε' = a f^b and σ = c f^d [S/m], f in GHz, stated from `low` to `high` [GHz]."""
+
+    low: float
+    high: float
+    a: float
+    b: float
+    c: float
+    d: float
+
+
+ITU_MATERIALS: Mapping[str, tuple[Coefficients, ...]] = {
+    "vacuum": (Coefficients(0.001, 100, 1.0, 0.0, 0.0, 0.0),),
+    "concrete": (Coefficients(1, 100, 5.24, 0.0, 0.0462, 0.7822),),
+    "brick": (Coefficients(1, 40, 3.91, 0.0, 0.0238, 0.16),),
+    "plasterboard": (Coefficients(1, 100, 2.73, 0.0, 0.0085, 0.9395),),
+    "wood": (Coefficients(0.001, 100, 1.99, 0.0, 0.0047, 1.0718),),
+    "glass": (
+        Coefficients(0.1, 100, 6.31, 0.0, 0.0036, 1.3394),
+        Coefficients(220, 450, 5.79, 0.0, 0.0004, 1.658),
+    ),
+    "ceiling_board": (
+        Coefficients(1, 100, 1.48, 0.0, 0.0011, 1.0750),
+        Coefficients(220, 450, 1.52, 0.0, 0.0029, 1.029),
+    ),
+    "chipboard": (Coefficients(1, 100, 2.58, 0.0, 0.0217, 0.7800),),
+    "plywood": (Coefficients(1, 40, 2.71, 0.0, 0.33, 0.0),),
+    "marble": (Coefficients(1, 60, 7.074, 0.0, 0.0055, 0.9262),),
+    "floorboard": (Coefficients(50, 100, 3.66, 0.0, 0.0044, 1.3515),),
+    "metal": (Coefficients(1, 100, 1.0, 0.0, 1e7, 0.0),),
+    "very_dry_ground": (Coefficients(1, 10, 3.0, 0.0, 0.00015, 2.52),),
+    "medium_dry_ground": (Coefficients(1, 10, 15.0, -0.1, 0.035, 1.63),),
+    "wet_ground": (Coefficients(1, 10, 30.0, -0.4, 0.15, 1.30),),
+}
+"""The table of the recommendation by name; several entries where it states several ranges.
+
+Source: ITU-R P.2040-3 (2023), §3, table of material properties."""
+
+_warned: set[str] = set()
+
+
+@dataclass(frozen=True)
+class Itu:
+    """The permittivity or conductivity of a material of the table, at the frequency of the radar.
+
+    Stands in a material's `permittivity` or `conductivity` in place of a number; the constructor
+    `itu` of the materials sets both.
+
+    Attributes:
+        name: one of `ITU_MATERIALS`.
+
+    Raises:
+        InputError: an unknown name (the nearest ones are named).
+    """
+
+    name: str
+
+    def __post_init__(self) -> None:
+        if self.name in ITU_MATERIALS:
+            return
+        plain = str(self.name).strip().lower().replace(" ", "_").replace("-", "_")
+        near = difflib.get_close_matches(plain, ITU_MATERIALS, cutoff=0.5)
+        do = f"did you mean {' or '.join(near)}?" if near else f"use {', '.join(ITU_MATERIALS)}"
+        raise InputError(f"expected a material of ITU-R P.2040, got {self.name!r}; {do}")
+
+    def coefficients(self, frequency: float) -> Coefficients:
+        """The entry of the table for `frequency` [Hz]; outside all, the nearest, with a warning.
+
+        The warning (`OutsideTableWarning`) comes once for every material.
+
+        Raises:
+            InputError: a frequency that is not positive.
+        """
+        ghz = checked_number(frequency, "frequency [Hz]", 0.0, open_low=True) / 1e9
+        entries = ITU_MATERIALS[self.name]
+        found = min(entries, key=lambda entry: max(entry.low / ghz, ghz / entry.high))
+        if not found.low <= ghz <= found.high and self.name not in _warned:
+            _warned.add(self.name)
+            stated = " and ".join(f"{entry.low:g} to {entry.high:g}" for entry in entries)
+            warnings.warn(
+                f"ITU-R P.2040 states {self.name} from {stated} GHz, got {ghz:g} GHz; "
+                "its formula is used outside: give measured values if you have some",
+                OutsideTableWarning,
+                stacklevel=2,
+            )
+        return found
+
+    def permittivity(self, frequency: float) -> float:
+        """Real part ε' of the relative permittivity at `frequency` [Hz]."""
+        entry = self.coefficients(frequency)
+        return entry.a * (frequency / 1e9) ** entry.b
+
+    def conductivity(self, frequency: float) -> float:
+        """Conductivity σ [S/m] at `frequency` [Hz]."""
+        entry = self.coefficients(frequency)
+        return entry.c * (frequency / 1e9) ** entry.d

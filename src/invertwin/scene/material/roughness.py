@@ -1,0 +1,122 @@
+"""Roughness: how the reflected power is shared among a mirror-like lobe and scattered ones.
+
+Effective roughness: the share 1 − S² of the reflected power stays about the mirror direction, in a
+glossy lobe as wide as the slopes of the surface make it; the share S² is scattered, into a
+Lambertian part, a directive lobe about the mirror direction, and a lobe back to where it came from.
+
+Source: Degli-Esposti et al., "Measurement and modelling of scattering from buildings", 2007.
+
+Differs from the source: weights are normalised by the lobes' integrals at normal incidence, where
+these are largest, instead of at every angle, and the reflectance enters as sqrt(R(θi) R(θo)); the
+pattern is then reciprocal. The specular part has a width.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.scene.material.surface import LOBE_COUNT
+from invertwin.scene.material.values import Value, checked_value, evaluated
+
+MIRROR_LOBE_WIDTH = math.radians(5.0)
+ROUGH_LOBE_WIDTH = math.radians(20.0)
+
+
+class Weights(NamedTuple):
+    """The part of a `Surface` that says where the reflected power goes."""
+
+    diffuse: Float64[Tensor, "*row"]
+    lobes: Float64[Tensor, "*row 3"]
+    exponents: Float64[Tensor, "*row 3"]
+
+
+def lobe_exponent(width: Value) -> Float64[Tensor, "*row"]:
+    """Exponent p of a lobe ((1 + cosψ)/2)^p with the given full width at half maximum [rad].
+
+    From cos^2p(width/4) = 1/2; log1p keeps narrow lobes accurate.
+
+    Raises:
+        InputError: a width outside (0, π].
+    """
+    checked_value(width, "lobe_width")
+    return -math.log(2) / (2 * torch.log1p(-2 * torch.sin(evaluated(width) / 8) ** 2))
+
+
+def slope_exponent(rms_slope: Value) -> Float64[Tensor, "*row"]:
+    """Exponent of the lobe that a surface of small facets makes: p = 1/m², m the rms slope.
+
+    A facet tilted by β reflects by 2β off the mirror direction, where the lobe is cos^2p(β); for
+    gentle slopes that is exp(−tan²β/m²), the distribution of Gaussian slopes (Beckmann).
+
+    Args:
+        rms_slope: root mean square of the height's gradient, in (0, 1].
+
+    Raises:
+        InputError: a slope outside its range.
+    """
+    checked_value(rms_slope, "rms_slope")
+    return evaluated(rms_slope) ** -2
+
+
+def lobe_integral(exponent: Float64[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
+    """∫ ((1 + cosθ)/2)^p cosθ dω over the half space: the lobe's power at normal incidence."""
+    p = exponent
+    return 4 * math.pi * (p + torch.exp2(-(p + 1))) / ((p + 1) * (p + 2))
+
+
+def specular_weights(
+    diffuse: Float64[Tensor, "*#row"], exponent: Float64[Tensor, "*#row"]
+) -> Weights:
+    """A Lambertian part, and the rest in the specular lobe."""
+    diffuse, exponent = torch.broadcast_tensors(diffuse, exponent)
+    none = diffuse.new_zeros((*diffuse.shape, LOBE_COUNT - 1))
+    weight = (1 - diffuse) / lobe_integral(exponent)
+    return Weights(
+        diffuse,
+        torch.cat([weight[..., None], none], dim=-1),
+        torch.cat([exponent[..., None], none], dim=-1),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectiveRoughness:
+    """How the reflected power is spread. Values may be per triangle, a texture, and be fitted.
+
+    Attributes:
+        scattering: S in [0, 1]; the share S² of the reflected power is scattered.
+        rms_slope: root mean square slope of the surface, in (0, 1]; it makes the width of the lobe
+            that holds the rest (`slope_exponent`).
+        lambertian: share of the scattered power that goes in all directions alike, in [0, 1].
+        forward: share Λ of the rest that goes into the directive lobe about the mirror direction;
+            what is left goes back towards the source. In [0, 1].
+        directive_exponent: α_R of the directive lobe, ((1 + cosψ)/2)^α_R.
+        backscatter_exponent: α_i of the backscattering lobe.
+    """
+
+    scattering: Value = 0.0
+    rms_slope: Value = 0.1
+    lambertian: Value = 1.0
+    forward: Value = 1.0
+    directive_exponent: Value = 4.0
+    backscatter_exponent: Value = 4.0
+
+    def weights(self) -> Weights:
+        """Weights and exponents of the Lambertian part and the three lobes."""
+        scattered = evaluated(self.scattering) ** 2
+        lambertian, forward = evaluated(self.lambertian), evaluated(self.forward)
+        directed = scattered * (1 - lambertian)
+        shares = (1 - scattered, directed * forward, directed * (1 - forward))
+        exponents = (
+            slope_exponent(self.rms_slope),
+            evaluated(self.directive_exponent),
+            evaluated(self.backscatter_exponent),
+        )
+        diffuse, *rows = torch.broadcast_tensors(scattered * lambertian, *shares, *exponents)
+        exponent = torch.stack(rows[LOBE_COUNT:], dim=-1)
+        return Weights(
+            diffuse, torch.stack(rows[:LOBE_COUNT], dim=-1) / lobe_integral(exponent), exponent
+        )

@@ -1,0 +1,192 @@
+"""Sheets of layers in air: what they reflect, what they let through, and how much later.
+
+A plane wave in layer j has the normal wave number k s_j, s_j² = ε_j − sin²θ, and crosses it with
+the phase δ_j = k s_j d_j. With u_j = s_j for perpendicular and s_j/ε_j for parallel polarisation,
+every interface has r = (u_i − u_j)/(u_i + u_j) and t = 2u_i/(u_i + u_j), and one more layer in
+front of a stack (r', t') makes
+
+    r = (r_i + x)/(1 + r_i x),   t = t_i t' e^(−jδ)/(1 + r_i x),   x = r' e^(−2jδ).
+
+This is the transfer matrix's product in a form that holds only decaying exponentials, so that thick
+lossy layers neither overflow nor cancel.
+
+Where the phase lives: the transmission coefficient carries the whole propagation through the
+thickness, from the entry face to the exit face. The ray's geometric length is that of the straight
+line, which crosses the same sheet of air, d cosθ of phase. What is left, the `excess`, is the group
+delay of their ratio, times c₀:
+
+    excess = −c₀ ∂(arg t)/∂ω − d cosθ,
+
+at fixed θ, to first order in d over the distance of the antennas the extra length of the true,
+displaced ray (Fermat). It enters the delay, never the coefficient, so nothing is counted twice.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.scene.material.fresnel import LEAST_COSINE, FieldCoefficients
+
+
+class Sheet(NamedTuple):
+    """One layer as numbers: each 0-d or one per triangle with a last axis of 1 for the angles.
+
+    Attributes:
+        permittivity: complex relative permittivity ε.
+        dispersion: ω dε/dω.
+        thickness: [m].
+    """
+
+    permittivity: Tensor
+    dispersion: Tensor
+    thickness: Tensor
+
+
+class SlabTables(NamedTuple):
+    """Power coefficients of a slab, mean of both polarisations, and the length it adds [m]."""
+
+    reflectance: Float64[Tensor, "*angle"]
+    transmittance: Float64[Tensor, "*angle"]
+    excess: Float64[Tensor, "*angle"]
+
+
+class _Response(NamedTuple):
+    """Reflection and transmission of a stack for one polarisation.
+
+    `slope` of a value is its derivative ω d/dω; that of the transmission is of its logarithm, which
+    stays finite where nothing gets through.
+    """
+
+    reflection: Tensor
+    reflection_slope: Tensor
+    transmission: Tensor
+    log_power: Tensor
+    transmission_slope: Tensor
+
+
+def slab_coefficients(
+    layers: Sequence[Sheet], cos_theta: Float64[Tensor, "*angle"], frequency: float
+) -> FieldCoefficients:
+    """Complex field coefficients of a stack of layers in air, for both polarisations.
+
+    The transmission is from the entry face to the exit face, at the same place along them.
+
+    Args:
+        layers: from the side of incidence on.
+        cos_theta: cosine of the angle of incidence, in [0, 1].
+        frequency: [Hz].
+
+    Raises:
+        InputError: no layers.
+    """
+    s, p = _both(layers, cos_theta, frequency)
+    return FieldCoefficients(s.reflection, p.reflection, s.transmission, p.transmission)
+
+
+def slab_tables(
+    layers: Sequence[Sheet], cos_theta: Float64[Tensor, "*angle"], frequency: float
+) -> SlabTables:
+    """Reflectance, transmittance and excess length of a stack of layers in air.
+
+    Power coefficients are the mean of both polarisations; so is the excess, weighted by the power
+    that each lets through. Differentiable in the layers' values.
+
+    Args:
+        layers: from the side of incidence on.
+        cos_theta: cosine of the angle of incidence, in [0, 1].
+        frequency: [Hz].
+
+    Raises:
+        InputError: no layers.
+    """
+    responses = _both(layers, cos_theta, frequency)
+    s, p = responses
+    wave_number = 2 * math.pi * frequency / SPEED_OF_LIGHT
+    through_air = sum(layer.thickness for layer in layers) * cos_theta
+    excess_s, excess_p = (
+        -response.transmission_slope.imag / wave_number - through_air for response in responses
+    )
+    # The share of s in the power let through, from logarithms: both powers may underflow.
+    share = torch.sigmoid(s.log_power - p.log_power)
+    return SlabTables(
+        (_power(s.reflection) + _power(p.reflection)) / 2,
+        (s.log_power.exp() + p.log_power.exp()) / 2,
+        share * excess_s + (1 - share) * excess_p,
+    )
+
+
+def _both(
+    layers: Sequence[Sheet], cos_theta: Tensor, frequency: float
+) -> tuple[_Response, _Response]:
+    if not layers:
+        raise InputError("expected at least one layer, got none; give the layers of the slab")
+    cosine = cos_theta.clamp(min=LEAST_COSINE)
+    return (
+        _response(layers, cosine, frequency, parallel=False),
+        _response(layers, cosine, frequency, parallel=True),
+    )
+
+
+def _response(
+    layers: Sequence[Sheet], cosine: Tensor, frequency: float, *, parallel: bool
+) -> _Response:
+    """The stack's coefficients: of tangential E (perpendicular) or H (parallel)."""
+    wave_number = 2 * math.pi * frequency / SPEED_OF_LIGHT
+    air = cosine.to(torch.complex128)
+    media, phases = [(air, torch.zeros_like(air))], []
+    for layer in layers:
+        root = torch.sqrt(layer.permittivity - 1 + cosine**2)
+        root_slope = layer.dispersion / (2 * root)
+        thickness = wave_number * layer.thickness
+        phases.append((thickness * root, thickness * (root + root_slope)))
+        if parallel:
+            u = root / layer.permittivity
+            media.append((u, (root_slope - u * layer.dispersion) / layer.permittivity))
+        else:
+            media.append((root, root_slope))
+    media.append(media[0])
+    total = _interface(media[-2], media[-1])
+    for k in reversed(range(len(layers))):
+        total = _in_front(_interface(media[k], media[k + 1]), phases[k], total)
+    return total
+
+
+def _interface(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> _Response:
+    (u, u_slope), (v, v_slope) = before, after
+    both = u + v
+    transmission = 2 * u / both
+    return _Response(
+        (u - v) / both,
+        2 * (u_slope * v - u * v_slope) / both**2,
+        transmission,
+        torch.log(_power(transmission)),
+        (u_slope * v - u * v_slope) / (u * both),
+    )
+
+
+def _in_front(face: _Response, phase: tuple[Tensor, Tensor], rest: _Response) -> _Response:
+    """A layer, entered through `face`, in front of the rest of the stack."""
+    delta, delta_slope = phase
+    once = torch.exp(-1j * delta)
+    x = rest.reflection * once**2
+    x_slope = (rest.reflection_slope - 2j * delta_slope * rest.reflection) * once**2
+    echo = 1 + face.reflection * x
+    echo_slope = face.reflection_slope * x + face.reflection * x_slope
+    reflection = (face.reflection + x) / echo
+    return _Response(
+        reflection,
+        (face.reflection_slope + x_slope - reflection * echo_slope) / echo,
+        face.transmission * rest.transmission * once / echo,
+        face.log_power + rest.log_power + 2 * delta.imag - torch.log(_power(echo)),
+        face.transmission_slope + rest.transmission_slope - 1j * delta_slope - echo_slope / echo,
+    )
+
+
+def _power(field: Tensor) -> Tensor:
+    return field.real**2 + field.imag**2

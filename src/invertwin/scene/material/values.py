@@ -1,0 +1,162 @@
+"""What a material value may be: a number, one per triangle, or a texture; and its range."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import InitVar, dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """Values over a surface from an image, read at the middle of every triangle.
+
+    The value is constant on each triangle, so detail finer than the mesh is lost: subdivide the
+    mesh for more. Between pixel centres the image is interpolated bilinearly, outside it goes on
+    as at its border. Differentiable in the image.
+
+    Attributes:
+        image: values by row and column, the top row first.
+        uv: texture coordinates of the corners of every triangle: u from 0 at the left border of
+            the image to 1 at the right, v from 0 at the bottom to 1 at the top. With `faces`, one
+            pair per vertex instead.
+
+    Args:
+        faces: vertex indices of the triangles [f, 3], where `uv` is per vertex.
+
+    Raises:
+        InputError: wrong shapes, an empty image, NaN, or an index beyond the vertices.
+    """
+
+    image: Float64[Tensor, "row column"]
+    uv: Float64[Tensor, "f 3 2"]
+    faces: InitVar[ArrayLike | None] = None
+
+    def __post_init__(self, faces: ArrayLike | None) -> None:
+        image = checked_tensor(
+            self.image, (None, None), "image of a texture", "give rows of pixels"
+        )
+        if not image.numel():
+            raise InputError("expected an image of a texture with pixels, got none; give some")
+        if faces is None:
+            do = "give u, v of every corner, or of every vertex with `faces`"
+            uv = checked_tensor(self.uv, (None, 3, 2), "uv of a texture", do)
+        else:
+            do = "give u, v of every vertex"
+            vertices = checked_tensor(self.uv, (None, 2), "uv of a texture", do)
+            index = torch.as_tensor(faces)
+            fits = index.ndim == 2 and index.shape[1] == 3 and not index.is_floating_point()
+            if not fits or bool((index < 0).any() or (index >= len(vertices)).any()):
+                raise InputError(
+                    f"expected faces as indices [f, 3] below {len(vertices)}, "
+                    f"got shape {list(index.shape)}; give those of the mesh that `uv` belongs to"
+                )
+            uv = vertices[index]
+        object.__setattr__(self, "image", image)
+        object.__setattr__(self, "uv", uv.detach())
+
+    @property
+    def values(self) -> Float64[Tensor, " f"]:
+        """The value of every triangle: the image at the mean of its corners' coordinates."""
+        rows, columns = self.image.shape
+        u, v = self.uv.mean(1).unbind(-1)
+        # Pixel centres lie half a pixel inside the border.
+        x = (u * columns - 0.5).clamp(0, columns - 1)
+        y = ((1 - v) * rows - 0.5).clamp(0, rows - 1)
+        left = x.floor().long().clamp(max=max(columns - 2, 0))
+        top = y.floor().long().clamp(max=max(rows - 2, 0))
+        right, bottom = (left + 1).clamp(max=columns - 1), (top + 1).clamp(max=rows - 1)
+        a, b = x - left, y - top
+        upper = self.image[top, left] * (1 - a) + self.image[top, right] * a
+        lower = self.image[bottom, left] * (1 - a) + self.image[bottom, right] * a
+        return upper * (1 - b) + lower * b
+
+
+Value = float | Tensor | Texture
+"""A number or 0-d tensor for the whole object, one number per triangle [f], or a texture."""
+
+
+class Range(NamedTuple):
+    """What a value is called in messages, and the numbers it may take."""
+
+    what: str
+    low: float
+    high: float = math.inf
+    open_low: bool = False
+
+
+RANGES: Mapping[str, Range] = {
+    "permittivity": Range("relative permittivity", 1.0),
+    "conductivity": Range("conductivity [S/m]", 0.0),
+    "loss_tangent": Range("loss tangent", 0.0),
+    "thickness": Range("thickness [m]", 0.0),
+    "diffuse": Range("diffuse fraction", 0.0, 1.0),
+    "lobe_width": Range("lobe width [rad]", 0.0, math.pi, open_low=True),
+    "scattering": Range("scattering coefficient", 0.0, 1.0),
+    "rms_slope": Range("rms slope", 0.0, 1.0, open_low=True),
+    "lambertian": Range("Lambertian share", 0.0, 1.0),
+    "forward": Range("forward share", 0.0, 1.0),
+    "directive_exponent": Range("exponent of the directive lobe", 0.0),
+    "backscatter_exponent": Range("exponent of the backscattering lobe", 0.0),
+}
+"""Every value of the library's materials by the name of its field."""
+
+
+def checked_value(value: object, name: str) -> Value:
+    """The value of the field `name`, lists and arrays as tensors.
+
+    Raises:
+        InputError: not a number, a row of numbers or a texture; NaN, or out of the field's range.
+    """
+    span = RANGES[name]
+    if isinstance(value, Texture):
+        _checked_ends(value.image, span)
+        return value
+    if isinstance(value, list | tuple | np.ndarray) or (isinstance(value, Tensor) and value.ndim):
+        do = "give one number, one per triangle, or a Texture"
+        row = checked_tensor(value, (None,), span.what, do)
+        if not len(row):
+            raise InputError(f"expected {span.what} of some triangles, got none; {do}")
+        _checked_ends(row, span)
+        return row
+    checked_number(value, span.what, span.low, span.high, open_low=span.open_low)
+    return value  # type: ignore[return-value]
+
+
+def _checked_ends(numbers: Tensor, span: Range) -> None:
+    for end in (numbers.detach().min(), numbers.detach().max()):
+        checked_number(end, span.what, span.low, span.high, open_low=span.open_low)
+
+
+def evaluated(value: Value) -> Float64[Tensor, "*row"]:
+    """The value as a tensor: 0-d, or one number per triangle."""
+    if isinstance(value, Texture):
+        return value.values
+    return torch.as_tensor(value, dtype=torch.float64)
+
+
+def row_count(values: Mapping[str, object]) -> int | None:
+    """For how many triangles the values are, None if they hold for a whole object.
+
+    Raises:
+        InputError: values for different numbers of triangles.
+    """
+    counts = {}
+    for name, value in values.items():
+        if isinstance(value, Texture):
+            counts[name] = len(value.uv)
+        elif isinstance(value, Tensor) and value.ndim:
+            counts[name] = len(value)
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{name} for {count}" for name, count in counts.items())
+        raise InputError(
+            f"expected values for the same triangles, got {listed}; give one number per triangle"
+        )
+    return next(iter(counts.values()), None)
