@@ -113,18 +113,18 @@ def test_objects_that_start_at_one_place_may_part():
 def test_edges_of_a_mesh_with_split_vertices():
     cube = box(1.0)
     for mesh in (cube, halves(cube)):
-        edges, opposite = edges_of(mesh.faces.numpy(), mesh.vertices.numpy())
+        edges, opposite, _ = edges_of(mesh.faces.numpy(), mesh.vertices.numpy())
         assert len(edges) == 18
         assert opposite.shape == (18, 2)
         assert (opposite >= 0).all()
-    edges, opposite = edges_of(plain().faces.numpy(), plain().vertices.numpy())
+    edges, opposite, _ = edges_of(plain().faces.numpy(), plain().vertices.numpy())
     assert sorted((opposite >= 0).sum(1).tolist()) == [1, 1, 1, 1, 2]
-    _, opposite = edges_of(finned(plain()).faces.numpy(), finned(plain()).vertices.numpy())
+    _, opposite, _ = edges_of(finned(plain()).faces.numpy(), finned(plain()).vertices.numpy())
     assert opposite.shape[1] == 3
 
 
 def test_edges_of_a_mesh_that_is_a_point():
-    edges, opposite = edges_of(np.array([[0, 1, 2]]), np.zeros((3, 3)))
+    edges, opposite, _ = edges_of(np.array([[0, 1, 2]]), np.zeros((3, 3)))
     assert len(edges) == 0
     assert len(opposite) == 0
 

@@ -1,6 +1,6 @@
 """Boundary paths in torch: how fast a shadow's edge moves over the surface it falls on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Float64, Int64
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from invertwin.channel.bridge import Geometry, differentiated, to_torch, tracer
 from invertwin.channel.edges import EdgeSampler
+from invertwin.channel.kernel import Inputs
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import Shot, visible
 from invertwin.errors import InputError
@@ -67,12 +68,14 @@ def edge_points(shot: Shot, centre: str, samples: int, seed: int) -> EdgePoints:
     """Sample the silhouettes seen from ``tx`` or ``rx``; no rows where there are none."""
     import drjit as dr
 
-    sampler = EdgeSampler(shot, getattr(shot, centre), samples, seed)
+    inputs = Inputs.of(shot.geometry, shot.link, shot, monostatic=False)
+    sampler = EdgeSampler(shot, inputs, getattr(shot, centre), samples, seed)
     if not sampler.size:
         none, nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
         return EdgePoints(none, none, none, none, nothing, none, nothing)
     drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size))
-    columns = {n: to_torch(column) for n, column in vars(drawn).items() if n != "index"}
+    names = [field.name for field in fields(EdgePoints)]
+    columns = {name: to_torch(getattr(drawn, name)) for name in names}
     return EdgePoints(
         **{n: c.double() if n in ("along", "weight") else c.long() for n, c in columns.items()}
     )

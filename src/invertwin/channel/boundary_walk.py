@@ -19,6 +19,7 @@ from invertwin.channel.edges import (
     shadow_speed,
 )
 from invertwin.channel.kernel import Inputs, Place
+from invertwin.channel.passage import Passage
 from invertwin.channel.rays import Shot
 from invertwin.channel.walk import State, Walk
 
@@ -30,7 +31,7 @@ class BoundaryChains:
     Attributes:
         speed: Area newly lit per unit of θ, over the sampling density; attached.
         state: The chains at the shadow points, with unit speed.
-        visit: Adds, for one vertex, its path and whether it exists to a list.
+        run: Walks them, and shows each path and whether it exists to a visitor.
     """
 
     speed: Any
@@ -87,41 +88,37 @@ def boundary_chains(
     """
     import drjit as dr
 
-    shared = shot.link.shared_visibility
+    fixed, shared = inputs.detached(), shot.link.shared_visibility
     centres = ("tx",) if shared and depth == 1 else ("tx", "rx")
     families = len(centres) + (1 if depth > 1 and interior else 0)
     for stream, centre in enumerate(centres):
         table = getattr(shot, centre)
-        sampler = EdgeSampler(shot, table, samples // families, seed + stream)
+        sampler = EdgeSampler(shot, fixed, table, samples // families, seed + stream)
         for index in chunks(sampler.size):
             points = sampler.draw(index)
             if dr.width(points.face):
-                yield _antenna_segment(shot, inputs, chain, points, centre, depth)
+                yield from _antenna_segment(shot, inputs, chain, points, centre, depth)
     if families > len(centres):
-        sampler = InteriorEdgeSampler(shot, samples // families, seed + 2)
+        sampler = InteriorEdgeSampler(shot, fixed, samples // families, seed + 2)
         for index in chunks(sampler.size):
             found = sampler.draw(index)
-            if dr.width(found.face):
-                yield _interior_segment(shot, inputs, chain, found, depth)
+            if dr.width(found.edge.face):
+                yield from _interior_segment(shot, inputs, chain, found, depth)
 
 
 def _antenna_segment(
     shot: Shot, inputs: Inputs, chain: Walk, points: EdgePoints, centre: str, depth: int
-) -> BoundaryChains:
+) -> Iterator[BoundaryChains]:
     """Family 1: the shadow that an edge casts from an antenna, then the chain to the other one."""
     import drjit as dr
 
     at_receiver = centre == "rx"
     fixed, frame = inputs.detached(), points.frame
-    shadow = shadow_speed(inputs, points, inputs.antenna(frame, at_receiver))
+    shadow = shadow_speed(fixed, points, fixed.antenna(frame, at_receiver))
     point = kernel.place(fixed, points.face, shadow.b1, shadow.b2)
     back, distance = kernel.leg(point.position, fixed.antenna(frame, at_receiver))
     seen = kernel.to_radar(fixed, frame, -back)
     throughput = fixed.scale * fixed.gain(frame, at_receiver, seen) / dr.square(distance)
-    state = walk.start(
-        points.index, frame, points.face, shadow.b1, shadow.b2, back, throughput, distance
-    )
-    state["u"], state["v"] = seen.x, seen.y
     shared = shot.link.shared_visibility
 
     def run(state: State, visit: Callable[[State, Contribution, Any], None]) -> State:
@@ -134,12 +131,22 @@ def _antenna_segment(
 
         return chain.run(state, depth, connected)
 
-    return BoundaryChains(shadow.speed, state, run)
+    for sign, share, excess in points.sides(fixed):
+        state = walk.start(
+            points.index, frame, points.face, shadow.b1, shadow.b2, back,
+            throughput=throughput * share * sign,
+            length=distance + excess,
+            passed=Passage(share, excess) if fixed.sheets else None,
+        )  # fmt: skip
+        state["u"], state["v"] = seen.x, seen.y
+        # Anew for each side: a derivative taken uses the speed up.
+        speed = shadow_speed(inputs, points, inputs.antenna(frame, at_receiver)).speed
+        yield BoundaryChains(speed, state, run)
 
 
 def _interior_segment(
     shot: Shot, inputs: Inputs, chain: Walk, found: TwoSided, depth: int
-) -> BoundaryChains:
+) -> Iterator[BoundaryChains]:
     """Family 2: a shadow that one surface point casts past an edge on another surface.
 
     The chain from the point behind has a drawn number of vertices; that from the shadow, all that
@@ -149,9 +156,8 @@ def _interior_segment(
 
     mi = tracer()
     fixed, points = inputs.detached(), found.edge
-    attached = kernel.place(inputs, found.face, found.b1, found.b2)
-    shadow = shadow_speed(inputs, points, attached.position)
     behind = kernel.place(fixed, found.face, found.b1, found.b2)
+    shadow = shadow_speed(fixed, points, behind.position)
     ahead = kernel.place(fixed, points.face, shadow.b1, shadow.b2)
     to_behind, distance = kernel.leg(ahead.position, behind.position)
     choices = depth - 1
@@ -176,11 +182,6 @@ def _interior_segment(
 
     with dr.suspend_grad():
         done = chain.run(first, count, ending)
-    state = walk.start(
-        points.index + _OTHER_SIDE, points.frame, points.face, shadow.b1, shadow.b2, to_behind,
-        done["amount"], done["so_far"] + distance,
-    )  # fmt: skip
-    state |= {"u": done["u"], "v": done["v"], "to_receiver": ~ends_at_receiver}
 
     def run(state: State, visit: Callable[[State, Contribution, Any], None]) -> State:
         def connected(state: State, point: Place) -> None:
@@ -189,7 +190,16 @@ def _interior_segment(
 
         return chain.run(state, depth - count, connected)
 
-    return BoundaryChains(shadow.speed, state, run)
+    for sign, share, excess in points.sides(fixed):
+        state = walk.start(
+            points.index + _OTHER_SIDE, points.frame, points.face, shadow.b1, shadow.b2, to_behind,
+            throughput=done["amount"] * share * sign,
+            length=done["so_far"] + distance + excess,
+        )  # fmt: skip
+        state |= {"u": done["u"], "v": done["v"], "to_receiver": ~ends_at_receiver}
+        moving = kernel.place(inputs, found.face, found.b1, found.b2)
+        speed = shadow_speed(inputs, points, moving.position).speed
+        yield BoundaryChains(speed, state, run)
 
 
 _OTHER_SIDE = 1 << 30  # so that both sides of a segment draw their own numbers

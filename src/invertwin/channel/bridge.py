@@ -269,11 +269,12 @@ class Topology:
         owner = torch.zeros(len(vertices), 1, dtype=torch.float64)
         owner[faces.ravel(), 0] = face_object.repeat_interleave(3).double()
         places = torch.cat([owner, vertices], dim=1).numpy()
-        self.edges, self.opposite = edges_of(faces.numpy(), places)
+        self.edges, self.opposite, beside = edges_of(faces.numpy(), places)
         self.device_faces = to_index(faces)
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
         self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
+        self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]
         mesh = mi.Mesh("scene", vertex_count=len(vertices), face_count=len(faces))
         self._parameters = mi.traverse(mesh)
         self._parameters["faces"] = self.device_faces
@@ -327,12 +328,12 @@ def _topology(
 
 def edges_of(
     faces: np.ndarray, places: np.ndarray
-) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"]]:
-    """Edges of a triangle mesh with the opposite vertex of every triangle at the edge.
+) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"], Int64[Tensor, "e k"]]:
+    """Edges of a triangle mesh, with opposite vertex and number of every triangle at the edge.
 
     Vertices with equal rows in ``places`` (object and position) count as one, so that a mesh
-    with split vertices has no false open edges; objects that touch may part. The second table
-    has as many columns as the edge with most triangles (2 for a manifold mesh); absent ones are
+    with split vertices has no false open edges; objects that touch may part. The other two tables
+    have as many columns as the edge with most triangles (2 for a manifold mesh); absent ones are
     −1.
     """
     _, first, inverse = np.unique(places, axis=0, return_index=True, return_inverse=True)
@@ -341,10 +342,14 @@ def edges_of(
     ends = np.concatenate([np.sort(welded[:, [a, b]], axis=1) for a, b, _ in corners])
     apex = np.concatenate([welded[:, c] for _, _, c in corners])
     proper = ends[:, 0] != ends[:, 1]
+    triangle = np.tile(np.arange(len(faces)), 3)[proper]
     ends, apex = ends[proper], apex[proper]
     edges, group, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
     order = np.argsort(group.ravel(), kind="stable")
     start = np.repeat(np.cumsum(counts) - counts, counts)
     opposite = np.full((len(edges), counts.max(initial=1)), -1, dtype=np.int64)
-    opposite[group.ravel()[order], np.arange(len(order)) - start] = apex[order]
-    return torch.from_numpy(edges.astype(np.int64)), torch.from_numpy(opposite)
+    beside = opposite.copy()
+    at = group.ravel()[order], np.arange(len(order)) - start
+    opposite[at], beside[at] = apex[order], triangle[order]
+    tables = edges.astype(np.int64), opposite, beside
+    return torch.from_numpy(tables[0]), torch.from_numpy(tables[1]), torch.from_numpy(tables[2])

@@ -28,6 +28,7 @@ from invertwin.channel.bridge import (
     use_backend,
 )
 from invertwin.channel.kernel import DIFFERENTIABLE, Inputs, Place
+from invertwin.channel.passage import Passage
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.rays import Shot
 from invertwin.channel.sampling import AreaSampler, RaySampler
@@ -231,16 +232,18 @@ class _Trace:
         """Chains at their first vertex."""
         import drjit as dr
 
-        drawn = self.sampler.draw(index)
+        drawn = self.sampler.draw(index, self.fixed)
         tx = self.fixed.antenna(drawn.frame, False)
         point = kernel.place(self.fixed, drawn.face, drawn.b1, drawn.b2)
         back, distance = kernel.leg(point.position, tx)
         gain = self.fixed.gain(drawn.frame, False, kernel.to_radar(self.fixed, drawn.frame, -back))
-        weight = drawn.weight * self.fixed.scale * gain / dr.square(distance)
-        throughput = dr.select(drawn.weight > 0, weight, 0.0)
+        weight = drawn.weight * drawn.share * self.fixed.scale * gain / dr.square(distance)
         return walk.start(
-            index, drawn.frame, drawn.face, drawn.b1, drawn.b2, back, throughput, distance
-        )
+            index, drawn.frame, drawn.face, drawn.b1, drawn.b2, back,
+            throughput=dr.select(drawn.weight > 0, weight, 0.0),
+            length=distance + drawn.excess,
+            passed=Passage(drawn.share, drawn.excess) if self.fixed.sheets else None,
+        )  # fmt: skip
 
     def boundary(self, inputs: Inputs) -> Iterator[BoundaryChains]:
         """Boundary paths of all segments, a chunk at a time."""

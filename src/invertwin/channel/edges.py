@@ -11,6 +11,7 @@ from typing import Any
 from invertwin.channel import kernel
 from invertwin.channel.bridge import tracer
 from invertwin.channel.kernel import Inputs
+from invertwin.channel.passage import land, passage, through
 from invertwin.channel.rays import NEAR, Shot, scrambled, uniform_pair
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
@@ -22,7 +23,10 @@ _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 class EdgePoints:
     """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
 
-    ``weight`` is one over (samples × density along the edge parameter).
+    ``weight`` is one over (samples × density along the edge parameter). ``share`` and ``excess``
+    are those of the sheets on the way, the edge's own triangles left out; what these let through
+    on the side of ``opposite`` is ``covered``, on the other side ``open`` (1 where there is
+    nothing, 0 where it is opaque), both with an excess length.
     """
 
     index: Any
@@ -33,6 +37,19 @@ class EdgePoints:
     along: Any
     face: Any
     weight: Any
+    share: Any
+    excess: Any
+    open: Any
+    open_excess: Any
+    covered: Any
+    covered_excess: Any
+
+    def sides(self, inputs: Inputs) -> list[tuple[float, Any, Any]]:
+        """Sign, share and excess of what is lit on either side of the shadow's edge."""
+        lit = (1.0, self.share * self.open, self.excess + self.open_excess)
+        if not inputs.sheets:
+            return [lit]
+        return [lit, (-1.0, self.share * self.covered, self.excess + self.covered_excess)]
 
 
 @dataclass(frozen=True)
@@ -76,16 +93,17 @@ class EdgeSampler:
 
     An edge is a silhouette if all its triangles lie, as seen from the antenna, on one side of
     it: one triangle for an open edge, two for a fold, any number for a non-manifold edge. The
-    rule needs no consistent winding.
+    rule needs no consistent winding. Of sheets, every edge counts at which they let through
+    more on one side than on the other.
     """
 
-    def __init__(self, shot: Shot, centre: Any, samples: int, seed: int) -> None:
+    def __init__(self, shot: Shot, inputs: Inputs, centre: Any, samples: int, seed: int) -> None:
         import drjit as dr
 
         mi = tracer()
         topology = shot.geometry.topology
         count = len(topology.edges)
-        self.shot, self.centre = shot, centre
+        self.shot, self.inputs, self.centre = shot, inputs, centre
         index = dr.arange(mi.UInt32, shot.link.frame_count * count)
         frame, edge = index // count, index % count
         origin = shot.point(centre, frame)
@@ -93,14 +111,14 @@ class EdgeSampler:
             shot.point(shot.vertices, dr.gather(mi.UInt32, ends, edge))
             for ends in topology.device_edges
         )
-        one_sided = _one_sided(shot, edge, y0, dr.cross(y0 - origin, y1 - y0))
-        self.index: Any = dr.compress(one_sided)
+        sides = _sides(shot, inputs, edge, y0, y1, 0.5 * (y0 + y1) - origin)
+        self.index: Any = dr.compress(sides.unlike)
         self.size = samples if dr.width(self.index) else 0
         if self.size:
             length = dr.norm(y1 - y0) / dr.norm(0.5 * (y0 + y1) - origin)
             weight = dr.gather(mi.Float, length, self.index)
             self.distribution = mi.DiscreteDistribution(weight / dr.max(weight))
-        self.seed = scrambled(seed, 3)
+        self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
 
     def draw(self, index: Any) -> EdgePoints:
         """The samples of the given indices below ``size``; those without a shadow are left out."""
@@ -113,17 +131,24 @@ class EdgeSampler:
         frame, edge = entry // len(topology.edges), entry % len(topology.edges)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0 = shot.point(shot.vertices, first)
-        y = y0 + (shot.point(shot.vertices, second) - y0) * along
+        y1 = shot.point(shot.vertices, second)
+        y = y0 + (y1 - y0) * along
         origin = shot.point(self.centre, frame)
         away = y - origin
-        valid = shot.clear(origin, y)
-        hit = shot.scene.ray_intersect_preliminary(
-            mi.Ray3f(y + away * NEAR, away), coherent=True, active=valid
-        )
-        valid &= hit.is_valid() & _not_grazing(shot, hit.prim_index, away, hit.is_valid())
-        opposite = mi.UInt32(dr.gather(mi.Int32, topology.device_opposite[0], edge))
-        weight = 1 / (pmf * self.size)
-        found = EdgePoints(index, frame, first, second, opposite, along, hit.prim_index, weight)
+        before = passage(shot, self.inputs, origin, y, mi.Bool(True))
+        sides = _sides(shot, self.inputs, edge, y0, y1, away)
+        valid = (before.share > 0) & sides.unlike
+        ray = mi.Ray3f(y + away * NEAR, dr.normalize(away))
+        hit = land(shot, self.inputs, ray, valid, (index, self.dice), coherent=True)
+        valid &= hit.valid & _not_grazing(shot, hit.face, away, hit.valid)
+        found = EdgePoints(
+            index, frame, first, second, sides.opposite, along, hit.face,
+            weight=1 / (pmf * self.size * hit.chance),
+            share=before.share * hit.share,
+            excess=before.excess + hit.excess,
+            open=sides.open, open_excess=sides.open_excess,
+            covered=sides.covered, covered_excess=sides.covered_excess,
+        )  # fmt: skip
         return _compressed(valid, found)[0]
 
 
@@ -136,12 +161,14 @@ class InteriorEdgeSampler:
     from the whole sphere: what the benchmark compares with.
     """
 
-    def __init__(self, shot: Shot, samples: int, seed: int, *, weighted: bool = True) -> None:
+    def __init__(
+        self, shot: Shot, inputs: Inputs, samples: int, seed: int, *, weighted: bool = True
+    ) -> None:
         import drjit as dr
 
         mi = tracer()
         topology = shot.geometry.topology
-        self.shot, self.weighted = shot, weighted
+        self.shot, self.inputs, self.weighted = shot, inputs, weighted
         self.frames = shot.link.frame_count
         edge = dr.arange(mi.UInt32, len(topology.edges))
         y0, y1 = (
@@ -165,7 +192,8 @@ class InteriorEdgeSampler:
         if self.size:
             chosen = dr.gather(mi.Float, weight, self.index)
             self.distribution = mi.DiscreteDistribution(chosen / dr.max(chosen))
-        self.seeds = scrambled(seed, 4), scrambled(seed, 5), scrambled(seed, 6)
+        self.seeds = scrambled(seed, 4), scrambled(seed, 5)
+        self.dice = scrambled(seed, 10), scrambled(seed, 11)
 
     def _opening(self, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
         """Start and span of the tangential directions' azimuth about the edge, up to sign.
@@ -189,10 +217,24 @@ class InteriorEdgeSampler:
         # Behind a fold the free azimuths are those beyond the second triangle, up to π.
         start = dr.select(apex >= 0, dr.select(angle > 0, turn, 0.0), start)
         span = dr.select(apex >= 0, dr.pi - turn, span)
+        unsure = mi.Bool(False)
         for column in topology.device_opposite[2:]:
-            many = dr.gather(mi.Int32, column, edge) >= 0
-            start, span = dr.select(many, 0.0, start), dr.select(many, dr.pi, span)
-        return start, span
+            unsure |= dr.gather(mi.Int32, column, edge) >= 0
+        if self.inputs.sheets:
+            unsure |= self._sheet(edge) & (span > _FLAT)
+        return dr.select(unsure, 0.0, start), dr.select(unsure, dr.pi, span)
+
+    def _sheet(self, edge: Any) -> Any:
+        """Whether any triangle of an edge lets something through."""
+        import drjit as dr
+
+        mi = tracer()
+        inputs, found = self.inputs, mi.Bool(False)
+        for column in self.shot.geometry.topology.device_beside:
+            face = dr.gather(mi.UInt32, column, edge)
+            row = dr.gather(mi.UInt32, inputs.face_surface, face)
+            found |= kernel.tabulated(inputs, "transmittance", row, mi.Float(1.0)) > 0
+        return found
 
     def _azimuth_axes(self, edge: Any, y0: Any, along: Any) -> tuple[Any, Any]:
         import drjit as dr
@@ -219,24 +261,30 @@ class InteriorEdgeSampler:
         y0, y1 = (shot.point(shot.vertices, end) for end in (first, second))
         y = y0 + (y1 - y0) * along
         omega, density = self._direction(index, edge, y0, y1)
-        valid = _one_sided(shot, edge, y0, dr.cross(omega, y1 - y0))
+        sides = _sides(shot, self.inputs, edge, y0, y1, omega)
+        valid = sides.unlike
         hits = []
-        for sign in (-1.0, 1.0):
+        for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
             ray = mi.Ray3f(mi.Point3f(y + omega * (sign * NEAR * dr.norm(y))), omega * sign)
-            hit = shot.scene.ray_intersect_preliminary(ray, active=valid)
-            valid &= hit.is_valid()
-            valid &= _not_grazing(shot, hit.prim_index, omega, hit.is_valid())
+            hit = land(shot, self.inputs, ray, valid, (index, dice), coherent=False)
+            valid &= hit.valid & _not_grazing(shot, hit.face, omega, hit.valid)
             hits.append(hit)
         behind, ahead = hits
-        p0, p1, p2 = shot.corners(behind.prim_index, valid)
-        b1, b2 = behind.prim_uv.x, behind.prim_uv.y
+        p0, p1, p2 = shot.corners(behind.face, valid)
+        b1, b2 = behind.b1, behind.b2
         point = p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2
         cosine = dr.abs(dr.dot(dr.normalize(dr.cross(p1 - p0, p2 - p0)), omega))
         measure = dr.squared_norm(point - y) / cosine
-        weight = measure / (pmf * density * self.per_frame)
-        opposite = mi.UInt32(dr.maximum(dr.gather(mi.Int32, topology.device_opposite[0], edge), 0))
-        points = EdgePoints(index, frame, first, second, opposite, along, ahead.prim_index, weight)
-        other = _Behind(behind.prim_index, b1, b2)
+        chance = behind.chance * ahead.chance
+        points = EdgePoints(
+            index, frame, first, second, sides.opposite, along, ahead.face,
+            weight=measure / (pmf * density * self.per_frame * chance),
+            share=behind.share * ahead.share,
+            excess=behind.excess + ahead.excess,
+            open=sides.open, open_excess=sides.open_excess,
+            covered=sides.covered, covered_excess=sides.covered_excess,
+        )  # fmt: skip
+        other = _Behind(behind.face, b1, b2)
         points, other = _compressed(valid, points, other)
         return TwoSided(points, other.face, other.b1, other.b2)
 
@@ -282,20 +330,61 @@ def _along(
     return place, along, pmf
 
 
-def _one_sided(shot: Shot, edge: Any, y0: Any, plane: Any) -> Any:
-    """Whether all triangles of an edge lie on one side of a plane through it."""
+@dataclass(frozen=True)
+class _Sides:
+    """What an edge's triangles let through on either side of a direction; see ``EdgePoints``."""
+
+    opposite: Any
+    open: Any
+    open_excess: Any
+    covered: Any
+    covered_excess: Any
+
+    @property
+    def unlike(self) -> Any:
+        """Whether the sides differ by more than rounding."""
+        import drjit as dr
+
+        same_length = dr.abs(self.open_excess - self.covered_excess) <= 1e-7
+        return ~((dr.abs(self.open - self.covered) <= 1e-6) & same_length)
+
+
+def _sides(shot: Shot, inputs: Inputs, edge: Any, y0: Any, y1: Any, direction: Any) -> _Sides:
+    """Sort an edge's triangles by the side of the plane through edge and direction they lie on.
+
+    An opaque edge is a silhouette if nothing is on one side. The covered side is that of the
+    triangle that leaves the plane most.
+    """
     import drjit as dr
 
     mi = tracer()
-    left, right = mi.Bool(False), mi.Bool(False)
-    for column in shot.geometry.topology.device_opposite:
+    topology = shot.geometry.topology
+    plane = dr.cross(direction, y1 - y0)
+    offsets, heights = [], []
+    opposite, most = mi.UInt32(0), mi.Float(0.0)
+    for column in topology.device_opposite:
         apex = dr.gather(mi.Int32, column, edge)
-        here = apex >= 0
-        offset = shot.point(shot.vertices, mi.UInt32(dr.maximum(apex, 0))) - y0
-        side = dr.dot(plane, offset)
-        left |= here & (side > 0)
-        right |= here & (side < 0)
-    return left ^ right
+        place = mi.UInt32(dr.maximum(apex, 0))
+        offset = shot.point(shot.vertices, place) - y0
+        height = dr.select(apex >= 0, dr.dot(plane, offset), 0.0)
+        # Squares, since Dr.Jit 1.5 drops the abs of a select on an abs.
+        further = dr.square(height) > dr.square(most)
+        opposite, most = dr.select(further, place, opposite), dr.select(further, height, most)
+        offsets.append(offset)
+        heights.append(height)
+    shares, lengths = [mi.Float(1.0), mi.Float(1.0)], [mi.Float(0.0), mi.Float(0.0)]
+    for number, (offset, height) in enumerate(zip(offsets, heights, strict=True)):
+        share, excess = mi.Float(0.0), mi.Float(0.0)
+        if inputs.sheets:
+            face = dr.gather(mi.UInt32, topology.device_beside[number], edge)
+            row = dr.gather(mi.UInt32, inputs.face_surface, face)
+            normal = dr.cross(y1 - y0, offset)
+            cosine = dr.abs(dr.dot(normal, direction)) / (dr.norm(normal) * dr.norm(direction))
+            share, excess = through(inputs, row, cosine, height != 0)
+        for index, on in enumerate((height * most < 0, height * most > 0)):
+            shares[index] = dr.select(on, shares[index] * share, shares[index])
+            lengths[index] = dr.select(on, lengths[index] + excess, lengths[index])
+    return _Sides(opposite, shares[0], lengths[0], shares[1], lengths[1])
 
 
 def _not_grazing(shot: Shot, face: Any, direction: Any, active: Any) -> Any:

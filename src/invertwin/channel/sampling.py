@@ -13,7 +13,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.channel import kernel
 from invertwin.channel.bridge import Geometry, to_float, tracer
+from invertwin.channel.kernel import Inputs
+from invertwin.channel.passage import land, passage
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import Shot, face_areas, scrambled, uniform_pair
 from invertwin.errors import InputError
@@ -21,13 +24,18 @@ from invertwin.errors import InputError
 
 @dataclass(frozen=True)
 class Samples:
-    """Points on surfaces (Dr.Jit arrays). ``weight`` is one over (samples × area density)."""
+    """Points on surfaces (Dr.Jit arrays). ``weight`` is one over (samples × area density).
+
+    ``share`` and ``excess`` are those of the sheets between the transmitter and the point.
+    """
 
     frame: Any
     face: Any
     b1: Any
     b2: Any
     weight: Any
+    share: Any
+    excess: Any
 
 
 def _caps(
@@ -66,9 +74,9 @@ class RaySampler:
         self.columns = max(1, samples // blocks // self.rows)
         self.size = blocks * self.rows * self.columns
         self.axes, self.heights = to_float(axes), to_float(heights)
-        self.seed = scrambled(seed, 0)
+        self.seed, self.dice = scrambled(seed, 0), scrambled(seed, 8)
 
-    def draw(self, index: Any) -> Samples:
+    def draw(self, index: Any, inputs: Inputs) -> Samples:
         """The samples of the given indices below ``size``."""
         import drjit as dr
 
@@ -97,15 +105,13 @@ class RaySampler:
             inside = (dr.squared_norm(away) <= 2 * cap) | (block == entry)
             density += dr.select(inside, per_block / (2 * dr.pi * cap), 0.0)
         centre = shot.point(shot.tx, frame)
-        hit = shot.scene.ray_intersect_preliminary(mi.Ray3f(centre, direction), coherent=True)
-        valid = hit.is_valid()
-        p0, p1, p2 = shot.corners(hit.prim_index, valid)
-        normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
-        cosine = dr.maximum(dr.abs(dr.dot(normal, direction)), 1e-6)
-        weight = dr.select(valid, dr.square(hit.t) / (cosine * density), 0.0)
-        face = dr.select(valid, hit.prim_index, shot.sound_face)
-        b = dr.select(valid, hit.prim_uv, 0.25)
-        return Samples(frame, face, b.x, b.y, weight)
+        ray = mi.Ray3f(centre, direction)
+        hit = land(shot, inputs, ray, mi.Bool(True), (index, self.dice), coherent=True)
+        point = kernel.place(inputs, hit.face, hit.b1, hit.b2)
+        cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
+        distance = dr.squared_norm(point.position - centre)
+        weight = dr.select(hit.valid, distance / (cosine * density * hit.chance), 0.0)
+        return Samples(frame, hit.face, hit.b1, hit.b2, weight, hit.share, hit.excess)
 
 
 class AreaSampler:
@@ -132,7 +138,7 @@ class AreaSampler:
         self.distribution = mi.DiscreteDistribution(to_float(areas / areas.mean()))
         self.seeds = scrambled(seed, 1), scrambled(seed, 2)
 
-    def draw(self, index: Any) -> Samples:
+    def draw(self, index: Any, inputs: Inputs) -> Samples:
         """The samples of the given indices below ``size``."""
         import drjit as dr
 
@@ -146,6 +152,6 @@ class AreaSampler:
         p0, p1, p2 = shot.corners(face)
         area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
         position = p0 * (1 - b.x - b.y) + p1 * b.x + p2 * b.y
-        valid = shot.clear(shot.point(shot.tx, frame), position)
-        weight = dr.select(valid, area / (pmf * self.per_frame), 0.0)
-        return Samples(frame, face, b.x, b.y, weight)
+        passed = passage(shot, inputs, shot.point(shot.tx, frame), position, mi.Bool(True))
+        weight = dr.select(passed.share > 0, area / (pmf * self.per_frame), 0.0)
+        return Samples(frame, face, b.x, b.y, weight, passed.share, passed.excess)

@@ -6,7 +6,7 @@ and lengths come from float64 vertices, so that the phase is right at millimetre
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from invertwin.channel.boundary import (
     silhouettes_move,
 )
 from invertwin.channel.bridge import Geometry, flatten, to_torch, tracer, use_backend
+from invertwin.channel.kernel import Inputs
 from invertwin.channel.paths import Link, Paths
 from invertwin.channel.rays import Shot, face_areas, visible
 from invertwin.channel.sampling import RaySampler
@@ -407,8 +408,10 @@ def _boundary_paths(
 def _drawn(sampler: Any) -> _Points:
     import drjit as dr
 
-    drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size))
-    frame, face, b1, b2, weight = (to_torch(column) for column in vars(drawn).values())
+    inputs = Inputs.of(sampler.shot.geometry, sampler.shot.link, sampler.shot, monostatic=False)
+    drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size), inputs)
+    names = [field.name for field in fields(_Points)]
+    frame, face, b1, b2, weight = (to_torch(getattr(drawn, name)) for name in names)
     return _Points(frame.long(), face.long(), b1.double(), b2.double(), weight.double())
 
 

@@ -13,6 +13,7 @@ from invertwin.channel.bins import Contribution
 from invertwin.channel.bridge import opaque, tracer
 from invertwin.channel.directions import Directions
 from invertwin.channel.kernel import Inputs, Place
+from invertwin.channel.passage import Passage, land, passage
 from invertwin.channel.rays import NEAR, Shot, scrambled
 
 _LEAST_SURVIVAL = 0.1  # of Russian roulette
@@ -23,12 +24,21 @@ State = dict[str, Any]
 
 
 def start(
-    index: Any, frame: Any, face: Any, b1: Any, b2: Any, back: Any, throughput: Any, length: Any
+    index: Any,
+    frame: Any,
+    face: Any,
+    b1: Any,
+    b2: Any,
+    back: Any,
+    throughput: Any,
+    length: Any,
+    passed: Passage | None = None,
 ) -> State:
     """The state at the first vertex.
 
     ``back`` points to where the path comes from; ``throughput`` is everything up to arriving
     here, one over the density of the samples included; ``length`` is that of the path so far.
+    ``passed`` is what lies on the first leg, for antennas that share what they see.
     """
     import drjit as dr
 
@@ -45,6 +55,7 @@ def start(
         "back": mi.Vector3f(back),
         "throughput": throughput,
         "length": length,
+        **({} if passed is None else {"share": passed.share, "excess": passed.excess}),
     }
 
 
@@ -69,7 +80,8 @@ class Walk:
             visit(state, self._place(state))
             return state
         last = opaque(depth) if isinstance(depth, int) else depth
-        state = {**state, "last": mi.UInt32(last) + dr.zeros(mi.UInt32, dr.width(state["index"]))}
+        lanes = dr.width(state["index"])
+        state = {**state, "last": mi.UInt32(last) + dr.zeros(mi.UInt32, lanes)}
 
         def body(state: State) -> tuple[State]:
             state = dict(state)
@@ -104,22 +116,19 @@ class Walk:
         active &= (scattered > 0) & (self._numbers(state, 2)[0] < survival)
         side = dr.mulsign(point.normal, dr.dot(point.normal, omega))
         origin = point.position + side * (NEAR * dr.norm(point.position))
-        hit = self.shot.scene.ray_intersect_preliminary(
-            mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega)), active=active
-        )
-        active &= hit.is_valid()
-        found = kernel.place(self.inputs, hit.prim_index, hit.prim_uv.x, hit.prim_uv.y, active)
+        ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
+        key = state["index"], self.seed + (state["number"] * 4 + 3) * _STREAM
+        hit = land(self.shot, self.inputs, ray, active, key, coherent=False)
+        active &= hit.valid
+        found = kernel.place(self.inputs, hit.face, hit.b1, hit.b2, active)
         to_point, distance = kernel.leg(found.position, point.position)
         cosine = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
-        state["throughput"] = dr.select(
-            active, state["throughput"] * scattered / (density * survival * cosine), 0.0
-        )
-        state["face"] = dr.select(active, hit.prim_index, self.shot.sound_face)
-        state["b1"] = dr.select(active, hit.prim_uv.x, 0.25)
-        state["b2"] = dr.select(active, hit.prim_uv.y, 0.25)
+        weight = scattered * hit.share / (density * survival * cosine * hit.chance)
+        state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
+        state["face"], state["b1"], state["b2"] = hit.face, hit.b1, hit.b2
         state["back"] = mi.Vector3f(to_point)
-        state["length"] = state["length"] + distance
+        state["length"] = state["length"] + distance + hit.excess
         state["number"] = state["number"] + 1
         state["active"] = active
 
@@ -169,14 +178,16 @@ def connect(
         u, v = dr.select(receiver, u, state["u"]), dr.select(receiver, v, state["v"])
     power = state["throughput"] * found.factor
     exists = state["active"] & (power != 0) & (state["number"] >= least)
-    length = 0.5 * (state["length"] + found.distance)
-    contribution = Contribution(state["frame"], power, length, u, v)
-    if shared and "last" not in state:
-        return contribution, exists
-    tested = exists & (state["number"] > 1) if shared else exists
-    antenna = inputs.antenna(state["frame"], receiver, exists)
-    clear = shot.clear(point.position, antenna, tested)
-    return contribution, exists & (clear | ~tested)
+    one, none = tracer().Float(1.0), tracer().Float(0.0)
+    share, excess = state.get("share", one), state.get("excess", none)
+    if not (shared and "last" not in state):
+        first = exists & (state["number"] == 1) if shared else tracer().Bool(False)
+        antenna = inputs.antenna(state["frame"], receiver, exists)
+        passed = passage(shot, inputs, point.position, antenna, exists & ~first)
+        share = dr.select(first, share, passed.share)
+        excess = dr.select(first, excess, passed.excess)
+    length = 0.5 * (state["length"] + found.distance + excess)
+    return Contribution(state["frame"], power * share, length, u, v), exists & (share > 0)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,239 @@
+"""What a segment passes through: nothing, sheets that let part of the power through, or a wall.
+
+A sheet (a slab meshed as one surface) is passed straight on: power times its transmittance, length
+plus its excess (``scene.material.Surface``), any number of sheets one after another.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from invertwin.channel import kernel
+from invertwin.channel.bridge import opaque, tracer
+from invertwin.channel.kernel import Inputs
+from invertwin.channel.rays import NEAR, Shot
+
+_MOST = 32  # surfaces that a segment may pass
+_CHANCE = (0.1, 0.9)  # least and most probability of passing a sheet where landing is possible
+
+
+@dataclass(frozen=True)
+class Passage:
+    """Share of the power that gets through (0 if blocked), and the length it adds."""
+
+    share: Any
+    excess: Any
+
+
+def passage(shot: Shot, inputs: Inputs, start: Any, end: Any, active: Any) -> Passage:
+    """What gets from one point to another (their own surfaces excluded). Detached."""
+    import drjit as dr
+
+    mi = tracer()
+    if not inputs.sheets:
+        return Passage(dr.select(shot.clear(start, end, active), 1.0, 0.0), mi.Float(0.0))
+    lanes = dr.width(active)
+    state = {
+        "active": mi.Bool(active),
+        "share": dr.ones(mi.Float, lanes),
+        "excess": dr.zeros(mi.Float, lanes),
+    }
+
+    def meet(state: dict[str, Any], face: Any, hit: Any) -> None:
+        share, excess = _through(inputs, face, start, end, hit)
+        state["share"] = dr.select(hit, state["share"] * share, state["share"])
+        state["excess"] = state["excess"] + dr.select(hit, excess, 0.0)
+        state["active"] = hit & (state["share"] > 0)
+
+    state = _along(shot, start, end, state, meet)
+    return Passage(dr.select(active & ~state["active"], state["share"], 0.0), state["excess"])
+
+
+def crossed(
+    shot: Shot,
+    inputs: Inputs,
+    start: Callable[[], Any],
+    end: Callable[[], Any],
+    active: Any,
+    carry: dict[str, Any],
+    act: Callable[[dict[str, Any], Any, Any], None],
+) -> dict[str, Any]:
+    """Show every sheet between two attached points: ``act(carry, share, excess)``, attached.
+
+    The ends are functions, so that the loop over sheets gathers them anew: no derivative has to
+    cross the loop's border.
+    """
+    import drjit as dr
+
+    fixed_start, fixed_end = dr.detach(start()), dr.detach(end())
+    state = {"active": tracer().Bool(active), **carry}
+
+    def meet(state: dict[str, Any], face: Any, hit: Any) -> None:
+        with dr.resume_grad():
+            share, excess = _through(inputs, face, start(), end(), hit)
+            act(state, dr.select(hit, share, 1.0), dr.select(hit, excess, 0.0))
+        state["active"] = hit & (dr.detach(share) > 0)
+
+    return _along(shot, fixed_start, fixed_end, state, meet)
+
+
+def _through(inputs: Inputs, face: Any, start: Any, end: Any, active: Any) -> tuple[Any, Any]:
+    import drjit as dr
+
+    p0, p1, p2 = kernel.corners(inputs, face, active)
+    normal = dr.cross(p1 - p0, p2 - p0)
+    offset = end - start
+    cosine = dr.abs(dr.dot(normal, offset)) / (dr.norm(normal) * dr.norm(offset))
+    row = dr.gather(tracer().UInt32, inputs.face_surface, face, active)
+    return through(inputs, row, cosine, active)
+
+
+def through(inputs: Inputs, row: Any, cosine: Any, active: Any) -> tuple[Any, Any]:
+    """Transmittance and excess length of a sheet."""
+    return (
+        kernel.tabulated(inputs, "transmittance", row, cosine, active),
+        kernel.tabulated(inputs, "excess", row, cosine, active),
+    )
+
+
+def _along(
+    shot: Shot,
+    start: Any,
+    end: Any,
+    state: dict[str, Any],
+    meet: Callable[[dict[str, Any], Any, Any], None],
+) -> dict[str, Any]:
+    """Walk a segment from surface to surface until ``meet`` ends it or nothing is left."""
+    import drjit as dr
+
+    mi = tracer()
+    lanes = dr.width(state["active"])
+    state = {**state, "at": dr.full(mi.Float, NEAR, lanes), "count": dr.zeros(mi.UInt32, lanes)}
+    most = opaque(_MOST)
+
+    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
+        state = dict(state)
+        offset = end - start
+        at, active = state["at"], state["active"]
+        hit = shot.scene.ray_intersect_preliminary(
+            mi.Ray3f(mi.Point3f(start + offset * at), mi.Vector3f(offset), 1 - NEAR - at, 0.0, []),
+            active=active,
+        )
+        found = active & hit.is_valid()
+        face = dr.select(found, hit.prim_index, shot.sound_face)
+        state["active"] = found
+        meet(state, face, found)
+        state["at"] = dr.select(found, at + hit.t + NEAR, at)
+        state["count"] = state["count"] + 1
+        return (state,)
+
+    (state,) = dr.while_loop(
+        (state,),
+        lambda state: state["active"] & (state["count"] < most),
+        body,
+        labels=("state",),
+        mode="symbolic",
+    )
+    return state
+
+
+@dataclass(frozen=True)
+class Landing:
+    """Where a ray ends.
+
+    Attributes:
+        valid: Whether it meets a surface to end on.
+        face, b1, b2: Where.
+        share, excess: Of the sheets that it passed.
+        chance: Probability of having passed those and ended on this one.
+    """
+
+    valid: Any
+    face: Any
+    b1: Any
+    b2: Any
+    share: Any
+    excess: Any
+    chance: Any
+
+
+def land(
+    shot: Shot, inputs: Inputs, ray: Any, active: Any, key: tuple[Any, Any], *, coherent: bool
+) -> Landing:
+    """Follow a ray to a surface; every sheet on the way is passed or not by a throw of dice.
+
+    Args:
+        shot: Rays.
+        inputs: Detached.
+        ray: Origin and unit direction.
+        active: Lanes.
+        key: Index and seed of the dice.
+        coherent: Whether neighbouring rays are alike.
+    """
+    import drjit as dr
+
+    mi = tracer()
+    one = mi.Float(1.0)
+    hit = shot.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+    if not inputs.sheets:
+        valid = active & hit.is_valid()
+        face = dr.select(valid, hit.prim_index, shot.sound_face)
+        b1, b2 = (dr.select(valid, b, 0.25) for b in (hit.prim_uv.x, hit.prim_uv.y))
+        return Landing(valid, face, b1, b2, one, mi.Float(0.0), one)
+    lanes = max(dr.width(active), dr.width(ray.d))
+    state = {
+        "going": active & hit.is_valid(),
+        "valid": dr.zeros(mi.Bool, lanes),
+        "face": dr.zeros(mi.UInt32, lanes) + shot.sound_face,
+        "b1": dr.full(mi.Float, 0.25, lanes),
+        "b2": dr.full(mi.Float, 0.25, lanes),
+        "share": dr.ones(mi.Float, lanes),
+        "excess": dr.zeros(mi.Float, lanes),
+        "chance": dr.ones(mi.Float, lanes),
+        "origin": mi.Point3f(ray.o) + dr.zeros(mi.Point3f, lanes),
+        "count": dr.zeros(mi.UInt32, lanes),
+    }
+    index, seed = key
+
+    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
+        state = dict(state)
+        going, origin = state["going"], state["origin"]
+        hit = shot.scene.ray_intersect_preliminary(mi.Ray3f(origin, ray.d), active=going)
+        found = going & hit.is_valid()
+        face = dr.select(found, hit.prim_index, shot.sound_face)
+        point = origin + ray.d * dr.select(found, hit.t, 0.0)
+        share, excess = _through(inputs, face, origin, origin + ray.d, found)
+        reflectance = dr.square(_amplitude(inputs, face, ray.d, found))
+        odds = share / dr.maximum(share + reflectance, 1e-12)
+        chance = dr.select(share > 0, dr.clip(odds, *_CHANCE), 0.0)
+        first, _ = mi.sample_tea_32(index, seed + state["count"] * 0x85EBCA6B)
+        passes = found & (mi.Float(first >> 8) * 2.0**-24 < chance)
+        ends = found & ~passes
+        for name, value in (("face", face), ("b1", hit.prim_uv.x), ("b2", hit.prim_uv.y)):
+            state[name] = dr.select(ends, value, state[name])
+        state["valid"] = state["valid"] | ends
+        state["share"] = dr.select(passes, state["share"] * share, state["share"])
+        state["excess"] = dr.select(passes, state["excess"] + excess, state["excess"])
+        odds = dr.select(passes, chance, dr.select(ends, 1 - chance, 1.0))
+        state["chance"] = state["chance"] * odds
+        step = NEAR * (hit.t + dr.norm(point))
+        state["origin"] = dr.select(passes, point + ray.d * step, origin)
+        state["count"] = state["count"] + 1
+        state["going"] = passes & (state["count"] < _MOST)
+        return (state,)
+
+    (state,) = dr.while_loop(
+        (state,), lambda state: state["going"], body, labels=("state",), mode="symbolic"
+    )
+    names = ("valid", "face", "b1", "b2", "share", "excess", "chance")
+    return Landing(*(state[name] for name in names))
+
+
+def _amplitude(inputs: Inputs, face: Any, direction: Any, active: Any) -> Any:
+    import drjit as dr
+
+    p0, p1, p2 = kernel.corners(inputs, face, active)
+    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    row = dr.gather(tracer().UInt32, inputs.face_surface, face, active)
+    cosine = dr.abs(dr.dot(normal, direction))
+    return kernel.tabulated(inputs, "amplitude", row, cosine, active)
