@@ -36,7 +36,7 @@ class Texture:
     """
 
     image: Float64[Tensor, "row column"]
-    uv: Float64[Tensor, "f 3 2"]
+    uv: Float64[Tensor, "f 3 2"] | Float64[Tensor, "v 2"]
     faces: InitVar[ArrayLike | None] = None
 
     def __post_init__(self, faces: ArrayLike | None) -> None:
@@ -79,7 +79,7 @@ class Texture:
         return upper * (1 - b) + lower * b
 
 
-Value = float | Tensor | Texture
+Value = float | ArrayLike | Texture
 """A number or 0-d tensor for the whole object, one number per triangle [f], or a texture."""
 
 
@@ -102,7 +102,7 @@ RANGES: Mapping[str, Range] = {
     "scattering": Range("scattering coefficient", 0.0, 1.0),
     "rms_slope": Range("rms slope", 0.0, 1.0, open_low=True),
     "lambertian": Range("Lambertian share", 0.0, 1.0),
-    "forward": Range("forward share", 0.0, 1.0),
+    "directive": Range("directive share", 0.0, 1.0),
     "directive_exponent": Range("exponent of the directive lobe", 0.0),
     "backscatter_exponent": Range("exponent of the backscattering lobe", 0.0),
 }
