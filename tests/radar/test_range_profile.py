@@ -147,7 +147,12 @@ def test_gradients(waveform, track):
     inputs = [paths.coefficient, paths.delay * 1e9, paths.first, paths.last, radar.positions]
     inputs = [value.clone().requires_grad_() for value in inputs]
     assert torch.autograd.gradcheck(
-        lambda a, d, *rest: signal(a, d * 1e-9, *rest), inputs, eps=1e-6, atol=1e-4, rtol=1e-5
+        lambda a, d, *rest: signal(a, d * 1e-9, *rest),
+        inputs,
+        eps=1e-6,
+        atol=1e-4,
+        rtol=1e-5,
+        check_forward_ad=True,
     )
 
 

@@ -314,6 +314,54 @@ class _BeatSum(torch.autograd.Function):
         gradients = (np.conj(coefficient), inner, first.T, last.T, tx, rx)
         return *(torch.from_numpy(np.ascontiguousarray(g)) for g in gradients), None, None
 
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
+        signal: _Signal = ctx.signal
+        like = (signal.coefficient, signal.inner, signal.first.T, signal.last.T)
+        columns = [
+            np.zeros_like(value) if tangent is None else tangent.resolve_conj().numpy()
+            for value, tangent in zip((*like, signal.tx, signal.rx), tangents[:6], strict=True)
+        ]
+        size = (len(signal.tx), len(signal.rx), signal.waveform.samples)
+        result = np.zeros(size, dtype=np.complex128)
+
+        def share(pairs: list[tuple[int, int]]) -> None:
+            _forward_share(signal, columns, pairs, result)
+
+        if len(signal.inner):
+            _in_threads(share, signal.shares())
+        return torch.from_numpy(result)
+
+
+def _forward_share(
+    signal: _Signal, change: list[np.ndarray], pairs: list[tuple[int, int]], result: np.ndarray
+) -> None:
+    """Derivative of some channels when the inputs of the sum change.
+
+    Of s_n = Σ b E_n: Σ (ḃ − 2πj S τ τ̇ b) E_n + f_n Σ 2πj τ̇ b E_n.
+    """
+    coefficient, inner, first, last, tx, rx = change
+    waveform = signal.waveform
+    frequency = waveform.frequencies.numpy()
+    plan = signal.plan(1, 2)
+    for t, r in pairs:
+        delay = signal.delay(t, r)
+        speed = np.zeros(len(delay))
+        for vertex, element, vertex_change, element_change in (
+            (signal.first, signal.tx[t], first, tx[t]),
+            (signal.last, signal.rx[r], last, rx[r]),
+        ):
+            away = (vertex - element[:, None]) / _distance(vertex, element)
+            speed += np.sum(away * (vertex_change - element_change).T, axis=0)
+        speed = inner + speed / SPEED_OF_LIGHT
+        turning = 2j * math.pi * speed * signal.coefficient
+        strengths = np.stack(
+            [coefficient.conj() - waveform.residual_slope * delay * turning, turning]
+        )
+        plan.setpts(signal.rate * delay)
+        sums = plan.execute(strengths * signal.carrier(delay))
+        result[t, r] = sums[0] + frequency * sums[1]
+
 
 def _adjoint_share(
     signal: _Signal, grad: np.ndarray, pairs: list[tuple[int, int]]
