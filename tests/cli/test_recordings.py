@@ -11,7 +11,8 @@ from cli.small import RUN, call, read_metrics
 from cli.test_build import RADAR, read
 from invertwin.capture import Capture, ChannelCalibration, ChirpData, described_arrays
 from invertwin.capture.ti import read_cfg, read_recording, read_settings
-from invertwin.cli import build, sensors
+from invertwin.cli import build, schema, sensors
+from invertwin.cli.raw_files import chirp_data
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
@@ -30,9 +31,15 @@ TRAIN = (
         )
         + """
 [radar]
-waveform = { kind = "fmcw", start_frequency = 77e9, bandwidth = 2e9, duration = 32e-6, samples = 64 }
 board = { name = "xWR1642", transmitters = [2, 1], pattern = { kind = "cosine", exponent = 1.0 } }
 positions = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]
+
+[radar.waveform]
+kind = "fmcw"
+start_frequency = 77e9
+bandwidth = 2e9
+duration = 32e-6
+samples = 64
 
 [grid]
 range_min = 0.8
@@ -143,6 +150,7 @@ def test_impairments_reach_the_front_end():
         data={"kind": "simulated", "density": 1.0, "noise_figure_db": 12.0},
     )
     assert run.impairments is not None
+    assert isinstance(run.data, schema.SimulatedData)
     found = sensors.impairments(run.impairments, run.data)
     assert found.phase_noise is not None
     assert found.phase_noise.levels == (-90.0,)
@@ -151,6 +159,7 @@ def test_impairments_reach_the_front_end():
     run = read(impairments={"phase_noise": {"offsets": [1e6], "levels": [-90, -95]}})
     assert run.impairments is not None
     data = read(data={"kind": "simulated", "density": 1.0}).data
+    assert isinstance(data, schema.SimulatedData)
     with pytest.raises(InputError, match="impairments: expected 1 levels"):
         sensors.impairments(run.impairments, data)
 
@@ -223,7 +232,7 @@ def test_raw_files_are_data_of_a_fit(train, run_file, monkeypatch):
 
 def data_table(**changes):
     data = read(data=changes).data
-    assert data is not None
+    assert isinstance(data, schema.ArraysData)
     return data
 
 
@@ -274,8 +283,8 @@ def test_recordings_that_do_not_fit_are_refused(train, changes, message):
         ("[raw]", "[impairments]\n[raw]", "impairments"),
         ("[raw]", "[raw]\nfull_scale = -1.0", "raw.full_scale"),
         (
-            'kind = "fmcw", start_frequency = 77e9, bandwidth = 2e9, duration = 32e-6',
-            'kind = "stepped", start_frequency = 77e9, step = 30e6, dwell = 1e-6',
+            'kind = "fmcw"\nstart_frequency = 77e9\nbandwidth = 2e9\nduration = 32e-6',
+            'kind = "stepped"\nstart_frequency = 77e9\nstep = 30e6\ndwell = 1e-6',
             'raw: expected radar.waveform.kind = "fmcw"',
         ),
     ],
@@ -294,8 +303,6 @@ def test_samples_are_kept_as_they_are(tmp_path):
     table = {"waveform": WAVE, "board": BOARD | {"elevation": 1}}
     radar = radar_of(table)
     run = read(radar=table, chirps={"count": 2, "interval": 6e-5})
-    from invertwin.cli.raw_files import chirp_data
-
     beat = torch.randn(1, 2, 3, 4, 64, dtype=torch.complex128, generator=torch.Generator())
     data = chirp_data(run, radar, beat)
     assert isinstance(data, ChirpData)
