@@ -212,7 +212,7 @@ def test_material_values_carry_gradients():
         "block", permittivity=2.5, conductivity=0.3, diffuse=0.4, lobe_width=0.2
     )
     surface = module(scene())["block"].material.surface(77e9)
-    (surface.amplitude.sum() + surface.lobe + surface.diffuse).backward()
+    (surface.amplitude.sum() + surface.lobes.sum() + surface.diffuse).backward()
     gradients = [p.grad for p in module.parameters()]
     assert len(gradients) == 4
     assert all(g is not None and torch.isfinite(g) and g != 0 for g in gradients)

@@ -28,7 +28,7 @@ def test_surface_tables():
     assert surface.amplitude.dtype == torch.float64
     assert float(surface.amplitude[-1]) == pytest.approx(1 / 3)
     assert float(surface.diffuse) == 0.25
-    assert float(surface.lobe) == pytest.approx(0.75 / float(lobe_integral(lobe_exponent(0.3))))
+    assert float(surface.lobes[0]) == pytest.approx(0.75 / float(lobe_integral(lobe_exponent(0.3))))
     mirror = PerfectConductor().surface(FREQUENCY)
     assert (mirror.amplitude == 1).all()
     assert float(mirror.diffuse) == 0.0
@@ -41,7 +41,7 @@ def test_gradients_of_the_tables(values):
     def tables(permittivity, conductivity, diffuse, lobe_width):
         material = RoughDielectric(permittivity, conductivity, diffuse, lobe_width)
         surface = material.surface(FREQUENCY)
-        return surface.amplitude, surface.diffuse, surface.lobe, surface.exponent
+        return surface.amplitude, surface.diffuse, surface.lobes, surface.exponents
 
     inputs = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in values]
     assert torch.autograd.gradcheck(tables, inputs)
@@ -49,7 +49,7 @@ def test_gradients_of_the_tables(values):
 
 def test_gradient_of_the_conductor_lobe():
     width = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda w: PerfectConductor(w).surface(FREQUENCY).lobe, width)
+    assert torch.autograd.gradcheck(lambda w: PerfectConductor(w).surface(FREQUENCY).lobes, width)
 
 
 def test_gradient_is_finite_in_vacuum():

@@ -10,6 +10,7 @@ from invertwin.errors import InputError
 from invertwin.scene import (
     Dielectric,
     Layer,
+    Mesh,
     Multilayer,
     Object,
     PerfectConductor,
@@ -55,6 +56,19 @@ def test_coordinates_per_vertex_are_those_of_the_corners():
     uv = torch.rand(4, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     by_vertex = Texture(image(), uv, WALL.faces)
     assert torch.equal(by_vertex.values, Texture(image(), uv[WALL.faces]).values)
+
+
+def test_texture_laid_over_a_plate():
+    pixels = torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64)
+    wall = plate(3.0, 2.0, divisions=2)
+    texture = Texture.over(pixels, wall)
+    middles = wall.vertices[wall.faces].mean(1)
+    for place, value in zip(middles, texture.values, strict=True):
+        column, row = int(place[0] > 0), int(place[1] < 0)
+        assert abs(float(value) - float(pixels[row, column])) < 1  # bilinear, nearest wins
+    flat = Mesh(wall.vertices * torch.tensor([1.0, 0.0, 1.0]), wall.faces)
+    with pytest.raises(InputError, match="width and height"):
+        Texture.over(pixels, flat)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (4, 1)])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.scene.mesh import Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +41,7 @@ class Texture:
     faces: InitVar[ArrayLike | None] = None
 
     def __post_init__(self, faces: ArrayLike | None) -> None:
-        image = checked_tensor(
-            self.image, (None, None), "image of a texture", "give rows of pixels"
-        )
-        if not image.numel():
-            raise InputError("expected an image of a texture with pixels, got none; give some")
+        image = _checked_image(self.image)
         if faces is None:
             do = "give u, v of every corner, or of every vertex with `faces`"
             uv = checked_tensor(self.uv, (None, 3, 2), "uv of a texture", do)
@@ -62,6 +59,26 @@ class Texture:
         object.__setattr__(self, "image", image)
         object.__setattr__(self, "uv", uv.detach())
 
+    @classmethod
+    def over(cls, image: ArrayLike, mesh: Mesh) -> "Texture":
+        """The image laid over a mesh as seen along its z axis.
+
+        The left and right borders are at the least and largest x of the mesh, bottom and top at
+        the least and largest y, in the object's own frame.
+
+        Raises:
+            InputError: a mesh without width or height, or a bad image.
+        """
+        corners = mesh.vertices.detach()[:, :2]
+        low = corners.min(0).values
+        size = corners.max(0).values - low
+        if not bool((size > 0).all()):
+            raise InputError(
+                "expected a mesh with width and height along its x and y axes for a texture, "
+                f"got {size.tolist()} m; give uv coordinates"
+            )
+        return cls(_checked_image(image), (corners - low) / size, mesh.faces)
+
     @property
     def values(self) -> Float64[Tensor, " f"]:
         """The value of every triangle: the image at the mean of its corners' coordinates."""
@@ -77,6 +94,13 @@ class Texture:
         upper = self.image[top, left] * (1 - a) + self.image[top, right] * a
         lower = self.image[bottom, left] * (1 - a) + self.image[bottom, right] * a
         return upper * (1 - b) + lower * b
+
+
+def _checked_image(image: object) -> Tensor:
+    pixels = checked_tensor(image, (None, None), "image of a texture", "give rows of pixels")
+    if not pixels.numel():
+        raise InputError("expected an image of a texture with pixels, got none; give some")
+    return pixels
 
 
 Value = float | ArrayLike | Texture
