@@ -1,5 +1,6 @@
 """The forward model on one page: scene → paths → signals → spectrum."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,12 +11,22 @@ from invertwin.channel.bridge import use_backend
 from invertwin.channel.paths import Grid, Paths
 from invertwin.channel.tracer import RoughPoints, rough_points, trace_field
 from invertwin.errors import InputError
-from invertwin.radar.motion import Chirps, moving_beat
-from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import add_noise, beat_signal
+from invertwin.radar.motion import (
+    Chirps,
+    Places,
+    Train,
+    every_ramp,
+    moving_beat,
+    sample_interval,
+)
+from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
 from invertwin.scene.scene import Scene
+
+# Motion over half a ramp is straight where it bends by less than this, in wavelengths.
+_STRAIGHT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -114,7 +125,7 @@ def simulate(
 
 
 def simulate_chirps(
-    scene: Scene,
+    scene: Scene | Callable[[float], Scene],
     radar: Radar,
     chirps: Chirps,
     *,
@@ -127,35 +138,105 @@ def simulate_chirps(
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
     """Beat signals of a moving scene, chirp by chirp; the radar rests within a frame.
 
+    A scene moves with the velocities of its objects. Any other motion is a function of time:
+    ``lambda time: scene.replace("rotor", pose=...)`` gives the scene at that many seconds after
+    the start of the frame, the same objects with the same triangles (materials as at 0). It is
+    traced in the middle of every ramp; the points seen there follow it over the ramp, along
+    parabolas that are exact at the first, middle and last sample. See ``moving_beat`` for what
+    is exact.
+
     Every frame starts from the scene as given: move it between frames with ``scene.at(time)``.
 
     Args:
-        scene: Objects with velocities.
+        scene: Objects with velocities, or the scene at any time [s].
         radar: Arrays, waveform and poses.
         chirps: Timing of the ramps.
         seed: Places and phases; those of rough points belong to the surface and move with it.
         retrace: Trace visibility and amplitudes anew at every ramp, instead of moving the
-            points seen at the start of the frame.
+            points seen at the start of the frame. A function of time always does.
         samples: Samples per frame on conductors.
         density: Points per m² of rough surfaces.
         points: Rough points to reuse.
         backend: See ``deposit_power``.
 
     Raises:
-        InputError: See ``trace_field`` and ``moving_beat``.
+        InputError: See ``trace_field`` and ``moving_beat``; a function of time whose objects
+            change their triangles.
     """
-    fixed = points or rough_points(scene, density, seed)
+    motion = scene.at if isinstance(scene, Scene) else scene
+    fixed = points or rough_points(motion(0.0), density, seed)
 
     def traced(instant: Scene) -> Paths:
         return trace_field(
             instant, radar.link(), samples=samples, points=fixed, seed=seed, backend=backend
         )
 
-    if not retrace:
+    if isinstance(scene, Scene) and not retrace:
         return moving_beat(traced(scene), radar, chirps)
-    rows = []
-    for instants in chirps.times(len(radar.transmitters.positions)).tolist():
-        beats = {time: beat_signal(traced(scene.at(time)), radar) for time in set(instants)}
-        slots = [beats[time][:, tx] for tx, time in enumerate(instants)]
-        rows.append(torch.stack(slots, dim=1))
-    return torch.stack(rows, dim=1)
+    half = 0.5 * (sampled(radar).samples - 1) * sample_interval(sampled(radar))
+
+    def ramp(start: float, senders: list[int]) -> Tensor:
+        paths, places = _over_a_ramp(motion, start + half, half, traced, radar)
+        check_paths(paths, radar, sampled(radar))
+        return Train(paths, radar, places).ramp(start, senders)
+
+    return every_ramp(chirps, len(radar.transmitters.positions), ramp)
+
+
+def _over_a_ramp(
+    motion: Callable[[float], Scene],
+    middle: float,
+    half: float,
+    traced: Callable[[Scene], Paths],
+    radar: Radar,
+) -> tuple[Paths, Places]:
+    """Paths in the middle of a ramp, and where their points are half a ramp before and after."""
+    scene = motion(middle)
+    ahead = _displacements(scene, motion(middle + half))
+    behind = _displacements(scene, motion(middle - half))
+    # A trace interpolates the velocities of vertices at its points; so it does displacements.
+    paths = traced(_with_velocities(scene, ahead))
+    if paths.velocity is None:
+        return paths, lambda time: paths.first
+    # Paths of several bounces stand still within a ramp.
+    alone = (paths.first == paths.last).all(dim=1, keepdim=True)
+    forward = paths.velocity * alone
+    bend = max(float((ahead[n] + behind[n]).norm(dim=1).max()) for n in scene.names)
+    backward = -forward
+    if bend > _STRAIGHT * radar.waveform.wavelength:
+        again = traced(_with_velocities(scene, behind)).velocity
+        assert again is not None
+        assert again.shape == forward.shape  # The same scene and seed, so the same points.
+        backward = again * alone
+    slope, curve = 0.5 * (forward - backward), 0.5 * (forward + backward)
+
+    def places(time: float) -> Tensor:
+        part = (time - middle) / half
+        return paths.first + slope * part + curve * part**2
+
+    return paths, places
+
+
+def _displacements(scene: Scene, other: Scene) -> dict[str, Tensor]:
+    """How far the vertices of one instant are at another."""
+    if scene.names != other.names:
+        raise InputError(
+            f"expected the same objects at all times, got {', '.join(scene.names)} and "
+            f"{', '.join(other.names)}; move objects out of sight instead of leaving them out"
+        )
+    found = {}
+    for name in scene.names:
+        here, there = scene[name], other[name]
+        if not torch.equal(here.mesh.faces, there.mesh.faces):
+            raise InputError(
+                f"expected the same triangles of {name!r} at all times, got others; "
+                "move its vertices only"
+            )
+        found[name] = (there.vertices - here.vertices).detach()
+    return found
+
+
+def _with_velocities(scene: Scene, values: dict[str, Tensor]) -> Scene:
+    for name, value in values.items():
+        scene = scene.replace(name, velocity=value if value.any() else None)
+    return scene

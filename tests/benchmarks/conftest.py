@@ -18,3 +18,10 @@ def throughput(repository, monkeypatch) -> ModuleType:
     """`benchmarks/throughput.py`."""
     monkeypatch.syspath_prepend(repository / "benchmarks")
     return importlib.import_module("throughput")
+
+
+@pytest.fixture
+def signals(repository, monkeypatch) -> ModuleType:
+    """`benchmarks/signals.py`."""
+    monkeypatch.syspath_prepend(repository / "benchmarks")
+    return importlib.import_module("signals")

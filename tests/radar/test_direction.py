@@ -231,7 +231,11 @@ def test_gradient_of_the_projector(eigenvalues):
     """Right for equal eigenvalues too, as long as signal and noise are apart."""
     factor = torch.linalg.cholesky(matrix_of(eigenvalues)).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda root: MUSIC(root @ root.mH, SIGNAL), factor, eps=1e-6, atol=1e-6
+        lambda root: MUSIC(root @ root.mH, SIGNAL),
+        factor,
+        eps=1e-6,
+        atol=1e-6,
+        check_forward_ad=True,
     )
 
 
@@ -256,6 +260,7 @@ def test_gradients(method, linear):
         profile.requires_grad_(),
         fast_mode=True,
         atol=1e-5,
+        check_forward_ad=True,
     )
 
 

@@ -22,6 +22,7 @@ from invertwin.radar import (
     exact_spectrum,
     range_profile,
 )
+from invertwin.radar.range_profile import tensor_beat
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.pose import rotation_from_vector
 from oracles.beat import beat as direct_beat
@@ -147,7 +148,12 @@ def test_gradients(waveform, track):
     inputs = [paths.coefficient, paths.delay * 1e9, paths.first, paths.last, radar.positions]
     inputs = [value.clone().requires_grad_() for value in inputs]
     assert torch.autograd.gradcheck(
-        lambda a, d, *rest: signal(a, d * 1e-9, *rest), inputs, eps=1e-6, atol=1e-4, rtol=1e-5
+        lambda a, d, *rest: signal(a, d * 1e-9, *rest),
+        inputs,
+        eps=1e-6,
+        atol=1e-4,
+        rtol=1e-5,
+        check_forward_ad=True,
     )
 
 
@@ -166,6 +172,62 @@ def test_gradient_at_77_ghz_equals_autodiff_of_the_plain_sum(track):
         grads.append([leaf.grad for leaf in leaves])
     for found, expected in zip(*grads, strict=True):
         assert (found - expected).norm() < 1e-7 * expected.norm()
+
+
+@pytest.mark.parametrize("samples", [63, 64])
+def test_tensor_operations_give_the_same(samples, track):
+    """The path that CUDA tensors take, on the CPU: values and gradients."""
+    radar = replace(track, waveform=FMCW(76.5e9, 1e9, 40e-6, samples))
+    paths = two_bounces(radar, 60)
+    grads, signals = [], []
+    for forward in (
+        lambda moved: beat_signal(moved, radar),
+        lambda moved: tensor_beat(moved, radar, radar.waveform, 1e-9),
+    ):
+        leaves = [
+            value.clone().requires_grad_()
+            for value in (paths.coefficient, paths.delay, paths.first, paths.last)
+        ]
+        named = dict(zip(("coefficient", "delay", "first", "last"), leaves, strict=True))
+        signals.append(forward(replace(paths, **named)))
+        (signals[-1] - (1 + 0.5j)).abs().square().sum().backward()
+        grads.append([leaf.grad for leaf in leaves])
+    assert (signals[1] - signals[0]).norm() < 1e-8 * signals[0].norm()
+    for found, expected in zip(*reversed(grads), strict=True):
+        assert (found - expected).norm() < 1e-7 * expected.norm()
+    empty = torch.zeros(0, dtype=torch.int64)
+    columns = {n: getattr(paths, n)[empty] for n in vars(paths) if n not in ("kind", "velocity")}
+    none = replace(paths, **columns)
+    assert not tensor_beat(none, radar, radar.waveform, 1e-9).any()
+
+
+@pytest.mark.gpu
+def test_sums_on_a_gpu(track):
+    pytest.importorskip("cufinufft")
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    paths = two_bounces(track, 200)
+    columns = {n: v.cuda() for n, v in vars(paths).items() if isinstance(v, torch.Tensor)}
+    found = beat_signal(replace(paths, **columns), track)
+    expected = beat_signal(paths, track)
+    assert found.is_cuda
+    assert (found.cpu() - expected).norm() < 1e-8 * expected.norm()
+
+
+def test_twelve_channels_of_256_samples(point_paths):
+    """Against the float64 sum, by the peak; `benchmarks/signals.py` has a million paths."""
+    half = SPEED_OF_LIGHT / 154e9
+    radar = Radar(
+        linear_array(3, 4 * half),
+        linear_array(4, half),
+        FMCW(76.5e9, 1e9, 51.2e-6, 256),
+        torch.zeros(1, 3, dtype=torch.float64),
+    )
+    points, coefficient = cloud(3_000, 5)
+    paths = point_paths(radar, 7 * points, coefficient)
+    expected = direct_beat(paths, radar)
+    error = (beat_signal(paths, radar) - expected).abs().max()
+    assert error < 1e-8 * expected.abs().max()
 
 
 def test_no_paths_and_empty_frames(track, point_paths):

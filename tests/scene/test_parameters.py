@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -10,8 +11,11 @@ from torch import Tensor, nn
 from invertwin.errors import InputError
 from invertwin.scene import (
     Compose,
+    Itu,
+    Layer,
     MaterialValues,
     Mesh,
+    Multilayer,
     Object,
     PerfectConductor,
     Pose,
@@ -19,6 +23,8 @@ from invertwin.scene import (
     RoughDielectric,
     Scale,
     Scene,
+    Slab,
+    Texture,
     Translation,
     Vertices,
     box,
@@ -182,8 +188,8 @@ def test_material_values_start_where_told_and_keep_the_rest():
     with torch.no_grad():
         material = module(scene())["block"].material
     assert isinstance(material, RoughDielectric)
-    assert float(material.permittivity) == pytest.approx(2.5, rel=1e-14)
-    assert float(material.diffuse) == pytest.approx(0.25, rel=1e-14)
+    assert material.permittivity == pytest.approx(2.5, rel=1e-14)
+    assert material.diffuse == pytest.approx(0.25, rel=1e-14)
     assert material.conductivity == 0.1
     assert material.lobe_width == 0.3
     assert scene()["wall"].material == module(scene())["wall"].material
@@ -206,17 +212,88 @@ def test_material_values_carry_gradients():
         "block", permittivity=2.5, conductivity=0.3, diffuse=0.4, lobe_width=0.2
     )
     surface = module(scene())["block"].material.surface(77e9)
-    (surface.amplitude.sum() + surface.lobe + surface.diffuse).backward()
+    (surface.amplitude.sum() + surface.lobes.sum() + surface.diffuse).backward()
     gradients = [p.grad for p in module.parameters()]
     assert len(gradients) == 4
     assert all(g is not None and torch.isfinite(g) and g != 0 for g in gradients)
+
+
+SLAB: dict[str, Any] = {
+    "permittivity": 2.7,
+    "conductivity": 0.1,
+    "loss_tangent": 0.01,
+    "thickness": 12.5e-3,
+    "scattering": 0.4,
+    "rms_slope": 0.2,
+    "lambertian": 0.5,
+    "directive": 0.6,
+    "directive_exponent": 3.0,
+    "backscatter_exponent": 5.0,
+}
+
+
+def test_every_value_of_a_slab_can_be_fitted():
+    module = MaterialValues("wall", **SLAB)
+    board = Scene({"wall": Object(plate(1.0, 1.0), Slab(2.0, thickness=1e-3))})
+    material = module(board)["wall"].material
+    assert isinstance(material, Slab)
+    for name, value in SLAB.items():
+        assert float(getattr(material, name).detach()) == pytest.approx(value, rel=1e-12)
+    surface = material.surface(77e9)
+    # The exponent of a lobe tells about the slope, the weights about the rest.
+    parts = (surface.amplitude, surface.transmittance, surface.excess, surface.lobes.square())
+    torch.stack([part[1:].sum() for part in parts]).sum().backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad) for p in module.parameters())
+    for extreme in (-30.0, 30.0):
+        for parameter in module.parameters():
+            parameter.data.fill_(extreme)
+        surface = module(board)["wall"].material.surface(77e9)
+        assert all(torch.isfinite(value).all() for value in vars(surface).values())
+
+
+def test_values_per_triangle_and_textures_can_be_fitted():
+    start = torch.tensor([2.0, 3.0], dtype=torch.float64)
+    uv = torch.tensor([[0.2, 0.2], [0.8, 0.2], [0.2, 0.8], [0.8, 0.8]], dtype=torch.float64)
+    wall = plate(1.0, 1.0)
+    pixels = torch.tensor([[0.2, 0.3], [0.4, 0.5]], dtype=torch.float64)
+    module = MaterialValues("wall", permittivity=start, diffuse=Texture(pixels, uv, wall.faces))
+    material = module(Scene({"wall": Object(wall, RoughDielectric(4.0))}))["wall"].material
+    assert isinstance(material, RoughDielectric)
+    assert isinstance(material.diffuse, Texture)
+    assert torch.allclose(material.diffuse.image, pixels)
+    assert torch.allclose(module.values()["wall.permittivity"], start)
+    assert torch.allclose(module.values()["wall.diffuse"], pixels)
+    surface = material.surface(77e9)
+    (surface.amplitude.sum() + surface.diffuse.square().sum()).backward()
+    for name, shape in (("permittivity", (2,)), ("diffuse", (2, 2))):
+        gradient = module.raw[name].grad
+        assert gradient is not None
+        assert gradient.shape == shape
+        assert (gradient != 0).any()
+
+
+def test_values_of_one_layer_can_be_fitted():
+    stack = Multilayer([Layer(2.7, thickness=12e-3), Layer.itu("glass", thickness=4e-3)])
+    board = Scene({"wall": Object(plate(1.0, 1.0), stack)})
+    module = MaterialValues("wall", layer=1, thickness=5e-3)
+    material = module(board)["wall"].material
+    assert isinstance(material, Multilayer)
+    assert material.layers[0] == stack.layers[0]
+    assert material.layers[1].permittivity == Itu("glass")
+    assert float(module.values()["wall.layers[1].thickness"]) == pytest.approx(5e-3)
+    material.surface(77e9).transmittance.sum().backward()
+    assert float(module.raw["thickness"].grad) != 0
+    with pytest.raises(InputError, match="a layer below 2 of 'wall', got 2"):
+        MaterialValues("wall", layer=2, thickness=5e-3)(board)
+    with pytest.raises(InputError, match="layer with scattering"):
+        MaterialValues("wall", layer=0, scattering=0.5)(board)
 
 
 def test_conductor_lobe_can_be_fitted():
     with torch.no_grad():
         material = MaterialValues("wall", lobe_width=0.2)(scene())["wall"].material
     assert isinstance(material, PerfectConductor)
-    assert float(material.lobe_width) == pytest.approx(0.2)
+    assert material.lobe_width == pytest.approx(0.2)
 
 
 @dataclass(frozen=True)
@@ -321,6 +398,9 @@ class Elsewhere(nn.Module):
         (lambda: Vertices("block", 7)(scene()), "expected 7 vertices in 'block', got 8"),
         (lambda: Compose(Elsewhere()), "map scenes or radars, got Elsewhere for range"),
         (lambda: MaterialValues("block"), "at least one of permittivity"),
+        (lambda: MaterialValues("block", colour=1.0), "at least one of permittivity.*got colour"),
+        (lambda: MaterialValues("block", layer=0, thickness=1.0)(scene()), "a layer below 0"),
+        (lambda: MaterialValues("block", thickness=0.0), r"inside \(0, inf\), got 0"),
         (lambda: MaterialValues("block", permittivity=1.0), r"inside \(1, inf\), got 1"),
         (lambda: MaterialValues("block", permittivity=0.5), r"\[1, inf\), got 0.5"),
         (lambda: MaterialValues("block", diffuse=1.0), r"inside \(0, 1\), got 1"),

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.cli import schema
+from invertwin.cli.materials import fitted, material
 from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import unknown_object
 from invertwin.cli.sensors import grid as grid
@@ -18,11 +19,8 @@ from invertwin.inversion.reconstruction import Optimizer
 from invertwin.inversion.regularization import Laplacian
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import (
-    Material,
     Mesh,
     Object,
-    PerfectConductor,
-    RoughDielectric,
     Scene,
     rigid,
     rotation_angle,
@@ -31,7 +29,6 @@ from invertwin.scene import (
 )
 from invertwin.scene.files import CONCRETE, load_mesh, load_scene_xml
 from invertwin.scene.parameters import (
-    MaterialValues,
     Pose,
     RadarPose,
     Scale,
@@ -82,14 +79,15 @@ def true_scene(run: schema.RunFile) -> Scene:
 
 
 def _from_file(table: schema.SceneFile) -> Scene:
-    materials = {name: _material(material) for name, material in table.materials.items()}
-    others = CONCRETE if table.material is None else _material(table.material)
+    materials = {name: material(found, None) for name, found in table.materials.items()}
+    others = CONCRETE if table.material is None else material(table.material, None)
     return load_scene_xml(table.file, materials, others)
 
 
 def _object(table: schema.SceneObject) -> Object:
     velocity = None if table.velocity is None else _float64(table.velocity)
-    return Object(_mesh(table), _material(table.material), _pose(table), velocity)
+    mesh = _mesh(table)
+    return Object(mesh, material(table.material, mesh), _pose(table), velocity)
 
 
 def _pose(table: schema.Placement) -> Tensor:
@@ -131,13 +129,6 @@ def _joined(parts: Sequence[schema.Part]) -> Mesh:
     return Mesh(torch.cat(vertices), torch.cat(faces))
 
 
-def _material(table: schema.Material) -> Material:
-    values = table.model_dump(exclude={"kind", "lobe_width_deg"})
-    if table.lobe_width_deg is not None:
-        values["lobe_width"] = math.radians(table.lobe_width_deg)
-    return (RoughDielectric if table.kind == "rough_dielectric" else PerfectConductor)(**values)
-
-
 def surrogate(table: schema.Surrogate) -> Surrogate:
     """The smooth model of the `[surrogate]` table, at its starting widths."""
     return Surrogate(**table.model_dump())
@@ -174,16 +165,8 @@ def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Modu
                 count = len(scene[table.object].mesh.vertices)
                 modules.append(Vertices(table.object, count))
             case schema.MaterialParameter():
-                material = scene[table.object].material
-                missing = [name for name in table.values if not hasattr(material, name)]
-                if missing:
-                    raise InputError(
-                        f"parameters[{i}].values: expected values of {type(material).__name__}, "
-                        f"got {missing[0]}; remove it"
-                    )
-                values = {name: float(getattr(material, name)) for name in table.values}
                 with about(f"parameters[{i}].values, material of {table.object}"):
-                    modules.append(MaterialValues(table.object, **values))
+                    modules.append(fitted(table, scene[table.object].material))
             case schema.RadarParameter():
                 modules.append(RadarPose())
     return modules

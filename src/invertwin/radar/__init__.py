@@ -30,7 +30,7 @@ from invertwin.radar.impairments import (
     quantize,
     residual_phase,
 )
-from invertwin.radar.motion import Chirps, moving_beat
+from invertwin.radar.motion import Chirps, moving_beat, range_rate
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import add_noise, beat_signal, range_profile
 from invertwin.radar.spectrum import beamform, exact_spectrum
@@ -87,6 +87,7 @@ __all__ = [
     "range_doppler",
     "range_doppler_angle",
     "range_profile",
+    "range_rate",
     "residual_phase",
     "resolve_fold",
     "source_count",

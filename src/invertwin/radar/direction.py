@@ -193,6 +193,7 @@ class _SignalProjector(torch.autograd.Function):
     ) -> Complex128[Tensor, "*batch element element"]:
         values, vectors = torch.linalg.eigh(matrix)
         ctx.save_for_backward(values, vectors, chosen)
+        ctx.save_for_forward(values, vectors, chosen)
         picked = vectors * chosen[..., None, :]
         return picked @ picked.mH
 
@@ -201,14 +202,24 @@ class _SignalProjector(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         values, vectors, chosen = ctx.saved_tensors
         gradient = 0.5 * (grads[0] + grads[0].mH)
-        gap = values[..., :, None] - values[..., None, :]
-        smallest = _SMALLEST_GAP * values.abs().amax(-1)[..., None, None]
-        between = chosen[..., :, None] != chosen[..., None, :]
-        # Matrices of zeros have no scale; their derivative is taken as zero.
-        damped = gap / (gap.square() + smallest.square()).clamp(min=torch.finfo(gap.dtype).tiny)
-        sign = torch.where(chosen[..., :, None], 1.0, -1.0)
-        inner = (vectors.mH @ gradient @ vectors) * (between * sign * damped)
-        return vectors @ inner @ vectors.mH, None
+        return _projector_change(values, vectors, chosen, gradient), None
+
+    @staticmethod
+    def jvp(ctx: Any, matrix: Tensor, _: None) -> Tensor:  # type: ignore[override]
+        # The derivative is its own adjoint.
+        return _projector_change(*ctx.saved_tensors, matrix)
+
+
+def _projector_change(values: Tensor, vectors: Tensor, chosen: Tensor, change: Tensor) -> Tensor:
+    """Derivative of the projector when the matrix changes by a Hermitian one."""
+    gap = values[..., :, None] - values[..., None, :]
+    smallest = _SMALLEST_GAP * values.abs().amax(-1)[..., None, None]
+    between = chosen[..., :, None] != chosen[..., None, :]
+    # Matrices of zeros have no scale; their derivative is taken as zero.
+    damped = gap / (gap.square() + smallest.square()).clamp(min=torch.finfo(gap.dtype).tiny)
+    sign = torch.where(chosen[..., :, None], 1.0, -1.0)
+    inner = (vectors.mH @ change @ vectors) * (between * sign * damped)
+    return vectors @ inner @ vectors.mH
 
 
 def _snapshots(

@@ -1,7 +1,8 @@
 """Motion within a frame: the beat signal of a train of chirps."""
 
-import warnings
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Complex128, Float64
@@ -10,9 +11,21 @@ from torch import Tensor
 from invertwin.channel.paths import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import beat_signal
-from invertwin.radar.waveform import PhysicsWarning
+from invertwin.radar.nonuniform import (
+    beat_of_delays,
+    instants_derivative,
+    phase_cycles,
+    ramp_instants,
+)
+from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.range_profile import beat_signal, check_paths
+from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
+
+# Largest error of interpolating a path's phase factor between the instants of a ramp.
+_INTERPOLATION_ERROR = 1e-6
+_MOST_INSTANTS = 33
+
+Places = Callable[[float], Float64[Tensor, "path 3"]]
 
 
 @dataclass(frozen=True)
@@ -24,14 +37,17 @@ class Chirps:
         interval: From one ramp's start to the next, idle time included [s].
         tdm: Transmitters take turns (time-division MIMO); else they send at once, told apart
             by an ideal code.
+        order: Transmitters, counted from 0, in the order of their turns; None = 0, 1, 2, …
 
     Raises:
-        InputError: No chirps, or an interval that is not positive.
+        InputError: No chirps, an interval that is not positive, an order that does not name
+            every transmitter once, or one of transmitters that send at once.
     """
 
     count: int
     interval: float
     tdm: bool = True
+    order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.count < 1 or not self.interval > 0:
@@ -39,13 +55,38 @@ class Chirps:
                 f"expected at least one chirp and an interval > 0, got {self.count} and "
                 f"{self.interval}; the interval is idle time + ramp time in seconds"
             )
+        if self.order is None:
+            return
+        object.__setattr__(self, "order", tuple(self.order))
+        if not self.tdm:
+            raise InputError(
+                f"expected no order of transmitters that send at once, got {self.order}; "
+                "leave it out, or set tdm=True"
+            )
+        if sorted(self.order) != list(range(len(self.order))):
+            raise InputError(
+                f"expected an order that names every transmitter from 0 once, got {self.order}; "
+                "(0, 2, 1) is that of three whose last two are swapped"
+            )
 
     def times(self, transmitters: int) -> Float64[Tensor, "chirp tx"]:
-        """Start of every ramp [s], the first one at 0."""
+        """First sample of every ramp [s], the first one at 0; columns are the radar's elements.
+
+        Raises:
+            InputError: An order of another number of transmitters.
+        """
         slots = torch.arange(self.count * transmitters, dtype=torch.float64)
-        if self.tdm:
-            return slots.reshape(self.count, transmitters) * self.interval
-        return slots[: self.count, None].expand(-1, transmitters) * self.interval
+        if not self.tdm:
+            return slots[: self.count, None].expand(-1, transmitters) * self.interval
+        times = slots.reshape(self.count, transmitters) * self.interval
+        if self.order is None:
+            return times
+        if len(self.order) != transmitters:
+            raise InputError(
+                f"expected an order of {transmitters} transmitters, got {self.order}; "
+                "use the timing of this radar"
+            )
+        return times[:, torch.argsort(torch.tensor(self.order))]
 
     def max_speed(self, wavelength: float, transmitters: int) -> float:
         """Range rate beyond which Doppler is ambiguous, λ/(4 T) [m/s]."""
@@ -54,64 +95,190 @@ class Chirps:
 
 
 def moving_beat(
-    paths: Paths, radar: Radar, chirps: Chirps
+    paths: Paths,
+    radar: Radar,
+    chirps: Chirps,
+    *,
+    places: Places | None = None,
+    tolerance: float = 1e-9,
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
-    """Beat signals of a train of chirps, stop and go: each ramp sees the points where it starts.
+    """Beat signals of a train of chirps, during which scattering points move.
 
-    Scattering points move with their velocities; lengths to every element are exact at each
-    chirp, amplitudes and visibility stay those of the start of the frame. Approaching points
-    have falling delays, so their beat phase falls from chirp to chirp by 4π v T/λ.
+    Every sample of every ramp has the delay of its own time, to each element: of the point
+    where it was when it scattered what is received then. Delays are computed exactly at three
+    or more instants of a ramp, as many as leave an error of 1e-6 between them; so range
+    migration, acceleration and rotation within a ramp and from ramp to ramp are exact.
+    Amplitudes and visibility stay those of the start of the frame. Approaching points have
+    falling delays, so their beat phase falls from chirp to chirp by 4π v T/λ. Samples that are
+    not taken in time (OFDM) see the points where the symbol starts.
 
-    Source: derivations §1.
+    Source: derivations §6.
     Differs from the source: the paper's scenes stand still.
 
     Args:
         paths: From ``trace_field`` of a scene with velocities.
-        radar: An FMCW radar, at rest within a frame.
+        radar: One with samples, at rest within a frame.
         chirps: Timing.
+        places: World positions of the paths' points [m] at a time [s] after the start of the
+            frame, for motion that is not uniform; None = they move with their velocities.
+        tolerance: As in ``beat_signal``.
 
     Raises:
-        InputError: As ``beat_signal``; paths of several bounces.
+        InputError: As ``beat_signal``; moving paths of several bounces; points so fast that a
+            ramp cannot follow them.
     """
+    waveform = sampled(radar)
+    check_paths(paths, radar, waveform)
+    if places is None and paths.velocity is None:
+        beat = beat_signal(paths, radar, tolerance=tolerance)
+        return beat[:, None].repeat(1, chirps.count, 1, 1, 1)
     if not torch.equal(paths.first, paths.last):
         raise InputError(
             "expected paths of one bounce, got paths whose first and last points differ; "
             "simulate their motion chirp by chirp with simulate_chirps(retrace=True)"
         )
+    train = Train(paths, radar, places or _uniform(paths), tolerance)
+    return every_ramp(chirps, len(radar.transmitters.positions), train.ramp)
+
+
+def every_ramp(
+    chirps: Chirps,
+    transmitters: int,
+    ramp: Callable[[float, list[int]], Complex128[Tensor, "frame sender rx sample"]],
+) -> Complex128[Tensor, "frame chirp tx rx sample"]:
+    """The signals of all ramps: ``ramp`` is called with each start [s] and who sends then."""
     rows = []
-    for instants in chirps.times(len(radar.transmitters.positions)).tolist():
-        if chirps.tdm:
-            slots = [
-                _one_transmitter(_advanced(paths, radar, time), radar, tx)
-                for tx, time in enumerate(instants)
-            ]
-            rows.append(torch.stack(slots, dim=1))
-        else:
-            rows.append(beat_signal(_advanced(paths, radar, instants[0]), radar))
+    for starts in chirps.times(transmitters).tolist():
+        signals = {}
+        for start in sorted(set(starts)):
+            senders = [tx for tx, time in enumerate(starts) if time == start]
+            signals |= dict(zip(senders, ramp(start, senders).unbind(1), strict=True))
+        rows.append(torch.stack([signals[tx] for tx in range(transmitters)], dim=1))
     return torch.stack(rows, dim=1)
 
 
-def _advanced(paths: Paths, radar: Radar, time: float) -> Paths:
-    """The paths after their points moved for ``time``."""
-    if paths.velocity is None or time == 0.0:
-        return paths
-    link = radar.link()
-    places = paths.last + paths.velocity * time
-    tx, rx = link.tx[paths.frame], link.rx[paths.frame]
-    grown = (places - tx).norm(dim=1) - (paths.first - tx).norm(dim=1)
-    grown = grown + (places - rx).norm(dim=1) - (paths.last - rx).norm(dim=1)
-    return replace(paths, delay=paths.delay + grown / SPEED_OF_LIGHT, first=places, last=places)
+def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
+    """Derivative of the paths' range R = L/2 with respect to time, by forward mode [m/s].
+
+    Positive moves away; the Doppler frequency is 2/λ times it.
+
+    Args:
+        paths: Of one bounce; zero where they carry no velocity.
+        radar: At rest.
+    """
+    if paths.velocity is None:
+        return torch.zeros_like(paths.delay)
+    link, velocity = radar.link(), paths.velocity
+    tx, rx = (centre.to(paths.first.device)[paths.frame] for centre in (link.tx, link.rx))
+
+    def half_length(time: Tensor) -> Tensor:
+        point = paths.last + velocity * time
+        return 0.5 * ((point - tx).norm(dim=1) + (point - rx).norm(dim=1))
+
+    now = torch.zeros((), dtype=torch.float64, device=velocity.device)
+    return torch.func.jvp(half_length, (now,), (torch.ones_like(now),))[1]
 
 
-def _one_transmitter(paths: Paths, radar: Radar, tx: int) -> Tensor:
-    """The beat signal [frame, rx, sample] while one transmitter sends."""
-    array = radar.transmitters
-    with warnings.catch_warnings():
-        # The spacing of all elements together has been judged; that of a part means nothing.
-        warnings.simplefilter("ignore", PhysicsWarning)
-        alone = replace(radar, transmitters=replace(array, positions=array.positions[tx : tx + 1]))
-    # Delays refer to the phase centre, which is now the element itself.
-    before, after = radar.link().tx[paths.frame], alone.link().tx[paths.frame]
-    nearer = (paths.first - after).norm(dim=1) - (paths.first - before).norm(dim=1)
-    delay = paths.delay + nearer / SPEED_OF_LIGHT
-    return beat_signal(replace(paths, delay=delay), alone)[:, 0]
+def sample_interval(waveform: SampledWaveform) -> float:
+    """Time from one sample to the next [s]; 0 where they are taken at once (OFDM)."""
+    if isinstance(waveform, FMCW | SteppedFrequency):
+        return float(waveform.sample_times[1])
+    return 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Train:
+    """Paths whose points move, and the ramps that see them.
+
+    Attributes:
+        paths: Their frames, coefficients, and delays at their first points.
+        radar: One with samples.
+        places: Positions of the first points at a time; the last ones move with them.
+        tolerance: Of the sums.
+    """
+
+    paths: Paths
+    radar: Radar
+    places: Places
+    tolerance: float = 1e-9
+
+    def ramp(
+        self, start: float, senders: Sequence[int]
+    ) -> Complex128[Tensor, "frame sender rx sample"]:
+        """What all receivers record of one ramp of transmitters that send at once [s]."""
+        paths, waveform = self.paths, sampled(self.radar)
+        device = paths.delay.device
+        centers = [centre.to(device) for centre in (self.radar.link().tx, self.radar.link().rx)]
+        chain = paths.last - paths.first
+        legs = _length(paths.first, chain, centers[0][paths.frame], centers[1][paths.frame])
+        inner = paths.delay - legs / SPEED_OF_LIGHT
+        placed = self._placed(start, 1 if sample_interval(waveform) == 0 else 3)
+        if len(placed) > 1 and len(paths):
+            length = _length(placed, chain, centers[0][paths.frame], centers[1][paths.frame])
+            cycles = phase_cycles((length / SPEED_OF_LIGHT).detach(), waveform)
+            bend = math.pi * float((cycles[0] - 2 * cycles[1] + cycles[2]).abs().max())
+            count = _instants(bend)
+            placed = placed if count == 3 else self._placed(start, count)
+        transmitters, receivers = (places.to(device) for places in self.radar.elements())
+        signals: list[list[Tensor]] = [[] for _ in senders]
+        for frame in range(self.radar.frame_count):
+            rows = torch.nonzero(paths.frame == frame)[:, 0]
+            points = self._when_scattered(placed[:, rows], centers[1][frame])
+            coefficient, rest = paths.coefficient[rows], inner[rows]
+            ends = points + chain[rows]
+            back = [(ends - place).norm(dim=-1) for place in receivers[frame]]
+            for tx, found in zip(senders, signals, strict=True):
+                forth = (points - transmitters[frame, tx]).norm(dim=-1)
+                channels = [
+                    beat_of_delays(
+                        coefficient, (forth + leg) / SPEED_OF_LIGHT + rest, waveform, self.tolerance
+                    )
+                    for leg in back
+                ]
+                found.append(torch.stack(channels))
+        return torch.stack([torch.stack(found) for found in signals], dim=1)
+
+    def _placed(self, start: float, count: int) -> Float64[Tensor, "instant path 3"]:
+        """The points at the instants of a ramp."""
+        waveform = sampled(self.radar)
+        interval = sample_interval(waveform)
+        instants = ramp_instants(waveform.samples, count) if interval else torch.zeros(1)
+        return torch.stack([self.places(start + interval * n) for n in instants.tolist()])
+
+    def _when_scattered(
+        self, points: Float64[Tensor, "instant path 3"], receiver: Float64[Tensor, "3"]
+    ) -> Float64[Tensor, "instant path 3"]:
+        """The points at the times when they scattered what is received at the instants."""
+        if len(points) == 1:
+            return points
+        waveform = sampled(self.radar)
+        per_sample = instants_derivative(waveform.samples, len(points)).to(points.device)
+        velocity = torch.einsum("kl,lpc->kpc", per_sample, points) / sample_interval(waveform)
+        lag = (points - receiver).norm(dim=-1, keepdim=True) / SPEED_OF_LIGHT
+        return points - lag * velocity
+
+
+def _uniform(paths: Paths) -> Places:
+    velocity = paths.velocity
+    assert velocity is not None
+    return lambda time: paths.first + velocity * time
+
+
+def _length(first: Tensor, chain: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
+    return (first - tx).norm(dim=-1) + (first + chain - rx).norm(dim=-1)
+
+
+def _instants(bend: float) -> int:
+    """How many instants of a ramp follow phases that bend by so many radians at its ends.
+
+    Of exp(jψ) with ψ of second degree over [-1, 1], the power h = (count + 1)/2 is the first that a
+    polynomial through the instants misses, by ψʰ/h! · 2^(1 − count).
+    """
+    for count in range(3, _MOST_INSTANTS + 1, 2):
+        power = (count + 1) // 2
+        if bend**power / math.factorial(power) * 2.0 ** (1 - count) <= _INTERPOLATION_ERROR:
+            return count
+    raise InputError(
+        f"expected points whose phase is near to a line over a ramp, got one that bends by "
+        f"{bend:.3g} rad; check velocities [m/s] and times [s], or shorten the ramp"
+    )

@@ -17,6 +17,7 @@ from torch import Tensor
 from invertwin.channel.paths import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.radar.nonuniform import beat_of_delays, sums_on_gpu
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, sample_window
 
@@ -52,6 +53,8 @@ def beat_signal(
     """
     waveform = sampled(radar)
     check_paths(paths, radar, waveform)
+    if sums_on_gpu(paths.delay):
+        return tensor_beat(paths, radar, waveform, tolerance)
     device = paths.delay.device
     tx, rx = (places.cpu() for places in radar.elements())
     centers = tx.mean(1), rx.mean(1)
@@ -72,16 +75,41 @@ def beat_signal(
     return torch.stack(signals).to(device)
 
 
+def tensor_beat(
+    paths: Paths, radar: Radar, waveform: SampledWaveform, tolerance: float
+) -> Complex128[Tensor, "frame tx rx sample"]:
+    """The same in tensor operations, wherever the paths are; slower on a CPU."""
+    device = paths.delay.device
+    tx, rx = (places.to(device) for places in radar.elements())
+    frames = []
+    for frame in range(radar.frame_count):
+        rows = torch.nonzero(paths.frame == frame)[:, 0]
+        first, last, coefficient = paths.first[rows], paths.last[rows], paths.coefficient[rows]
+        legs = (first - tx[frame].mean(0)).norm(dim=1) + (last - rx[frame].mean(0)).norm(dim=1)
+        inner = paths.delay[rows] - legs / SPEED_OF_LIGHT
+        forth = [(first - place).norm(dim=1) for place in tx[frame]]
+        back = [(last - place).norm(dim=1) for place in rx[frame]]
+        channels = [
+            beat_of_delays(
+                coefficient, (inner + (f + b) / SPEED_OF_LIGHT)[None], waveform, tolerance
+            )
+            for f in forth
+            for b in back
+        ]
+        frames.append(torch.stack(channels).unflatten(0, (len(forth), len(back))))
+    return torch.stack(frames)
+
+
 def add_noise(
-    beat: Complex128[Tensor, "frame tx rx sample"],
+    beat: Complex128[Tensor, "*batch sample"],
     radar: Radar | None = None,
     *,
     seed: int,
     snr_db: float | None = None,
     noise_figure_db: float | None = None,
     transmit_power: float = 0.01,
-) -> Complex128[Tensor, "frame tx rx sample"]:
-    """Beat signal plus white complex Gaussian noise.
+) -> Complex128[Tensor, "*batch sample"]:
+    """Beat signal, of frames or of trains of chirps, plus white complex Gaussian noise.
 
     Give either a signal-to-noise ratio or a noise figure. The power per sample is the mean
     signal power over ``snr_db``, or ``k T0 F b`` (T0 = 290 K, b the waveform's noise bandwidth,
@@ -313,6 +341,54 @@ class _BeatSum(torch.autograd.Function):
         coefficient, inner, first, last, tx, rx = parts
         gradients = (np.conj(coefficient), inner, first.T, last.T, tx, rx)
         return *(torch.from_numpy(np.ascontiguousarray(g)) for g in gradients), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
+        signal: _Signal = ctx.signal
+        like = (signal.coefficient, signal.inner, signal.first.T, signal.last.T)
+        columns = [
+            np.zeros_like(value) if tangent is None else tangent.resolve_conj().numpy()
+            for value, tangent in zip((*like, signal.tx, signal.rx), tangents[:6], strict=True)
+        ]
+        size = (len(signal.tx), len(signal.rx), signal.waveform.samples)
+        result = np.zeros(size, dtype=np.complex128)
+
+        def share(pairs: list[tuple[int, int]]) -> None:
+            _forward_share(signal, columns, pairs, result)
+
+        if len(signal.inner):
+            _in_threads(share, signal.shares())
+        return torch.from_numpy(result)
+
+
+def _forward_share(
+    signal: _Signal, change: list[np.ndarray], pairs: list[tuple[int, int]], result: np.ndarray
+) -> None:
+    """Derivative of some channels when the inputs of the sum change.
+
+    Of s_n = Σ b E_n: Σ (ḃ − 2πj S τ τ̇ b) E_n + f_n Σ 2πj τ̇ b E_n.
+    """
+    coefficient, inner, first, last, tx, rx = change
+    waveform = signal.waveform
+    frequency = waveform.frequencies.numpy()
+    plan = signal.plan(1, 2)
+    for t, r in pairs:
+        delay = signal.delay(t, r)
+        speed = np.zeros(len(delay))
+        for vertex, element, vertex_change, element_change in (
+            (signal.first, signal.tx[t], first, tx[t]),
+            (signal.last, signal.rx[r], last, rx[r]),
+        ):
+            away = (vertex - element[:, None]) / _distance(vertex, element)
+            speed += np.sum(away * (vertex_change - element_change).T, axis=0)
+        speed = inner + speed / SPEED_OF_LIGHT
+        turning = 2j * math.pi * speed * signal.coefficient
+        strengths = np.stack(
+            [coefficient.conj() - waveform.residual_slope * delay * turning, turning]
+        )
+        plan.setpts(signal.rate * delay)
+        sums = plan.execute(strengths * signal.carrier(delay))
+        result[t, r] = sums[0] + frequency * sums[1]
 
 
 def _adjoint_share(

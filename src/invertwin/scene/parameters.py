@@ -238,7 +238,7 @@ class MaterialValues(nn.Module):
                 material itself.
             start: by the names of `invertwin.scene.material.RANGES`, inside their ranges, ends
                 excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
-                lobe_width [rad], scattering, rms_slope, lambertian, forward, directive_exponent,
+                lobe_width [rad], scattering, rms_slope, lambertian, directive, directive_exponent,
                 backscatter_exponent.
 
         Raises:

@@ -294,6 +294,42 @@ def test_a_simulated_echo_is_found_in_its_file(tmp_path):
     assert float(profile.max().sqrt()) * 1e-4 / 32767 == pytest.approx(2e-5, rel=0.15)
 
 
+def openradar_organize(raw, chirps, receivers, samples):
+    """OpenRadar, mmwave/dataloader/adc.py: DCA1000.organize, for 2 lanes."""
+    found = np.zeros(len(raw) // 2, dtype=complex)
+    found[0::2] = raw[0::4] + 1j * raw[2::4]
+    found[1::2] = raw[1::4] + 1j * raw[3::4]
+    return found.reshape(chirps, receivers, samples)
+
+
+def readdca1000(raw, receivers):
+    """TI, SWRA581, readDCA1000.m for the xWR12xx and xWR14xx: [receiver, all samples]."""
+    columns = raw.reshape(-1, 2 * receivers).T
+    return columns[:receivers] + 1j * columns[receivers:]
+
+
+@pytest.mark.parametrize("lanes", [2, 4])
+def test_other_tools_find_the_samples_and_the_echo(tmp_path, lanes):
+    """Their own few lines, not ours; receivers grow in phase as they were told to."""
+    settings = replace(SETTINGS, samples=64, frames=1, receivers=(1, 2, 3, 4), lanes=lanes)
+    chirp = settings.waveform
+    cycles = 2 * 3.0 / 299792458.0 * (chirp.start_frequency + chirp.slope * chirp.sample_times)
+    turns = 0.1 * torch.arange(4.0)[:, None] + 0.2 * torch.arange(3.0)[:, None, None]
+    beat = torch.exp(2j * torch.pi * (cycles + turns))[None]
+    data = adc_counts(beat, settings, full_scale=2.0)
+    write_samples(tmp_path / "adc.bin", data)
+    raw = words_of(tmp_path / "adc.bin")
+    chirps = settings.loops * 3
+    if lanes == 2:
+        found = openradar_organize(raw, chirps, 4, 64)
+    else:
+        found = readdca1000(raw, 4).reshape(4, chirps, 64).swapaxes(0, 1)
+    expected = data.samples[0].flatten(0, 1).numpy()
+    assert (found == expected).all()
+    profile = np.fft.fft(found, axis=-1)
+    assert (np.abs(profile).argmax(-1) == round(3.0 / chirp.range_resolution)).all()
+
+
 def test_a_capture_needs_a_board(tmp_path):
     write_samples(tmp_path / "adc.bin", counts(SETTINGS))
     with pytest.raises(InputError, match="either board or arrays, got neither"):

@@ -79,12 +79,18 @@ def read_recording(
         lanes: of the LVDS link, where the settings do not say.
 
     Raises:
-        InputError: no settings, or what `read_settings` and `read_samples` raise.
+        InputError: other lanes than the settings say, or what `read_settings` and `read_samples`
+            raise.
     """
     if settings is None:
         settings = path
     known = settings if isinstance(settings, ChirpSettings) else read_settings(settings)
     if lanes is not None:
+        if known.lanes not in (None, lanes):
+            raise InputError(
+                f"expected the {known.lanes} LVDS lanes of the device in the settings, got "
+                f"lanes={lanes}; leave lanes out"
+            )
         known = replace(known, lanes=lanes)
     return read_samples(recorded_files(path), known)
 

@@ -112,14 +112,32 @@ class VerticesParameter(Section):
     """weight; 0 = free"""
 
 
+MaterialValue = Literal[
+    "permittivity",
+    "conductivity",
+    "loss_tangent",
+    "thickness",
+    "diffuse",
+    "lobe_width",
+    "scattering",
+    "rms_slope",
+    "lambertian",
+    "directive",
+    "directive_exponent",
+    "backscatter_exponent",
+]
+
+
 class MaterialParameter(Section):
     """Material values that are sought, from the values of the scene table."""
 
     kind: Literal["material"]
     object: str
     """name in the scene"""
-    values: Annotated[list[Literal["permittivity", "conductivity", "diffuse"]], Field(min_length=1)]
+    values: Annotated[list[MaterialValue], Field(min_length=1)]
     """which are sought"""
+    layer: Annotated[int, Field(ge=0)] | None = None
+    """of a multilayer, from 0: the layer whose values they are"""
 
 
 class RadarParameter(Section):
@@ -279,7 +297,7 @@ class GradientParameter(Section):
     """name in the scene; none for the radar's"""
     axis: Vector | None = None
     """direction, or axis of the turn"""
-    value: Literal["permittivity", "conductivity", "diffuse"] | None = None
+    value: MaterialValue | None = None
     """for kind material"""
 
     @model_validator(mode="after")

@@ -1,8 +1,8 @@
 """The tables of the scene: materials, shapes, where they stand."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, Tag
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from invertwin.cli.schema.section import (
     TAG_MARK,
@@ -12,21 +12,91 @@ from invertwin.cli.schema.section import (
     Positive,
     Section,
     Vector,
+    fail,
     tag_by,
 )
 
 
-class RoughDielectric(Section):
-    """A rough surface of a dielectric."""
+class TextureFile(Section):
+    """Values from an image, laid over the object as seen along its own z axis."""
+
+    image: InputPath
+    """NumPy file (.npy) of rows of pixels, top row first, read at the middle of each triangle"""
+
+
+def _form(value: Any) -> str:
+    """Which form a material value has in the run file."""
+    form = "list" if isinstance(value, list) else "table"
+    return TAG_MARK + (form if isinstance(value, list | dict | TextureFile) else "number")
+
+
+_FORM = Discriminator(_form)
+_Above1 = Annotated[float, Field(ge=1)]
+_Share = Annotated[float, Field(ge=0, le=1)]
+_Slope = Annotated[float, Field(gt=0, le=1)]
+
+
+def _listed(number: Any) -> Any:
+    """One number, a list of one number per triangle, or a texture."""
+    return Annotated[
+        Annotated[number, Tag(TAG_MARK + "number")]
+        | Annotated[list[number], Field(min_length=1), Tag(TAG_MARK + "list")]
+        | Annotated[TextureFile, Tag(TAG_MARK + "table")],
+        _FORM,
+    ]
+
+
+if TYPE_CHECKING:
+    Permittivity = ZeroOrMore = AboveZero = Share = Slope = float | list[float] | TextureFile
+else:
+    Permittivity, ZeroOrMore, AboveZero, Share, Slope = map(
+        _listed, (_Above1, NonNegative, Positive, _Share, _Slope)
+    )
+
+
+class Medium(Section):
+    """A dielectric, by numbers or from the ITU table."""
+
+    itu: Annotated[str, Field(min_length=1)] | None = None
+    """material of ITU-R P.2040, e.g. "concrete", at the radar's frequency"""
+    permittivity: Permittivity | None = None
+    """relative, real part; needed without `itu`"""
+    conductivity: ZeroOrMore | None = None
+    """S/m; 0 without `itu`"""
+    loss_tangent: ZeroOrMore = 0.0
+    """of other losses"""
+
+    @model_validator(mode="after")
+    def _known(self) -> "Medium":
+        if self.itu is None and self.permittivity is None:
+            fail("expected `permittivity`, or `itu` with a name of its table, got neither; add one")
+        return self
+
+
+class Roughness(Section):
+    """Effective roughness of a surface."""
+
+    scattering: Share = 0.0
+    """coefficient S; the share S² of the reflected power is scattered"""
+    rms_slope: Slope = 0.1
+    """of the surface; makes the width of the lobe that holds the rest"""
+    lambertian: Share = 1.0
+    """share of the scattered power that goes in all directions alike"""
+    directive: Share = 1.0
+    """share of what is left that goes about the mirror direction, the rest goes back"""
+    directive_exponent: ZeroOrMore = 4.0
+    """of the lobe about the mirror direction"""
+    backscatter_exponent: ZeroOrMore = 4.0
+    """of the lobe back to the source"""
+
+
+class RoughDielectric(Medium):
+    """A rough surface of a dielectric, in two values."""
 
     kind: Literal["rough_dielectric"]
-    permittivity: Annotated[float, Field(ge=1)]
-    """relative, real part"""
-    conductivity: NonNegative = 0.0
-    """S/m"""
-    diffuse: Annotated[float, Field(ge=0, le=1)] = 1.0
+    diffuse: Share = 1.0
     """share of the reflected power that is scattered evenly"""
-    lobe_width_deg: Positive | None = None
+    lobe_width_deg: AboveZero | None = None
     """full width at half power of the rest"""
 
 
@@ -34,13 +104,57 @@ class PerfectConductor(Section):
     """A smooth perfect conductor."""
 
     kind: Literal["perfect_conductor"]
-    lobe_width_deg: Positive | None = None
+    lobe_width_deg: AboveZero | None = None
     """full width at half power of the mirror lobe"""
+
+
+class RoughConductor(Roughness):
+    """A perfect conductor with a rough surface."""
+
+    kind: Literal["rough_conductor"]
+
+
+class Dielectric(Medium, Roughness):
+    """A half space: what enters it does not come back."""
+
+    kind: Literal["dielectric"]
+
+
+class RefractingBody(Medium, Roughness):
+    """A solid body with a closed mesh, which rays enter and leave by Snell's law."""
+
+    kind: Literal["refracting_body"]
+
+
+class Layer(Medium):
+    """One layer of a sheet."""
+
+    thickness: ZeroOrMore
+    """m"""
+
+
+class Slab(Layer, Roughness):
+    """A thin sheet in air, meshed as an open surface: it reflects and lets through."""
+
+    kind: Literal["slab"]
+
+
+class Multilayer(Roughness):
+    """A thin sheet of several layers, meshed as an open surface."""
+
+    kind: Literal["multilayer"]
+    layers: Annotated[list[Layer], Field(min_length=1)]
+    """from the first face to the last"""
 
 
 Material = Annotated[
     Annotated[RoughDielectric, Tag(TAG_MARK + "rough_dielectric")]
-    | Annotated[PerfectConductor, Tag(TAG_MARK + "perfect_conductor")],
+    | Annotated[PerfectConductor, Tag(TAG_MARK + "perfect_conductor")]
+    | Annotated[RoughConductor, Tag(TAG_MARK + "rough_conductor")]
+    | Annotated[Dielectric, Tag(TAG_MARK + "dielectric")]
+    | Annotated[RefractingBody, Tag(TAG_MARK + "refracting_body")]
+    | Annotated[Slab, Tag(TAG_MARK + "slab")]
+    | Annotated[Multilayer, Tag(TAG_MARK + "multilayer")],
     tag_by("kind"),
 ]
 

@@ -272,7 +272,7 @@ class Multilayer(_Values, EffectiveRoughness, Material):
         layers: from the first face to the last. Both sides of the mesh reflect as the first face
             does, which is exact for stacks without losses and for symmetric ones; what passes is
             the same from both sides.
-        scattering, rms_slope, lambertian, forward, directive_exponent, backscatter_exponent: see
+        scattering, rms_slope, lambertian, directive, directive_exponent, backscatter_exponent: see
             `EffectiveRoughness`.
 
     Raises:

@@ -91,7 +91,7 @@ class EffectiveRoughness:
         rms_slope: root mean square slope of the surface, in (0, 1]; it makes the width of the lobe
             that holds the rest (`slope_exponent`).
         lambertian: share of the scattered power that goes in all directions alike, in [0, 1].
-        forward: share Λ of the rest that goes into the directive lobe about the mirror direction;
+        directive: share Λ of the rest that goes into the directive lobe about the mirror direction;
             what is left goes back towards the source. In [0, 1].
         directive_exponent: α_R of the directive lobe, ((1 + cosψ)/2)^α_R.
         backscatter_exponent: α_i of the backscattering lobe.
@@ -100,16 +100,16 @@ class EffectiveRoughness:
     scattering: Value = 0.0
     rms_slope: Value = 0.1
     lambertian: Value = 1.0
-    forward: Value = 1.0
+    directive: Value = 1.0
     directive_exponent: Value = 4.0
     backscatter_exponent: Value = 4.0
 
     def weights(self) -> Weights:
         """Weights and exponents of the Lambertian part and the three lobes."""
         scattered = evaluated(self.scattering) ** 2
-        lambertian, forward = evaluated(self.lambertian), evaluated(self.forward)
+        lambertian, directive = evaluated(self.lambertian), evaluated(self.directive)
         directed = scattered * (1 - lambertian)
-        shares = (1 - scattered, directed * forward, directed * (1 - forward))
+        shares = (1 - scattered, directed * directive, directed * (1 - directive))
         exponents = (
             slope_exponent(self.rms_slope),
             evaluated(self.directive_exponent),

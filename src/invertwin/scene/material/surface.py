@@ -87,16 +87,6 @@ class Surface:
             attenuation=diffuse.new_zeros(row),
         )
 
-    @property
-    def lobe(self) -> Float64[Tensor, "*row"]:
-        """Weight of the specular lobe."""
-        return self.lobes[..., 0]
-
-    @property
-    def exponent(self) -> Float64[Tensor, "*row"]:
-        """Exponent of the specular lobe."""
-        return self.exponents[..., 0]
-
 
 class Material(ABC):
     """What an object's surface does to the waves.

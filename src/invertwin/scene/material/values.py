@@ -12,6 +12,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.scene.mesh import Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +37,11 @@ class Texture:
     """
 
     image: Float64[Tensor, "row column"]
-    uv: Float64[Tensor, "f 3 2"]
+    uv: Float64[Tensor, "f 3 2"] | Float64[Tensor, "v 2"]
     faces: InitVar[ArrayLike | None] = None
 
     def __post_init__(self, faces: ArrayLike | None) -> None:
-        image = checked_tensor(
-            self.image, (None, None), "image of a texture", "give rows of pixels"
-        )
-        if not image.numel():
-            raise InputError("expected an image of a texture with pixels, got none; give some")
+        image = _checked_image(self.image)
         if faces is None:
             do = "give u, v of every corner, or of every vertex with `faces`"
             uv = checked_tensor(self.uv, (None, 3, 2), "uv of a texture", do)
@@ -61,6 +58,26 @@ class Texture:
             uv = vertices[index]
         object.__setattr__(self, "image", image)
         object.__setattr__(self, "uv", uv.detach())
+
+    @classmethod
+    def over(cls, image: ArrayLike, mesh: Mesh) -> "Texture":
+        """The image laid over a mesh as seen along its z axis.
+
+        The left and right borders are at the least and largest x of the mesh, bottom and top at
+        the least and largest y, in the object's own frame.
+
+        Raises:
+            InputError: a mesh without width or height, or a bad image.
+        """
+        corners = mesh.vertices.detach()[:, :2]
+        low = corners.min(0).values
+        size = corners.max(0).values - low
+        if not bool((size > 0).all()):
+            raise InputError(
+                "expected a mesh with width and height along its x and y axes for a texture, "
+                f"got {size.tolist()} m; give uv coordinates"
+            )
+        return cls(_checked_image(image), (corners - low) / size, mesh.faces)
 
     @property
     def values(self) -> Float64[Tensor, " f"]:
@@ -79,7 +96,14 @@ class Texture:
         return upper * (1 - b) + lower * b
 
 
-Value = float | Tensor | Texture
+def _checked_image(image: object) -> Tensor:
+    pixels = checked_tensor(image, (None, None), "image of a texture", "give rows of pixels")
+    if not pixels.numel():
+        raise InputError("expected an image of a texture with pixels, got none; give some")
+    return pixels
+
+
+Value = float | ArrayLike | Texture
 """A number or 0-d tensor for the whole object, one number per triangle [f], or a texture."""
 
 
@@ -102,7 +126,7 @@ RANGES: Mapping[str, Range] = {
     "scattering": Range("scattering coefficient", 0.0, 1.0),
     "rms_slope": Range("rms slope", 0.0, 1.0, open_low=True),
     "lambertian": Range("Lambertian share", 0.0, 1.0),
-    "forward": Range("forward share", 0.0, 1.0),
+    "directive": Range("directive share", 0.0, 1.0),
     "directive_exponent": Range("exponent of the directive lobe", 0.0),
     "backscatter_exponent": Range("exponent of the backscattering lobe", 0.0),
 }

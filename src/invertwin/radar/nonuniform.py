@@ -1,0 +1,178 @@
+"""Sums of many exponentials: non-uniform FFTs on the CPU and, where tensors are there, on CUDA."""
+
+import math
+from functools import cache, lru_cache
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import finufft
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+from invertwin.radar.waveform import SampledWaveform
+
+
+def sums_on_gpu(values: Tensor) -> bool:
+    """Whether sums over these values run on their GPU: they are there, and cufinufft is."""
+    return values.is_cuda and _cufinufft() is not None
+
+
+@cache
+def _cufinufft() -> ModuleType | None:
+    try:
+        return import_module("cufinufft")
+    except (ImportError, OSError):  # OSError: its CUDA libraries are not there
+        return None
+
+
+def ramp_instants(samples: int, count: int) -> Float64[Tensor, " instant"]:
+    """Where in a ramp delays are taken, in samples: its middle one, or Chebyshev–Lobatto points.
+
+    Args:
+        samples: In a ramp.
+        count: 1, or odd and at least 3; then the first, middle and last are those of the ramp.
+    """
+    if count == 1:
+        return torch.tensor([float(samples // 2)], dtype=torch.float64)
+    angle = torch.arange(count, dtype=torch.float64) * (math.pi / (count - 1))
+    return 0.5 * (samples - 1) * (1 - torch.cos(angle))
+
+
+@lru_cache(maxsize=32)
+def _interpolation(samples: int, count: int) -> Float64[Tensor, "instant sample"]:
+    """Lagrange's polynomials through the instants, at the samples (barycentric form)."""
+    apart = torch.arange(samples, dtype=torch.float64) - ramp_instants(samples, count)[:, None]
+    there = apart.abs() < 1e-9
+    terms = _weights(count)[:, None] / torch.where(there, 1.0, apart)
+    return torch.where(there.any(0), there.to(apart), terms / terms.sum(0))
+
+
+def instants_derivative(samples: int, count: int) -> Float64[Tensor, "instant instant"]:
+    """Derivatives per sample at the instants, from values there."""
+    places, weight = ramp_instants(samples, count), _weights(count)
+    apart = places[:, None] - places
+    matrix = (weight / weight[:, None]) / (apart + torch.eye(count, dtype=torch.float64))
+    matrix.fill_diagonal_(0.0)
+    return matrix - torch.diag(matrix.sum(1))
+
+
+def _weights(count: int) -> Float64[Tensor, " instant"]:
+    weight = 1.0 - 2.0 * (torch.arange(count, dtype=torch.float64) % 2)
+    weight[[0, -1]] *= 0.5
+    return weight
+
+
+def beat_of_delays(
+    coefficient: Complex128[Tensor, " path"],
+    delay: Float64[Tensor, "instant path"],
+    waveform: SampledWaveform,
+    tolerance: float,
+) -> Complex128[Tensor, " sample"]:
+    """Beat signal of one channel, from the paths' delays at some instants of the ramp.
+
+    With one instant delays are constant, and the phase is a straight line over the samples. With
+    more, a path has its exact phase at every instant. What this phase has beyond a straight line
+    becomes a factor of each path, known at the instants, a polynomial between them; so the sum
+    is as many non-uniform FFTs as there are instants, over the same rates.
+
+    Args:
+        coefficient: a of the paths; the signal has its conjugate.
+        delay: At ``ramp_instants`` [s].
+        waveform: Frequencies of the samples.
+        tolerance: Relative error of the sums.
+    """
+    count, samples = len(delay), waveform.samples
+    instants = ramp_instants(samples, count).to(delay.device)
+    cycles = phase_cycles(delay, waveform)
+    place = (instants - samples // 2)[:, None]
+    if count == 1:
+        turns = waveform.step * delay[0]
+    else:
+        # Any line will do, since the rest takes up what it leaves; so it needs no gradient.
+        turns = ((cycles[-1] - cycles[0]) / (instants[-1] - instants[0])).detach()
+    rest = cycles - place * turns
+    # Reduced before the radians: at 77 GHz and 200 m there are 1e5 cycles.
+    phase = 2 * math.pi * (rest - rest.detach().round())
+    strengths = torch.polar(torch.ones_like(phase), phase) * coefficient.conj()
+    rate = 2 * math.pi * (turns - turns.detach().round())
+    sums = NonUniformSum.apply(strengths, rate, samples, tolerance)
+    if count == 1:
+        return sums[0]
+    return (sums * _interpolation(samples, count).to(sums)).sum(0)
+
+
+def phase_cycles(
+    delay: Float64[Tensor, "instant path"], waveform: SampledWaveform
+) -> Float64[Tensor, "instant path"]:
+    """Phase of paths at ``ramp_instants``, ``f τ − S τ²/2``."""
+    instants = ramp_instants(waveform.samples, len(delay)).to(delay.device)
+    frequency = waveform.start_frequency + waveform.step * instants
+    return (frequency[:, None] - (0.5 * waveform.residual_slope) * delay) * delay
+
+
+class NonUniformSum(torch.autograd.Function):
+    """Σ_i strengths_ki exp(j (n − N//2) rate_i), with gradients in both (type 2)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        strengths: Complex128[Tensor, "sum path"],
+        rate: Float64[Tensor, " path"],
+        samples: int,
+        tolerance: float,
+    ) -> Complex128[Tensor, "sum sample"]:
+        ctx.save_for_backward(strengths, rate)
+        ctx.tolerance = tolerance
+        if len(rate) == 0:
+            return strengths.new_zeros(len(strengths), samples)
+        return _transform(1, rate, strengths, samples, tolerance)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        strengths, rate = ctx.saved_tensors
+        grad, samples = grads[0], grads[0].shape[-1]
+        if len(rate) == 0:
+            return torch.zeros_like(strengths), torch.zeros_like(rate), None, None
+        with_rate = ctx.needs_input_grad[1]
+        if with_rate:
+            place = torch.arange(samples, dtype=torch.float64, device=grad.device) - samples // 2
+            grad = torch.cat([grad, grad * place])
+        sums = _transform(2, rate, grad, samples, ctx.tolerance)
+        of_rate = None
+        if with_rate:
+            of_rate = (strengths.conj() * sums[len(strengths) :]).imag.sum(0)
+        return sums[: len(strengths)], of_rate, None, None
+
+
+def _transform(kind: int, rate: Tensor, values: Tensor, samples: int, tolerance: float) -> Tensor:
+    """Type 1 (to samples) with the exponential's plus sign, type 2 (to paths) with minus."""
+    rate, values = rate.detach().contiguous(), values.detach().resolve_conj().contiguous()
+    sign = 1 if kind == 1 else -1
+    library = _cufinufft() if values.is_cuda else None
+    if library is not None:
+        out = values.new_empty(len(values), samples if kind == 1 else len(rate))
+        plan = library.Plan(
+            kind,
+            (samples,),
+            len(values),
+            tolerance,
+            sign,
+            dtype="complex128",
+            gpu_device_id=values.device.index,
+        )
+        plan.setpts(rate)
+        return plan.execute(values, out=out)
+    plan = finufft.Plan(
+        kind,
+        (samples,),
+        len(values),
+        eps=tolerance,
+        isign=sign,
+        nthreads=torch.get_num_threads(),
+    )
+    plan.setpts(rate.cpu().numpy())
+    found = torch.from_numpy(plan.execute(values.cpu().numpy())).to(values.device)
+    return found.reshape(len(values), -1)

@@ -1,0 +1,204 @@
+"""`invertwin look`: recordings of every kind as pictures, numbers and captures; bad ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from cli.small import call, read_metrics
+from invertwin.capture import (
+    Capture,
+    ChannelCalibration,
+    ChirpData,
+    ChirpSettings,
+    adc_counts,
+    described_arrays,
+)
+from invertwin.capture.ti import write_cfg, write_samples, write_setup, write_studio
+from invertwin.radar import Chirps, Radar, velocity_span
+from invertwin.radar.boards import board
+from oracles.moving_point import moving_point
+
+SETTINGS = ChirpSettings(
+    start_frequency=60e9,
+    slope=40e12,
+    sample_rate=2e6,
+    samples=64,
+    transmit_order=(1, 3, 2),
+    receivers=(1, 2, 3, 4),
+    loops=16,
+    frames=2,
+    frame_period=0.05,
+    idle_time=8e-6,
+    adc_start_time=0.0,
+    ramp_end_time=32e-6,
+    lanes=2,
+)
+ARRAYS = board("IWR6843ISK").arrays(elevation=1, transmitters=[1, 3, 2])
+RADAR = Radar(*ARRAYS, SETTINGS.waveform, torch.zeros(2, 3, dtype=torch.float64))
+CHIRPS = Chirps(SETTINGS.loops, SETTINGS.idle_time + SETTINGS.ramp_time)
+RATE = 0.25 * velocity_span(RADAR, CHIRPS)
+BOARD = ("--board", "IWR6843ISK", "--elevation", "1")
+
+
+def mover(settings: ChirpSettings = SETTINGS, full_scale: float = 1.5) -> ChirpData:
+    """A point at 3 m, u = 0.3, that moves away, in counts of a 16-bit ADC."""
+    beat = moving_point(RADAR, CHIRPS, 3.0, RATE, 0.3, 0.0)
+    return adc_counts(beat, settings, full_scale)
+
+
+@pytest.fixture
+def recording(tmp_path, monkeypatch):
+    """The raw files of a bench, as the tools of the board write them."""
+    monkeypatch.chdir(tmp_path)
+    data = mover()
+    write_samples("adc.bin", data)
+    write_cfg("bench.cfg", SETTINGS)
+    write_studio("bench.mmwave.json", SETTINGS)
+    write_setup("bench.setup.json", "bench.mmwave.json", ["adc.bin"])
+    described_arrays.write_chirps("adc.toml", data, "adc.h5", ARRAYS)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["adc.bin", "--config", "bench.cfg", *BOARD],
+        ["adc.bin", "-c", "bench.mmwave.json", *BOARD],
+        ["bench.setup.json", *BOARD],
+        ["adc.toml"],
+    ],
+    ids=["cfg", "studio", "setup", "described arrays"],
+)
+def test_a_mover_is_where_it_is(recording, monkeypatch, capsys, arguments):
+    assert call(monkeypatch, "look", *arguments, "-o", "seen", "--frame", "1") == 0
+    found = read_metrics(recording / "seen")
+    span = velocity_span(RADAR, CHIRPS)
+    assert found["frames"] == 2
+    assert found["velocity_span_m_s"] == pytest.approx(span)
+    for kind in ("peak", "mover"):
+        assert found[f"{kind}_range_m"] == pytest.approx(3.0, abs=0.06)
+        assert found[f"{kind}_velocity_m_s"] == pytest.approx(RATE, abs=span / 16)
+        assert found[f"{kind}_u"] == pytest.approx(0.3, abs=0.07)
+    names = {path.name for path in (recording / "seen").iterdir()}
+    assert names >= {"capture.nc", "look.png", "metrics.json", "report.html"}
+    assert "range rate" in capsys.readouterr().out
+
+
+def test_the_capture_that_it_writes_is_looked_at_again(recording, monkeypatch):
+    """One chirp keeps a mover, whose range is then found without Doppler."""
+    assert call(monkeypatch, "look", "adc.toml", "--chirp", "3") == 0
+    capture = Capture.load("out/adc/capture.nc")
+    assert torch.equal(capture.beat, mover().samples[:, 3])
+    assert call(monkeypatch, "look", "out/adc/capture.nc", "-o", "again") == 0
+    found = read_metrics(recording / "again")
+    assert found["peak_range_m"] == pytest.approx(3.0, abs=0.06)
+    assert "mover_range_m" not in found
+
+
+def test_results_are_kept_unless_overwritten(recording, monkeypatch, capfd):
+    assert call(monkeypatch, "look", "adc.toml", "-o", "seen") == 0
+    before = (recording / "seen" / "look.png").read_bytes()
+    assert call(monkeypatch, "look", "adc.toml", "-o", "seen") == 2
+    assert "--overwrite" in capfd.readouterr().err
+    assert call(monkeypatch, "look", "adc.toml", "-o", "seen", "--overwrite") == 0
+    assert (recording / "seen" / "look.png").read_bytes() == before
+
+
+def test_real_samples_serve_half_the_range(recording, monkeypatch, capfd):
+    settings = replace(SETTINGS, real=True)
+    write_samples("real.bin", mover(settings))
+    write_cfg("real.cfg", settings)
+    arguments = ["look", "real.bin", "-c", "real.cfg", *BOARD]
+    assert call(monkeypatch, *arguments, "-o", "seen") == 0
+    found = read_metrics(recording / "seen")
+    assert found["max_range_m"] == pytest.approx(SETTINGS.waveform.max_range / 2)
+    assert found["mover_range_m"] == pytest.approx(3.0, abs=0.06)
+    assert call(monkeypatch, *arguments, "-o", "far", "--range-max", "7") == 2
+    assert "--range-max within" in capfd.readouterr().err
+
+
+def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
+    """What one recording says of the channels is taken out of another."""
+    generator = torch.Generator().manual_seed(1)
+    gains = torch.randn(3, 4, dtype=torch.complex128, generator=generator) * 0.3 + 1
+    ideal = moving_point(RADAR, CHIRPS, 2.5, 0.0, 0.0)
+    data = ChirpData((ideal * gains[..., None]).to(torch.complex64), SETTINGS)
+    described_arrays.write_chirps("reflector.toml", data, "reflector.npy", ARRAYS)
+    moving = mover().samples * gains[..., None]
+    other = ChirpData(moving.to(torch.complex64), SETTINGS)
+    described_arrays.write_chirps("other.toml", other, "other.npy", ARRAYS)
+
+    reflector = ["--reflector", "0", "0", "2.5"]
+    assert call(monkeypatch, "look", "reflector.toml", *reflector, "-o", "bench") == 0
+    found = ChannelCalibration.load("bench/channels.json").gains
+    torch.testing.assert_close(found, ChannelCalibration(gains).gains, atol=2e-3, rtol=0)
+    spread = 20 * torch.log10(gains.abs().max() / gains.abs().min())
+    assert read_metrics(recording / "bench")["channel_spread_db"] == pytest.approx(
+        float(spread), abs=0.1
+    )
+    used = ["--channels", "bench/channels.json", "--chirp", "0"]
+    assert call(monkeypatch, "look", "other.toml", *used, "-o", "other") == 0
+    beat = Capture.load("other/capture.nc").beat
+    scale = (beat / mover().samples[:, 0]).mean()
+    torch.testing.assert_close(beat / scale, mover().samples[:, 0], atol=200, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["none.bin"], ["none.bin", "check the path"]),
+        (["notes.txt"], ["notes.txt", ".setup.json"]),
+        (["adc.bin", *BOARD], ["settings in a .cfg or .json file"]),
+        (["adc.bin", "-c", "bench.cfg"], ["--board", "preset"]),
+        (["adc.bin", "-c", "bench.cfg", "-b", "xWR9999"], ["xWR9999", "IWR6843ISK"]),
+        (["adc.bin", "-c", "bench.cfg", "-b", "IWR6843ISK"], ["elevation=+1 or -1"]),
+        (["adc.bin", "-c", "bench.cfg", "-b", "xWR1642"], ["TX numbers of xWR1642 from 1 to 2"]),
+        (["odd.bin", "-c", "bench.cfg", *BOARD], ["odd number of bytes"]),
+        (["adc.bin", "-c", "three.cfg", *BOARD], ["what fits: ", "4 receivers"]),
+        (["adc.bin", "-c", "long.cfg", *BOARD], ["what fits: ", "samples=64"]),
+        (["adc.bin", "-c", "bench.cfg", *BOARD, "--lanes", "4"], ["2 LVDS lanes", "lanes=4"]),
+        (["adc.bin", "-c", "bench.cfg", *BOARD, "--lanes", "3"], ["lanes=3"]),
+        (["adc.bin", "-c", "plain.cfg", *BOARD, "--lanes", "3"], ["2 or 4 LVDS lanes"]),
+        (["adc.bin", "-c", "plain.cfg", *BOARD], ["2 or 4 LVDS lanes", "set lanes"]),
+        (["adc.toml", "--frame", "2"], ["--frame from 0 to 1"]),
+        (["adc.toml", "--chirp", "16"], ["number from 0 to 15"]),
+        (["adc.toml", "--range-max", "900"], ["--range-max within"]),
+        (["adc.toml", "--channels", "bench.cfg"], ["no calibration"]),
+        (["adc.toml", "--reflector", "0", "0", "90"], ["reflector within"]),
+        (["."], ["openradar.npz"]),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(recording, monkeypatch, capfd, arguments, said):
+    (recording / "notes.txt").write_text("a note")
+    raw = (recording / "adc.bin").read_bytes()
+    (recording / "odd.bin").write_bytes(raw[:-1])
+    write_cfg("three.cfg", replace(SETTINGS, receivers=(1, 2, 3)))
+    write_cfg("long.cfg", replace(SETTINGS, samples=63 + 3, ramp_end_time=40e-6))
+    write_cfg("plain.cfg", replace(SETTINGS, lanes=None))
+    assert call(monkeypatch, "look", *arguments, "-o", "seen") == 2
+    error = capfd.readouterr().err
+    assert error.startswith("invertwin: ")
+    assert error.count("\n") == 1
+    for part in said:
+        assert part in error
+    assert not (recording / "seen").exists()
+
+
+@pytest.mark.filterwarnings("always")
+def test_what_is_cut_or_saturated_is_warned_of(recording, monkeypatch, capfd):
+    write_samples("loud.bin", _saturated())
+    raw = np.fromfile("loud.bin", "<i2")
+    raw[:-100].tofile("cut.bin")
+    assert call(monkeypatch, "look", "cut.bin", "-c", "bench.cfg", *BOARD, "-o", "seen") == 0
+    error = capfd.readouterr().err
+    assert "cut.bin ends within a frame: 1 whole frames are read" in error
+    assert "saturated" in error
+    assert read_metrics(recording / "seen")["frames"] == 1
+
+
+def _saturated() -> ChirpData:
+    samples = mover().samples.clone()
+    samples[0, 0, 0, 0, :5] = 32767
+    return ChirpData(samples, SETTINGS)
