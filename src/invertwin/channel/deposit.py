@@ -301,7 +301,9 @@ class _Deposit(torch.autograd.Function):
             inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
             seed = to_float(grad)
             for records in trace.records():
-                replay.pull(inputs, records, lambda *path: bins.gather(seed, grid, *path))
+                replay.pull(
+                    trace.shot, inputs, records, lambda *path: bins.gather(seed, grid, *path)
+                )
                 dr.eval([dr.grad(table) for table in tables.values()])
             for chains in trace.boundary(inputs):
                 total = chains.weighted(lambda *path: bins.gather(seed, grid, *path)[0])
@@ -341,7 +343,10 @@ class _Deposit(torch.autograd.Function):
             for records in trace.records():
                 point_tangents()
                 replay.push(
-                    inputs, records, lambda *path: bins.scatter_derivative(out, grid, *path)
+                    trace.shot,
+                    inputs,
+                    records,
+                    lambda *path: bins.scatter_derivative(out, grid, *path),
                 )
                 dr.eval(out)
             for chains in trace.boundary(inputs):

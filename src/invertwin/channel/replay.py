@@ -14,6 +14,8 @@ from invertwin.channel import kernel
 from invertwin.channel.bins import Contribution
 from invertwin.channel.bridge import opaque, tracer
 from invertwin.channel.kernel import Inputs
+from invertwin.channel.passage import Passage, crossed, passage
+from invertwin.channel.rays import Shot
 from invertwin.channel.walk import Records
 
 
@@ -31,16 +33,19 @@ class _Vertex:
     leg: Any
     connection: kernel.Connection
     scattered: Any  # towards the next vertex
+    passed: Passage  # by the connection
+    twice: Any  # whether the connection passes what the leg here passed
+    ends: tuple[Callable[[], Any], Callable[[], Any], Callable[[], Any]]  # before, here, receiver
 
     def path(self) -> Contribution:
         """The path that ends here."""
-        found = self.connection
-        power = self.throughput * found.factor
-        length = 0.5 * (self.length + found.distance)
+        found, passed = self.connection, self.passed
+        power = self.throughput * found.factor * passed.share
+        length = 0.5 * (self.length + found.distance + passed.excess)
         return Contribution(self.frame, power, length, found.seen.x, found.seen.y)
 
 
-def _vertex(inputs: Inputs, records: Records, number: Any) -> _Vertex:
+def _vertex(shot: Shot, inputs: Inputs, records: Records, number: Any) -> _Vertex:
     """Evaluate vertex ``number`` (from 0) of every chain."""
     import drjit as dr
 
@@ -59,12 +64,14 @@ def _vertex(inputs: Inputs, records: Records, number: Any) -> _Vertex:
         face, b1, b2 = (read(name, at, exists) for name in ("face", "b1", "b2"))
         return kernel.place(inputs, face, b1, b2, exists)
 
-    here = located(number, active)
-    transmitter = inputs.antenna(frame, False, active)
-    before, gain = transmitter, mi.Float(1.0)
-    if not single:
+    def previous() -> Any:
+        transmitter = inputs.antenna(frame, False, active)
+        if single:
+            return transmitter
         inner = active & (number > 0)
-        before = dr.select(inner, located(number - 1, inner).position, transmitter)
+        return dr.select(inner, located(number - 1, inner).position, transmitter)
+
+    here, before = located(number, active), previous()
     back, leg = kernel.leg(here.position, before)
     first = active if single else active & (number == 0)
     seen_from_tx = kernel.to_radar(inputs, frame, -back, first)
@@ -77,13 +84,29 @@ def _vertex(inputs: Inputs, records: Records, number: Any) -> _Vertex:
     if not single:
         goes_on = active & (number + 1 < records.depth)
         goes_on &= read("throughput", number + 1, goes_on) != 0
+        transmitter = inputs.antenna(frame, False, active)
         onward = dr.select(goes_on, located(number + 1, goes_on).position, transmitter)
         direction, _ = kernel.leg(here.position, onward)
         scattered = kernel.reflected(inputs, here.surface, here.normal, back, direction, goes_on)
+    seen = active & read("seen", number)
+    twice, passed = mi.Bool(False), Passage(mi.Float(1.0), mi.Float(0.0))
+    if inputs.sheets:
+        twice = first if shot.link.shared_visibility else twice
+        end = dr.select(twice, before, inputs.antenna(frame, True, active))
+        fixed = (dr.detach(here.position), dr.detach(end))
+        with dr.suspend_grad():
+            passed = passage(shot, inputs.detached(), *fixed, seen)
     return _Vertex(
+        passed=passed,
+        twice=twice,
+        ends=(
+            previous,
+            lambda: located(number, active).position,
+            lambda: inputs.antenna(frame, True, active),
+        ),
         active=active,
         goes_on=goes_on,
-        seen=active & read("seen", number),
+        seen=seen,
         throughput=throughput,
         length=read("length", number),
         frame=frame,
@@ -102,6 +125,7 @@ def _share(active: Any, total: Any, value: Any) -> Any:
 
 
 def pull(
+    shot: Shot,
     inputs: Inputs,
     records: Records,
     gather: Callable[[Contribution, Any], tuple[Any, Any, Any, Any]],
@@ -116,7 +140,7 @@ def pull(
 
     def sweep(number: Any, power_sum: Any, range_sum: Any) -> tuple[Any, Any]:
         with dr.resume_grad():
-            vertex = _vertex(inputs, records, number)
+            vertex = _vertex(shot, inputs, records, number)
             path = vertex.path()
             power, length, u, v = (
                 dr.select(vertex.seen, bar, 0.0) for bar in gather(path, vertex.seen)
@@ -131,7 +155,27 @@ def pull(
             objective = dr.select(vertex.active, so_far, 0.0) + dr.select(vertex.seen, ending, 0.0)
             objective += dr.select(vertex.goes_on, later, 0.0)
             dr.backward_from(objective)
+        if inputs.sheets:
+            pull_sheets(vertex, power * dr.detach(path.power), length, power_sum, range_sum)
         return power_sum, range_sum
+
+    def pull_sheets(
+        vertex: _Vertex, power: Any, length: Any, power_sum: Any, range_sum: Any
+    ) -> None:
+        own = dr.select(vertex.seen, power, 0.0), dr.select(vertex.seen, 0.5 * length, 0.0)
+        again = [dr.select(vertex.twice, amount, 0.0) for amount in own]
+        weights = power_sum + again[0], range_sum + again[1]
+        legs = (
+            (vertex.ends[0], vertex.active, weights),
+            (vertex.ends[2], vertex.seen & ~vertex.twice, own),
+        )
+        for start, active, (by_share, by_excess) in legs:
+
+            def act(_: Any, share: Any, excess: Any, a: Any = by_share, b: Any = by_excess) -> None:
+                known = dr.detach(share) > 0
+                dr.backward_from(_share(known, a, share) * share + b * excess)
+
+            crossed(shot, inputs, start, vertex.ends[1], active, {}, act)
 
     zero = dr.zeros(mi.Float, records.lanes)
     with dr.suspend_grad():
@@ -148,6 +192,7 @@ def pull(
 
 
 def push(
+    shot: Shot,
     inputs: Inputs,
     records: Records,
     scatter: Callable[[Contribution, tuple[Any, Any, Any, Any], Any], None],
@@ -159,7 +204,7 @@ def push(
 
     def sweep(number: Any, growth: Any, longer: Any) -> tuple[Any, Any]:
         with dr.resume_grad():
-            vertex = _vertex(inputs, records, number)
+            vertex = _vertex(shot, inputs, records, number)
             path = vertex.path()
             values = (
                 vertex.arriving, vertex.leg, path.power, vertex.connection.distance,
@@ -171,14 +216,32 @@ def push(
         arriving, leg, power, distance, u, v, scattered = (dr.detach(dot) for dot in dots)
         growth = growth + _share(vertex.active, arriving, vertex.arriving)
         longer = longer + dr.select(vertex.active, leg, 0.0)
-        found = dr.detach(path.power)
+        found, more, further = dr.detach(path.power), mi.Float(0.0), mi.Float(0.0)
+        if inputs.sheets:
+            by_leg = push_sheets(vertex.ends[0], vertex.ends[1], vertex.active)
+            by_end = push_sheets(vertex.ends[2], vertex.ends[1], vertex.seen & ~vertex.twice)
+            growth, longer = growth + by_leg[0], longer + by_leg[1]
+            more = by_end[0] + dr.select(vertex.twice, by_leg[0], 0.0)
+            further = by_end[1] + dr.select(vertex.twice, by_leg[1], 0.0)
         scatter(
             Contribution(vertex.frame, found, *(dr.detach(x) for x in path.attached[1:])),
-            (power + growth * found, 0.5 * (longer + distance), u, v),
+            (power + (growth + more) * found, 0.5 * (longer + distance + further), u, v),
             vertex.seen,
         )
         growth = growth + _share(vertex.goes_on, scattered, vertex.scattered)
         return growth, longer
+
+    def push_sheets(start: Any, end: Any, active: Any) -> tuple[Any, Any]:
+        def act(carry: dict[str, Any], share: Any, excess: Any) -> None:
+            dots = dr.forward_to(share, excess, flags=dr.ADFlag.ClearEdges)
+            known = dr.detach(share) > 0
+            carry["growth"] = carry["growth"] + _share(known, dr.detach(dots[0]), share)
+            carry["longer"] = carry["longer"] + dr.detach(dots[1])
+
+        nothing = [dr.zeros(mi.Float, records.lanes) for _ in range(2)]
+        carry = dict(zip(("growth", "longer"), nothing, strict=True))
+        done = crossed(shot, inputs, start, end, active, carry, act)
+        return done["growth"], done["longer"]
 
     zero = dr.zeros(mi.Float, records.lanes)
     with dr.suspend_grad():

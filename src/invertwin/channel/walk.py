@@ -17,6 +17,7 @@ from invertwin.channel.passage import Passage, land, passage
 from invertwin.channel.rays import NEAR, Shot, scrambled
 
 _LEAST_SURVIVAL = 0.1  # of Russian roulette
+_ROULETTE_FROM = 3  # vertices after which it begins; shorter paths have less noise without
 _STREAM = 0x9E3779B9  # seeds of successive vertices
 
 #: A chain at its latest vertex, one lane a path: what the loop carries.
@@ -111,7 +112,9 @@ class Walk:
         )
         ratio = scattered / (density * dr.abs(dr.dot(point.normal, back)))
         survival = dr.select(
-            state["number"] > 1, dr.minimum(dr.maximum(ratio, _LEAST_SURVIVAL), 1.0), 1.0
+            state["number"] >= _ROULETTE_FROM,
+            dr.minimum(dr.maximum(ratio, _LEAST_SURVIVAL), 1.0),
+            1.0,
         )
         active &= (scattered > 0) & (self._numbers(state, 2)[0] < survival)
         side = dr.mulsign(point.normal, dr.dot(point.normal, omega))
