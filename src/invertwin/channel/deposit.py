@@ -4,8 +4,6 @@ No path is ever stored for torch: chains are walked, deposited and forgotten, or
 while these fit the memory budget, and replayed for the derivative.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -13,26 +11,20 @@ from jaxtyping import Float32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from invertwin.channel import bins, bridge, kernel, replay, walk
+from invertwin.channel import bins, bridge, replay
 from invertwin.channel.boundary import require_edges
-from invertwin.channel.boundary_walk import BoundaryChains, boundary_chains
 from invertwin.channel.bridge import (
-    Geometry,
     differentiated,
     flatten,
     one_torch_thread,
-    opaque,
     to_float,
     to_torch,
     tracer,
     use_backend,
 )
-from invertwin.channel.kernel import DIFFERENTIABLE, Inputs, Place
-from invertwin.channel.passage import Passage
+from invertwin.channel.kernel import DIFFERENTIABLE
 from invertwin.channel.paths import Grid, Link
-from invertwin.channel.rays import Shot
-from invertwin.channel.sampling import AreaSampler, RaySampler
-from invertwin.channel.walk import Records, State, Walk
+from invertwin.channel.trace import Settings, Trace
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
@@ -105,7 +97,7 @@ def deposit_power(
         raise InputError(f"expected sampling 'rays' or 'area', got {sampling!r}; choose one")
     with use_backend(backend), one_torch_thread():
         geometry = flatten(scene, link.wavelength)
-        settings = _Settings(
+        settings = Settings(
             geometry=geometry,
             link=link,
             grid=grid,
@@ -129,147 +121,6 @@ def deposit_power(
         return _Deposit.apply(settings, *settings.tables)  # type: ignore[no-any-return]
 
 
-@dataclass(frozen=True)
-class _Settings:
-    geometry: Geometry
-    link: Link
-    grid: Grid
-    samples: int
-    boundary_samples: int
-    seed: int
-    sampling: str
-    reference: tuple[Geometry, Link] | None
-    depth: int
-    interior_edges: bool
-    chunk: int
-    backend: str
-
-    @property
-    def tables(self) -> list[Tensor]:
-        """What the map can be differentiated by, in the kernel's order."""
-        owners = (self.geometry, self.link)
-        return [
-            next(getattr(owner, name) for owner in owners if hasattr(owner, name))
-            for name in DIFFERENTIABLE
-        ]
-
-
-class _Trace:
-    """The detached half of a call: chains, and their records while they fit the budget."""
-
-    def __init__(self, settings: _Settings) -> None:
-        self.settings = settings
-        self.shot = Shot(settings.geometry, settings.link)
-        sampler = RaySampler if settings.sampling == "rays" else AreaSampler
-        self.sampler = sampler(self.shot, settings.samples, settings.seed, settings.reference)
-        self.fixed = self.inputs()
-        self._walk = Walk(self.shot, self.fixed, settings.seed)
-        self._kept: Records | None = None
-
-    @property
-    def bins(self) -> int:
-        """Number of bins over all frames."""
-        shape = self.settings.grid.shape
-        return self.shot.link.frame_count * shape[0] * shape[1] * shape[2]
-
-    def inputs(self, tables: dict[str, Any] | None = None, *, together: bool = True) -> Inputs:
-        """The kernel's inputs, with some arrays replaced by ones that carry derivatives.
-
-        ``together`` says that antennas at one place also move as one.
-        """
-        link = self.settings.link
-        monostatic = together and bool((link.tx == link.rx).all())
-        made = Inputs.of(self.settings.geometry, link, self.shot, monostatic)
-        return replace(made, **(tables or {}))
-
-    def deposit(self, out: Any, *, record: bool) -> None:
-        """Walk all chains into the bins; ``record`` keeps them if all fit in one chunk."""
-        import drjit as dr
-
-        record = record and self.sampler.size <= self.settings.chunk
-        for index in _chunks(self.sampler.size, self.settings.chunk):
-            records = self._walked(index, out, record=record)
-            if record:
-                self._kept = records
-                dr.schedule(*records.columns)
-            dr.eval(out)
-
-    def records(self) -> Iterator[Records]:
-        """The vertices of all chains, a chunk at a time."""
-        if self._kept is not None:
-            yield self._kept
-            return
-        for index in _chunks(self.sampler.size, self.settings.chunk):
-            yield self._walked(index, None, record=True)
-
-    def _walked(self, index: Any, out: Any, *, record: bool) -> Records:
-        """Walk some chains into the bins, if given, and into records, if asked (else empty)."""
-        import drjit as dr
-
-        depth, shared = self.settings.depth, self.settings.link.shared_visibility
-        one_place = depth == 1 and self.fixed.monostatic
-        state = self._started(index)
-        state["lane"] = dr.arange(tracer().UInt32, dr.width(index))
-        looped = record and depth > 1
-        records = Records.empty(state, depth if looped else 0, self.shot.sound_face)
-
-        def visit(state: State, point: Place) -> None:
-            nonlocal records
-            found, exists = walk.connect(
-                self.shot, self.fixed, state, point, True, shared=shared, one_place=one_place
-            )
-            if out is not None:
-                bins.scatter(out, self.settings.grid, found, exists)
-            if looped:
-                records.write(state, exists)
-            elif record:
-                records = Records.single(state, exists)
-
-        self._walk.run(state, depth, visit)
-        return records
-
-    def _started(self, index: Any) -> State:
-        """Chains at their first vertex."""
-        import drjit as dr
-
-        drawn = self.sampler.draw(index, self.fixed)
-        tx = self.fixed.antenna(drawn.frame, False)
-        point = kernel.place(self.fixed, drawn.face, drawn.b1, drawn.b2)
-        back, distance = kernel.leg(point.position, tx)
-        gain = self.fixed.gain(drawn.frame, False, kernel.to_radar(self.fixed, drawn.frame, -back))
-        weight = drawn.weight * drawn.share * self.fixed.scale * gain / dr.square(distance)
-        return walk.start(
-            index, drawn.frame, drawn.face, drawn.b1, drawn.b2, back,
-            throughput=dr.select(drawn.weight > 0, weight, 0.0),
-            length=distance + drawn.excess,
-            passed=Passage(drawn.share, drawn.excess) if self.fixed.sheets else None,
-        )  # fmt: skip
-
-    def boundary(self, inputs: Inputs) -> Iterator[BoundaryChains]:
-        """Boundary paths of all segments, a chunk at a time."""
-        settings = self.settings
-        if settings.boundary_samples:
-            yield from boundary_chains(
-                self.shot,
-                inputs,
-                self._walk,
-                samples=settings.boundary_samples,
-                depth=settings.depth,
-                seed=settings.seed,
-                interior=settings.interior_edges,
-                chunks=lambda size: _chunks(size, settings.chunk),
-            )
-
-
-def _chunks(size: int, chunk: int) -> Iterator[Any]:
-    """Index arrays that together count to ``size``; their offset is opaque (no recompilation)."""
-    import drjit as dr
-
-    mi = tracer()
-    for start in range(0, size, chunk):
-        yield dr.arange(mi.UInt32, min(chunk, size - start)) + opaque(start)
-
-
 class _Deposit(torch.autograd.Function):
     """∂map/∂(vertices, poses, materials), forward and backward.
 
@@ -278,10 +129,10 @@ class _Deposit(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, settings: _Settings, *tables: Tensor) -> Tensor:
+    def forward(ctx: Any, settings: Settings, *tables: Tensor) -> Tensor:
         import drjit as dr
 
-        trace = _Trace(settings)
+        trace = Trace(settings)
         out = dr.zeros(tracer().Float, trace.bins)
         trace.deposit(out, record=any(ctx.needs_input_grad))
         ctx.trace = trace
@@ -292,7 +143,7 @@ class _Deposit(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         import drjit as dr
 
-        trace: _Trace = ctx.trace
+        trace: Trace = ctx.trace
         grid = trace.settings.grid
         with use_backend(trace.settings.backend), one_torch_thread():
             wanted = [n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[1:], strict=True) if w]
@@ -323,7 +174,7 @@ class _Deposit(torch.autograd.Function):
     def jvp(ctx: Any, _: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         import drjit as dr
 
-        trace: _Trace = ctx.trace
+        trace: Trace = ctx.trace
         grid = trace.settings.grid
         with use_backend(trace.settings.backend), one_torch_thread():
             given = {

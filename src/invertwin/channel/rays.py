@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import bridge
@@ -73,6 +73,11 @@ class Shot:
         )
 
 
+def _points(shot: Shot, place: Float64[Tensor, "n 3"]) -> Any:
+    local = (place.detach() - shot.origin).to(torch.float32)
+    return tracer().Point3f(*(to_float(local[:, k]) for k in range(3)))
+
+
 def _sound_face(geometry: Geometry) -> int:
     """A triangle that is no sliver; the last answer while it stays one, which is quicker."""
     topology = geometry.topology
@@ -99,9 +104,20 @@ def visible(shot: Shot, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3
     """Whether nothing lies between pairs of world points (torch in, torch out)."""
     if not len(start):
         return torch.zeros(0, dtype=torch.bool)
+    return bridge.to_torch(shot.clear(_points(shot, start), _points(shot, end))).bool()
+
+
+def next_surface(
+    shot: Shot, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
+) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
+    """First triangle between pairs of world points (−1: none), and how far along it lies."""
+    import drjit as dr
+
     mi = tracer()
-    points = []
-    for ends in (start, end):
-        local = (ends.detach() - shot.origin).to(torch.float32)
-        points.append(mi.Point3f(*(to_float(local[:, k]) for k in range(3))))
-    return bridge.to_torch(shot.clear(*points)).bool()
+    origin = _points(shot, start)
+    offset = _points(shot, end) - origin
+    ray = mi.Ray3f(origin + offset * NEAR, mi.Vector3f(offset), 1 - 2 * NEAR, 0.0, [])
+    hit = shot.scene.ray_intersect_preliminary(ray)
+    face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
+    along = dr.select(hit.is_valid(), hit.t + NEAR, 1.0)
+    return bridge.to_torch(face).long(), bridge.to_torch(along).double()

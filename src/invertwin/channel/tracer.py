@@ -22,14 +22,20 @@ from invertwin.channel.boundary import (
     silhouettes_move,
 )
 from invertwin.channel.bridge import Geometry, flatten, to_torch, tracer, use_backend
+from invertwin.channel.chains import Chain, RoughChains, chain_view, rough_chains, tabulated
 from invertwin.channel.kernel import Inputs
-from invertwin.channel.paths import Link, Paths
+from invertwin.channel.paths import Grid, Link, Paths
 from invertwin.channel.rays import Shot, face_areas, visible
 from invertwin.channel.sampling import RaySampler
+from invertwin.channel.trace import Settings, Trace
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
+_NO_ROUGH_DERIVATIVE = (
+    "expected no geometry derivative of rough field paths, got one: single points appear and "
+    "vanish; use power paths, or boundary=False for fixed visibility"
+)
 _GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
 
 
@@ -66,7 +72,9 @@ def view(
     gain = link.tx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -w_tx))
     gain = gain * link.rx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -w_rx))
     row = geometry.face_surface[face]
-    reflectance = _amplitude(geometry, row, cos_tx) * _amplitude(geometry, row, cos_rx)
+    reflectance = tabulated(geometry.amplitude, row, cos_tx) * tabulated(
+        geometry.amplitude, row, cos_rx
+    )
     between = (w_tx * w_rx).sum(1)
     mirror, back = (0.5 * (1 + c) for c in (2 * cos_tx * cos_rx - between, between))
     shape = geometry.diffuse[row] / torch.pi
@@ -78,14 +86,6 @@ def view(
     facing = 0.5 * (cos_tx + cos_rx).abs()
     field = -1j / (4 * torch.pi) * spread.sqrt() * facing
     return View(power * (cos_tx * cos_rx), field, r_tx + r_rx)
-
-
-def _amplitude(geometry: Geometry, owner: Tensor, cosine: Tensor) -> Tensor:
-    entries = geometry.amplitude.shape[1]
-    t = cosine.abs().clamp_max(1.0) * (entries - 1)
-    low = t.detach().long().clamp_max(entries - 2)
-    first, second = geometry.amplitude[owner, low], geometry.amplitude[owner, low + 1]
-    return first + (second - first) * (t - low)
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,7 @@ def trace_power(
     samples: int,
     boundary_samples: int = 0,
     seed: int,
+    depth: int = 1,
     boundary: bool = True,
     backend: str | None = None,
 ) -> Paths:
@@ -134,10 +135,17 @@ def trace_power(
     The same samples, in the same sense, as :func:`invertwin.channel.deposit.deposit_power`.
 
     Raises:
-        InputError: See ``deposit_power``.
+        InputError: See ``deposit_power``; boundary paths of more than one bounce or past sheets.
     """
     with use_backend(backend):
         geometry = flatten(scene, link.wavelength)
+        if boundary and silhouettes_move(geometry, link) and (depth > 1 or geometry.sheets):
+            raise InputError(
+                "expected explicit paths of one bounce without sheets for derivatives in which "
+                "silhouettes move; use deposit_power, or boundary=False for fixed visibility"
+            )
+        if depth > 1 or geometry.sheets:
+            return _power_chains(geometry, link, samples, depth, seed)
         shot = Shot(geometry, link)
         if boundary:
             require_edges(geometry, link, boundary_samples)
@@ -166,6 +174,42 @@ def trace_power(
             )
 
         return inner + _boundary_paths(geometry, link, shot, boundary_samples, seed, value)
+
+
+def _power_chains(geometry: Geometry, link: Link, samples: int, depth: int, seed: int) -> Paths:
+    """The chains that ``deposit_power`` walks, evaluated in torch."""
+    nowhere = Grid(0.0, 1.0, 1)
+    trace = Trace(
+        Settings(geometry, link, nowhere, samples, 0, seed, "rays", None, depth, False, samples, "")
+    )
+    parts = []
+    for records in trace.records():
+        frame = to_torch(records.frame).long()
+        columns = [
+            to_torch(column).reshape(depth, -1).T
+            for column in (records.face, records.b1, records.b2, records.throughput, records.seen)
+        ]
+        for count in range(1, depth + 1):
+            seen = columns[4][:, count - 1].bool()
+            face, b1, b2 = (column[seen, :count] for column in columns[:3])
+            weight = columns[3][seen, count - 1].double()
+            chain = Chain(face.long(), b1.double(), b2.double(), weight, torch.zeros_like(weight))
+            found = chain_view(geometry, link, trace.shot, frame[seen], chain)
+            follows = found.power / found.power.detach().clamp_min(1e-300)
+            power = weight * found.ending * follows
+            parts.append(
+                _paths(
+                    frame[seen], found.length, found.last, "power", power=power, first=found.first
+                )
+            )
+    return _joined(parts)
+
+
+def _joined(parts: list[Paths]) -> Paths:
+    joined = parts[0]
+    for part in parts[1:]:
+        joined = joined + part
+    return joined
 
 
 @dataclass(frozen=True)
@@ -246,6 +290,9 @@ def trace_field(
     samples: int = 100_000,
     density: float = 20_000.0,
     points: RoughPoints | None = None,
+    depth: int = 1,
+    chains: RoughChains | None = None,
+    chain_count: int = 200_000,
     boundary_samples: int = 0,
     seed: int,
     boundary: bool = True,
@@ -259,6 +306,10 @@ def trace_field(
         samples: Samples per frame over all coherent objects (a converging integral).
         density: Rough points per m² (used where ``points`` is not given).
         points: The rough points to use, so that they stay while the scene moves.
+        depth: Most bounces. From the second on, every surface scatters as a rough one does: a
+            fixed phase for every ordered chain, conductors by their lobe.
+        chains: The chains of two bounces and more to use, so that they stay while the scene moves.
+        chain_count: How many to draw of each length (used where ``chains`` is not given).
         boundary_samples: Silhouette samples of the coherent objects.
         seed: Places and phases.
         boundary: Off leaves fixed-visibility derivatives alone.
@@ -297,16 +348,20 @@ def trace_field(
                 parts.append(_boundary_paths(geometry, link, shot, boundary_samples, seed, value))
         if not all(geometry.coherent):
             if boundary and silhouettes_move(geometry, link):
-                raise InputError(
-                    "expected no geometry derivative of rough field paths, got one: single points "
-                    "appear and vanish; use power paths, or boundary=False for fixed visibility"
-                )
+                raise InputError(_NO_ROUGH_DERIVATIVE)
             fixed = points or rough_points(scene, density, seed)
             parts.append(_rough(geometry, link, shot, fixed))
-        joined = parts[0]
-        for part in parts[1:]:
-            joined = joined + part
-        return joined
+        if depth > 1:
+            if geometry.velocities is not None:
+                raise InputError(
+                    f"expected depth 1 for objects in motion, got {depth}; the range rate of "
+                    "longer paths is not modelled"
+                )
+            if boundary and silhouettes_move(geometry, link):
+                raise InputError(_NO_ROUGH_DERIVATIVE)
+            drawn = chains or rough_chains(scene, link, count=chain_count, depth=depth, seed=seed)
+            parts += _rough_chains(geometry, link, shot, drawn, depth)
+        return _joined(parts)
 
 
 def _coherent(geometry: Geometry, link: Link, shot: Shot, samples: int, seed: int) -> Paths:
@@ -367,6 +422,32 @@ def _rough(geometry: Geometry, link: Link, shot: Shot, fixed: RoughPoints) -> Pa
     )
 
 
+def _rough_chains(
+    geometry: Geometry, link: Link, shot: Shot, drawn: RoughChains, depth: int
+) -> list[Paths]:
+    """Fields of the rough chains: amplitude sqrt(f · weight), phase of the chain."""
+    parts = []
+    for chain in drawn.chains[: depth - 1]:
+        for number in range(link.frame_count):
+            frame = torch.full((len(chain.weight),), number)
+            with torch.no_grad():
+                lit = chain_view(geometry, link, shot, frame, chain).power > 0
+            kept, frame = chain.keep(lit), frame[lit]
+            found = chain_view(geometry, link, shot, frame, kept)
+            coefficient = torch.polar((found.power * kept.weight).sqrt(), kept.phase)
+            parts.append(
+                _paths(
+                    frame,
+                    found.length,
+                    found.last,
+                    "rough",
+                    coefficient=coefficient,
+                    first=found.first,
+                )
+            )
+    return parts
+
+
 def _seen(
     geometry: Geometry, link: Link, shot: Shot, points: _Points
 ) -> tuple[_Points, Tensor, Tensor, Tensor]:
@@ -399,10 +480,7 @@ def _boundary_paths(
         seen = view(geometry, link, edge.frame, edge.face, edge.shadow, edge.normal)
         seen = View(seen.power.detach(), seen.mirror.detach(), seen.length.detach())
         parts.append(value(edge, seen))
-    joined = parts[0]
-    for part in parts[1:]:
-        joined = joined + part
-    return joined
+    return _joined(parts)
 
 
 def _drawn(sampler: Any) -> _Points:
@@ -421,6 +499,7 @@ def _paths(
     position: Tensor,
     kind: str,
     *,
+    first: Tensor | None = None,
     power: Tensor | None = None,
     coefficient: Tensor | None = None,
     boundary: bool = False,
@@ -434,7 +513,7 @@ def _paths(
         if coefficient is None
         else coefficient,
         power=torch.zeros(count, dtype=torch.float64) if power is None else power,
-        first=position,
+        first=position if first is None else first,
         last=position,
         kind=kind,
         boundary=torch.full((count,), boundary),

@@ -39,7 +39,8 @@ def start(
 
     ``back`` points to where the path comes from; ``throughput`` is everything up to arriving
     here, one over the density of the samples included; ``length`` is that of the path so far.
-    ``passed`` is what lies on the first leg, for antennas that share what they see.
+    ``passed`` is what lies on the first leg, for antennas that share what they see. A state with
+    a ``weight`` also follows one over the density of its points per area.
     """
     import drjit as dr
 
@@ -96,6 +97,12 @@ class Walk:
         )
         return state
 
+    def step(self, state: State) -> State:
+        """One more vertex, outside any loop."""
+        state = {**state, "last": state["number"] + 1}
+        self._extend(state, self._place(state))
+        return state
+
     def _place(self, state: State) -> Place:
         return kernel.place(self.inputs, state["face"], state["b1"], state["b2"], state["active"])
 
@@ -127,8 +134,11 @@ class Walk:
         to_point, distance = kernel.leg(found.position, point.position)
         cosine = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
-        weight = scattered * hit.share / (density * survival * cosine * hit.chance)
+        odds = density * survival * cosine * hit.chance
+        weight = scattered * hit.share / odds
         state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
+        if "weight" in state:
+            state["weight"] = state["weight"] * dr.square(distance) / odds
         state["face"], state["b1"], state["b2"] = hit.face, hit.b1, hit.b2
         state["back"] = mi.Vector3f(to_point)
         state["length"] = state["length"] + distance + hit.excess
