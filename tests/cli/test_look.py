@@ -1,7 +1,9 @@
 """`invertwin look`: recordings of every kind as pictures, numbers and captures; bad ones."""
 
+import re
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -59,6 +61,24 @@ def recording(tmp_path, monkeypatch):
     write_setup("bench.setup.json", "bench.mmwave.json", ["adc.bin"])
     described_arrays.write_chirps("adc.toml", data, "adc.h5", ARRAYS)
     return tmp_path
+
+
+def test_the_command_of_the_readme(recording, monkeypatch, repository):
+    page = (repository / "README.md").read_text()
+    (line,) = re.findall(r"^    \.venv/bin/invertwin (look .*)$", page, re.MULTILINE)
+    assert call(monkeypatch, *line.split()) == 0
+    assert read_metrics(recording / "out" / "adc")["mover_range_m"] == pytest.approx(3.0, abs=0.06)
+
+
+def test_a_description_as_the_docs_have_it(recording, monkeypatch, repository):
+    page = (repository / "docs" / "measured_data.md").read_text()
+    (text,) = re.findall(r"^```ini\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    samples = mover().samples[:, :, :2].flatten(2, 3).numpy()
+    with h5py.File("adc.h5", "w") as file:
+        file["adc"] = samples
+    (recording / "own.toml").write_text(text)
+    assert call(monkeypatch, "look", "own.toml") == 0
+    assert read_metrics(recording / "out" / "own")["channels"] == 8
 
 
 @pytest.mark.parametrize(
