@@ -12,7 +12,6 @@ from invertwin.channel.paths import Grid, Paths
 from invertwin.channel.tracer import RoughPoints, rough_points, trace_field
 from invertwin.errors import InputError
 from invertwin.radar.impairments import Impairments
-from invertwin.radar.impairments import Impairments
 from invertwin.radar.motion import (
     Chirps,
     Places,
