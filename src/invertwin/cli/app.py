@@ -251,7 +251,7 @@ def doctor(backend: BackendOption = None) -> None:
 
 def main() -> None:
     """Entry point: bad input is one line and exit code 2, an interruption 130."""
-    warnings.showwarning = _show_warning
+    warnings.showwarning = _shown_once()
     try:
         app(standalone_mode=True)
     except InputError as error:
@@ -349,5 +349,14 @@ def _print(tables: list[Table]) -> None:
             console.print(table.note, markup=False)
 
 
-def _show_warning(message: Warning | str, *_: Any) -> None:
-    print(f"invertwin: warning: {message}", file=sys.stderr)
+def _shown_once() -> Callable[..., None]:
+    """Prints every warning on one line, the same text once."""
+    said: set[str] = set()
+
+    def show(message: Warning | str, *_: Any) -> None:
+        line = f"invertwin: warning: {message}"
+        if line not in said:
+            said.add(line)
+            print(line, file=sys.stderr)
+
+    return show
