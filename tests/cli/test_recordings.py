@@ -51,6 +51,7 @@ interval = 40e-6
 
 [raw]
 frame_period = 0.1
+adc_start_time = 4e-6
 
 [data]
 kind = "simulated"
@@ -208,6 +209,8 @@ def test_a_train_is_written_as_arrays_and_as_raw_files(train):
     assert replace(counts.settings, frames=2) == cfg
     assert cfg.chirps.interval == pytest.approx(40e-6)
     assert cfg.frame_period == 0.1
+    assert (cfg.start_frequency, cfg.adc_start_time) == (76.75e9, 4e-6)
+    assert cfg.idle_time == pytest.approx(4e-6)
     assert cfg.waveform == FMCW(77e9, 2e9, 32e-6, 64)
 
 
