@@ -51,6 +51,7 @@ def simulate(
     *,
     seed: int,
     surrogate: Surrogate | str | None = None,
+    depth: int = 1,
     samples: int = 400_000,
     boundary_samples: int = 50_000,
     boundary: bool = True,
@@ -71,6 +72,7 @@ def simulate(
         grid: Bins, see ``Radar.grid``.
         seed: Places, phases and noise.
         surrogate: The smooth model, or its name among ``SURROGATES``; None, "exact" = exact chain.
+        depth: Most bounces of a path; of the exact chain, one.
         samples: Surrogate: rays over all frames. Exact: samples per frame on conductors.
         boundary_samples: Silhouette samples (surrogate and conductors).
         boundary: Off for fixed-visibility gradients.
@@ -81,7 +83,8 @@ def simulate(
         backend: See ``deposit_power``.
 
     Raises:
-        InputError: An object in motion: a frame is one instant. Noise on a mean spectrum.
+        InputError: An object in motion: a frame is one instant. Noise on a mean spectrum. Several
+            bounces in the exact chain.
     """
     smooth = chosen_surrogate(surrogate)
     with use_backend(backend):
@@ -97,11 +100,17 @@ def simulate(
                     radar,
                     grid,
                     smooth,
+                    depth=depth,
                     samples=samples,
                     boundary_samples=boundary_samples,
                     seed=seed,
                     boundary=boundary,
                 )
+            )
+        if depth != 1:
+            raise InputError(
+                f"expected depth 1 for the exact chain, got {depth}; its paths have one bounce: "
+                "give depth=1, or simulate with a surrogate"
             )
         paths = trace_field(
             scene,
@@ -134,6 +143,7 @@ def surrogate_correlation(
     surrogate: Surrogate | str = "response",
     looks: int = 16,
     samples: int = 400_000,
+    depth: int = 1,
     density: float = 20_000.0,
 ) -> float:
     """How well a surrogate's map is that of the exact chain, the mean over looks at the scene.
@@ -149,6 +159,7 @@ def surrogate_correlation(
         surrogate: The smooth model, or its name.
         looks: Exact spectra that are averaged.
         samples: As in :func:`simulate`.
+        depth: Most bounces of a path.
         density: Points per m² of rough surfaces.
 
     Returns:
@@ -163,12 +174,15 @@ def surrogate_correlation(
             f"expected looks >= 1 and a surrogate, got {looks} and {surrogate!r}; 16 looks leave "
             "a quarter of the speckle"
         )
+    if all(item.material.coherent for item in scene.objects.values()):
+        looks = 1
+    settings = {"samples": samples, "depth": depth}
     with torch.no_grad():
         mean = torch.zeros(radar.frame_count, *grid.shape, dtype=torch.float64)
         for look in range(looks):
-            found = simulate(scene, radar, grid, seed=seed + look, samples=samples, density=density)
+            found = simulate(scene, radar, grid, seed=seed + look, density=density, **settings)
             mean += found.spectrum / looks
-        twin = simulate(scene, radar, grid, seed=seed, surrogate=smooth, samples=samples)
+        twin = simulate(scene, radar, grid, seed=seed, surrogate=smooth, **settings)
         a, b = (power.double() - power.double().mean() for power in (mean, twin.spectrum))
         norms = a.norm() * b.norm()
     return float((a * b).sum() / norms) if norms > 0 else 0.0

@@ -61,6 +61,7 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
             grid,
             seed=seed,
             samples=data.samples,
+            depth=data.depth,
             density=data.density,
             snr_db=None if front else data.snr_db,
             noise_figure_db=None if front else data.noise_figure_db,
@@ -98,7 +99,13 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
     assert found.paths is not None
     with torch.no_grad():
         smooth = simulate(
-            scene, radar, grid, seed=run.seed, surrogate=Surrogate(), samples=_SURROGATE_SAMPLES
+            scene,
+            radar,
+            grid,
+            seed=run.seed,
+            surrogate=Surrogate(),
+            samples=_SURROGATE_SAMPLES,
+            depth=_simulated(run).depth,
         ).spectrum
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
     metrics = {

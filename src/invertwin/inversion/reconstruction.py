@@ -301,8 +301,8 @@ class _Fit:
     def key(self) -> list[Any]:
         """What must be equal for a checkpoint to be of this fit."""
         shapes = [[n, list(p.shape)] for n, p in self.modules.named_parameters()]
-        settings = [self.annealing, self.depth, self.samples, self.boundary_samples, self.frames_per_step]
-        settings += [str(self.loss), str(self.surrogate)]
+        settings = [self.annealing, self.samples, self.boundary_samples, self.frames_per_step]
+        settings += [self.depth, str(self.loss), str(self.surrogate)]
         return [self.steps, self.seed, list(self.grid.shape), self.boundary, settings, shapes]
 
     def applied(self) -> tuple[Scene, Radar, Tensor | None]:

@@ -100,6 +100,7 @@ def sharp_spectrum(
             samples=4 * settings.samples,
             boundary_samples=0,
             seed=problem.run.seed,
+            depth=settings.depth,
             range_offset=offset,
         )
 
