@@ -18,6 +18,7 @@ from invertwin.capture import (
     described_arrays,
 )
 from invertwin.capture.ti import write_cfg, write_samples, write_setup, write_studio
+from invertwin.cli.doppler_maps import sharp_map, snapshots_of
 from invertwin.radar import Chirps, Radar, velocity_span
 from invertwin.radar.boards import board
 from oracles.moving_point import moving_point
@@ -126,6 +127,33 @@ def test_results_are_kept_unless_overwritten(recording, monkeypatch, capfd):
     assert (recording / "seen" / "look.png").read_bytes() == before
 
 
+@pytest.mark.parametrize("method", ["capon", "music"])
+def test_finer_directions_and_points(recording, monkeypatch, method):
+    """Beside Bartlett's; the mover is the strongest point of the CFAR."""
+    arguments = ["look", "adc.toml", "--range-min", "2", "--range-max", "4"]
+    assert call(monkeypatch, *arguments, "--method", method) == 0
+    plain = recording / "out" / "adc" / "look.png"
+    assert call(monkeypatch, *arguments, "-o", "plain") == 0
+    assert len(plain.read_bytes()) > len((recording / "plain" / "look.png").read_bytes())
+    head, first, *_ = (recording / "plain" / "points.csv").read_text().splitlines()
+    point = dict(zip(head.split(","), map(float, first.split(",")), strict=True))
+    assert point["range_m"] == pytest.approx(3.0, abs=0.03)
+    assert point["velocity_m_s"] == pytest.approx(RATE, abs=0.05 * velocity_span(RADAR, CHIRPS))
+    assert point["u"] == pytest.approx(0.3, abs=0.03)
+    assert point["x_m"] == pytest.approx(0.9, abs=0.1)
+    assert read_metrics(recording / "plain")["points"] >= 1
+
+
+def test_sharp_maps_peak_at_the_mover():
+    beat, grid = mover().samples, RADAR.grid(2.8, 3.2)
+    snapshots = snapshots_of(beat, RADAR, grid, CHIRPS, 0)
+    for method, sources in (("capon", None), ("music", None), ("music", 1)):
+        power = sharp_map(snapshots, RADAR, grid, method, sources)
+        _, u, v = np.unravel_index(int(power.argmax()), power.shape)
+        assert grid.u[int(u)] == pytest.approx(0.3, abs=0.07)
+        assert abs(grid.v[int(v)]) < 0.3
+
+
 def test_real_samples_serve_half_the_range(recording, monkeypatch, capfd):
     settings = replace(SETTINGS, real=True)
     write_samples("real.bin", mover(settings))
@@ -187,6 +215,7 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
         (["adc.toml", "--range-max", "900"], ["--range-max within"]),
         (["adc.toml", "--channels", "bench.cfg"], ["no calibration"]),
         (["adc.toml", "--reflector", "0", "0", "90"], ["reflector within"]),
+        (["adc.toml", "--method", "music", "--sources", "12"], ["fewer than the 12 elements"]),
         (["."], ["openradar.npz"]),
     ],
 )

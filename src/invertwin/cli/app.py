@@ -44,6 +44,14 @@ class Backend(StrEnum):
     cuda = "cuda"
 
 
+class Method(StrEnum):
+    """How directions are told apart."""
+
+    bartlett = "bartlett"
+    capon = "capon"
+    music = "music"
+
+
 def _use_backend(value: Backend | None) -> Backend | None:
     if value is not None:
         os.environ["INVERTWIN_BACKEND"] = value.value
@@ -171,6 +179,12 @@ def look(
     frame: Annotated[int, typer.Option(min=0, help="The one that the pictures show.")] = 0,
     range_min: Annotated[float | None, typer.Option(help="m; default: 3 range cells.")] = None,
     range_max: Annotated[float | None, typer.Option(help="m; default: all.")] = None,
+    method: Annotated[
+        Method, typer.Option(help="Of directions; others than bartlett are shown beside it.")
+    ] = Method.bartlett,
+    sources: Annotated[
+        int | None, typer.Option(help="For music; default: counted in each range.")
+    ] = None,
     channels: Annotated[
         Path | None, typer.Option(help="Channel calibration to divide out (channels.json).")
     ] = None,
@@ -195,6 +209,8 @@ def look(
         frame,
         range_min,
         range_max,
+        method.value,
+        sources,
         channels,
         reflector,
     )
