@@ -119,7 +119,7 @@ def test_run_files_on_the_page_fit_the_schema(tmp_path):
 @pytest.mark.slow
 def test_run_file_on_the_page_finds_the_ball(tmp_path):
     page = (REPOSITORY / "docs" / "run_files.md").read_text()
-    (text,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    text, *_ = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (tmp_path / "ball.toml").write_text(text)
     for command in ("simulate", "reconstruct"):
         line = ["-c", "from invertwin.cli.app import main; main()", command, "ball.toml"]

@@ -11,18 +11,18 @@ from invertwin.channel.bridge import use_backend
 from invertwin.channel.paths import Grid, Paths
 from invertwin.channel.tracer import RoughPoints, rough_points, trace_field
 from invertwin.errors import InputError
+from invertwin.radar.impairments import Impairments
 from invertwin.radar.motion import (
     Chirps,
     Places,
     Train,
     every_ramp,
-    moving_beat,
     sample_interval,
 )
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.spectrum import exact_spectrum
-from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
+from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
 from invertwin.scene.scene import Scene
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.
@@ -50,7 +50,8 @@ def simulate(
     grid: Grid,
     *,
     seed: int,
-    surrogate: Surrogate | None = None,
+    surrogate: Surrogate | str | None = None,
+    depth: int = 1,
     samples: int = 400_000,
     boundary_samples: int = 50_000,
     boundary: bool = True,
@@ -70,7 +71,8 @@ def simulate(
         radar: Arrays, waveform and poses.
         grid: Bins, see ``Radar.grid``.
         seed: Places, phases and noise.
-        surrogate: Kernels of the smooth model (None = exact).
+        surrogate: The smooth model, or its name among ``SURROGATES``; None, "exact" = exact chain.
+        depth: Most bounces of a path; of the exact chain, one.
         samples: Surrogate: rays over all frames. Exact: samples per frame on conductors.
         boundary_samples: Silhouette samples (surrogate and conductors).
         boundary: Off for fixed-visibility gradients.
@@ -81,10 +83,12 @@ def simulate(
         backend: See ``deposit_power``.
 
     Raises:
-        InputError: An object in motion: a frame is one instant. Noise on a mean spectrum.
+        InputError: An object in motion: a frame is one instant. Noise on a mean spectrum. Several
+            bounces in the exact chain.
     """
+    smooth = chosen_surrogate(surrogate)
     with use_backend(backend):
-        if surrogate is not None:
+        if smooth is not None:
             if snr_db is not None or noise_figure_db is not None:
                 raise InputError(
                     "expected no noise with a surrogate, got a noise level; the surrogate is the "
@@ -95,12 +99,18 @@ def simulate(
                     scene,
                     radar,
                     grid,
-                    surrogate,
+                    smooth,
+                    depth=depth,
                     samples=samples,
                     boundary_samples=boundary_samples,
                     seed=seed,
                     boundary=boundary,
                 )
+            )
+        if depth != 1:
+            raise InputError(
+                f"expected depth 1 for the exact chain, got {depth}; its paths have one bounce: "
+                "give depth=1, or simulate with a surrogate"
             )
         paths = trace_field(
             scene,
@@ -124,6 +134,60 @@ def simulate(
     return Simulation(exact_spectrum(beat, radar, grid), paths, beat)
 
 
+def surrogate_correlation(
+    scene: Scene,
+    radar: Radar,
+    grid: Grid,
+    *,
+    seed: int,
+    surrogate: Surrogate | str = "response",
+    looks: int = 16,
+    samples: int = 400_000,
+    depth: int = 1,
+    density: float = 20_000.0,
+) -> float:
+    """How well a surrogate's map is that of the exact chain, the mean over looks at the scene.
+
+    A look has its own phases of the rough surfaces. One look is speckle as strong as the map
+    itself; a scene of conductors has none, and looks the same each time.
+
+    Args:
+        scene: What is seen.
+        radar: Arrays, waveform and poses.
+        grid: Bins, see ``Radar.grid``.
+        seed: Of the first look, and of the surrogate's samples.
+        surrogate: The smooth model, or its name.
+        looks: Exact spectra that are averaged.
+        samples: As in :func:`simulate`.
+        depth: Most bounces of a path.
+        density: Points per m² of rough surfaces.
+
+    Returns:
+        Pearson's correlation over all bins and frames; 0 where a map is constant.
+
+    Raises:
+        InputError: No looks; "exact", which is no surrogate.
+    """
+    smooth = chosen_surrogate(surrogate)
+    if looks < 1 or smooth is None:
+        raise InputError(
+            f"expected looks >= 1 and a surrogate, got {looks} and {surrogate!r}; 16 looks leave "
+            "a quarter of the speckle"
+        )
+    if all(item.material.coherent for item in scene.objects.values()):
+        looks = 1
+    settings = {"samples": samples, "depth": depth}
+    with torch.no_grad():
+        mean = torch.zeros(radar.frame_count, *grid.shape, dtype=torch.float64)
+        for look in range(looks):
+            found = simulate(scene, radar, grid, seed=seed + look, density=density, **settings)
+            mean += found.spectrum / looks
+        twin = simulate(scene, radar, grid, seed=seed, surrogate=smooth, **settings)
+        a, b = (power.double() - power.double().mean() for power in (mean, twin.spectrum))
+        norms = a.norm() * b.norm()
+    return float((a * b).sum() / norms) if norms > 0 else 0.0
+
+
 def simulate_chirps(
     scene: Scene | Callable[[float], Scene],
     radar: Radar,
@@ -134,16 +198,16 @@ def simulate_chirps(
     samples: int = 400_000,
     density: float = 20_000.0,
     points: RoughPoints | None = None,
+    impairments: Impairments | None = None,
     backend: str | None = None,
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
     """Beat signals of a moving scene, chirp by chirp; the radar rests within a frame.
 
     A scene moves with the velocities of its objects. Any other motion is a function of time:
     ``lambda time: scene.replace("rotor", pose=...)`` gives the scene at that many seconds after
-    the start of the frame, the same objects with the same triangles (materials as at 0). It is
-    traced in the middle of every ramp; the points seen there follow it over the ramp, along
-    parabolas that are exact at the first, middle and last sample. See ``moving_beat`` for what
-    is exact.
+    the start of the frame, the same objects with the same triangles. It is traced in the middle
+    of every ramp; the points seen there follow it over the ramp, along parabolas that are exact
+    at the first, middle and last sample. See ``moving_beat`` for what is exact.
 
     Every frame starts from the scene as given: move it between frames with ``scene.at(time)``.
 
@@ -157,12 +221,16 @@ def simulate_chirps(
         samples: Samples per frame on conductors.
         density: Points per m² of rough surfaces.
         points: Rough points to reuse.
+        impairments: Of the front end, drawn from the seed too; phase noise only without retracing.
         backend: See ``deposit_power``.
 
     Raises:
         InputError: See ``trace_field`` and ``moving_beat``; a function of time whose objects
-            change their triangles.
+            change their triangles; phase noise where rays are traced anew.
     """
+    again = retrace or not isinstance(scene, Scene)
+    if again and impairments is not None:
+        impairments.check_applicable()
     motion = scene.at if isinstance(scene, Scene) else scene
     fixed = points or rough_points(motion(0.0), density, seed)
 
@@ -171,8 +239,9 @@ def simulate_chirps(
             instant, radar.link(), samples=samples, points=fixed, seed=seed, backend=backend
         )
 
-    if isinstance(scene, Scene) and not retrace:
-        return moving_beat(traced(scene), radar, chirps)
+    if isinstance(scene, Scene) and not again:
+        front = impairments or Impairments()
+        return front.record(traced(scene), radar, seed=seed, chirps=chirps)
     half = 0.5 * (sampled(radar).samples - 1) * sample_interval(sampled(radar))
 
     def ramp(start: float, senders: list[int]) -> Tensor:
@@ -180,7 +249,8 @@ def simulate_chirps(
         check_paths(paths, radar, sampled(radar))
         return Train(paths, radar, places).ramp(start, senders)
 
-    return every_ramp(chirps, len(radar.transmitters.positions), ramp)
+    beat = every_ramp(chirps, len(radar.transmitters.positions), ramp)
+    return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
 
 
 def _over_a_ramp(

@@ -25,3 +25,17 @@ def signals(repository, monkeypatch) -> ModuleType:
     """`benchmarks/signals.py`."""
     monkeypatch.syspath_prepend(repository / "benchmarks")
     return importlib.import_module("signals")
+
+
+@pytest.fixture
+def edges(repository, monkeypatch) -> ModuleType:
+    """`benchmarks/edges.py`."""
+    monkeypatch.syspath_prepend(repository / "benchmarks")
+    return importlib.import_module("edges")
+
+
+@pytest.fixture
+def multibounce(repository, monkeypatch) -> ModuleType:
+    """`benchmarks/multibounce.py`."""
+    monkeypatch.syspath_prepend(repository / "benchmarks")
+    return importlib.import_module("multibounce")

@@ -9,6 +9,7 @@ from invertwin.capture import ChirpData, ChirpSettings, adc_counts, settings_of
 from invertwin.capture.chirps import shortest_loop
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
+from invertwin.radar.motion import Chirps
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 
 SETTINGS = ChirpSettings(
@@ -51,6 +52,26 @@ def test_settings_of_a_waveform_record_it():
     assert settings.waveform.bandwidth == pytest.approx(chirp.bandwidth, rel=1e-12)
     assert settings.sample_rate == 5e6
     assert (settings.transmit_order, settings.receivers) == ((1, 2), (1, 2, 3, 4))
+
+
+def test_turns_of_a_simulation_become_the_order_of_sending():
+    """Elements in the board's order, sent as TX3, TX1, TX2: files have them as they were sent."""
+    turns = Chirps(4, 50e-6, order=(2, 0, 1))
+    chirp = FMCW(77e9, 1.2e9, 40e-6, 16)
+    settings = settings_of(chirp, 3, 2, loops=4, idle_time=10e-6, order=turns.order)
+    assert settings.transmit_order == (3, 1, 2)
+    beat = torch.randn(1, 4, 3, 2, 16, dtype=torch.complex128)
+    data = adc_counts(beat, settings, full_scale=10.0, order=turns.order)
+    plain = adc_counts(beat, settings, full_scale=10.0)
+    for slot, element in enumerate((2, 0, 1)):
+        assert torch.equal(data.samples[:, :, slot], plain.samples[:, :, element])
+        sent = settings.chirps.times(3)[:, slot]
+        torch.testing.assert_close(sent, turns.times(3)[:, element])
+    for order in ((0, 1), (0, 1, 3), (0, 0, 1)):
+        with pytest.raises(InputError, match="transmitters 0 to 2, each once"):
+            adc_counts(beat, settings, 10.0, order)
+        with pytest.raises(InputError, match="transmitters 0 to 2, each once"):
+            settings_of(chirp, 3, 2, order=order)
 
 
 def test_repeated_orders_are_loops():

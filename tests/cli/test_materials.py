@@ -10,6 +10,7 @@ import torch
 
 from invertwin.cli import build
 from invertwin.cli.keys import key_tables
+from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import load_run, to_toml, validate
 from invertwin.errors import InputError
 from invertwin.scene import (
@@ -186,6 +187,21 @@ def test_rows_and_layers_can_be_sought():
     layers = [{"itu": "wood", "thickness": 0.01}, {"permittivity": 2.0, "thickness": 0.02}]
     stack = parameters({"kind": "multilayer", "layers": layers}, "thickness", layer=1)
     assert float(stack.layers[1].thickness.detach()) == pytest.approx(0.02)
+
+
+def test_truth_may_be_of_another_material_and_the_error_is_told():
+    known = {"kind": "slab", "permittivity": 3.0, "conductivity": 0.1, "thickness": 0.01}
+    real = {"kind": "slab", "itu": "plasterboard", "thickness": [0.0125, 0.0125]}
+    tables = [{"kind": "material", "object": "wall", "values": ["permittivity", "thickness"]}]
+    run = read(known, truth={"wall": {"material": real}}, parameters=tables)
+    scene, truth = build.scene(run), build.true_scene(run)
+    assert truth["wall"].material.faces == 2
+    assert torch.equal(truth["wall"].vertices, scene["wall"].vertices)
+    errors = value_errors(run.parameters, scene, truth, 77e9)
+    assert errors == pytest.approx({"permittivity_error": 0.27 / 2.73, "thickness_error": 0.2})
+    assert value_errors(run.parameters, truth, truth, 77e9)["thickness_error"] == 0
+    with pytest.raises(InputError, match=r"truth\.wall: expected a material of ITU"):
+        build.true_scene(read(known, truth={"wall": {"material": real | {"itu": "woood"}}}))
 
 
 @pytest.mark.parametrize(

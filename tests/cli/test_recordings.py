@@ -51,6 +51,7 @@ interval = 40e-6
 
 [raw]
 frame_period = 0.1
+adc_start_time = 4e-6
 
 [data]
 kind = "simulated"
@@ -208,7 +209,24 @@ def test_a_train_is_written_as_arrays_and_as_raw_files(train):
     assert replace(counts.settings, frames=2) == cfg
     assert cfg.chirps.interval == pytest.approx(40e-6)
     assert cfg.frame_period == 0.1
+    assert (cfg.start_frequency, cfg.adc_start_time) == (76.75e9, 4e-6)
+    assert cfg.idle_time == pytest.approx(4e-6)
     assert cfg.waveform == FMCW(77e9, 2e9, 32e-6, 64)
+
+
+def test_trains_are_impaired(train, tmp_path, monkeypatch):
+    """Channel errors alone: every channel keeps its signal but for one factor."""
+    monkeypatch.chdir(tmp_path)
+    silent = TRAIN.replace("snr_db = 20.0\n", "")
+    errors = "[impairments]\ngain_std_db = 2.0\nphase_std_deg = 40.0\n"
+    beats = []
+    for name, part in (("plain", ""), ("impaired", errors)):
+        Path(f"{name}.toml").write_text(silent + part)
+        assert call(monkeypatch, "simulate", f"{name}.toml") == 0
+        beats.append(described_arrays.read_chirps(f"out/{name}/chirps.toml").samples)
+    factors = beats[1] / beats[0]
+    assert torch.allclose(factors, factors[:1, :1, ..., :1].expand_as(factors), rtol=1e-6)
+    assert factors[0, 0, :, :, 0].abs().std() > 0.05
 
 
 def test_raw_files_show_what_was_simulated(train, monkeypatch):
@@ -280,7 +298,12 @@ def test_recordings_that_do_not_fit_are_refused(train, changes, message):
     [
         ("interval = 40e-6", "interval = 40e-6\ntdm = false", "raw: expected transmitters that"),
         ("interval = 40e-6", "interval = 20e-6", "chirps.interval: expected at least the ramp's"),
-        ("[raw]", "[impairments]\n[raw]", "impairments"),
+        (
+            "interval = 40e-6",
+            "interval = 40e-6\nretrace = true\n"
+            "[impairments]\nphase_noise = { offsets = [1e6], levels = [-90.0] }",
+            "chirps: expected",
+        ),
         ("[raw]", "[raw]\nfull_scale = -1.0", "raw.full_scale"),
         (
             'kind = "fmcw"\nstart_frequency = 77e9\nbandwidth = 2e9\nduration = 32e-6',

@@ -12,6 +12,7 @@ from invertwin.radar import (
     ADC,
     FMCW,
     OFDM,
+    Chirps,
     Impairments,
     Impulse,
     Leakage,
@@ -23,11 +24,13 @@ from invertwin.radar import (
     beat_signal,
     channel_errors,
     leakage_signal,
+    moving_beat,
     noisy_oscillator_beat,
     quantize,
     range_profile,
     residual_phase,
 )
+from invertwin.radar.impairments import _streams
 from invertwin.radar.waveform import sample_window
 from invertwin.scene.antenna import linear_array
 
@@ -208,6 +211,117 @@ def test_range_warning_counts_all_paths_once(point_paths):
     with pytest.warns(PhysicsWarning, match="1 of 2 paths") as caught:
         noisy_oscillator_beat(paths, radar, FLAT, seed=1)
     assert len(caught) == 1
+
+
+# --------------------------------------------------------------------------- trains of chirps
+
+TRAIN = Chirps(count=6, interval=30e-6)
+
+
+def test_an_oscillator_runs_through_a_train():
+    """Ramps without pauses are one record, whose spectrum is right far below 1 / ramp."""
+    radar = recorder(frames=400)
+    steep = PhaseNoise((1e3, 1e6, 1e7), (-30.0, -150.0, -150.0))
+    count, samples, interval = 16, 128, 20e-6 / 128
+    train = Chirps(count, 20e-6)
+    delay = 4e-7
+    residual = residual_phase(steep, radar, delay, seed=3, chirps=train)
+    assert residual.shape == (400, count, 1, samples)
+    whole = residual[:, :, 0].flatten(1)
+    window = torch.hann_window(count * samples, dtype=torch.float64)
+    power = torch.fft.rfft(whole * window).abs().square().mean(0)
+    density = 2 * interval * power / window.square().sum()
+    offsets = torch.fft.rfftfreq(count * samples, interval, dtype=torch.float64)
+    # The lowest of them is a fifth of what a single ramp of 20 µs resolves.
+    rows = torch.arange(3, 400)
+    expected = steep.density(offsets[rows]) * 4 * torch.sin(math.pi * offsets[rows] * delay) ** 2
+    ratio = density[rows] / expected
+    assert ratio.mean() == pytest.approx(1, abs=0.02)
+    assert (ratio - 1).abs().max() < 0.3  # 400 draws scatter by 5 %
+    # So neighbouring ramps have nearly the same mean phase, ramps of frames by themselves none.
+    means = residual[:, :, 0].mean(-1)
+    assert torch.corrcoef(means[:, :2].T)[0, 1] > 0.5
+    alone = residual_phase(steep, recorder(2, 400), delay, seed=3).mean(-1)
+    assert torch.corrcoef(alone)[0, 1].abs() < 0.2
+
+
+def test_transmitters_of_a_train_share_the_oscillator():
+    """In turn they read it one after the other, at once they read the same."""
+    radar = recorder(2, 3)
+    turns = residual_phase(FLAT, radar, 1e-7, seed=5, chirps=TRAIN)
+    assert turns.shape == (2, 6, 3, 128)
+    order = residual_phase(FLAT, radar, 1e-7, seed=5, chirps=replace(TRAIN, order=(2, 0, 1)))
+    assert torch.equal(order, turns[:, :, [1, 2, 0]])
+    slots = residual_phase(FLAT, recorder(2), 1e-7, seed=5, chirps=replace(TRAIN, count=18))
+    assert torch.equal(turns.flatten(1, 2), slots[:, :, 0])
+    once = residual_phase(FLAT, radar, 1e-7, seed=5, chirps=replace(TRAIN, tdm=False))
+    assert torch.equal(once[:, :, 0], once[:, :, 2])
+    assert not torch.equal(turns[0], turns[1])
+
+
+def test_phase_noise_of_a_train(point_paths):
+    """Every path of a moving scene has the residual of its delay, in every ramp."""
+    radar = recorder(transmitters=2, receivers=2)
+    paths = scatterers(radar, point_paths, 12)
+    paths = replace(paths, velocity=torch.tensor([[0.0, 1.0, -20.0]]).double().expand(12, 3))
+    clean = moving_beat(paths, radar, TRAIN)
+    found = noisy_oscillator_beat(paths, radar, FLAT, seed=9, chirps=TRAIN)
+    assert found.shape == (1, 6, 2, 2, 128)
+    expected = torch.zeros_like(clean)
+    columns = [n for n, v in vars(paths).items() if isinstance(v, torch.Tensor)]
+    for row in range(len(paths)):
+        one = replace(paths, **{name: getattr(paths, name)[row : row + 1] for name in columns})
+        residual = residual_phase(FLAT, radar, float(paths.delay[row]), seed=9, chirps=TRAIN)
+        turn = torch.polar(torch.ones_like(residual), residual)
+        expected = expected + moving_beat(one, radar, TRAIN) * turn[..., None, :]
+    assert (found - expected).norm() < 0.005 * (expected - clean).norm()
+
+
+def test_a_train_with_everything(point_paths):
+    radar = recorder(2, 2, 3)
+    paths = point_paths(radar, torch.tensor([[0.0, 0.5, 20], [1, 0, 23]]), torch.tensor([3.0, 2j]))
+    paths = replace(paths, velocity=torch.tensor([[0.0, 1.0, -20.0]]).double().expand(2, 3))
+    adc, leakage = ADC(10, 30.0), Leakage(2e-9, -3.0)
+    everything = Impairments(FLAT, leakage, 0.5, 0.1, snr_db=20, adc=adc)
+    found = everything.record(paths, radar, seed=11, chirps=TRAIN)
+    assert found.shape == (2, 6, 2, 3, 128)
+    analog = replace(everything, adc=None).record(paths, radar, seed=11, chirps=TRAIN)
+    assert torch.equal(quantize(analog, radar, adc), found)
+    quiet = replace(everything, adc=None, snr_db=None).record(paths, radar, seed=11, chirps=TRAIN)
+    noise = analog - quiet
+    assert noise.abs().square().mean() == pytest.approx(
+        float(0.01 * quiet.abs().square().mean()), rel=0.05
+    )
+    # New in every chirp.
+    pair = torch.view_as_real(noise[:, :2]).movedim(1, 0).flatten(1)
+    assert torch.corrcoef(pair)[0, 1].abs() < 0.1
+    # The same in every chirp: factors of the channels, here of leakage alone.
+    none = point_paths(radar, torch.zeros(0, 3), torch.zeros(0))
+    still = Impairments(leakage=leakage, gain_std_db=0.5, phase_std=0.1)
+    direct = still.record(none, radar, seed=11, chirps=TRAIN)
+    factors = channel_errors(radar, 0.5, 0.1, seed=_streams(11)[1])
+    expected = leakage_signal(leakage, radar) * factors[..., None]
+    assert torch.allclose(direct, expected.expand_as(direct))
+
+
+def test_impairments_of_a_finished_signal(point_paths):
+    """As of paths, where nothing needs them; phase noise does and is refused."""
+    radar = recorder(2, 2, 3)
+    paths = scatterers(radar, point_paths, 10)
+    some = Impairments(leakage=Leakage(2e-9, -3.0), phase_std=0.1, snr_db=20, adc=ADC(10, 40.0))
+    for chirps in (None, TRAIN):
+        beat = beat_signal(paths, radar) if chirps is None else moving_beat(paths, radar, chirps)
+        expected = some.record(paths, radar, seed=4, chirps=chirps)
+        assert torch.equal(some.apply(beat, radar, seed=4), expected)
+    with pytest.raises(InputError, match="phase noise, which depends on the delay"):
+        Impairments(FLAT).apply(beat_signal(paths, radar), radar, seed=4)
+
+
+def test_saturation_of_a_train_is_warned_of(point_paths):
+    radar = recorder()
+    paths = scatterers(radar, point_paths, 10)
+    with pytest.warns(PhysicsWarning, match=r"of 768 samples exceed"):
+        Impairments(adc=ADC(10, 0.1)).record(paths, radar, seed=1, chirps=TRAIN)
 
 
 # -------------------------------------------------------------------------------------- leakage

@@ -11,6 +11,8 @@ from invertwin.radar import (
     FMCW,
     OFDM,
     Chirps,
+    Impairments,
+    PhaseNoise,
     PhysicsWarning,
     Radar,
     SteppedFrequency,
@@ -171,6 +173,21 @@ def test_a_function_of_time_is_what_velocities_are():
     by_velocity = simulate_chirps(scene, RADAR, CHIRPS, retrace=True, **options)
     by_function = simulate_chirps(scene.at, RADAR, CHIRPS, **options)
     assert relative(by_function, by_velocity) < 1e-9
+
+
+def test_impairments_of_moving_scenes():
+    """The front end's own numbers on top; phase noise follows the paths of the frame's start."""
+    scene, options = moving([0.0, 0.0, -3.0]), {"seed": 1, "density": 3e3}
+    front = Impairments(snr_db=20, gain_std_db=1.0)
+    for retrace in (False, True):
+        clean = simulate_chirps(scene, RADAR, CHIRPS, retrace=retrace, **options)
+        found = simulate_chirps(scene, RADAR, CHIRPS, retrace=retrace, impairments=front, **options)
+        assert torch.equal(found, front.apply(clean, RADAR, seed=1))
+        assert relative(found, clean) > 0.01
+    noisy = replace(front, phase_noise=PhaseNoise((1e5,), (-80.0,)))
+    assert simulate_chirps(scene, RADAR, CHIRPS, impairments=noisy, **options).shape == clean.shape
+    with pytest.raises(InputError, match="without retracing"):
+        simulate_chirps(scene.at, RADAR, CHIRPS, impairments=noisy, **options)
 
 
 def test_objects_and_triangles_stay():

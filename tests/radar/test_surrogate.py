@@ -12,6 +12,7 @@ from invertwin.errors import InputError
 from invertwin.radar import (
     FMCW,
     OFDM,
+    SURROGATES,
     Impulse,
     Radar,
     SampledWaveform,
@@ -20,12 +21,12 @@ from invertwin.radar import (
     Waveform,
     airy,
     beat_signal,
+    chosen_surrogate,
     exact_spectrum,
     normalized_gaussian,
     surrogate_spectrum,
 )
-from invertwin.radar.spectrum import aperture
-from invertwin.radar.surrogate import array_point_spread, bessel_j1, range_point_spread
+from invertwin.radar.point_spread import range_point_spread
 from invertwin.scene import Object, RoughDielectric, Scene, plate, rigid, rotation_from_vector
 from invertwin.scene.antenna import AntennaArray, linear_array
 from oracles.bspline import deposit
@@ -157,6 +158,41 @@ def test_the_windows_are_part_of_the_kernel(planar, point_paths):
         assert error < limit if limit else error > 0.1
 
 
+def test_dirichlet_is_the_response_without_a_window(linear, point_paths):
+    """Whatever the radar's window is: the exact chain of the same paths, untapered."""
+    points, power = cloud(40)
+    bare = replace(linear, window="rectangular")
+    grid = linear.grid(3, 6, 0.7, oversample=3)
+    exact = expected_exact(bare, points, power, grid, point_paths)
+    spread = deposited(points, power, grid)
+    twin = Surrogate(range_kernel="dirichlet").shape(spread, linear, grid)
+    assert (exact - twin).norm() < 0.02 * exact.norm()
+    assert (exact - Surrogate().shape(spread, linear, grid)).norm() > 0.1 * exact.norm()
+
+
+def test_gaussian_kernel_is_the_papers_normalised_one(linear):
+    """Inside of a grid the sum over bins is a constant, so the derivative is the same too."""
+    radar = replace(linear, receivers=linear_array(1, 1.0))
+    grid = radar.grid(3, 6, oversample=6)
+    sigma = radar.waveform.range_resolution / math.sqrt(8 * math.log(2))
+    place = torch.tensor([4.5 + 0.3 * grid.range_step], dtype=torch.float64, requires_grad=True)
+    zero = torch.zeros(1, dtype=torch.float64)
+
+    def shaped(where):
+        spread = deposit(torch.ones(1, dtype=torch.float64), where, zero, zero, grid)[None]
+        return Surrogate(range_kernel="gaussian").shape(spread, radar, grid)[0, :, 0, 0]
+
+    peak = sigma * math.sqrt(2 * math.pi) / grid.range_step
+    printed = peak * normalized_gaussian(place, grid.ranges, sigma)[0]
+    assert (shaped(place) - printed).abs().max() < 2e-3
+    weight = torch.linspace(-1, 1, grid.range_count, dtype=torch.float64).square()
+    slopes = [
+        torch.autograd.grad((weight * kernel).sum(), place)[0]
+        for kernel in (shaped(place), printed)
+    ]
+    assert torch.allclose(*slopes, rtol=2e-3)
+
+
 def half_width(profile: torch.Tensor, step: float) -> float:
     """Full width at half maximum by linear interpolation."""
     peak = int(profile.argmax())
@@ -165,7 +201,7 @@ def half_width(profile: torch.Tensor, step: float) -> float:
     return 2 * step * (right - 1 + float(fraction) - peak)
 
 
-@pytest.mark.parametrize("kernel", ["gaussian", "response"])
+@pytest.mark.parametrize("kernel", ["gaussian", "response", "dirichlet"])
 def test_range_kernel_width_and_peak(kernel, linear):
     radar = replace(linear, receivers=linear_array(1, 1.0))
     grid = radar.grid(3, 6, oversample=16)
@@ -173,8 +209,8 @@ def test_range_kernel_width_and_peak(kernel, linear):
     power[0, 170] = 2.0
     profile = Surrogate(range_kernel=kernel).shape(power, radar, grid)[0, :, 0, 0]
     cell = radar.waveform.range_resolution
-    # −3 dB width of the Hamming window: 1.30 cells of its transform.
-    width = {"gaussian": 1.0, "response": 1.30}[kernel]
+    # −3 dB width of the Hamming window: 1.30 cells of its transform; of no window 0.886.
+    width = {"gaussian": 1.0, "response": 1.30, "dirichlet": 0.886}[kernel]
     assert profile.argmax() == 170
     assert profile.max() == pytest.approx(2, rel=0.01)
     assert half_width(profile, grid.range_step) == pytest.approx(width * cell, rel=0.02)
@@ -311,45 +347,6 @@ def test_impulse_is_a_gaussian_pulse():
     assert half_width(maps[0][0, :, 0, 0], grid.range_step) == pytest.approx(cell, rel=0.02)
 
 
-def test_point_spreads_peak_at_one(planar):
-    zero = torch.zeros(1, dtype=torch.float64)
-    assert range_point_spread(planar.waveform, zero).item() == pytest.approx(1)
-    assert array_point_spread(aperture(planar), zero, zero).item() == pytest.approx(1)
-
-
-def test_bessel_and_airy_gradients():
-    z = torch.tensor([-3.0, 0.0, 1e-4, 9.9e-4, 1.1e-3, 0.5, 3.8, 40.0], dtype=torch.float64)
-    z.requires_grad_()
-    assert torch.autograd.gradcheck(bessel_j1, z)
-    assert torch.autograd.gradcheck(airy, z)
-    values = airy(z).detach()
-    assert values[1] == 1
-    assert values[3] == pytest.approx(1 - 0.25 * 9.9e-4**2, abs=1e-12)
-    # First dark ring.
-    assert airy(torch.tensor([3.8317059702], dtype=torch.float64)).item() < 1e-18
-
-
-def test_normalized_gaussian_has_the_derivative_stated_and_not_the_printed_one():
-    bins = torch.linspace(0, 2, 21, dtype=torch.float64)
-    ranges = torch.tensor([0.93, 1.31], dtype=torch.float64, requires_grad=True)
-    sigma = 0.12
-    kernel = normalized_gaussian(ranges, bins, sigma)
-    assert torch.allclose(kernel.sum(1), torch.ones(2, dtype=torch.float64))
-    assert torch.autograd.gradcheck(lambda r: normalized_gaussian(r, bins, sigma), ranges)
-    pull = (bins[None] - ranges[:, None]) / sigma**2
-    stated = kernel * (pull - (kernel * pull).sum(1, keepdim=True))
-    printed = kernel * pull * (1 - kernel)
-    for path in range(2):
-        row = torch.stack(
-            [
-                torch.autograd.grad(kernel[path, f], ranges, retain_graph=True)[0][path]
-                for f in range(21)
-            ]
-        )
-        assert torch.allclose(row, stated[path])
-        assert (row - printed[path]).norm() > 0.04 * row.norm()
-
-
 def test_both_chains_of_a_scene_agree(mimo):
     """Ray-traced: the rough points' exact spectra, summed in power, are the surrogate's map."""
     pose = rigid(
@@ -371,6 +368,36 @@ def test_both_chains_of_a_scene_agree(mimo):
     assert (exact - twin).norm() < 0.02 * exact.norm()
 
 
+def test_annealing_ends_at_the_exact_response(linear, point_paths):
+    """The last stage of a fit: no extra width, and the mean of the exact chain."""
+    radar = linear
+    points, power = cloud(40)
+    grid = radar.grid(3, 6, 0.7)
+    exact = expected_exact(radar, points, power, grid, point_paths)
+    spread = deposited(points, power, grid)
+    wide = SURROGATES["annealed"]
+    assert wide is not None
+    last = replace(wide, range_width=0.0, angle_width=0.0)
+    assert last == SURROGATES["response"]
+    assert torch.equal(last.blur(exact, radar, grid), exact)
+    misses = []
+    for left in (1.0, 0.5, 0.1, 0.0):
+        stage = replace(wide, range_width=3.0 * left, angle_width=1.5 * left)
+        misses.append(float((stage.shape(spread, radar, grid) - exact).norm() / exact.norm()))
+    assert misses == sorted(misses, reverse=True)
+    assert misses[-1] < 0.02
+
+
+def test_one_switch_for_all(linear):
+    assert chosen_surrogate(None) is None
+    assert chosen_surrogate("exact") is None
+    assert chosen_surrogate("gaussian") == Surrogate("gaussian", "airy")
+    mine = Surrogate(range_width=1.0)
+    assert chosen_surrogate(mine) is mine
+    with pytest.raises(InputError, match=r"one of exact, response, .* got 'bessel'"):
+        chosen_surrogate("bessel")
+
+
 def test_wrong_input(planar):
     grid = planar.grid(4, 5)
     with pytest.raises(InputError, match="expected a map of shape"):
@@ -383,3 +410,16 @@ def test_wrong_input(planar):
         Surrogate(range_width=-1.0)
     with pytest.raises(InputError, match="positive aperture_radius"):
         Surrogate(aperture_radius=0.0)
+    with pytest.raises(InputError, match="phases"):
+        Surrogate(phases="coherent")
+    with pytest.raises(InputError, match="'gaussian', angle_kernel 'airy'"):
+        Surrogate(phases="random")
+    with pytest.raises(InputError, match="angle_width 0 with random"):
+        Surrogate("gaussian", "airy", angle_width=1.0, phases="random")
+    with pytest.raises(InputError, match="phases='mean' to shape"):
+        Surrogate("gaussian", "airy", phases="random").shape(
+            torch.zeros(1, *grid.shape), planar, grid
+        )
+    pulse = replace(planar, waveform=Impulse(77e9, 1e9))
+    with pytest.raises(InputError, match="sampled waveform for the Dirichlet kernel, got Impulse"):
+        Surrogate(range_kernel="dirichlet").shape(torch.zeros(1, *grid.shape), pulse, grid)

@@ -118,7 +118,10 @@ class ChirpSettings:
 
     @property
     def chirps(self) -> Chirps:
-        """When the ramps of a frame start, as range-Doppler processing asks for it."""
+        """When the ramps of a frame start, as range-Doppler processing asks for it.
+
+        For the transmitters of `ChirpData`, which are in the order of sending already.
+        """
         return Chirps(self.loops, self.idle_time + self.ramp_time)
 
 
@@ -270,6 +273,7 @@ def adc_counts(
     beat: Complex[Tensor, "frame chirp tx rx sample"] | Complex[Tensor, "frame tx rx sample"],
     settings: ChirpSettings,
     full_scale: float,
+    order: Sequence[int] | None = None,
 ) -> ChirpData:
     """Simulated samples as the counts that an ADC would have written.
 
@@ -280,13 +284,18 @@ def adc_counts(
         beat: simulated; without a chirp dimension every chirp of a frame is the same.
         settings: whose bits, loops and kind of samples are used.
         full_scale: amplitude of the largest count, in the units of ``beat``.
+        order: of the turns of ``beat``'s transmitters, counted from 0, as in `Chirps`; None = they
+            are in the order of sending.
 
     Raises:
-        InputError: a full scale that is not positive, or a shape that the settings contradict.
+        InputError: a full scale that is not positive, a shape that the settings contradict, or
+            an order of other transmitters.
     """
     checked_number(full_scale, "full scale", 0.0, open_low=True)
     if beat.ndim == 4:
         beat = beat[:, None].expand(-1, settings.loops, -1, -1, -1)
+    if order is not None:
+        beat = beat[:, :, _checked_order(order, beat.shape[2])]
     top = 2 ** (settings.bits - 1) - 1
     parts = torch.view_as_real(beat.to(torch.complex128).resolve_conj()) * (top / full_scale)
     parts = parts.round().clamp(-top - 1, top)
@@ -316,12 +325,25 @@ def settings_of(
     frame_period: float | None = None,
     idle_time: float = 0.0,
     lanes: int | None = None,
+    order: Sequence[int] | None = None,
 ) -> ChirpSettings:
-    """Settings that record this waveform with TX1, TX2, … in turn and all receivers.
+    """Settings that record this waveform with all transmitters in turn and all receivers.
+
+    Args:
+        waveform: of every ramp.
+        transmitters: how many.
+        receivers: how many.
+        loops: chirps of each transmitter in a frame.
+        frames: how many, if it is known.
+        frame_period: from frame to frame [s].
+        idle_time: between ramps [s].
+        lanes: of the LVDS link.
+        order: of the transmitters, counted from 0, as in `Chirps`; None = TX1, TX2, …
 
     Raises:
-        InputError: see `ChirpSettings`.
+        InputError: see `ChirpSettings`; an order of other transmitters.
     """
+    turns = range(transmitters) if order is None else _checked_order(order, transmitters)
     rate = waveform.samples / waveform.duration
     nearest = round(rate)
     return ChirpSettings(
@@ -329,7 +351,7 @@ def settings_of(
         slope=waveform.slope,
         sample_rate=float(nearest) if math.isclose(rate, nearest, rel_tol=1e-12) else rate,
         samples=waveform.samples,
-        transmit_order=tuple(range(1, transmitters + 1)),
+        transmit_order=tuple(1 + turn for turn in turns),
         receivers=tuple(range(1, receivers + 1)),
         loops=loops,
         frames=frames,
@@ -337,3 +359,12 @@ def settings_of(
         idle_time=idle_time,
         lanes=lanes,
     )
+
+
+def _checked_order(order: Sequence[int], transmitters: int) -> list[int]:
+    if sorted(order) != list(range(transmitters)):
+        raise InputError(
+            f"expected an order of the transmitters 0 to {transmitters - 1}, each once, got "
+            f"{tuple(order)}; use Chirps.order of the simulation"
+        )
+    return list(order)

@@ -44,6 +44,14 @@ class Backend(StrEnum):
     cuda = "cuda"
 
 
+class Method(StrEnum):
+    """How directions are told apart."""
+
+    bartlett = "bartlett"
+    capon = "capon"
+    music = "music"
+
+
 def _use_backend(value: Backend | None) -> Backend | None:
     if value is not None:
         os.environ["INVERTWIN_BACKEND"] = value.value
@@ -171,6 +179,12 @@ def look(
     frame: Annotated[int, typer.Option(min=0, help="The one that the pictures show.")] = 0,
     range_min: Annotated[float | None, typer.Option(help="m; default: 3 range cells.")] = None,
     range_max: Annotated[float | None, typer.Option(help="m; default: all.")] = None,
+    method: Annotated[
+        Method, typer.Option(help="Of directions; others than bartlett are shown beside it.")
+    ] = Method.bartlett,
+    sources: Annotated[
+        int | None, typer.Option(help="For music; default: counted in each range.")
+    ] = None,
     channels: Annotated[
         Path | None, typer.Option(help="Channel calibration to divide out (channels.json).")
     ] = None,
@@ -195,6 +209,8 @@ def look(
         frame,
         range_min,
         range_max,
+        method.value,
+        sources,
         channels,
         reflector,
     )
@@ -251,7 +267,7 @@ def doctor(backend: BackendOption = None) -> None:
 
 def main() -> None:
     """Entry point: bad input is one line and exit code 2, an interruption 130."""
-    warnings.showwarning = _show_warning
+    warnings.showwarning = _shown_once()
     try:
         app(standalone_mode=True)
     except InputError as error:
@@ -349,5 +365,14 @@ def _print(tables: list[Table]) -> None:
             console.print(table.note, markup=False)
 
 
-def _show_warning(message: Warning | str, *_: Any) -> None:
-    print(f"invertwin: warning: {message}", file=sys.stderr)
+def _shown_once() -> Callable[..., None]:
+    """Prints every warning on one line, the same text once."""
+    said: set[str] = set()
+
+    def show(message: Warning | str, *_: Any) -> None:
+        line = f"invertwin: warning: {message}"
+        if line not in said:
+            said.add(line)
+            print(line, file=sys.stderr)
+
+    return show

@@ -63,17 +63,21 @@ def scene(run: schema.RunFile) -> Scene:
 
 
 def true_scene(run: schema.RunFile) -> Scene:
-    """The scene with the placements of the `[truth.<name>]` tables."""
+    """The scene with the placements and materials of the `[truth.<name>]` tables."""
     found = scene(run)
     for name, truth in run.truth.items():
-        changes = truth.model_dump(exclude_none=True)
-        if name in run.scene:
-            item = _object(run.scene[name].model_copy(update=changes))
-        else:
-            # Objects of a file stand where it puts them: they are scaled and placed from there.
-            item, place = found[name], schema.Placement(**changes)
-            mesh = Mesh(item.mesh.vertices * place.scale, item.mesh.faces)
-            item = replace(item, mesh=mesh, pose=_pose(place))
+        changes = {key: value for key, value in truth if value is not None}
+        with about(f"truth.{name}"):
+            if name in run.scene:
+                item = _object(run.scene[name].model_copy(update=changes))
+            else:
+                # Objects of a file stand where it puts them: they are scaled and placed from there.
+                made_of = changes.pop("material", None)
+                item, place = found[name], schema.Placement(**changes)
+                mesh = Mesh(item.mesh.vertices * place.scale, item.mesh.faces)
+                item = replace(item, mesh=mesh, pose=_pose(place))
+                if made_of is not None:
+                    item = replace(item, material=material(made_of, mesh))
         found = Scene({**found.objects, name: item})
     return found
 

@@ -16,16 +16,23 @@ from invertwin.channel.paths import Grid
 from invertwin.cli.pictures import DYNAMIC_RANGE_DB, U_LABEL, V_LABEL, png_bytes
 from invertwin.radar import (
     Chirps,
+    PointCloud,
     Radar,
     beamform,
+    capon,
+    cell_averaging_cfar,
     compensate_tdm,
+    music,
+    point_cloud,
     range_doppler,
+    range_doppler_angle,
     velocity_axis,
 )
 
 # Bins of range rate on either side of zero that a window spreads what stands still over.
 _STILL_BINS = 2
 _BINS_AT_ONCE = 2e7  # of range rate, range, u, v
+_MOST_BINS = 1e8  # the same, of all that are searched for points
 
 DOPPLER_NOTE = (
     "Range rates are modulo the unambiguous span; phases that transmitters in turn add to movers "
@@ -134,6 +141,74 @@ def doppler_maps(
         strongest,
         peaks[1],
     )
+
+
+def sharp_map(
+    profile: Complex[Tensor, "snapshot tx rx range"],
+    radar: Radar,
+    grid: Grid,
+    method: str,
+    sources: int | None,
+) -> NDArray:
+    """Capon or MUSIC over range and direction [range, u, v].
+
+    Args:
+        profile: Range profiles of one frame; bins of range rate whose transmitters' turns are
+            compensated serve as snapshots, too.
+        radar: Its array.
+        grid: Directions.
+        method: capon or music.
+        sources: For music; None = counted in each range.
+
+    Raises:
+        InputError: As ``capon`` and ``music``.
+    """
+    snapshots = profile[None].to(torch.complex128)
+    if method == "capon":
+        power = capon(snapshots, radar, grid)[0]
+    else:
+        power = music(snapshots, radar, grid, sources="mdl" if sources is None else sources)[0]
+    return (power * (grid.u[:, None].square() + grid.v.square() <= 1)).numpy()
+
+
+def snapshots_of(
+    beat: Complex[Tensor, "frame chirp tx rx sample"],
+    radar: Radar,
+    grid: Grid,
+    chirps: Chirps,
+    frame: int,
+) -> Complex[Tensor, "velocity tx rx range"]:
+    """Bins of range rate of one frame, transmitters' turns compensated."""
+    radar = radar.frames([frame])
+    cube = range_doppler(beat[frame : frame + 1], radar, grid, chirps, window="rectangular")
+    return compensate_tdm(cube, radar, chirps)[0]
+
+
+def points_of(
+    beat: Complex[Tensor, "frame chirp tx rx sample"],
+    radar: Radar,
+    grid: Grid,
+    chirps: Chirps,
+    frame: int,
+) -> PointCloud | None:
+    """What a cell-averaging CFAR detects in one frame; None where the map is too large for it."""
+    if chirps.count * math.prod(grid.shape) > _MOST_BINS:
+        return None
+    radar, signal = radar.frames([frame]), beat[frame : frame + 1]
+    flat = range_doppler(signal, radar, grid, chirps).abs().square().mean((2, 3))
+    detected = cell_averaging_cfar(flat, looks=len(radar.virtual_positions))
+    power = range_doppler_angle(signal, radar, grid, chirps)
+    return point_cloud(power, detected, radar, grid, chirps)
+
+
+def points_csv(points: PointCloud) -> str:
+    """One line per point, the strongest first."""
+    lines = ["range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m"]
+    for i in points.power.argsort(descending=True).tolist():
+        level = 10 * math.log10(float(points.power[i]))
+        values = [points.range[i], points.velocity[i], points.u[i], points.v[i], level]
+        lines.append(",".join(f"{float(value):.6g}" for value in (*values, *points.position[i])))
+    return "\n".join(lines) + "\n"
 
 
 def still_peak(spectrum: Float[Tensor, "range u v"], grid: Grid) -> Peak:

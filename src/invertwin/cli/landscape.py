@@ -125,6 +125,7 @@ def _smooth(
             samples=settings.samples,
             boundary_samples=0,
             seed=run.seed,
+            depth=settings.depth,
         )
         return float(loss(simulated, measured))
 

@@ -1,7 +1,7 @@
 """From the material tables of a run file to the library's materials."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,12 @@ from invertwin.scene import (
     RefractingBody,
     RoughConductor,
     RoughDielectric,
+    Scene,
     Slab,
     Texture,
 )
+from invertwin.scene.material import Value
+from invertwin.scene.material.values import evaluated
 from invertwin.scene.parameters import MaterialValues
 
 _KINDS: Mapping[str, type[Material]] = {
@@ -59,15 +62,7 @@ def fitted(table: schema.MaterialParameter, material: Any) -> MaterialValues:
         InputError: the material has no such value, it comes from the ITU table, or it starts at
             the end of its range.
     """
-    holder = material
-    if table.layer is not None:
-        layers = getattr(material, "layers", ())
-        if table.layer >= len(layers):
-            raise InputError(
-                f"expected a layer below {len(layers)} of {type(material).__name__}, "
-                f"got {table.layer}; correct `layer`"
-            )
-        holder = layers[table.layer]
+    holder = _holder(material, table.layer)
     missing = [name for name in table.values if name not in vars(holder)]
     if missing:
         raise InputError(f"expected values of {type(holder).__name__}, got {missing[0]}; remove it")
@@ -79,6 +74,49 @@ def fitted(table: schema.MaterialParameter, material: Any) -> MaterialValues:
                 f"give `{name}` beside `itu`"
             )
     return MaterialValues(table.object, layer=table.layer, **start)
+
+
+def value_errors(
+    parameters: Sequence[schema.Parameter], twin: Scene, truth: Scene, frequency: float
+) -> dict[str, float]:
+    """How far the sought material values are from the truth, relative to it.
+
+    Args:
+        parameters: what was sought.
+        twin: the scene that was found.
+        truth: the true scene.
+        frequency: of the radar [Hz], for values of the ITU table.
+    """
+    found: dict[str, float] = {}
+    for table in parameters:
+        if not isinstance(table, schema.MaterialParameter):
+            continue
+        ends = [_holder(scene[table.object].material, table.layer) for scene in (twin, truth)]
+        for name in table.values:
+            if all(hasattr(end, name) for end in ends):
+                value, true = (_number(getattr(end, name), name, frequency) for end in ends)
+                found[f"{name}_error"] = float((value - true).abs().mean() / true.abs().mean())
+    return found
+
+
+def _holder(material: Any, layer: int | None) -> Any:
+    """The material, or one of its layers."""
+    if layer is None:
+        return material
+    layers = getattr(material, "layers", ())
+    if layer >= len(layers):
+        raise InputError(
+            f"expected a layer below {len(layers)} of {type(material).__name__}, "
+            f"got {layer}; correct `layer`"
+        )
+    return layers[layer]
+
+
+def _number(value: Value | Itu, name: str, frequency: float) -> Tensor:
+    if isinstance(value, Itu):
+        curve = value.permittivity if name == "permittivity" else value.conductivity
+        return evaluated(curve(frequency))
+    return evaluated(value).detach()
 
 
 def _values(table: schema.Section, mesh: Mesh | None) -> dict[str, Any]:

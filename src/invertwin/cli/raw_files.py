@@ -30,6 +30,8 @@ def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
             f'raw: expected radar.waveform.kind = "fmcw", got {type(radar.waveform).__name__}; '
             "raw files are those of FMCW boards: remove [raw]"
         )
+    raw = run.raw or Raw()
+    ramp = raw.adc_start_time + radar.waveform.duration
     idle = 0.0
     if run.chirps is not None:
         if not run.chirps.tdm:
@@ -37,13 +39,12 @@ def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
                 "raw: expected transmitters that take turns, got chirps.tdm = false; "
                 "raw files of transmitters that send at once cannot be separated"
             )
-        idle = run.chirps.interval - radar.waveform.duration
+        idle = run.chirps.interval - ramp
         if idle < -1e-12:
             raise InputError(
-                f"chirps.interval: expected at least the ramp's {radar.waveform.duration:g} s, "
-                f"got {run.chirps.interval:g}; idle time comes on top"
+                f"chirps.interval: expected at least the ramp's {ramp:g} s, got "
+                f"{run.chirps.interval:g}; idle time comes on top"
             )
-    raw = run.raw or Raw()
     with about("raw"):
         found = settings_of(
             radar.waveform,
@@ -61,7 +62,13 @@ def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
             found = replace(found, transmit_order=tuple(board.transmitters))
         if board is not None and board.receivers is not None:
             found = replace(found, receivers=tuple(board.receivers))
-        return replace(found, real=raw.real, bits=raw.bits)
+        return replace(
+            found,
+            start_frequency=found.start_frequency - found.slope * raw.adc_start_time,
+            adc_start_time=raw.adc_start_time,
+            real=raw.real,
+            bits=raw.bits,
+        )
 
 
 def write_raw(

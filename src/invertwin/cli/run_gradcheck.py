@@ -23,6 +23,7 @@ COLUMNS = (
     "scene",
     "L1 full",
     "L1 interior",
+    "L1 no interior edges",
     "ratio",
     "L2 full",
     "correlation",
@@ -36,8 +37,10 @@ COLUMNS = (
 _LEGEND = (
     "L1 full, L1 interior: distance of the gradient to the differences over the size of the "
     "differences, ‖g − g_FD‖₁ / ‖g_FD‖₁, with boundary terms (silhouettes) and without; 0 is best. "
-    "ratio: interior over full, how much the boundary terms gain. L2 full: the same in ‖·‖₂. "
-    "correlation: of the two maps, bin by bin. noise: relative standard error of the differences, "
+    "L1 no interior edges: without the shadows that surfaces cast on each other, where paths have "
+    "two bounces or more. ratio: interior over full, how much the boundary terms gain. L2 full: "
+    "the same in ‖·‖₂. correlation: of the two maps, bin by bin. noise: relative standard error "
+    "of the differences, "
     "that is how sharp this check is. steps differ: relative change of the differences when "
     "their step is halved, noise included. order: how the gap to the differences grows with their "
     "step; 2 for a right gradient, 0 for a wrong one. pairs: difference pairs averaged."
@@ -113,6 +116,7 @@ def _check(
         grid,
         _direction(settings),
         surrogate=build.surrogate(run.surrogate),
+        depth=settings.depth,
         samples=settings.samples,
         boundary_samples=settings.boundary_samples,
         repeats=settings.repeats,
@@ -125,12 +129,14 @@ def _check(
         progress=say,
     )
     table = settings.parameter
+    outer = report.no_interior_edges
     unit = _UNITS.get(table.kind, f"per unit of {table.value}")
     folder.write_bytes(f"{name}.png", _maps(report, grid, unit))
     folder.write_bytes(f"{name}_scene.png", _picture(scene, radar, settings.parameter.object))
     return {
         "full": asdict(report.full),
         "interior": asdict(report.interior),
+        **({} if outer is None else {"no_interior_edges": asdict(outer)}),
         "difference_noise": report.difference_noise,
         "step_agreement": report.step_agreement,
         "pairs": report.pairs,
@@ -173,6 +179,7 @@ def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
         name,
         full["relative_l1"],
         interior["relative_l1"],
+        found.get("no_interior_edges", {}).get("relative_l1"),
         interior["relative_l1"] / full["relative_l1"] if full["relative_l1"] else None,
         full["relative_l2"],
         full["correlation"],

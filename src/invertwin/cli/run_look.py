@@ -26,12 +26,16 @@ from invertwin.cli.doppler_maps import (
     doppler_maps,
     panels,
     panels_picture,
+    points_csv,
+    points_of,
+    sharp_map,
+    snapshots_of,
     still_peak,
 )
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.runs import RunFolder
 from invertwin.errors import InputError
-from invertwin.radar import Radar, SampledWaveform, velocity_span
+from invertwin.radar import Radar, SampledWaveform, range_profile, velocity_span
 from invertwin.scene import AntennaArray
 
 _ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"
@@ -53,6 +57,7 @@ _LABELS = {
     "mover_range_m": "strongest bin that moves, range [m]",
     "mover_velocity_m_s": "strongest bin that moves, range rate [m/s]",
     "mover_azimuth_deg": "strongest bin that moves, azimuth [°]",
+    "points": "points that CFAR detects (points.csv)",
     "channel_spread_db": "gains of the channels, largest over smallest [dB]",
 }
 
@@ -70,6 +75,8 @@ class Look:
         chirp: The one that the capture keeps; None = the mean.
         frame: The one that the pictures show.
         range_min, range_max: [m].
+        method: Of directions: bartlett, or capon or music beside it.
+        sources: For music; None = counted in each range.
         channels: Channel calibration to divide out.
         reflector: Known place of a reflector [m], to calibrate the channels on.
     """
@@ -84,6 +91,8 @@ class Look:
     frame: int = 0
     range_min: float | None = None
     range_max: float | None = None
+    method: str = "bartlett"
+    sources: int | None = None
     channels: Path | None = None
     reflector: tuple[float, float, float] | None = None
 
@@ -133,12 +142,21 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
         metrics |= {"samples": radar.waveform.samples, "max_range_m": recording.farthest}
     shown, found = _maps(recording, radar, grid, look.frame)
     metrics |= found
+    if look.method != "bartlett":
+        shown |= _sharper(look, recording, radar, grid)
+    points = None
+    if recording.chirps is not None:
+        timing = recording.chirps.settings.chirps
+        points = points_of(recording.chirps.beat, radar, grid, timing, look.frame)
     if radar.frame_count > 1:
         profiles = recording.capture.spectrum(replace(grid, u_count=1, v_count=1))
         power = profiles[:, :, 0, 0].T.double().numpy()
         times = torch.arange(radar.frame_count).numpy()
         shown["all frames"] = Panel(power, grid.ranges.numpy(), times, "frame")
     recording.capture.save(folder.file("capture.nc"))
+    if points is not None:
+        metrics["points"] = len(points)
+        folder.write_text("points.csv", points_csv(points))
     folder.write_json("metrics.json", metrics)
     folder.write_bytes("look.png", panels_picture(shown))
     rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
@@ -267,6 +285,23 @@ def _grid(look: Look, radar: Radar, recording: _Recording) -> Grid:
         first, count = low, int((high - low) / step)
         return Grid(range_start=first, range_step=step, range_count=max(count, 1))
     return radar.grid(low, high)
+
+
+def _sharper(look: Look, recording: _Recording, radar: Radar, grid: Grid) -> dict[str, Panel]:
+    """Directions by another method than Bartlett's."""
+    if "range_profile" in recording.capture.dataset:
+        raise InputError(
+            f"expected --method bartlett, got {look.method}; this recording has one channel"
+        )
+    if recording.chirps is None:
+        one = radar.frames([look.frame])
+        beat = recording.capture.beat[look.frame : look.frame + 1]
+        profile = range_profile(beat, one, grid)
+    else:
+        timing = recording.chirps.settings.chirps
+        profile = snapshots_of(recording.chirps.beat, radar, grid, timing, look.frame)
+    power = sharp_map(profile, radar, grid, look.method, look.sources)
+    return direction_panels(f"everything, {look.method}", power, grid)
 
 
 def _maps(

@@ -15,9 +15,9 @@ from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import Chirps, RunFile, SimulatedData
+from invertwin.cli.schema import Chirps, Impairments, RunFile, SimulatedData
 from invertwin.errors import InputError
-from invertwin.radar import FMCW, add_noise, exact_spectrum, velocity_span
+from invertwin.radar import FMCW, exact_spectrum, velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Scene
@@ -61,6 +61,7 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
             grid,
             seed=seed,
             samples=data.samples,
+            depth=data.depth,
             density=data.density,
             snr_db=None if front else data.snr_db,
             noise_figure_db=None if front else data.noise_figure_db,
@@ -98,7 +99,13 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
     assert found.paths is not None
     with torch.no_grad():
         smooth = simulate(
-            scene, radar, grid, seed=run.seed, surrogate=Surrogate(), samples=_SURROGATE_SAMPLES
+            scene,
+            radar,
+            grid,
+            seed=run.seed,
+            surrogate=Surrogate(),
+            samples=_SURROGATE_SAMPLES,
+            depth=_simulated(run).depth,
         ).spectrum
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
     metrics = {
@@ -141,8 +148,8 @@ def _chirp_train(
             retrace=table.retrace,
             samples=data.samples,
             density=data.density,
+            impairments=sensors.impairments(run.impairments or Impairments(), data),
         )
-        beat = _received(run, data, beat, radar, seed)
     seconds = time.perf_counter() - begin
     maps = doppler_maps(beat, radar, grid, chirps)
     if table.tdm and isinstance(radar.waveform, FMCW):
@@ -173,26 +180,6 @@ def _chirp_train(
     )
     status = f"{chirps.count} chirps a frame, {radar.frame_count} frames."
     return _finish(run, folder, scene, radar, metrics, shown, status)
-
-
-def _received(
-    run: RunFile, data: SimulatedData, beat: torch.Tensor, radar: Radar, seed: int
-) -> torch.Tensor:
-    """Chirps as the front end of the run file hands them on."""
-    if run.impairments is not None:
-        raise InputError(
-            "impairments: expected no [impairments] with [chirps], got both; remove one"
-        )
-    if data.snr_db is None and data.noise_figure_db is None:
-        return beat
-    noisy = add_noise(
-        beat.flatten(0, 1),
-        radar,
-        seed=seed,
-        snr_db=data.snr_db,
-        noise_figure_db=data.noise_figure_db,
-    )
-    return noisy.unflatten(0, beat.shape[:2])
 
 
 def _finish(

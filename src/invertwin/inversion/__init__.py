@@ -2,6 +2,14 @@
 
 from invertwin.inversion.gradcheck import Agreement, Direction, GradientReport
 from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.mover import (
+    Echo,
+    MotionMap,
+    MovingBody,
+    fit_mover,
+    motion_map,
+    strongest_mover,
+)
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
@@ -10,12 +18,18 @@ __all__ = [
     "Agreement",
     "ClockOffset",
     "Direction",
+    "Echo",
     "GradientReport",
     "Laplacian",
+    "MotionMap",
+    "MovingBody",
     "Optimizer",
     "RangeBias",
     "Reconstruction",
     "Regularizer",
     "SpectrumLoss",
+    "fit_mover",
+    "motion_map",
     "reconstruct",
+    "strongest_mover",
 ]

@@ -105,6 +105,8 @@ class GradientReport:
 
     Attributes:
         full, interior: Agreement with and without boundary paths.
+        no_interior_edges: With boundary paths, but without those of the shadows that surfaces
+            cast on each other; None for paths of one bounce, which have none.
         difference_noise: ‖standard error‖₁ / ‖g_FD‖₁.
         step_agreement: ‖FD(ε) − FD(ε/2)‖₁ / ‖FD(ε)‖₁ (holds the noise of both).
         pairs: Number of independent difference pairs.
@@ -113,6 +115,7 @@ class GradientReport:
 
     full: Agreement
     interior: Agreement
+    no_interior_edges: Agreement | None
     difference_noise: float
     step_agreement: float
     pairs: int
@@ -129,6 +132,7 @@ def gradcheck(
     direction: Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]],
     *,
     surrogate: Surrogate,
+    depth: int = 3,
     samples: int = 4_000_000,
     boundary_samples: int = 1_000_000,
     repeats: int = 4,
@@ -152,6 +156,7 @@ def gradcheck(
         grid: Bins of the map.
         direction: θ → scene and radar, e.g. :class:`Direction`.
         surrogate: Point spread of the map.
+        depth: Most bounces of a path.
         samples: Interior samples of one derivative.
         boundary_samples: Silhouette samples of one derivative.
         repeats: Derivatives averaged, with different seeds.
@@ -176,11 +181,12 @@ def gradcheck(
             samples=count,
             boundary_samples=edges,
             seed=key,
+            depth=depth,
             **options,  # type: ignore[arg-type]
         )
         return surrogate.shape(deposit.double(), seen, grid)
 
-    def derivative(boundary: bool) -> tuple[Tensor, Tensor]:
+    def derivative(boundary: bool, interior_edges: bool = True) -> tuple[Tensor, Tensor]:
         primals, tangents = [], []
         for k in range(repeats):
             with forward_ad.dual_level():
@@ -188,7 +194,10 @@ def gradcheck(
                     torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
                 )
                 edges = boundary_samples if boundary else 0
-                out = map_at(theta, samples, edges, seed + k, boundary=boundary)
+                out = map_at(
+                    theta, samples, edges, seed + k,
+                    boundary=boundary, interior_edges=interior_edges,
+                )  # fmt: skip
                 primal, tangent = forward_ad.unpack_dual(out)
                 primals.append(primal)
                 tangents.append(torch.zeros_like(primal) if tangent is None else tangent)
@@ -211,6 +220,7 @@ def gradcheck(
     with torch.no_grad():
         value, gradient = derivative(boundary=True)
         _, interior_gradient = derivative(boundary=False)
+        outer_gradient = derivative(True, interior_edges=False)[1] if depth > 1 else None
         pairs: list[Tensor] = []
         reached = math.inf
         while len(pairs) < max_pairs and (len(pairs) < _LEAST_PAIRS or reached > noise):
@@ -236,6 +246,9 @@ def gradcheck(
     return GradientReport(
         full=_agreement(gradient, truth, far, farther),
         interior=_agreement(interior_gradient, truth, far, farther),
+        no_interior_edges=(
+            None if outer_gradient is None else _agreement(outer_gradient, truth, far, farther)
+        ),
         difference_noise=reached,
         step_agreement=float((same - half).abs().sum() / same.abs().sum()),
         pairs=len(pairs),

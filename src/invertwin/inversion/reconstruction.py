@@ -15,12 +15,14 @@ from torch import Tensor, nn
 from invertwin.capture.capture import Capture
 from invertwin.channel.bridge import use_backend
 from invertwin.channel.paths import Grid
+from invertwin.channel.tracer import RoughPoints, rough_points
 from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.regularization import Regularizer
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
+from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
 from invertwin.scene.scene import Scene
+from invertwin.simulation import simulate
 
 Status = Literal["converged", "budget", "diverged"]
 
@@ -109,13 +111,16 @@ def reconstruct(
     grid: Grid,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
     optimizer: Optimizer | None = None,
-    surrogate: Surrogate | None = None,
+    surrogate: Surrogate | str | None = "annealed",
     steps: int = 200,
     annealing: float = 0.7,
     seed: int = 0,
+    depth: int = 3,
     samples: int = 400_000,
     boundary_samples: int = 50_000,
     boundary: bool = True,
+    density: float = 20_000.0,
+    points: RoughPoints | None = None,
     frames_per_step: int | None = None,
     nuisances: Sequence[nn.Module] = (),
     regularizers: Sequence[Regularizer] = (),
@@ -141,13 +146,18 @@ def reconstruct(
         grid: Bins that are compared.
         loss: How maps are compared: (simulated, measured) → a number.
         optimizer: Kind and rates.
-        surrogate: Kernels, and the extra widths at the first step.
+        surrogate: Kernels, and the extra widths at the first step; or a name among
+            ``SURROGATES``. None, "exact" = the exact chain, whose loss has a minimum every half
+            wavelength and whose rough surfaces need ``boundary=False``: for comparison.
         steps: Budget.
         annealing: Share of the steps with extra widths.
         seed: Of all samples; the same seed gives the same fit.
+        depth: Most bounces of a path.
         samples: Interior samples a step, over the frames of the step.
         boundary_samples: Silhouette samples a step.
         boundary: Off for ablation.
+        density: Points per m² of rough surfaces (exact).
+        points: Rough points with their phases, which a twin does not know; None = drawn (exact).
         frames_per_step: Random subset of frames a step (None = all).
         nuisances: ``RangeBias``, ``ClockOffset``.
         regularizers: Added to the loss, functions of the scene.
@@ -163,8 +173,12 @@ def reconstruct(
     Differs from the source: Adam beside SGD; annealed widths.
 
     Raises:
-        InputError: Nothing to fit, a map of zeros, a checkpoint of another fit.
+        InputError: Nothing to fit, a map of zeros, a checkpoint of another fit; a range bias
+            with the exact chain.
     """
+    smooth = chosen_surrogate(surrogate)
+    if smooth is None and points is None:
+        points = rough_points(scene, density, seed)
     listed = [parameters] if isinstance(parameters, nn.Module) else list(parameters)
     fit = _Fit(
         scene=scene,
@@ -173,9 +187,11 @@ def reconstruct(
         measured=capture.spectrum(grid).to(torch.float32),
         grid=grid,
         loss=loss or SpectrumLoss(),
-        surrogate=surrogate or Surrogate(range_width=3.0, angle_width=1.5),
+        surrogate=smooth,
+        points=points,
         annealing=annealing,
         seed=seed,
+        depth=depth,
         samples=samples,
         boundary_samples=boundary_samples,
         boundary=boundary,
@@ -270,9 +286,11 @@ class _Fit:
     measured: Float[Tensor, "frame range u v"]
     grid: Grid
     loss: Callable[[Tensor, Tensor], Tensor]
-    surrogate: Surrogate
+    surrogate: Surrogate | None
+    points: RoughPoints | None
     annealing: float
     seed: int
+    depth: int
     samples: int
     boundary_samples: int
     boundary: bool
@@ -284,7 +302,7 @@ class _Fit:
         """What must be equal for a checkpoint to be of this fit."""
         shapes = [[n, list(p.shape)] for n, p in self.modules.named_parameters()]
         settings = [self.annealing, self.samples, self.boundary_samples, self.frames_per_step]
-        settings += [str(self.loss), str(self.surrogate)]
+        settings += [self.depth, str(self.loss), str(self.surrogate)]
         return [self.steps, self.seed, list(self.grid.shape), self.boundary, settings, shapes]
 
     def applied(self) -> tuple[Scene, Radar, Tensor | None]:
@@ -304,8 +322,10 @@ class _Fit:
         """A copy of the present parameters."""
         return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
 
-    def widths(self, step: int) -> Surrogate:
-        """The surrogate with the extra widths of a step."""
+    def widths(self, step: int) -> Surrogate | None:
+        """The surrogate with the extra widths of a step; None for the exact chain."""
+        if self.surrogate is None:
+            return None
         left = max(0.0, 1 - step / max(1.0, self.annealing * self.steps))
         return replace(
             self.surrogate,
@@ -315,7 +335,7 @@ class _Fit:
 
     def annealed(self, step: int) -> bool:
         """Whether the extra widths are zero from this step on."""
-        return step >= self.annealing * self.steps
+        return self.surrogate is None or step >= self.annealing * self.steps
 
     def evaluate(self, step: int) -> Tensor:
         """The loss of a step."""
@@ -325,21 +345,44 @@ class _Fit:
             rng = np.random.default_rng([self.seed, step])
             chosen = np.sort(rng.choice(radar.frame_count, self.frames_per_step, replace=False))
             radar, measured = radar.frames(chosen.tolist()), measured[torch.from_numpy(chosen)]
-        simulated = surrogate_spectrum(
-            scene,
-            radar,
-            self.grid,
-            kernels,
-            samples=self.samples,
-            boundary_samples=self.boundary_samples,
-            seed=self.seed * 1_000_003 + step,
-            boundary=self.boundary,
-            range_offset=offset,
-        )
-        value = self.loss(simulated, kernels.blur(measured, radar, self.grid))
+        if kernels is None:
+            value = self.loss(self._exact(scene, radar, offset), measured)
+        else:
+            simulated = surrogate_spectrum(
+                scene,
+                radar,
+                self.grid,
+                kernels,
+                samples=self.samples,
+                boundary_samples=self.boundary_samples,
+                seed=self.seed * 1_000_003 + step,
+                depth=self.depth,
+                boundary=self.boundary,
+                range_offset=offset,
+            )
+            value = self.loss(simulated, kernels.blur(measured, radar, self.grid))
         for term in self.regularizers:
             value = value + term(scene)
         return value
+
+    def _exact(self, scene: Scene, radar: Radar, offset: Tensor | None) -> Tensor:
+        """The exact chain's map; the same samples and phases every step."""
+        if offset is not None:
+            raise InputError(
+                "expected no range bias with the exact chain, got one; fit it with a surrogate"
+            )
+        found = simulate(
+            scene,
+            radar,
+            self.grid,
+            seed=self.seed,
+            depth=self.depth,
+            samples=self.samples,
+            boundary_samples=self.boundary_samples,
+            boundary=self.boundary,
+            points=self.points,
+        )
+        return found.spectrum.to(torch.float32)
 
 
 def _descend(

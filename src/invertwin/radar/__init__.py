@@ -31,10 +31,17 @@ from invertwin.radar.impairments import (
     residual_phase,
 )
 from invertwin.radar.motion import Chirps, moving_beat, range_rate
+from invertwin.radar.point_spread import airy, dirichlet, normalized_gaussian
 from invertwin.radar.radar import Radar
+from invertwin.radar.random_phase import random_phase_spectrum
 from invertwin.radar.range_profile import add_noise, beat_signal, range_profile
 from invertwin.radar.spectrum import beamform, exact_spectrum
-from invertwin.radar.surrogate import Surrogate, airy, normalized_gaussian, surrogate_spectrum
+from invertwin.radar.surrogate import (
+    SURROGATES,
+    Surrogate,
+    chosen_surrogate,
+    surrogate_spectrum,
+)
 from invertwin.radar.waveform import (
     FMCW,
     OFDM,
@@ -50,6 +57,7 @@ __all__ = [
     "BOARDS",
     "FMCW",
     "OFDM",
+    "SURROGATES",
     "Board",
     "Chirps",
     "Impairments",
@@ -73,7 +81,9 @@ __all__ = [
     "capon",
     "cell_averaging_cfar",
     "channel_errors",
+    "chosen_surrogate",
     "compensate_tdm",
+    "dirichlet",
     "exact_spectrum",
     "leakage_signal",
     "micro_doppler",
@@ -84,6 +94,7 @@ __all__ = [
     "ordered_statistics_cfar",
     "point_cloud",
     "quantize",
+    "random_phase_spectrum",
     "range_doppler",
     "range_doppler_angle",
     "range_profile",

@@ -1,4 +1,6 @@
-"""What a real front end adds to the beat signal; each impairment is off unless asked for.
+"""What a real front end adds to beat signals, of frames or of trains of chirps.
+
+Each impairment is off unless asked for.
 
 The order is that of the hardware: phase noise and leakage on the way to the mixer, gain and phase
 errors of the channels, thermal noise, then the converter.
@@ -15,6 +17,7 @@ from torch import Tensor
 
 from invertwin.channel.paths import Paths
 from invertwin.errors import InputError
+from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
@@ -179,32 +182,68 @@ class Impairments:
             )
 
     def record(
-        self, paths: Paths, radar: Radar, *, seed: int
-    ) -> Complex128[Tensor, "frame tx rx sample"]:
-        """The beat signal of the paths with these impairments.
+        self, paths: Paths, radar: Radar, *, seed: int, chirps: Chirps | None = None
+    ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
+        """The beat signal of the paths, or of a train of chirps, with these impairments.
 
         Each impairment draws from its own stream of the seed: adding one leaves the others'
-        numbers as they are.
+        numbers as they are. Channel errors and leakage stay from chirp to chirp, thermal noise
+        is new in every sample, and the oscillator runs on through a train (``residual_phase``).
 
         Args:
             paths: Field paths.
             radar: One with samples.
             seed: Of all that is drawn.
+            chirps: Timing of a train, as for ``moving_beat``; None = one ramp a frame.
 
         Raises:
             InputError: As the single functions.
         """
-        streams = [int(s) for s in np.random.SeedSequence(seed).generate_state(3, np.uint32)]
-        if self.phase_noise is None:
+        if self.phase_noise is not None:
+            stream = _streams(seed)[0]
+            beat = noisy_oscillator_beat(paths, radar, self.phase_noise, seed=stream, chirps=chirps)
+        elif chirps is None:
             beat = beat_signal(paths, radar)
         else:
-            beat = noisy_oscillator_beat(paths, radar, self.phase_noise, seed=streams[0])
+            beat = moving_beat(paths, radar, chirps)
+        return self._after_mixing(beat, radar, seed, chirps)
+
+    def apply(
+        self, beat: Complex128[Tensor, "frame *chirp tx rx sample"], radar: Radar, *, seed: int
+    ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
+        """The same for a beat signal, of frames or of trains; all but phase noise.
+
+        Args:
+            beat: Without impairments.
+            radar: What records it.
+            seed: Of all that is drawn.
+
+        Raises:
+            InputError: Phase noise, which each path has of its own; otherwise as ``record``.
+        """
+        self.check_applicable()
+        return self._after_mixing(beat, radar, seed, None)
+
+    def check_applicable(self) -> None:
+        """Raise where ``apply`` would: impairments that need the paths."""
+        if self.phase_noise is not None:
+            raise InputError(
+                "expected impairments of a finished beat signal, got phase noise, which depends on "
+                "the delay of each path; use record(paths, radar, chirps=...), without retracing"
+            )
+
+    def _after_mixing(
+        self, beat: Tensor, radar: Radar, seed: int, chirps: Chirps | None
+    ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
+        streams = _streams(seed)
         if self.leakage is not None:
             direct = leakage_signal(self.leakage, radar)
             if self.phase_noise is not None:
                 delay = self.leakage.delay
-                residual = residual_phase(self.phase_noise, radar, delay, seed=streams[0])
-                direct = direct * _turn(residual)[:, :, None]
+                residual = residual_phase(
+                    self.phase_noise, radar, delay, seed=streams[0], chirps=chirps
+                )
+                direct = direct * _turn(residual).unsqueeze(-2)
             beat = beat + direct.to(beat.device)
         if self.gain_std_db > 0 or self.phase_std > 0:
             factors = channel_errors(radar, self.gain_std_db, self.phase_std, seed=streams[1])
@@ -221,29 +260,39 @@ class Impairments:
         return beat if self.adc is None else quantize(beat, radar, self.adc)
 
 
+def _streams(seed: int) -> list[int]:
+    return [int(s) for s in np.random.SeedSequence(seed).generate_state(3, np.uint32)]
+
+
 def noisy_oscillator_beat(
-    paths: Paths, radar: Radar, noise: PhaseNoise, *, seed: int
-) -> Complex128[Tensor, "frame tx rx sample"]:
+    paths: Paths, radar: Radar, noise: PhaseNoise, *, seed: int, chirps: Chirps | None = None
+) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
     """Beat signal of an oscillator with phase noise φ, which transmits and mixes.
 
         s'[n] = Σ s_i[n] exp(j (φ(t_n) − φ(t_n − τ_i)))
 
     with s_i the beat signal of one path: noise that the echo and the mixer share cancels. The
-    factor is computed at delays so close that it is linear between them.
+    factor is computed at delays so close that it is linear between them; in a train of chirps
+    a path keeps the τ of the frame's start in this factor.
 
     Args:
         paths: Field paths.
         radar: An FMCW or stepped frequency radar.
         noise: Its level.
-        seed: Of the noise, independent for each frame and transmitter.
+        seed: Of the noise, see ``residual_phase``.
+        chirps: Timing of a train; None = one ramp a frame.
 
     Raises:
         InputError: As ``beat_signal`` and ``residual_phase``.
     """
     waveform = _sampled_in_time(radar)
     check_paths(paths, radar, waveform)
+
+    def clean(part: Paths) -> Tensor:
+        return beat_signal(part, radar) if chirps is None else moving_beat(part, radar, chirps)
+
     if len(paths) == 0:
-        return beat_signal(paths, radar)
+        return clean(paths)
     first, last = (float(end) for end in paths.delay.detach().aminmax())
     highest = 0.5 / float(waveform.sample_times[1])
     intervals = math.ceil((last - first) * 2 * math.pi * highest / _DELAY_STEP)
@@ -256,44 +305,67 @@ def noisy_oscillator_beat(
         with warnings.catch_warnings():
             # All paths have been judged together.
             warnings.simplefilter("ignore", PhysicsWarning)
-            beat = beat_signal(part, radar)
-        residual = residual_phase(noise, radar, first + node * spacing, seed=seed)
-        beat = beat * _turn(residual)[:, :, None].to(beat.device)
+            beat = clean(part)
+        residual = residual_phase(noise, radar, first + node * spacing, seed=seed, chirps=chirps)
+        beat = beat * _turn(residual).unsqueeze(-2).to(beat.device)
         total = beat if total is None else total + beat
     assert total is not None
     return total
 
 
 def residual_phase(
-    noise: PhaseNoise, radar: Radar, delay: float, *, seed: int
-) -> Float64[Tensor, "frame tx sample"]:
+    noise: PhaseNoise, radar: Radar, delay: float, *, seed: int, chirps: Chirps | None = None
+) -> Float64[Tensor, "frame *chirp tx sample"]:
     """Phase noise left after mixing with an echo, φ(t_n) − φ(t_n − τ) [rad].
 
     Its one-sided density is ``S_φ(f) · 4 sin²(πfτ)``. Offsets reach up to half the sampling
-    rate, where the IF filter ends; below a quarter of 1 / sweep, where little is left, there is
-    none. The same seed gives the same φ at every delay.
+    rate, where the IF filter ends. The same seed gives the same φ at every delay.
+
+    Sweeps one by one have φ of their own, in every frame and transmitter, without what is slower
+    than four sweeps. In a train of chirps one oscillator runs through the frame, pauses
+    included: transmitters in turn read φ at their own times, those at once the same φ, and
+    what is slow is correlated from chirp to chirp, down to a quarter of 1 / frame. Ramps start
+    on multiples of the sampling interval, to which φ is rounded.
 
     Args:
         noise: Level of φ.
         radar: An FMCW or stepped frequency radar.
         delay: τ of the echo [s].
-        seed: Independent φ for each frame and transmitter, whose sweeps follow one another.
+        seed: Of φ, independent for each frame.
+        chirps: Timing of a train; None = one ramp a frame.
 
     Raises:
         InputError: A waveform whose samples are not taken in time.
     """
     waveform = _sampled_in_time(radar)
-    length = _FINER * waveform.samples
+    transmitters, samples = len(radar.transmitters.positions), waveform.samples
+    if chirps is None:
+        runs = (radar.frame_count, transmitters)
+        return _oscillator(noise, waveform, delay, seed, runs, samples)[..., :samples]
+    starts = (chirps.times(transmitters) / float(waveform.sample_times[1])).round().long()
+    length = int(starts.max()) + samples
+    phase = _oscillator(noise, waveform, delay, seed, (radar.frame_count,), length)
+    return phase[:, starts[..., None] + torch.arange(samples)]
+
+
+def _oscillator(
+    noise: PhaseNoise,
+    waveform: FMCW | SteppedFrequency,
+    delay: float,
+    seed: int,
+    runs: tuple[int, ...],
+    samples: int,
+) -> Float64[Tensor, "*run sample"]:
+    """φ(t) − φ(t − τ) at the sampling rate, of independent runs at least so many samples long."""
+    length = _FINER * samples
     spacing = 1 / (length * float(waveform.sample_times[1]))
     offsets = spacing * torch.arange(1, length // 2, dtype=torch.float64)
-    shape = (radar.frame_count, len(radar.transmitters.positions), len(offsets))
     generator = torch.Generator().manual_seed(seed)
-    lines = torch.randn(shape, dtype=torch.complex128, generator=generator)
+    lines = torch.randn((*runs, len(offsets)), dtype=torch.complex128, generator=generator)
     lines = lines * (2 * spacing * noise.density(offsets)).sqrt()
     lines = lines * (1 - _turn(-2 * math.pi * delay * offsets))
     # Re Σ lines exp(2πj f t): a real inverse FFT, but for its factor 2 / length and f = 0.
-    phase = torch.fft.irfft(torch.nn.functional.pad(lines, (1, 1)) * (0.5 * length), length)
-    return phase[..., : waveform.samples]
+    return torch.fft.irfft(torch.nn.functional.pad(lines, (1, 1)) * (0.5 * length), length)
 
 
 def leakage_signal(leakage: Leakage, radar: Radar) -> Complex128[Tensor, " sample"]:

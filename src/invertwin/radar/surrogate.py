@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from types import MappingProxyType
 
 import torch
 from jaxtyping import Float, Float64
@@ -11,10 +11,18 @@ from torch import Tensor
 
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
+from invertwin.channel.tracer import trace_power
 from invertwin.errors import InputError
+from invertwin.radar.point_spread import (
+    airy,
+    airy_radii,
+    array_point_spread,
+    range_point_spread,
+)
 from invertwin.radar.radar import Radar
+from invertwin.radar.random_phase import random_phase_spectrum
 from invertwin.radar.spectrum import Aperture, aperture
-from invertwin.radar.waveform import Waveform, gaussian_response
+from invertwin.radar.waveform import Waveform
 from invertwin.scene.scene import Scene
 
 # Kernels are tabulated at least this far out, so that short grids do not truncate them.
@@ -32,19 +40,25 @@ class Surrogate:
 
     Source: §3.4 of the paper; derivations §5.
     Differs from the source: power is spread, not a field with random phases, whose boundary
-    gradient has mean zero; the Airy argument is k r |Δ(u, v)|, which is shift invariant, not
-    k r sin ψ; the Gaussian has peak 1 (``normalized_gaussian`` is the printed one).
+    gradient has mean zero (``phases="random"`` is that field); the Airy argument is k r |Δ(u, v)|,
+    which is shift invariant, not k r sin ψ; the Gaussian has peak 1, which inside of a grid is
+    ``normalized_gaussian`` times a constant.
 
     Attributes:
-        range_kernel: "response", or "gaussian" with a full width at half maximum of one range
-            cell c/2B. For an ``Impulse`` radar both are the Gaussian.
+        range_kernel: "response"; "gaussian" with a full width at half maximum of one range cell
+            c/2B; or "dirichlet", the response without a window. For an ``Impulse`` radar the
+            first two are one.
         angle_kernel: "response", or "airy" (an evenly lit ellipse that fills the aperture).
         range_width: Standard deviation of the extra Gaussian [range cells].
         angle_width: The same in u and v [beamwidths λ/D].
         aperture_radius: Radius for "airy" [m]; None = half the virtual aperture along x and y.
+        phases: "mean" over random phases, or "random": one draw of them, new with every seed,
+            as ``random_phase_spectrum`` does with the kernels "gaussian" and "airy". Its gradient
+            knows nothing of silhouettes on average: for comparison only.
 
     Raises:
-        InputError: An unknown kernel, a negative width or radius.
+        InputError: An unknown kernel, a negative width or radius, random phases with other
+            kernels than the paper's or an extra angular width.
     """
 
     range_kernel: str = "response"
@@ -52,9 +66,14 @@ class Surrogate:
     range_width: float = 0.0
     angle_width: float = 0.0
     aperture_radius: float | None = None
+    phases: str = "mean"
 
     def __post_init__(self) -> None:
-        choices = {"range_kernel": ("response", "gaussian"), "angle_kernel": ("response", "airy")}
+        choices = {
+            "range_kernel": ("response", "gaussian", "dirichlet"),
+            "angle_kernel": ("response", "airy"),
+            "phases": ("mean", "random"),
+        }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 raise InputError(
@@ -67,6 +86,13 @@ class Surrogate:
                 "expected widths >= 0 and a positive aperture_radius, got "
                 f"{self.range_width}, {self.angle_width} and {self.aperture_radius}; "
                 "widths are in range cells and beamwidths, the radius in metres"
+            )
+        kernels = (self.range_kernel, self.angle_kernel)
+        if self.phases == "random" and (kernels != ("gaussian", "airy") or self.angle_width > 0):
+            raise InputError(
+                "expected range_kernel 'gaussian', angle_kernel 'airy' and angle_width 0 with "
+                f"random phases, got {kernels[0]!r}, {kernels[1]!r} and {self.angle_width}; "
+                "phases='mean' takes all kernels"
             )
 
     def shape(
@@ -89,9 +115,15 @@ class Surrogate:
             range_offset: Moves everything to larger ranges [m]; differentiable.
 
         Raises:
-            InputError: The map does not have the grid's shape.
+            InputError: The map does not have the grid's shape; random phases, which belong to
+                paths.
         """
         _check_map(deposit, grid)
+        if self.phases == "random":
+            raise InputError(
+                "expected phases='mean' to shape deposited power, got 'random'; a field has phases "
+                "path by path: use surrogate_spectrum"
+            )
         for kernel in self._kernels(radar, grid):
             offset = None
             if kernel.dims == (1,) and range_offset is not None:
@@ -119,17 +151,12 @@ class Surrogate:
         return _kernels(
             self.range_kernel,
             self.angle_kernel,
-            self._radii(radar),
+            airy_radii(radar, self.aperture_radius),
             radar.waveform,
             radar.window,
             aperture(radar) if resolved else None,
             grid,
         )
-
-    def _radii(self, radar: Radar) -> tuple[float, float]:
-        if self.aperture_radius is not None:
-            return self.aperture_radius, self.aperture_radius
-        return 0.5 * radar.aperture[0], 0.5 * radar.aperture[1]
 
     def _extra(self, dims: tuple[int, ...], radar: Radar, grid: Grid) -> list[float]:
         """Standard deviations of the extra Gaussian along map dimensions, in bins."""
@@ -142,6 +169,35 @@ class Surrogate:
         return [sigmas[dim] for dim in dims]
 
 
+SURROGATES = MappingProxyType(
+    {
+        "exact": None,
+        "response": Surrogate(),
+        "annealed": Surrogate(range_width=3.0, angle_width=1.5),
+        "gaussian": Surrogate(range_kernel="gaussian", angle_kernel="airy"),
+        "dirichlet": Surrogate(range_kernel="dirichlet"),
+        "random_phase": Surrogate("gaussian", "airy", phases="random"),
+    }
+)
+"""What a ``surrogate`` argument may name; "exact" is the exact chain, as None is."""
+
+
+def chosen_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
+    """The surrogate meant by a ``surrogate`` argument; None = the exact chain.
+
+    Raises:
+        InputError: A name that is not in ``SURROGATES``.
+    """
+    if not isinstance(surrogate, str):
+        return surrogate
+    if surrogate not in SURROGATES:
+        raise InputError(
+            f"expected a Surrogate or one of {', '.join(SURROGATES)}, got {surrogate!r}; "
+            'surrogate="exact" is the exact chain'
+        )
+    return SURROGATES[surrogate]
+
+
 def surrogate_spectrum(
     scene: Scene,
     radar: Radar,
@@ -151,10 +207,14 @@ def surrogate_spectrum(
     samples: int,
     boundary_samples: int,
     seed: int,
+    depth: int = 3,
     boundary: bool = True,
+    interior_edges: bool = True,
     range_offset: Float[Tensor, ""] | None = None,
 ) -> Float[Tensor, "frame range u v"]:
-    """Expected power spectrum of a scene, differentiable in it: deposit, then shape.
+    """Power spectrum of a scene, differentiable in it: deposit, then shape.
+
+    With ``phases="random"`` paths of one bounce are listed one by one, each with its random phase.
 
     Args:
         scene: What is seen.
@@ -164,9 +224,37 @@ def surrogate_spectrum(
         samples: Interior samples over all frames.
         boundary_samples: Silhouette samples over all frames.
         seed: Same seed, same spectrum.
+        depth: Most bounces of a path.
         boundary: Off leaves the visibility terms out of the gradient, for ablation.
+        interior_edges: Off leaves out those between two surfaces, for ablation.
         range_offset: Moves everything to larger ranges [m]; differentiable.
+
+    Raises:
+        InputError: See ``deposit_power``; random phases on paths of several bounces.
     """
+    if surrogate.phases == "random":
+        if depth != 1:
+            raise InputError(
+                f"expected depth 1 with random phases, got {depth}; give depth=1, or a surrogate "
+                "with phases='mean'"
+            )
+        paths = trace_power(
+            scene,
+            radar.link(),
+            samples=samples,
+            boundary_samples=boundary_samples,
+            seed=seed,
+            boundary=boundary,
+        )
+        return random_phase_spectrum(
+            paths,
+            radar,
+            grid,
+            seed=seed,
+            range_width=surrogate.range_width,
+            aperture_radius=surrogate.aperture_radius,
+            range_offset=range_offset,
+        )
     deposit = deposit_power(
         scene,
         radar.link(),
@@ -174,94 +262,11 @@ def surrogate_spectrum(
         samples=samples,
         boundary_samples=boundary_samples,
         seed=seed,
+        depth=depth,
         boundary=boundary,
+        interior_edges=interior_edges,
     )
     return surrogate.shape(deposit, radar, grid, range_offset)
-
-
-def range_point_spread(
-    waveform: Waveform,
-    distance: Float64[Tensor, " point"],
-    window: str = "hamming",
-    kernel: str = "response",
-) -> Float64[Tensor, " point"]:
-    """Power of a point target at a distance from its range, peak 1.
-
-    Args:
-        waveform: Of the radar.
-        distance: [m].
-        window: Taper of the samples.
-        kernel: As ``Surrogate.range_kernel``.
-    """
-    if kernel == "response":
-        return waveform.range_response(distance, window)
-    return gaussian_response(waveform, distance)
-
-
-def array_point_spread(
-    array: Aperture, du: Float64[Tensor, " u"], dv: Float64[Tensor, " v"]
-) -> Float64[Tensor, "u v"]:
-    """Power of a point target at offsets in u and v from its direction, peak 1."""
-    weight = array.counts * array.x_taper[:, None] * array.y_taper[None]
-    weight = (weight / weight.sum()).to(torch.complex128)
-    response = array.steering(du, array.x) @ weight @ array.steering(dv, array.y).T
-    return response.abs().square()
-
-
-def airy(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
-    """Power pattern of an evenly lit disc, (2 J1(z)/z)² with z = k r |Δ(u, v)|; differentiable.
-
-    Source: the spatial spectrum surrogate of the paper (§3.4.2); derivations §5.
-    """
-    near = z.abs() < 1e-3
-    away = torch.where(near, torch.ones_like(z), z)
-    lobe = (2 * bessel_j1(away) / away).square()
-    return torch.where(near, 1 - z.square() / 4 + 5 * z**4 / 192, lobe)
-
-
-def bessel_j1(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
-    """Bessel function of the first kind and order one, with the gradient J0 − J1/z.
-
-    ``torch.special.bessel_j1`` has none and says nothing.
-    """
-    return _BesselJ1.apply(z)  # type: ignore[no-any-return]
-
-
-def normalized_gaussian(
-    ranges: Float[Tensor, " path"], bins: Float[Tensor, " bin"], sigma: float
-) -> Float[Tensor, "path bin"]:
-    """The paper's range kernel: a Gaussian around each path, normalised over the bins.
-
-        G_f(R) = exp(−(R − D_f)²/2σ²) / Σ_j exp(−(R − D_j)²/2σ²)
-
-    Its derivative, which automatic differentiation gives, is
-    ``∂G_f/∂R = G_f [(D_f − R)/σ² − Σ_j G_j (D_j − R)/σ²]``.
-
-    Source: §3.4.1 of the paper; derivations §5.
-    Differs from the source: the printed derivative ``G (D − τ)/σ² (1 − G)`` belongs to another
-    normalisation (4–28 % off here), and the delay there stands for the range R.
-
-    Args:
-        ranges: R of each path [m].
-        bins: D_f, centres of the bins [m].
-        sigma: σ [m].
-    """
-    return torch.softmax(-0.5 * ((ranges[:, None] - bins[None]) / sigma).square(), dim=1)
-
-
-class _BesselJ1(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, z: Tensor) -> Tensor:
-        value = torch.special.bessel_j1(z)
-        ctx.save_for_backward(z, value)
-        return value
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        z, value = ctx.saved_tensors
-        ratio = torch.where(z == 0, 0.5 * torch.ones_like(z), value / z)
-        return grads[0] * (torch.special.bessel_j0(z) - ratio)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from invertwin.errors import InputError
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
-_SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
+SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
 
 
 class PhysicsWarning(UserWarning):
@@ -370,7 +370,7 @@ def gaussian_response(
     waveform: Waveform, distance: Float64[Tensor, " point"]
 ) -> Float64[Tensor, " point"]:
     """Gaussian of one range cell full width at half maximum, peak 1."""
-    sigma = _SIGMA_PER_FWHM * waveform.range_resolution
+    sigma = SIGMA_PER_FWHM * waveform.range_resolution
     return torch.exp(-0.5 * (distance / sigma).square())
 
 

@@ -14,6 +14,7 @@ from invertwin.scene import (
     PerfectConductor,
     RoughConductor,
     RoughDielectric,
+    Slab,
     Surface,
     complex_permittivity,
     fresnel_reflectance,
@@ -23,6 +24,7 @@ from invertwin.scene.material.roughness import EffectiveRoughness
 
 FREQUENCY = 77e9
 ANGLES = torch.linspace(0, 1, 13, dtype=torch.float64)
+NODES = torch.linspace(0, 1, 256, dtype=torch.float64)[::5]
 
 
 def cosines(*values: float) -> Tensor:
@@ -162,6 +164,17 @@ def test_the_sum_over_the_hemisphere_is_the_albedo(cos_in):
     values = reflectance_distribution(surface, incoming.expand_as(outgoing), outgoing)
     total = 2 * math.pi * (values * z).mean()
     assert float(total) == pytest.approx(float(albedo(surface, cosines(cos_in))), rel=1e-4)
+
+
+def test_a_sheet_returns_and_lets_through_about_what_came_in():
+    # √(R R) is right on average over angles only; this is the worst of some hundred sheets.
+    resonant = Slab(7.3948, thickness=6.366326e-3, scattering=1.0).surface(FREQUENCY)
+    board = Slab.itu("plasterboard", thickness=12.5e-3, scattering=1.0).surface(FREQUENCY)
+    everywhere = albedo(resonant, NODES) + resonant.transmittance[::5]
+    assert 1.05 < float(everywhere.max()) < 1.12
+    assert float((albedo(board, NODES) + board.transmittance[::5]).max()) < 1
+    mirror = Slab(7.3948, thickness=6.366326e-3, rms_slope=0.01).surface(FREQUENCY)
+    assert float((albedo(mirror, NODES) + mirror.transmittance[::5]).max()) < 1.01
 
 
 def test_shares_of_the_power():

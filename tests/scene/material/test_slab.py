@@ -269,3 +269,19 @@ def test_gradients_are_finite_at_the_ends(permittivity, conductivity, thickness)
 def test_bad_slabs_are_refused(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("slab", "least", "most"),
+    [
+        (Slab.itu("plasterboard", thickness=12.5e-3), 1e-5, 1e-4),
+        # Fringes finer than the table: docs/limitations.md says how far off it is.
+        (Slab(1.05, loss_tangent=1e-4, thickness=0.1), 0.03, 0.08),
+    ],
+)
+def test_tables_between_their_nodes(slab, least, most):
+    cosine = np.linspace(0, 1, 5000)
+    exact = slab_tables([slab.sheet(FREQUENCY)], torch.from_numpy(cosine), FREQUENCY)
+    table = np.interp(cosine, NODES, slab.surface(FREQUENCY).amplitude.numpy())
+    error = np.abs(table - exact.reflectance.sqrt().numpy()).max()
+    assert least < error < most

@@ -217,7 +217,8 @@ def _whole_frames(size: int, settings: ChirpSettings, name: str) -> int:
     if rest:
         warnings.warn(
             f"{name} ends within a frame: {frames} whole frames are read, 1 incomplete frame "
-            f"({rest} of {frame} bytes) is dropped",
+            f"({rest} of {frame} bytes) is dropped; unless it was stopped there, the settings are "
+            "those of another recording",
             PhysicsWarning,
             stacklevel=4,
         )

@@ -131,6 +131,7 @@ def _reconstruct(
         "seed": problem.run.seed,
         "samples": settings.samples,
         "boundary_samples": settings.boundary_samples,
+        "depth": settings.depth,
         "boundary": settings.boundary,
         "frames_per_step": settings.frames_per_step,
         "tolerance": settings.tolerance,

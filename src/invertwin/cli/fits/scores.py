@@ -10,8 +10,9 @@ import torch
 from invertwin.capture import calibrate, locate
 from invertwin.cli import build
 from invertwin.cli.fits.problem import INTERIOR, Problem
+from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import need
-from invertwin.cli.schema import RunFile
+from invertwin.cli.schema import MaterialParameter, Parameter, RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import surrogate_spectrum
@@ -42,7 +43,18 @@ def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
         rows["success"] &= angle <= settings.rotation_limit_deg
     if "scale" in kinds:
         rows |= {"scale_error": abs(after.scale - 1)}
-    return rows
+    sought = [p for p in problem.run.parameters if _made_known(problem, p)]
+    frequency = problem.radar.waveform.center_frequency
+    return rows | value_errors(sought, twin, problem.truth, frequency)
+
+
+def _made_known(problem: Problem, parameter: Parameter) -> bool:
+    """Whether the run file tells what the sought object is really made of."""
+    if not isinstance(parameter, MaterialParameter):
+        return False
+    table = problem.run.truth.get(parameter.object)
+    stated = table is not None and table.material is not None
+    return stated or isinstance(problem.run.data, SimulatedData)
 
 
 def summary(
@@ -100,6 +112,7 @@ def sharp_spectrum(
             samples=4 * settings.samples,
             boundary_samples=0,
             seed=problem.run.seed,
+            depth=settings.depth,
             range_offset=offset,
         )
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 import torch
 
@@ -11,7 +11,7 @@ from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, annealed_until, 
 from invertwin.cli.report import Again, Picture, Table, report_html, shown
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema import MaterialValue, RunFile, SimulatedData
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
@@ -29,6 +29,7 @@ COLUMNS = {
     "position_error_m": "off at the end [m]",
     "rotation_error_deg": "off at the end [°]",
     "scale_error": "size off by",
+    **{f"{name}_error": f"{name} off by" for name in get_args(MaterialValue)},
     "success": "within the limits",
     "loss": "loss",
     "status": "ended as",
@@ -41,6 +42,7 @@ _LABELS = {
     "position_error_m": "distance to the truth, twin [m]",
     "rotation_error_deg": "angle to the truth, twin [°]",
     "scale_error": "size, share off the truth",
+    **{f"{name}_error": f"{name}, share off the truth" for name in get_args(MaterialValue)},
     "start_loss_sharp": "loss without extra width, start",
     "loss_sharp": "loss without extra width, twin",
     "loss": "loss at the last step",

@@ -8,6 +8,7 @@ from invertwin.cli.schema.recording import ArraysData, Dca1000Data
 from invertwin.cli.schema.section import (
     TAG_MARK,
     Count,
+    Depth,
     InputPath,
     Interval,
     NonNegative,
@@ -30,6 +31,8 @@ class SimulatedData(Section):
     """rough points per m²"""
     samples: Count = 200_000
     """coherent paths"""
+    depth: Depth = 1
+    """most bounces of a path"""
     snr_db: float | None = None
     """signal to noise per sample; without it no noise"""
     noise_figure_db: float | None = None
@@ -229,6 +232,8 @@ class Optimizer(Section):
 class Reconstruct(Section):
     steps: Count
     """budget"""
+    depth: Depth = 3
+    """most bounces of a path"""
     samples: Count = 400_000
     """rays a step"""
     boundary_samples: Count = 50_000
@@ -324,6 +329,8 @@ class Gradcheck(Section):
     """‖standard error‖₁/‖g_FD‖₁ at which repeating stops"""
     max_pairs: Count = 64
     """of differences, at most"""
+    depth: Depth = 3
+    """most bounces of a path"""
     samples: Count = 4_000_000
     """rays of one derivative"""
     boundary_samples: Count = 1_000_000

@@ -312,7 +312,7 @@ class SceneFile(Section):
 
 
 class Truth(Section):
-    """Where an object really is: replaces the placement of its scene table, key by key."""
+    """Where an object really is, and of what: replaces values of its scene table, key by key."""
 
     position: Vector | None = None
     """m"""
@@ -320,3 +320,5 @@ class Truth(Section):
     """rotation vector"""
     scale: Positive | None = None
     """factor"""
+    material: Material | None = None
+    """what it is really made of"""

@@ -34,6 +34,8 @@ class Raw(Section):
     """of the ADC"""
     full_scale: Positive | None = None
     """√(received over sent power) of the largest count; without it 1.25 times the largest sample"""
+    adc_start_time: NonNegative = 0.0
+    """s, from the start of the ramp to the first sample; the waveform is what is sampled"""
     frame_period: Positive | None = None
     """s, from frame to frame, as the settings say it"""
 

@@ -10,6 +10,7 @@ from pydantic_core import PydanticCustomError
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
+Depth = Annotated[int, Field(ge=1, le=16)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 

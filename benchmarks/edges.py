@@ -1,0 +1,228 @@
+"""What weighting the edges is worth where surfaces hide each other, at equal time.
+
+    python benchmarks/edges.py [-o DIR]
+
+A body before a wall and above a floor, seen by separate antennas at depth 2. The derivative of the
+received power by a shift of the body, as far as it is due to the shadows that surfaces cast on each
+other (family 2), is estimated with the weighted edge sampling and with uniform edge sampling (edges
+by length alone, directions from the whole sphere), with the same numbers of samples and seeds, in
+turns. Prints a table and writes `metrics.json` into DIR (default `out/edges`): for a plate, whose
+four edges are open, and for a ball, a closed mesh whose edges are nearly flat,
+`edge_sampling.<body>.variance_ratio` is variance × time of uniform sampling over that of the
+weighted one (> 1: the weighted one is better); `edge_sampling.variance_ratio` is the lesser.
+"""
+
+import argparse
+import json
+import math
+import os
+import statistics
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from invertwin.channel import boundary_walk
+from invertwin.channel.bridge import backend, flatten, one_torch_thread, opaque, tracer
+from invertwin.channel.edges import InteriorEdgeSampler
+from invertwin.channel.kernel import Inputs
+from invertwin.channel.paths import Grid
+from invertwin.channel.rays import Shot
+from invertwin.channel.walk import Walk
+from invertwin.radar import FMCW, Radar
+from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene
+from invertwin.scene.antenna import linear_array
+from invertwin.scene.shapes import plate, sphere
+
+SAMPLES, SEEDS = 100_000, 40
+WARM_UP = 3
+DEPTH = 2
+REQUIRED = 1.0
+WAYS = {"weighted": True, "uniform": False}
+WAVEFORM = FMCW(start_frequency=76e9, bandwidth=2e9, duration=50e-6, samples=512)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A scene, the antennas that look at it, the bins, and the object that moves."""
+
+    scene: Scene
+    radar: Radar
+    grid: Grid
+    moving: str
+
+    @staticmethod
+    def build(body: Mesh) -> "Task":
+        """A body before a wall and above a floor; it hides parts of both from each other."""
+        rough = RoughDielectric(permittivity=4.0)
+        objects = {
+            "wall": Object(plate(4.0, 3.0, divisions=4), rough, placed(0.0, 0.5, 4.0)),
+            "floor": Object(plate(4.0, 4.0, divisions=4), rough, lying(0.0, -1.0, 2.5)),
+            "body": Object(body, rough, placed(0.2, -0.4, 3.2)),
+        }
+        receivers = linear_array(16, WAVEFORM.wavelength / 2)
+        offset = torch.tensor([1.5, 0.4, 0.0], dtype=torch.float64)
+        radar = Radar(
+            single(-0.8, 0.6),
+            replace(receivers, positions=receivers.positions + offset),
+            WAVEFORM,
+            torch.zeros(1, 3, dtype=torch.float64),
+        )
+        return Task(Scene(objects), radar, radar.grid(1.0, 12.0, u_max=1.0), "body")
+
+    def moved(self, number: int) -> tuple[Scene, Tensor]:
+        """The scene with the moving object's vertices elsewhere, and these (a leaf)."""
+        mesh = self.scene[self.moving].mesh
+        vertices = (mesh.vertices * (1 + 1e-4 * number)).requires_grad_(True)
+        return self.scene.replace(self.moving, mesh=Mesh(vertices, mesh.faces)), vertices
+
+
+def bodies() -> dict[str, Mesh]:
+    """What is moved."""
+    return {"plate": plate(0.8, 0.6), "ball": sphere(0.3, subdivisions=3)}
+
+
+def placed(x: float, y: float, z: float) -> Tensor:
+    """A pose without rotation."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([x, y, z])
+    return pose
+
+
+def lying(x: float, y: float, z: float) -> Tensor:
+    """A pose that turns a plate's face upwards."""
+    pose = placed(x, y, z)
+    pose[:3, :3] = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return pose
+
+
+def single(x: float, y: float = 0.0) -> AntennaArray:
+    """One isotropic antenna."""
+    return AntennaArray(torch.tensor([[x, y, 0.0]], dtype=torch.float64), Isotropic())
+
+
+class Estimator:
+    """Draws estimates of the derivative by a rigid shift of the body."""
+
+    def __init__(self, task: Task) -> None:
+        link = task.radar.link()
+        geometry = flatten(task.scene, link.wavelength)
+        names = task.scene.names
+        owner = torch.zeros(len(geometry.vertices), dtype=torch.bool)
+        owner[geometry.topology.object_vertices[list(names).index(task.moving)]] = True
+        self.moving = owner
+        self.shot = Shot(geometry, link)
+        self.inputs = Inputs.of(geometry, link, self.shot, monostatic=False)
+
+    def __call__(
+        self, samples: int, seed: int, *, weighted: bool
+    ) -> tuple[Float64[np.ndarray, " 3"], float]:
+        """The derivative [1/m] of the power over all bins, and the seconds that it took."""
+        import drjit as dr
+
+        mi = tracer()
+        start = perf_counter()
+        sampler = InteriorEdgeSampler(self.shot, samples, seed, weighted=weighted)
+        found = sampler.draw(dr.arange(mi.UInt32, sampler.size) + opaque(0))
+        vertices = mi.Float(self.inputs.vertices)
+        dr.enable_grad(vertices)
+        attached = replace(self.inputs, vertices=vertices)
+        walk = Walk(self.shot, self.inputs, seed)
+        chains = boundary_walk._interior_segment(self.shot, attached, walk, found, DEPTH)
+        total = chains.weighted(lambda path, exists: dr.select(exists, 1.0, 0.0))
+        dr.backward_from(chains.speed * total)
+        gradient = np.array(dr.grad(vertices)).reshape(-1, 3)
+        seconds = perf_counter() - start
+        return gradient[self.moving.numpy()].sum(axis=0, dtype=np.float64), seconds
+
+
+def compare(body: Mesh, samples: int, seeds: int) -> dict[str, Any]:
+    """Variance and time of both ways of sampling edges."""
+    estimate = Estimator(Task.build(body))
+    values: dict[str, list[np.ndarray]] = {name: [] for name in WAYS}
+    times: dict[str, list[float]] = {name: [] for name in WAYS}
+    with one_torch_thread():
+        for seed in range(WARM_UP + seeds):
+            for name, weighted in WAYS.items():
+                value, seconds = estimate(samples, seed, weighted=weighted)
+                values[name].append(value)
+                times[name].append(seconds)
+    found: dict[str, Any] = {}
+    for name in WAYS:
+        kept = np.stack(values[name][WARM_UP:])
+        mean, variance = kept.mean(axis=0), float(kept.var(axis=0, ddof=1).sum())
+        found[name] = {
+            "mean": mean.tolist(),
+            "variance": variance,
+            "relative_error": math.sqrt(variance / (mean**2).sum()),
+            "seconds": statistics.median(times[name][WARM_UP:]),
+        }
+    pairs = zip(*(times[name][WARM_UP:] for name in ("uniform", "weighted")), strict=True)
+    time_ratio = statistics.median(uniform / weighted for uniform, weighted in pairs)
+    variances = found["uniform"]["variance"] / found["weighted"]["variance"]
+    return found | {
+        "equal_samples_variance_ratio": variances,
+        "time_ratio": time_ratio,
+        "variance_ratio": variances * time_ratio,
+    }
+
+
+def measure(samples: int = SAMPLES, seeds: int = SEEDS) -> dict[str, Any]:
+    """All metrics; the sizes are smaller in tests only."""
+    load = os.getloadavg()[0]
+    found: dict[str, Any] = {name: compare(body, samples, seeds) for name, body in bodies().items()}
+    found["variance_ratio"] = min(found[name]["variance_ratio"] for name in bodies())
+    return {
+        "samples": samples,
+        "seeds": seeds,
+        "backend": backend(),
+        "load_average": load,
+        "edge_sampling": found,
+    }
+
+
+def table(metrics: dict[str, Any]) -> Table:
+    """What was counted, and what must hold."""
+    found = metrics["edge_sampling"]
+    grid = Table(
+        title=f"Interior edges: {metrics['samples']} samples, {metrics['seeds']} seeds, backend "
+        f"{metrics['backend']}, load average {metrics['load_average']:.1f} at the start",
+        title_justify="left",
+    )
+    columns = ("body", "edges", "relative error of one estimate", "variance [1/m²]", "seconds")
+    for name in columns:
+        grid.add_column(name, no_wrap=True)
+    for body in bodies():
+        for name in WAYS:
+            row = found[body][name]
+            error, variance, seconds = row["relative_error"], row["variance"], row["seconds"]
+            grid.add_row(body, name, f"{error:.2f}", f"{variance:.3g}", f"{seconds:.4f}")
+    verdict = "yes" if found["variance_ratio"] >= REQUIRED else "NO"
+    ratios = ", ".join(f"{body} {found[body]['variance_ratio']:.2f}" for body in bodies())
+    grid.caption = f"variance × time, uniform over weighted: {ratios} (>= {REQUIRED:g} {verdict})"
+    return grid
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/edges"))
+    arguments = parser.parse_args()
+    metrics = measure()
+    Console(width=None if sys.stdout.isatty() else 120).print(table(metrics))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "metrics.json"
+    path.write_text(json.dumps(metrics, indent=2) + "\n")
+    print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    main()

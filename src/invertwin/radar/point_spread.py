@@ -1,0 +1,132 @@
+"""Point spreads: how the power of one path lies over range and direction, peak 1."""
+
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
+from invertwin.radar.spectrum import Aperture
+from invertwin.radar.waveform import SampledWaveform, Waveform, gaussian_response
+
+
+def range_point_spread(
+    waveform: Waveform,
+    distance: Float64[Tensor, " point"],
+    window: str = "hamming",
+    kernel: str = "response",
+) -> Float64[Tensor, " point"]:
+    """Power of a point target at a distance from its range, peak 1.
+
+    Args:
+        waveform: Of the radar.
+        distance: [m].
+        window: Taper of the samples.
+        kernel: As ``Surrogate.range_kernel``.
+    """
+    if kernel == "gaussian":
+        return gaussian_response(waveform, distance)
+    if kernel == "dirichlet":
+        return dirichlet(waveform, distance)
+    return waveform.range_response(distance, window)
+
+
+def dirichlet(waveform: Waveform, distance: Float64[Tensor, " point"]) -> Float64[Tensor, " point"]:
+    """Range response without a window, |sin(Nx) / (N sin x)|² with x = π d / R_max; peak 1.
+
+    It repeats after the unambiguous range, as the spectrum of samples does.
+
+    Raises:
+        InputError: A waveform without samples.
+    """
+    if not isinstance(waveform, SampledWaveform):
+        raise InputError(
+            f"expected a sampled waveform for the Dirichlet kernel, got {type(waveform).__name__}; "
+            'use range_kernel="response", which is its pulse'
+        )
+    x = math.pi * distance / waveform.max_range
+    below = waveform.samples * torch.sin(x)
+    peak = below.abs() < 1e-9
+    ratio = torch.sin(waveform.samples * x) / torch.where(peak, torch.ones_like(x), below)
+    return torch.where(peak, torch.ones_like(x), ratio.square())
+
+
+def array_point_spread(
+    array: Aperture, du: Float64[Tensor, " u"], dv: Float64[Tensor, " v"]
+) -> Float64[Tensor, "u v"]:
+    """Power of a point target at offsets in u and v from its direction, peak 1."""
+    weight = array.counts * array.x_taper[:, None] * array.y_taper[None]
+    weight = (weight / weight.sum()).to(torch.complex128)
+    response = array.steering(du, array.x) @ weight @ array.steering(dv, array.y).T
+    return response.abs().square()
+
+
+def airy_radii(radar: Radar, radius: float | None) -> tuple[float, float]:
+    """Half axes of the ellipse behind the Airy lobe [m]; by default it fills the aperture."""
+    if radius is not None:
+        return radius, radius
+    return 0.5 * radar.aperture[0], 0.5 * radar.aperture[1]
+
+
+def airy(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
+    """Power pattern of an evenly lit disc, (2 J1(z)/z)² with z = k r |Δ(u, v)|; differentiable.
+
+    Source: the spatial spectrum surrogate of the paper (§3.4.2); derivations §5.
+    """
+    return airy_field(z).square()
+
+
+def airy_field(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
+    """Field pattern of the same disc, 2 J1(z)/z; differentiable."""
+    near = z.abs() < 1e-3
+    away = torch.where(near, torch.ones_like(z), z)
+    series = 1 - z.square() / 8 + z**4 / 192
+    return torch.where(near, series, 2 * bessel_j1(away) / away)
+
+
+def bessel_j1(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
+    """Bessel function of the first kind and order one, with the gradient J0 − J1/z.
+
+    ``torch.special.bessel_j1`` has none and says nothing.
+    """
+    return _BesselJ1.apply(z)  # type: ignore[no-any-return]
+
+
+def normalized_gaussian(
+    ranges: Float[Tensor, " path"], bins: Float[Tensor, " bin"], sigma: float
+) -> Float[Tensor, "path bin"]:
+    """The paper's range kernel: a Gaussian around each path, normalised over the bins.
+
+        G_f(R) = exp(−(R − D_f)²/2σ²) / Σ_j exp(−(R − D_j)²/2σ²)
+
+    Its derivative, which automatic differentiation gives, is
+    ``∂G_f/∂R = G_f [(D_f − R)/σ² − Σ_j G_j (D_j − R)/σ²]``.
+
+    Source: §3.4.1 of the paper; derivations §5.
+    Differs from the source: the printed derivative ``G (D − τ)/σ² (1 − G)`` belongs to another
+    normalisation (4–28 % off here), and the delay there stands for the range R.
+
+    Args:
+        ranges: R of each path [m].
+        bins: D_f, centres of the bins [m].
+        sigma: σ [m].
+    """
+    return torch.softmax(-0.5 * ((ranges[:, None] - bins[None]) / sigma).square(), dim=1)
+
+
+class _BesselJ1(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, z: Tensor) -> Tensor:
+        value = torch.special.bessel_j1(z)
+        ctx.save_for_backward(z, value)
+        return value
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        z, value = ctx.saved_tensors
+        ratio = torch.where(z == 0, 0.5 * torch.ones_like(z), value / z)
+        return grads[0] * (torch.special.bessel_j0(z) - ratio)

@@ -1,0 +1,193 @@
+"""The moving twin: detection, the body, and its fit to the exact chain."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from invertwin.errors import InputError
+from invertwin.inversion.mover import (
+    MovingBody,
+    body_power,
+    fit_mover,
+    motion_map,
+    pattern_correlation,
+    strongest_mover,
+)
+from invertwin.inversion.reconstruction import Optimizer
+from invertwin.radar.boards import board
+from invertwin.radar.motion import Chirps, moving_beat
+from invertwin.radar.radar import Radar
+from invertwin.radar.range_profile import beat_signal
+from invertwin.radar.waveform import FMCW
+from invertwin.scene import Object, PerfectConductor, RoughDielectric, Scene, rigid, shapes
+from invertwin.simulation import simulate_chirps
+from radar.test_moving_power import paths_of
+
+CHIRPS = Chirps(32, 60e-6)
+RADAR = Radar(
+    *board("xWR1642").arrays(),
+    FMCW(77e9, 1.5e9, 40e-6, 64),
+    torch.zeros(1, 3, dtype=torch.float64),
+)
+GRID = RADAR.grid(1.0, 4.0)
+GLOSSY = RoughDielectric(5.0, diffuse=0.3, lobe_width=0.5)
+
+
+def float64(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def recorded(place, velocity, radius, seed):
+    """One look at a rough ball in motion, without noise."""
+    start = float64(*place) - float64(*velocity) * 0.5 * float(CHIRPS.times(2)[-1, 0])
+    ball = Object(
+        shapes.sphere(radius, 2), GLOSSY, rigid(translation=start), velocity=float64(*velocity)
+    )
+    scene = Scene({"ball": ball})
+    return simulate_chirps(scene, RADAR, CHIRPS, seed=seed, density=1e3)[0]
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """A point in motion and a stronger one at rest."""
+    velocity = float64(0.0, 0.0, 2.0)
+    start = float64(-0.5, 0.0, 2.8) - velocity * 0.5 * float(CHIRPS.times(2)[-1, 0])
+    places = torch.stack([start, float64(0.8, 0.0, 1.6)])
+    paths = paths_of(RADAR, places, float64(1.0, 50.0))
+    motion = torch.stack([velocity, 0 * velocity])
+    return noisy(moving_beat(replace(paths, velocity=motion), RADAR, CHIRPS)[0])
+
+
+def noisy(beat):
+    noise = torch.randn(beat.shape, dtype=beat.dtype, generator=torch.Generator().manual_seed(3))
+    return beat + 0.1 * noise
+
+
+def test_the_strongest_mover_is_found_beside_what_stands_still(frame):
+    found = motion_map(frame, RADAR, GRID, CHIRPS)
+    echo = strongest_mover(frame, found)
+    away = math.hypot(0.5, 2.8)
+    assert echo.range == pytest.approx(away, abs=0.02)
+    assert echo.rate == pytest.approx(2.0 * 2.8 / away, abs=0.1)
+    assert echo.u == pytest.approx(-0.5 / away, abs=0.03)
+    assert echo.coherence > 0.99
+    torch.testing.assert_close(
+        echo.position, echo.range * float64(echo.u, 0.0, math.sqrt(1 - echo.u**2))
+    )
+    near = found.around(echo, 4)
+    assert near.power.shape[0] in (16, 17)
+    assert near.power.shape[1] in (16, 17)
+    assert float(near.power.max()) == float(found.power.max())
+    assert float(pattern_correlation(near.of_point(echo), near.power, "power")) > 0.97
+
+
+def test_a_point_that_moves_on_is_where_its_rate_takes_it(frame):
+    found = motion_map(frame, RADAR, GRID, CHIRPS)
+    echo = strongest_mover(frame, found)
+    later = found.around(echo, 4, time=0.1)
+    middle = later.grid.ranges.mean()
+    assert float(middle) == pytest.approx(echo.range + 0.1 * echo.rate, abs=0.03)
+    ranges = later.of_point(echo, time=0.1).amax((0, 2, 3))
+    assert float(later.grid.ranges[ranges.argmax()]) == pytest.approx(float(middle), abs=0.06)
+
+
+def test_without_a_mover_there_is_nothing_to_fit():
+    beat = beat_signal(paths_of(RADAR, float64(0.0, 0.0, 2.0)[None], float64(1.0)), RADAR)
+    still = noisy(beat.repeat(CHIRPS.count, 1, 1, 1))
+    with pytest.raises(InputError, match="no echo above the noise"):
+        strongest_mover(still, motion_map(still, RADAR, GRID, CHIRPS))
+
+
+def test_correlation_ignores_gain_and_knows_three_scales(unchecked):
+    one = torch.rand(5, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    other = one.flip(0)
+    for scale in ("magnitude", "power", "level"):
+        assert float(pattern_correlation(7 * one, one, scale)) == pytest.approx(1)
+        assert float(pattern_correlation(one, other, scale)) < 0.9
+    root = torch.corrcoef(torch.stack([one.sqrt().flatten(), other.sqrt().flatten()]))[0, 1]
+    assert float(pattern_correlation(one, other)) == pytest.approx(float(root), abs=1e-6)
+    with pytest.raises(InputError, match="expected maps of one shape"):
+        pattern_correlation(one, other[1:])
+    with pytest.raises(InputError, match="'volts'"):
+        pattern_correlation(one, other, "volts")
+
+
+def start(echo, **changes):
+    scene = Scene({"ball": Object(shapes.sphere(0.1, 3), GLOSSY)})
+    return scene, MovingBody("ball", scene, RADAR, echo, **changes)
+
+
+def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
+    echo = strongest_mover(frame, motion_map(frame, RADAR, GRID, CHIRPS))
+    scene, body = start(echo)
+    vertices = body(scene)["ball"].vertices.detach()
+    assert float(vertices.norm(dim=1).min()) == pytest.approx(echo.range, abs=1e-3)
+    with torch.no_grad():
+        body.spin += 3.0
+        body.velocity += float64(0.7, 0.0)
+        body.size += float64(0.5, 0.1, -0.2)
+    twin = body.moving(scene)["ball"]
+    assert twin.velocity is not None
+    step = 1e-6
+    later = twin.vertices + twin.velocity * step
+    before, after = (v.diff(dim=0).norm(dim=1) for v in (twin.vertices, later))
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-10)
+    moved = body(scene, time=0.5)["ball"].center.detach() - twin.center
+    torch.testing.assert_close(moved, 0.5 * twin.velocity.mean(0), rtol=0, atol=1e-6)
+    # One row of antennas: nothing moves upwards, and the body turns about the axis up.
+    assert not twin.velocity[:, 1].any()
+    extent = body.values(scene)["extent_m"]
+    assert extent == pytest.approx([0.2 * math.exp(x) for x in (0.5, 0.1, -0.2)], rel=1e-6)
+
+
+def test_materials_without_a_diffuse_share_are_refused(frame):
+    echo = strongest_mover(frame, motion_map(frame, RADAR, GRID, CHIRPS))
+    for material, message in (
+        (PerfectConductor(), "rough_dielectric"),
+        (replace(GLOSSY, diffuse=1.0), "between 0 and 1"),
+    ):
+        scene = Scene({"ball": Object(shapes.sphere(0.1, 2), material)})
+        with pytest.raises(InputError, match=message):
+            MovingBody("ball", scene, RADAR, echo)
+
+
+def test_a_twin_finds_place_and_motion_in_the_exact_chain():
+    """A ball that fills several range cells, at mean power: 12 looks of other phases."""
+    place, velocity, radius = (-0.4, 0.0, 2.6), (0.0, 0.0, 1.6), 0.3
+    frames = [recorded(place, velocity, radius, seed) for seed in range(12)]
+    maps = [motion_map(frame, RADAR, GRID, CHIRPS) for frame in frames]
+    mean = replace(maps[0], power=torch.stack([m.power for m in maps]).mean(0))
+    echo = strongest_mover(frames[0], mean)
+    scene, body = start(echo)
+    near = mean.around(echo, 6)
+    losses = fit_mover(
+        body, scene, near, steps=80, samples=1500, seed=1, optimizer=Optimizer(rate=0.05)
+    )
+    assert losses[-1] < 0.5 * losses[0]
+    found = body.values(scene)
+    front = math.hypot(*place) - radius
+    nearest = body(scene)["ball"].vertices.detach().norm(dim=1).min()
+    assert float(nearest) == pytest.approx(front, abs=0.03)
+    # Along the line of sight; a row of antennas hardly sees motion across it.
+    center, motion = float64(*found["position_m"]), float64(*found["velocity_m_s"])
+    assert float(center @ motion / center.norm()) == pytest.approx(1.6 * 2.6 / 2.63, abs=0.05)
+    assert found["extent_m"][2] > 0.3
+    with torch.no_grad():
+        shown = body_power(body, scene, near, samples=20_000, seed=5)
+    twin, point = (float(pattern_correlation(p, near.power)) for p in (shown, near.of_point(echo)))
+    assert twin > 0.97
+    assert twin > point + 0.02
+
+
+def test_a_body_that_leaves_the_view_is_an_error(frame):
+    found = motion_map(frame, RADAR, GRID, CHIRPS)
+    echo = strongest_mover(frame, found)
+    scene, body = start(echo)
+    with torch.no_grad():
+        body.size += float64(math.nan, 0.0, 0.0)
+    with pytest.raises(InputError):
+        fit_mover(
+            body, scene, found.around(echo, 4), steps=1, samples=100, seed=1, optimizer=Optimizer()
+        )
