@@ -102,6 +102,7 @@ class Task:
             samples=samples,
             boundary_samples=boundary_samples,
             seed=number,
+            depth=1,
         )
         middle = perf_counter()
         (power / power.detach().mean()).square().mean().backward()
@@ -179,7 +180,7 @@ def useful_paths(rays: int, steps: int) -> dict[str, Any]:
 
     def deposited(seed: int) -> None:
         deposit_power(
-            scene, link, grid, samples=rays, boundary_samples=0, seed=seed, boundary=False
+            scene, link, grid, samples=rays, boundary_samples=0, seed=seed, depth=1, boundary=False
         )
 
     def listed(seed: int) -> int:

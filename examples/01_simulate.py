@@ -36,9 +36,9 @@ grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6)
 
 # The exact chain: fields of fixed scatterers, beat signals, window, FFT, beamforming. The
 # speckle is that of one rough surface; another seed is another surface.
-recorded = iw.simulate(scene, radar, grid, seed=1, snr_db=20.0)
+recorded = iw.simulate(scene, radar, grid, seed=1, depth=1, snr_db=20.0)
 # The surrogate: the mean over all such surfaces, smooth in everything that may move.
-expected = iw.simulate(scene, radar, grid, seed=1, surrogate=iw.Surrogate())
+expected = iw.simulate(scene, radar, grid, seed=1, depth=1, surrogate=iw.Surrogate())
 
 figure = Figure(figsize=(9, 4), layout="constrained")
 panels = figure.subplots(1, 2, sharey=True)

@@ -45,10 +45,11 @@ looks = [[x, y, 0.0] for x in (-0.6, -0.2, 0.2, 0.6) for y in (-0.4, 0.4)]
 radar = iw.Radar(row(2, 16 * half), row(16, half), chirp, looks)
 grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6, oversample=1)
 with torch.no_grad():
-    recorded = iw.simulate(hidden(start), radar, grid, seed=1, density=3e3, snr_db=20.0)
+    recorded = iw.simulate(hidden(start), radar, grid, seed=1, depth=1, density=3e3, snr_db=20.0)
 
 sought, capture = OnTheFloor(0.0, 0.0, 0.0), iw.Capture.from_beat(recorded.beat, radar)
-settings = {"steps": 60, "samples": 100_000, "loss": iw.SpectrumLoss(kind="likelihood"), "seed": 1}
+loss = iw.SpectrumLoss(kind="likelihood")
+settings = {"depth": 1, "steps": 60, "samples": 100_000, "loss": loss, "seed": 1}
 kernels = iw.Surrogate(range_width=3.0, angle_width=1.5)  # extra widths, annealed to zero
 fit = iw.reconstruct(start, radar, capture, [sought], grid=grid, surrogate=kernels, **settings)
 

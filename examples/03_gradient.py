@@ -32,7 +32,7 @@ grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.5)
 # θ moves the letter to the right. The differences are the truth: two maps, 8 mm apart.
 report = iw.gradcheck(
     scene, radar, grid, Direction("translation", "letter", axis=(1.0, 0.0, 0.0)),
-    surrogate=iw.Surrogate(), samples=1_000_000, boundary_samples=250_000, repeats=2,
+    surrogate=iw.Surrogate(), depth=1, samples=1_000_000, boundary_samples=250_000, repeats=2,
     difference_samples=2_000_000, max_pairs=4,
 )  # fmt: skip
 

@@ -41,6 +41,7 @@ def test_gradient_is_that_of_converged_differences(file):
         radar.grid(run.grid.range_min, run.grid.range_max, run.grid.u_max, oversample=1),
         Direction(table.kind, table.object or "", (x, y, z)),
         surrogate=Surrogate("gaussian", range_width=1.5, angle_width=1.0),
+        depth=settings.depth,
         samples=400_000,
         boundary_samples=100_000,
         repeats=3,

@@ -33,6 +33,7 @@ class Case:
         return {
             "grid": self.grid,
             "steps": 30,
+            "depth": 1,
             "samples": 8_000,
             "boundary_samples": 2_000,
             "optimizer": Optimizer(rate=0.02),
@@ -67,6 +68,6 @@ def case() -> Case:
     grid = device.grid(1.0, 2.4, 0.5, oversample=1)
     with torch.no_grad():
         true = Translation("plate", OFFSET)(scene)
-        beat = simulate(true, device, grid, density=3_000.0, seed=7).beat
+        beat = simulate(true, device, grid, depth=1, density=3_000.0, seed=7).beat
     assert beat is not None
     return Case(scene, device, Capture.from_beat(beat, device), grid)

@@ -11,6 +11,7 @@ from invertwin.radar import Surrogate
 from scenes import occluder, radar
 
 CHEAP: dict[str, Any] = {
+    "depth": 1,
     "surrogate": Surrogate("gaussian", range_width=2.0, angle_width=1.0),
     "samples": 100_000,
     "boundary_samples": 50_000,

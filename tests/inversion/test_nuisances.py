@@ -17,7 +17,7 @@ BIAS = 0.12
 def test_range_bias_is_found_in_shifted_data(case):
     """A beat of frequency S 2b/c more is a target b farther."""
     with torch.no_grad():
-        beat = simulate(case.scene, case.radar, case.grid, density=3_000.0, seed=7).beat
+        beat = simulate(case.scene, case.radar, case.grid, depth=1, density=3_000.0, seed=7).beat
     assert beat is not None
     waveform = case.radar.waveform
     phase = 2 * torch.pi * waveform.slope * 2 * BIAS / 299_792_458.0 * waveform.sample_times

@@ -131,7 +131,7 @@ def slowly(row):
 
 fit = reconstruct(
     scene, radar, capture, [Translation("plate")], grid=radar.grid(1.0, 2.4, 0.5, oversample=1),
-    steps=12, samples=8_000, boundary_samples=2_000, optimizer=Optimizer(rate=0.02),
+    depth=1, steps=12, samples=8_000, boundary_samples=2_000, optimizer=Optimizer(rate=0.02),
     surrogate=Surrogate(range_width=2.0, angle_width=1.0), seed=1,
     checkpoint=folder + "/fit.pt", checkpoint_every=2, resume=resume, progress=slowly,
 )
