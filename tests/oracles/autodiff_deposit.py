@@ -9,9 +9,9 @@ from torch import Tensor
 from invertwin.channel import replay
 from invertwin.channel.bins import Contribution
 from invertwin.channel.bridge import backend, flatten, to_float, to_torch, tracer
-from invertwin.channel.deposit import _Settings, _Trace
 from invertwin.channel.kernel import DIFFERENTIABLE
 from invertwin.channel.paths import Grid, Link
+from invertwin.channel.trace import Settings, Trace
 from invertwin.scene import Scene
 
 
@@ -20,7 +20,7 @@ def gradients(
 ) -> dict[str, Tensor]:
     """∂ Σ weights · map / ∂ every table of the kernel."""
     mi = tracer()
-    settings = _Settings(
+    settings = Settings(
         geometry=flatten(scene, link.wavelength),
         link=link,
         grid=grid,
@@ -34,7 +34,7 @@ def gradients(
         chunk=1 << 30,
         backend=backend(),
     )
-    trace = _Trace(settings)
+    trace = Trace(settings)
     tables = {name: mi.Float(getattr(trace.fixed, name)) for name in DIFFERENTIABLE}
     dr.enable_grad(list(tables.values()))
     inputs, out = trace.inputs(tables), mi.Float(0)

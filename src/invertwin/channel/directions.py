@@ -36,8 +36,10 @@ class Directions:
 
         mi = tracer()
         caps, outside = self._caps(point)
-        count = sum((mi.Float(dr.select(away, 1, 0)) for away in outside), mi.Float(0))
-        towards = dr.select(count > 0, _TOWARDS, 0.0)
+        count: Any = mi.Float(0)
+        for away in outside:
+            count += dr.select(away, 1, 0)
+        towards: Any = dr.select(count > 0, _TOWARDS, 0.0)
         facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, back)))
         aimed, rest = numbers[0] < towards, numbers[0]
         # The object, counted among those that the point is outside of.

@@ -238,8 +238,9 @@ def push(
             carry["growth"] = carry["growth"] + _share(known, dr.detach(dots[0]), share)
             carry["longer"] = carry["longer"] + dr.detach(dots[1])
 
-        nothing = [dr.zeros(mi.Float, records.lanes) for _ in range(2)]
-        carry = dict(zip(("growth", "longer"), nothing, strict=True))
+        carry: dict[str, Any] = {
+            name: dr.zeros(mi.Float, records.lanes) for name in ("growth", "longer")
+        }
         done = crossed(shot, inputs, start, end, active, carry, act)
         return done["growth"], done["longer"]
 

@@ -117,7 +117,7 @@ class Walk:
         scattered = kernel.reflected(
             self.inputs, point.surface, point.normal, back, mi.Vector3f(omega), active
         )
-        ratio = scattered / (density * dr.abs(dr.dot(point.normal, back)))
+        ratio: Any = scattered / (density * dr.abs(dr.dot(point.normal, back)))
         survival = dr.select(
             state["number"] >= _ROULETTE_FROM,
             dr.minimum(dr.maximum(ratio, _LEAST_SURVIVAL), 1.0),
@@ -132,7 +132,7 @@ class Walk:
         active &= hit.valid
         found = kernel.place(self.inputs, hit.face, hit.b1, hit.b2, active)
         to_point, distance = kernel.leg(found.position, point.position)
-        cosine = dr.abs(dr.dot(found.normal, to_point))
+        cosine: Any = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
         odds = density * survival * cosine * hit.chance
         weight = scattered * hit.share / odds
@@ -227,7 +227,8 @@ class Records:
         import drjit as dr
 
         names = ("frame", "face", "b1", "b2", "throughput", "length")
-        return Records(dr.width(state["index"]), 1, *(state[name] for name in names), seen)
+        columns = {name: state[name] for name in names}
+        return Records(lanes=dr.width(state["index"]), depth=1, **columns, seen=seen)
 
     @staticmethod
     def empty(state: State, depth: int, sound_face: Any) -> "Records":
@@ -239,12 +240,15 @@ class Records:
         size = lanes * depth
         face = dr.zeros(mi.UInt32, size)
         return Records(
-            lanes,
-            depth,
-            state["frame"],
-            face + sound_face if size else face,
-            *(dr.zeros(mi.Float, size) for _ in range(4)),
-            dr.zeros(mi.Bool, size),
+            lanes=lanes,
+            depth=depth,
+            frame=state["frame"],
+            face=face + sound_face if size else face,
+            b1=dr.zeros(mi.Float, size),
+            b2=dr.zeros(mi.Float, size),
+            throughput=dr.zeros(mi.Float, size),
+            length=dr.zeros(mi.Float, size),
+            seen=dr.zeros(mi.Bool, size),
         )
 
     @property
