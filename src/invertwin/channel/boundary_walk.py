@@ -160,10 +160,13 @@ def _interior_segment(
     shadow = shadow_speed(fixed, points, behind.position)
     ahead = kernel.place(fixed, points.face, shadow.b1, shadow.b2)
     to_behind, distance = kernel.leg(ahead.position, behind.position)
+    inside = kernel.medium(fixed, ahead, behind, to_behind, mi.Bool(True))
     choices = depth - 1
     count = 1 + (points.index // 2) % choices
     ends_at_receiver = (points.index % 2) == 1
-    throughput = fixed.scale * choices / dr.square(distance)
+    kept = dr.exp(-inside.attenuation * distance)
+    throughput = fixed.scale * choices * kept / dr.square(distance)
+    distance = inside.index * distance
     lanes = dr.width(points.face)
     zero = dr.zeros(mi.Float, lanes)
     first = walk.start(

@@ -201,6 +201,13 @@ def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geom
     shapes = torch.cat([item.mesh.vertices.detach() for item in objects])
     topology = _topology(key, [item.mesh.faces for item in objects], faces, owners, shapes)
     rows, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength)
+    skins = rows["refraction"][face_surface].any(1)
+    for number, name in enumerate(scene.objects):
+        own = topology.face_object == number
+        if bool(skins[own].any()):
+            _require_solid(
+                name, vertices.detach()[topology.faces[own]], topology.open_objects[number]
+            )
     weights = rows["lobes"]
     free = differentiated(weights)
     return Geometry(
@@ -220,6 +227,17 @@ def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geom
         topology=topology,
         velocities=torch.cat([_velocities(item) for item in objects]) if moving else None,
     )
+
+
+def _require_solid(name: str, triangles: Tensor, is_open: bool) -> None:
+    """Refuse a refracting body without an inside."""
+    volume = (triangles[:, 0] * torch.linalg.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
+    if is_open or not volume > 0:
+        found = "an open one" if is_open else "one wound inwards"
+        raise InputError(
+            f"expected a closed mesh with outward triangles for the refracting body {name}, got "
+            f"{found}; close or turn it, or use a Slab for a sheet"
+        )
 
 
 def _surfaces(objects: list[Object], frequency: float) -> tuple[dict[str, Tensor], Tensor]:
@@ -270,6 +288,9 @@ class Topology:
         owner[faces.ravel(), 0] = face_object.repeat_interleave(3).double()
         places = torch.cat([owner, vertices], dim=1).numpy()
         self.edges, self.opposite, beside = edges_of(faces.numpy(), places)
+        alone = (self.opposite >= 0).sum(1) == 1
+        lone_owner = face_object[beside[alone, 0]]
+        self.open_objects = [bool((lone_owner == owner).any()) for owner in owners]
         self.device_faces = to_index(faces)
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]

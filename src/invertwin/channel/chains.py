@@ -65,6 +65,7 @@ def chain_view(
 ) -> ChainView:
     """Evaluate the radar equation along chains; those that are blocked carry nothing."""
     places = [_place(geometry, chain, k) for k in range(chain.face.shape[1])]
+    rows = [geometry.face_surface[column] for column in chain.face.T]
     stops = [link.tx[frame], *(p for p, _, _ in places), link.rx[frame]]
     power = torch.full_like(chain.weight, (link.wavelength / (4 * torch.pi)) ** 2)
     length, ending = torch.zeros_like(power), torch.ones_like(power)
@@ -75,16 +76,24 @@ def chain_view(
             share, excess = passed(geometry, shot, end, start) if geometry.sheets else (1.0, 0.0)
         else:
             share, excess = passed(geometry, shot, start, end)
+        index = 1.0
+        if geometry.bodies and 0 < number < len(places):
+            normals = places[number - 1][1], places[number][1]
+            towards = (end - start) / distance[:, None]
+            index, attenuation = _medium(
+                geometry, (rows[number - 1], rows[number]), normals, towards
+            )
+            power = power * torch.exp(-attenuation * distance)
         power = power * share / distance**2
-        length = length + distance + excess
+        length = length + index * distance + excess
         ending = share / distance**2
     for number, (position, normal, jacobian) in enumerate(places):
-        row = geometry.face_surface[chain.face[:, number]]
+        row = rows[number]
         back, on = (
             torch.nn.functional.normalize(stop - position, dim=1)
             for stop in (stops[number], stops[number + 2])
         )
-        scattered = _reflected(geometry, row, normal, back, on)
+        scattered = _scattered(geometry, row, normal, back, on)
         power = power * jacobian * scattered
     for antenna, pattern, stop in (
         (link.tx[frame], link.tx_pattern, stops[1]),
@@ -108,8 +117,8 @@ def _place(geometry: Geometry, chain: Chain, number: int) -> tuple[Tensor, Tenso
     return p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2, normal / double_area[:, None], jacobian
 
 
-def _reflected(geometry: Geometry, row: Tensor, normal: Tensor, back: Tensor, on: Tensor) -> Tensor:
-    """``f_r |cosθ| |cosθ'|``; zero unless both directions are on one side."""
+def _scattered(geometry: Geometry, row: Tensor, normal: Tensor, back: Tensor, on: Tensor) -> Tensor:
+    """``f |cosθ| |cosθ'|`` on one side, or through the skin of a body (see ``kernel``)."""
     first, second, between = ((a * b).sum(1) for a, b in ((normal, back), (normal, on), (back, on)))
     product = first * second
     shape = geometry.diffuse[row] / torch.pi
@@ -117,10 +126,49 @@ def _reflected(geometry: Geometry, row: Tensor, normal: Tensor, back: Tensor, on
         half = (0.5 * (1 + cosine)).clamp_min(1e-7)
         lobe = half ** geometry.exponents[row, number]
         shape = shape + geometry.lobes[row, number] * lobe
-    reflectance = tabulated(geometry.amplitude, row, first) * tabulated(
-        geometry.amplitude, row, second
-    )
-    return torch.where(product > 0, reflectance * shape * product, 0.0)
+    outer = [_outside(geometry, row, cosine) for cosine in (first, second)]
+    reflectance = torch.ones_like(product)
+    for cosine, total in outer:
+        amplitude = tabulated(geometry.amplitude, row, cosine)
+        reflectance = reflectance * torch.where(total, 1.0, amplitude)
+    value = torch.where(product > 0, reflectance * shape * product, 0.0)
+    if not geometry.bodies:
+        return value
+    variance = 2 / geometry.exponents[row, 0].clamp_min(1.0)
+    share, index = torch.ones_like(product), torch.ones_like(product)
+    mismatch = torch.zeros_like(normal)
+    for (cosine, total), direction, tilt in zip(outer, (back, on), (first, second), strict=True):
+        passing = tabulated(geometry.refraction, row, cosine)
+        open_ = ~total & (passing > 0)
+        share = share * torch.where(open_, torch.where(open_, passing, 1.0).sqrt(), 0.0)
+        index = torch.where(tilt < 0, geometry.index[row], 1.0)
+        mismatch = mismatch + index[:, None] * (direction - normal * tilt[:, None])
+    lobe = torch.exp(-mismatch.square().sum(1) / (2 * variance)) / (2 * torch.pi * variance)
+    through = share * index**2 * lobe * product.abs()
+    return torch.where(product < 0, through, value)
+
+
+def _outside(geometry: Geometry, row: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine on the outer side of a skin (Snell), and whether there is none."""
+    if not geometry.bodies:
+        return cosine, torch.zeros_like(cosine, dtype=torch.bool)
+    inside = cosine < 0
+    square = 1 - geometry.index[row] ** 2 * (1 - cosine**2)
+    total = inside & (square <= 1e-6)
+    refracted = torch.where(inside & ~total, square, 1.0).sqrt()
+    return torch.where(inside, refracted, cosine), total
+
+
+def _medium(
+    geometry: Geometry, rows: tuple[Tensor, Tensor], normals: tuple[Tensor, Tensor], towards: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Refractive index and attenuation of what lies between two points."""
+    index, attenuation = torch.ones(len(towards)).double(), torch.zeros(len(towards)).double()
+    for row, normal, sign in zip(rows, normals, (1.0, -1.0), strict=True):
+        inside = ((normal * towards).sum(1) * sign < 0) & (geometry.refraction[row, -1] > 0)
+        index = torch.where(inside, geometry.index[row], index)
+        attenuation = torch.where(inside, geometry.attenuation[row], attenuation)
+    return index, attenuation
 
 
 def tabulated(

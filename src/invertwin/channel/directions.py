@@ -29,6 +29,8 @@ class Directions:
         self.shares = to_float(shares)
         self.width = shares.shape[1]
         self.exponents = to_float(geometry.exponents)
+        self.bodies = geometry.bodies
+        self.index = to_float(geometry.index)
 
     def draw(self, point: Place, back: Any, numbers: list[Any]) -> tuple[Any, Any]:
         """A unit direction from four uniform numbers, and its density per solid angle."""
@@ -96,7 +98,45 @@ class Directions:
             chosen = (numbers[1] >= limit) & (numbers[1] < limit + share)
             omega = dr.select(chosen, lobe, omega)
             limit += share
+        if self.bodies:
+            omega = dr.select(numbers[1] >= limit, self._refracted(point, back, numbers), omega)
         return omega
+
+    def _sides(self, point: Place, back: Any) -> tuple[Any, Any, Any]:
+        """Refractive index here and beyond, and standard deviation of the refracted lobe."""
+        import drjit as dr
+
+        mi = tracer()
+        body = dr.gather(mi.Float, self.index, point.surface)
+        outside = dr.dot(point.normal, back) > 0
+        exponent = dr.gather(mi.Float, self.exponents, point.surface * 3)
+        spread = dr.sqrt(2 / dr.maximum(exponent, 1.0))
+        return dr.select(outside, 1.0, body), dr.select(outside, body, 1.0), spread
+
+    def _refracted(self, point: Place, back: Any, numbers: list[Any]) -> Any:
+        """A direction beyond the surface about Snell's; along the normal if there is none."""
+        import drjit as dr
+
+        mi = tracer()
+        here, beyond, spread = self._sides(point, back)
+        gauss = mi.warp.square_to_std_normal(mi.Point2f(numbers[2], numbers[3])) * spread
+        frame = mi.Frame3f(mi.Vector3f(point.normal))
+        local = frame.to_local(mi.Vector3f(back))
+        x, y = ((gauss[k] - here * local[k]) / beyond for k in range(2))
+        rest = 1 - x * x - y * y
+        z = -dr.mulsign(dr.sqrt(dr.maximum(rest, 0.0)), local.z)
+        straight = mi.Vector3f(0.0, 0.0, -dr.sign(local.z))
+        return frame.to_world(dr.select(rest > 1e-6, mi.Vector3f(x, y, z), straight))
+
+    def _refraction_density(self, point: Place, back: Any, omega: Any) -> Any:
+        import drjit as dr
+
+        here, beyond, spread = self._sides(point, back)
+        first, second = dr.dot(point.normal, back), dr.dot(point.normal, omega)
+        mismatch = here * (back - point.normal * first) + beyond * (omega - point.normal * second)
+        lobe = dr.exp(-dr.squared_norm(mismatch) / (2 * dr.square(spread)))
+        lobe /= 2 * dr.pi * dr.square(spread)
+        return dr.select(first * second < 0, lobe * dr.square(beyond) * dr.abs(second), 0.0)
 
     def _density(self, point: Place, back: Any, facing: Any, omega: Any) -> Any:
         import drjit as dr
@@ -112,6 +152,9 @@ class Directions:
                 lobe = (exponent + 1) / (4 * dr.pi)
                 lobe *= dr.exp(exponent * dr.log(dr.maximum(half, 1e-7)))
                 density += self._share(point, number + 1) * lobe
+        if self.bodies:
+            share = self._share(point, self.width - 1)
+            density += share * self._refraction_density(point, back, omega)
         return density
 
     def _share(self, point: Place, number: int) -> Any:
@@ -153,4 +196,8 @@ def _shares(geometry: Geometry) -> torch.Tensor:
     total = diffuse + lobes.sum(1, keepdim=True)
     # Something of the cosine stays in, so that the density never vanishes where f does not.
     parts = torch.cat([diffuse + 0.05 * (total + (total == 0)), lobes], dim=1)
+    # What is reflected at normal incidence against what is refracted there.
+    reflected = geometry.amplitude.detach()[:, -1:].square()
+    parts = parts * torch.where(geometry.refraction.any(1, keepdim=True), reflected, 1.0)
+    parts = torch.cat([parts, geometry.refraction.detach()[:, -1:]], dim=1)
     return parts / parts.sum(1, keepdim=True)

@@ -237,23 +237,23 @@ def tabulated(inputs: Inputs, name: str, row: Any, cosine: Any, active: Any = Tr
     return first + (second - first) * (t - mi.Float(low))
 
 
-def reflected(inputs: Inputs, row: Any, normal: Any, back: Any, on: Any, active: Any = True) -> Any:
-    """``f_r |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
+def scattered(inputs: Inputs, row: Any, normal: Any, back: Any, on: Any, active: Any = True) -> Any:
+    """``f |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
 
-    ``f_r`` is the distribution of ``scene.material``; a surface scatters only to the side from
-    which it is lit. ``on`` is None where both directions are one.
+    On one side, ``f`` is the distribution of ``scene.material``; through the skin of a refracting
+    body, ``refracted``. ``on`` is None where both directions are one.
     """
     import drjit as dr
 
     mi = tracer()
     first = dr.dot(normal, back)
-    low = tabulated(inputs, "amplitude", row, dr.abs(first), active)
+    low = _amplitude(inputs, row, first, active)
     if on is None:
         product, between, reflectance = dr.square(first), mi.Float(1.0), dr.square(low)
     else:
         second = dr.dot(normal, on)
         product, between = first * second, dr.dot(back, on)
-        reflectance = low * tabulated(inputs, "amplitude", row, dr.abs(second), active)
+        reflectance = low * _amplitude(inputs, row, second, active)
     shape = dr.gather(mi.Float, inputs.diffuse, row, active) * dr.inv_pi
     for number, present in enumerate(inputs.lobed):
         if present:
@@ -262,7 +262,104 @@ def reflected(inputs: Inputs, row: Any, normal: Any, back: Any, on: Any, active:
             exponent = dr.gather(mi.Float, inputs.exponents, row * 3 + number, active)
             weight = dr.gather(mi.Float, inputs.lobes, row * 3 + number, active)
             shape += weight * dr.exp(exponent * dr.log(half))
-    return dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
+    value = dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
+    if inputs.bodies and on is not None:
+        through = refracted(inputs, row, normal, back, on, active)
+        value = dr.select(dr.detach(product) < 0, through, value)
+    return value
+
+
+def _amplitude(inputs: Inputs, row: Any, cosine: Any, active: Any) -> Any:
+    """Square root of the reflectance; from inside a body, that of the refracted angle."""
+    import drjit as dr
+
+    outer = dr.abs(cosine)
+    if not inputs.bodies:
+        return tabulated(inputs, "amplitude", row, outer, active)
+    outer, total = _outside(inputs, row, cosine, active)
+    return dr.select(total, 1.0, tabulated(inputs, "amplitude", row, outer, active))
+
+
+def _outside(inputs: Inputs, row: Any, cosine: Any, active: Any) -> tuple[Any, Any]:
+    """Cosine on the outer side of a skin (Snell), and whether there is none (total reflection)."""
+    import drjit as dr
+
+    inside = dr.detach(cosine) < 0
+    index = dr.gather(tracer().Float, inputs.index, row, active)
+    square = 1 - dr.square(index) * (1 - dr.square(cosine))
+    total = inside & (dr.detach(square) <= 1e-6)
+    refracted = dr.sqrt(dr.select(inside & ~total, square, 1.0))
+    return dr.select(inside, refracted, cosine), total
+
+
+def refracted(inputs: Inputs, row: Any, normal: Any, back: Any, on: Any, active: Any) -> Any:
+    """``f |cosθ| |cosθ'|`` through the skin of a body, in a lobe about Snell's direction.
+
+    ``f = n'² sqrt(T(θ) T(θ')) g(m)`` with the mismatch ``m = n d + n' d'`` of the directions'
+    tangential parts and a Gaussian ``g`` of the variance of the specular lobe: ``f / n'²`` is
+    reciprocal, and a lobe within the propagating directions passes T.
+    """
+    import drjit as dr
+
+    mi = tracer()
+    first, second = dr.dot(normal, back), dr.dot(normal, on)
+    inner = dr.gather(mi.Float, inputs.index, row, active)
+    variance = refraction_variance(inputs, row, active)
+    shares, mismatch, index = [], mi.Vector3f(0.0), mi.Float(1.0)
+    for direction, cosine in ((back, first), (on, second)):
+        outer, total = _outside(inputs, row, cosine, active)
+        share = tabulated(inputs, "refraction", row, outer, active)
+        # A root of zero has no derivative: opaque surfaces take part as well.
+        open_ = ~total & (dr.detach(share) > 0)
+        shares.append(dr.select(open_, dr.sqrt(dr.select(open_, share, 1.0)), 0.0))
+        index = dr.select(dr.detach(cosine) < 0, inner, 1.0)
+        mismatch = mismatch + index * (direction - normal * cosine)
+    lobe = dr.exp(-dr.squared_norm(mismatch) / (2 * variance)) / (2 * dr.pi * variance)
+    return shares[0] * shares[1] * dr.square(index) * lobe * dr.abs(first * second)
+
+
+def refraction_variance(inputs: Inputs, row: Any, active: Any = True) -> Any:
+    """Variance of the refracted direction's tangential part: that of the specular lobe."""
+    import drjit as dr
+
+    exponent = dr.gather(tracer().Float, inputs.exponents, row * 3, active)
+    return 2 / dr.maximum(exponent, 1.0)
+
+
+@dataclass(frozen=True)
+class Medium:
+    """What a segment runs through: refractive index, and power attenuation [1/m]."""
+
+    index: Any
+    attenuation: Any
+
+
+def medium(inputs: Inputs, start: Place, end: Place | None, towards: Any, active: Any) -> Medium:
+    """The body inside of which a segment runs, if any: that of a skin it leaves or meets inside.
+
+    Args:
+        inputs: Tables.
+        start: Where it starts.
+        end: Where it ends; None for an antenna.
+        towards: Unit direction from start to end.
+        active: Lanes.
+    """
+    import drjit as dr
+
+    mi = tracer()
+    index, attenuation = mi.Float(1.0), mi.Float(0.0)
+    ends = ((start, 1.0),) if end is None else ((start, 1.0), (end, -1.0))
+    for place, sign in ends if inputs.bodies else ():
+        share = dr.gather(mi.Float, inputs.refraction, (place.surface + 1) * inputs.cosines - 1)
+        inside = active & (dr.detach(dr.dot(place.normal, towards)) * sign < 0)
+        inside &= dr.detach(share) > 0
+        for name in ("index", "attenuation"):
+            value = dr.gather(mi.Float, getattr(inputs, name), place.surface, inside)
+            if name == "index":
+                index = dr.select(inside, value, index)
+            else:
+                attenuation = dr.select(inside, value, attenuation)
+    return Medium(index, attenuation)
 
 
 @dataclass(frozen=True)
@@ -290,8 +387,7 @@ def connection(
     antenna = inputs.antenna(frame, receiver, active)
     to_antenna, distance = leg(point.position, antenna)
     seen = to_radar(inputs, frame, -to_antenna, active)
-    scattered = reflected(
-        inputs, point.surface, point.normal, back, None if same else to_antenna, active
-    )
+    on = None if same else to_antenna
+    value = scattered(inputs, point.surface, point.normal, back, on, active)
     gain = inputs.gain(frame, receiver, seen)
-    return Connection(scattered * gain / dr.square(distance), distance, seen)
+    return Connection(value * gain / dr.square(distance), distance, seen)

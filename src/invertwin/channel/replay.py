@@ -30,7 +30,7 @@ class _Vertex:
     length: Any
     frame: Any
     arriving: Any  # gain at the start, 1/R² of the leg here, Jacobian
-    leg: Any
+    leg: Any  # optical length of the leg here
     connection: kernel.Connection
     scattered: Any  # towards the next vertex
     passed: Passage  # by the connection
@@ -64,19 +64,24 @@ def _vertex(shot: Shot, inputs: Inputs, records: Records, number: Any) -> _Verte
         face, b1, b2 = (read(name, at, exists) for name in ("face", "b1", "b2"))
         return kernel.place(inputs, face, b1, b2, exists)
 
+    inner = mi.Bool(False) if single else active & (number > 0)
+
     def previous() -> Any:
         transmitter = inputs.antenna(frame, False, active)
         if single:
             return transmitter
-        inner = active & (number > 0)
         return dr.select(inner, located(number - 1, inner).position, transmitter)
 
     here, before = located(number, active), previous()
     back, leg = kernel.leg(here.position, before)
+    optical, lost = leg, mi.Float(1.0)
+    if inputs.bodies and not single:
+        inside = kernel.medium(inputs, here, located(number - 1, inner), back, inner)
+        optical, lost = leg * inside.index, dr.exp(-inside.attenuation * leg)
     first = active if single else active & (number == 0)
     seen_from_tx = kernel.to_radar(inputs, frame, -back, first)
     gain = dr.select(first, inputs.gain(frame, False, seen_from_tx), 1.0)
-    arriving = gain * here.jacobian / dr.square(leg)
+    arriving = gain * here.jacobian * lost / dr.square(leg)
     connection = kernel.connection(
         inputs, frame, here, back, True, active, same=single and inputs.monostatic
     )
@@ -87,7 +92,7 @@ def _vertex(shot: Shot, inputs: Inputs, records: Records, number: Any) -> _Verte
         transmitter = inputs.antenna(frame, False, active)
         onward = dr.select(goes_on, located(number + 1, goes_on).position, transmitter)
         direction, _ = kernel.leg(here.position, onward)
-        scattered = kernel.reflected(inputs, here.surface, here.normal, back, direction, goes_on)
+        scattered = kernel.scattered(inputs, here.surface, here.normal, back, direction, goes_on)
     seen = active & read("seen", number)
     twice, passed = mi.Bool(False), Passage(mi.Float(1.0), mi.Float(0.0))
     if inputs.sheets:
@@ -111,7 +116,7 @@ def _vertex(shot: Shot, inputs: Inputs, records: Records, number: Any) -> _Verte
         length=read("length", number),
         frame=frame,
         arriving=arriving,
-        leg=leg,
+        leg=optical,
         connection=connection,
         scattered=scattered,
     )

@@ -114,7 +114,7 @@ class Walk:
         active = state["active"] & (state["number"] < state["last"])
         back = state["back"]
         omega, density = self.directions.draw(point, back, self._numbers(state))
-        scattered = kernel.reflected(
+        scattered = kernel.scattered(
             self.inputs, point.surface, point.normal, back, mi.Vector3f(omega), active
         )
         ratio: Any = scattered / (density * dr.abs(dr.dot(point.normal, back)))
@@ -134,14 +134,15 @@ class Walk:
         to_point, distance = kernel.leg(found.position, point.position)
         cosine: Any = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
+        inside = kernel.medium(self.inputs, point, found, -to_point, active)
         odds = density * survival * cosine * hit.chance
-        weight = scattered * hit.share / odds
+        weight = scattered * hit.share * dr.exp(-inside.attenuation * distance) / odds
         state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
         if "weight" in state:
             state["weight"] = state["weight"] * dr.square(distance) / odds
         state["face"], state["b1"], state["b2"] = hit.face, hit.b1, hit.b2
         state["back"] = mi.Vector3f(to_point)
-        state["length"] = state["length"] + distance + hit.excess
+        state["length"] = state["length"] + inside.index * distance + hit.excess
         state["number"] = state["number"] + 1
         state["active"] = active
 
