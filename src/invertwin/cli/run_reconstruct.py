@@ -15,8 +15,9 @@ from invertwin.cli.fits.writing import COLUMNS, draw, status, tables_of, write_r
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table
 from invertwin.cli.run_file import need
+from invertwin.cli.run_openradar import run_openradar
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
-from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema import OpenRadarData, RunFile, SimulatedData
 from invertwin.scene.files import save_mesh
 
 
@@ -25,6 +26,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
 
     Starts that an interrupted run has finished are not fitted again.
     """
+    if isinstance(run.data, OpenRadarData):
+        return run_openradar(run, folder, console)
     begin = time.perf_counter()
     settings = need(run, "reconstruct", "reconstruct")
     problem, calibration = calibrated(problem_of(run, console), folder, console)

@@ -47,7 +47,7 @@ def calibrated(
             problem,
             alone,
             nuisances,
-            _Bar(console, "calibration", steps),
+            Bar(console, "calibration", steps),
             folder.file(checkpoint),
             steps=steps,
             optimizer=replace(build.optimizer(problem.run.optimizer), rate=rate),
@@ -82,7 +82,7 @@ def fit(
         problem,
         scene,
         [*build.parameters(problem.run.parameters, scene), *nuisances_of(problem)],
-        _Bar(console, name, steps_of(problem)),
+        Bar(console, name, steps_of(problem)),
         folder.file(checkpoint),
         steps=steps_of(problem),
         boundary=mode == FULL,
@@ -117,7 +117,7 @@ def _reconstruct(
     problem: Problem,
     scene: Scene,
     modules: Sequence[nn.Module],
-    bar: "_Bar",
+    bar: "Bar",
     checkpoint: Any,
     **changes: Any,
 ) -> Reconstruction:
@@ -185,7 +185,7 @@ def _interrupted_between_steps() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-class _Bar:
+class Bar:
     """Progress with the loss and the first parameters: a bar, or lines where no terminal is."""
 
     def __init__(self, console: Console, name: str, steps: int):
@@ -200,7 +200,7 @@ class _Bar:
         )
         self._task = self._bar.add_task("", total=steps)
 
-    def __enter__(self) -> "_Bar":
+    def __enter__(self) -> "Bar":
         if self._console.is_terminal:
             self._bar.start()
         return self

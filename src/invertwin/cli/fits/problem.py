@@ -11,7 +11,7 @@ from invertwin.cli import build
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import RadarParameter, RunFile, SimulatedData
+from invertwin.cli.schema import MoverParameter, RadarParameter, RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.radar.radar import Radar
@@ -56,6 +56,12 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     scene, truth = build.scene(run), build.true_scene(run)
     build.parameters(run.parameters, scene)  # their errors come before any work
     data = need(run, "data", "reconstruct")
+    for i, parameter in enumerate(run.parameters):
+        if isinstance(parameter, MoverParameter):
+            raise InputError(
+                f'parameters[{i}].kind: expected "mover" with data.kind = "openradar" only, got '
+                f'"{data.kind}"; use "translation", "pose" or another kind'
+            )
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
         grid = build.grid(table, radar)

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Tag, model_validator
 
+from invertwin.cli.schema.mover import MoverParameter, OpenRadarData
 from invertwin.cli.schema.recording import ArraysData, Dca1000Data
 from invertwin.cli.schema.section import (
     TAG_MARK,
@@ -72,7 +73,8 @@ Data = Annotated[
     | Annotated[CaptureData, Tag(TAG_MARK + "capture")]
     | Annotated[Dca1000Data, Tag(TAG_MARK + "dca1000")]
     | Annotated[ArraysData, Tag(TAG_MARK + "arrays")]
-    | Annotated[RailSarData, Tag(TAG_MARK + "rail_sar")],
+    | Annotated[RailSarData, Tag(TAG_MARK + "rail_sar")]
+    | Annotated[OpenRadarData, Tag(TAG_MARK + "openradar")],
     tag_by("kind"),
 ]
 
@@ -153,7 +155,8 @@ Parameter = Annotated[
     | Annotated[ScaleParameter, Tag(TAG_MARK + "scale")]
     | Annotated[VerticesParameter, Tag(TAG_MARK + "vertices")]
     | Annotated[MaterialParameter, Tag(TAG_MARK + "material")]
-    | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")],
+    | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")]
+    | Annotated[MoverParameter, Tag(TAG_MARK + "mover")],
     tag_by("kind"),
 ]
 
