@@ -17,7 +17,14 @@ from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
-from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, nuisances_of, steps_of
+from invertwin.cli.fits.problem import (
+    FULL,
+    INTERIOR,
+    Problem,
+    density_of,
+    nuisances_of,
+    steps_of,
+)
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.run_file import need
 from invertwin.cli.runs import PARTS, RunFolder
@@ -121,12 +128,13 @@ def _reconstruct(
     checkpoint: Any,
     **changes: Any,
 ) -> Reconstruction:
-    settings = need(problem.run, "reconstruct", "reconstruct")
+    settings, table = need(problem.run, "reconstruct", "reconstruct"), problem.run.surrogate
     options = {
         "grid": problem.grid,
         "loss": build.loss(problem.run.loss),
         "optimizer": build.optimizer(problem.run.optimizer),
-        "surrogate": build.surrogate(problem.run.surrogate),
+        "surrogate": None if table.exact else build.surrogate(table),
+        "density": density_of(problem.run),
         "annealing": settings.annealing,
         "seed": problem.run.seed,
         "samples": settings.samples,

@@ -19,6 +19,8 @@ from invertwin.scene import Scene
 
 FULL, INTERIOR = "full", "interior_only"
 
+_DENSITY = 2_000.0  # points per m²
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -92,6 +94,11 @@ def sought_objects(run: RunFile) -> list[str]:
 def steps_of(problem: Problem) -> int:
     """The budget of a fit."""
     return need(problem.run, "reconstruct", "reconstruct").steps
+
+
+def density_of(run: RunFile) -> float:
+    """Rough points per m² of the exact chain: those of simulated data, or enough of them."""
+    return run.data.density if isinstance(run.data, SimulatedData) else _DENSITY
 
 
 def annealed_until(run: RunFile) -> float | None:

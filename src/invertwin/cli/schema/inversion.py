@@ -1,6 +1,6 @@
 """The tables of the data and of what is sought in them."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, Tag, model_validator
 
@@ -22,6 +22,8 @@ from invertwin.cli.schema.section import (
     fail,
     tag_by,
 )
+from invertwin.errors import InputError
+from invertwin.radar.surrogate import chosen_surrogate
 
 
 class SimulatedData(Section):
@@ -181,16 +183,48 @@ class Starts(Section):
 
 
 class Surrogate(Section):
-    """Kernels of the smooth model; the extra widths anneal to zero, in cells."""
+    """Kernels of the smooth model; the extra widths anneal to zero, in cells.
 
-    range_kernel: Literal["response", "gaussian"] = "response"
-    """response = that of waveform and window"""
+    A name may stand for the table: surrogate = "exact", "response", "annealed", "gaussian",
+    "dirichlet" or "random_phase", before the first table.
+    """
+
+    range_kernel: Literal["response", "gaussian", "dirichlet"] = "response"
+    """response = that of waveform and window; dirichlet = without a window"""
     angle_kernel: Literal["response", "airy"] = "response"
     """response = that of arrays and window"""
     range_width: NonNegative = 0.0
     """extra blur at the first step, in range cells; falls to 0"""
     angle_width: NonNegative = 0.0
     """extra blur at the first step, in beamwidths; falls to 0"""
+    phases: Literal["mean", "random"] = "mean"
+    """random = the paper's field (gaussian, airy), blind to silhouettes on average"""
+    exact: bool = False
+    """fit the exact chain instead; rough surfaces need boundary = false"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, data: Any) -> Any:
+        if not isinstance(data, str):
+            return data
+        try:
+            chosen = chosen_surrogate(data)
+        except InputError as error:
+            fail(str(error))
+        if chosen is None:
+            return {"exact": True}
+        return {k: v for k, v in vars(chosen).items() if k in cls.model_fields}
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Surrogate":
+        kernels = (self.range_kernel, self.angle_kernel)
+        if self.phases == "random" and (kernels != ("gaussian", "airy") or self.angle_width > 0):
+            fail(
+                'expected range_kernel = "gaussian", angle_kernel = "airy" and no angle_width with '
+                f'phases = "random", got "{kernels[0]}", "{kernels[1]}" and {self.angle_width:g}; '
+                'write surrogate = "random_phase"'
+            )
+        return self
 
 
 class Loss(Section):
