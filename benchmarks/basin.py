@@ -1,93 +1,129 @@
-"""Basin of attraction: from how far does a fit find a wall, by the exact signal or the surrogate?
+"""Basin of attraction: from how far off does a fit find a panel, in range and in direction?
 
     python benchmarks/basin.py [-o DIR]
 
 Prints a table and writes `metrics.json` and `basin.png` into DIR (default `out/basin`).
 
-A rough finite wall (random phases, so fully developed speckle) stands 3 m before the radar; the
-data is its exact beat signal with noise. A fit starts with the wall some range cells off and
-moves it in range by Adam. It converges if it ends within half a range cell of the truth. A seed
-is one realisation of speckle and noise, and converges at an offset if the fits from both sides
-do. The basin is the largest offset up to which 19 of 20 seeds converge.
+A rough panel of 0.6 m (random phases, so fully developed speckle) faces a radar of 2 GHz and 16
+antennas, 3 m away; the radar looks from 16 places on a vertical rail, so that the data are 16 looks
+at the speckle. They are beat signals of the exact chain with noise. A fit seeks range and direction
+at once. It starts some range cells, or some beamwidths along the arc about the radar, off the
+truth, and converges if it ends within half a range cell and half a beamwidth of it. A seed is one
+realisation of speckle and noise, and converges at an offset if the fits from both sides do. The
+basin is the largest offset up to which 19 of 20 seeds converge; no larger one is tried once a
+second seed has failed.
 
-- `exact`: the exact chain is differentiated (visibility fixed, derivations §4). The model is given
-  the very phases of the data's scatterers; the loss compares power spectra.
-- `exact_beat`: the same, but the loss compares the beat signals, phases included; it has a minimum
-  in every half wavelength.
-- `surrogate`: `invertwin.reconstruct` with annealed widths. It knows nothing of the phases.
+- `exact`: the exact chain is differentiated (visibility fixed, derivations §4) and given the very
+  phases of the data's scatterers, which nobody has; the loss compares power spectra.
+- `gaussian`: the paper's kernels (Gaussian pulse, Airy lobe) on powers, no extra width.
+- `dirichlet`: the response without a window, no extra width; the data have no window either, and
+  finer bins, which it needs.
+- `surrogate`: annealed. Extra widths fall to zero, and a last stage of its own has none: it fits
+  the exact mean response of the radar. It knows nothing of phases, as the two before.
 
-The loss of spectra, the optimiser and the number of steps are the same for all. The exact chain
-has its own rate, the best for it of 3, 10, 20 and 50 mm. A start within half a cell counts as
-converged unless it is led away.
+`final_error_cells` and `final_error_beamwidths` are what 19 of 20 seeds stay within after the last
+stage, from the required offsets. All fits are `invertwin.reconstruct` with one loss. Surrogates
+take as many steps, at a rate that was the best of 0.25, 0.5 and 1 cells for those of fixed width;
+the exact chain fewer at the best of 0.1, 0.3 and 1.
 """
 
 import argparse
 import json
 import os
-import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import takewhile
 from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 from torch import Tensor, nn
 
 from invertwin.capture import Capture
 from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import RoughPoints, rough_points, trace_field
+from invertwin.channel.tracer import RoughPoints, rough_points
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer, reconstruct
 from invertwin.radar import FMCW, Radar, Surrogate
-from invertwin.radar.range_profile import beat_signal
-from invertwin.radar.spectrum import exact_spectrum
-from invertwin.scene import AntennaArray, Isotropic, Object, RoughDielectric, Scene
+from invertwin.scene import AntennaArray, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array
-from invertwin.scene.pose import rigid
+from invertwin.scene.pose import rigid, rotation_from_vector
 from invertwin.scene.shapes import plate
 from invertwin.simulation import simulate
 
 SEEDS = 20
 MAY_FAIL = 1 / 20
-CONVERGED = 0.5  # range cells
-STEPS = 60
-RATES = {"exact": 0.01, "exact_beat": 0.01, "surrogate": 0.05}  # m
+CONVERGED = 0.5  # range cells and beamwidths
 LOSS = SpectrumLoss(kind="likelihood")
-OFFSETS: dict[str, Sequence[float]] = {
-    "exact": (0.25, 0.5, 1.0, 2.0, 3.0),
-    "exact_beat": (0.25, 0.5, 1.0, 2.0),
-    "surrogate": (2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 20.0, 24.0),
+AXES = ("cells", "beamwidths")
+OFFSETS: dict[str, dict[str, Sequence[float]]] = {
+    "exact": {"cells": (0.5, 1.0, 2.0), "beamwidths": (0.5, 1.0, 2.0)},
+    "gaussian": {"cells": (1.0, 2.0, 4.0, 8.0), "beamwidths": (1.0, 2.0, 3.0, 4.0)},
+    "dirichlet": {"cells": (1.0, 2.0, 4.0, 8.0), "beamwidths": (1.0, 2.0, 3.0, 4.0)},
+    "surrogate": {"cells": (6.0, 12.0, 18.0, 24.0), "beamwidths": (1.5, 3.0, 4.0, 5.0)},
 }
-REQUIRED = 9.3  # range cells, of the surrogate
-DISTANCE, SIZE = 3.0, 1.5  # m
-DENSITY = 1500.0  # scatterers per m²
+REQUIRED = {"cells": 18.0, "beamwidths": 3.0}  # of the surrogate
+REQUIRED_ERROR = 0.05  # cells
+DISTANCE, SIZE = 3.0, 0.6  # m
+LOOKS, RAIL_STEP = 16, 0.03  # m: more than λR/2 over the size, so that speckle is new
+DENSITY = 300.0  # scatterers per m²
 SNR_DB = 20.0
 WAVEFORM = FMCW(start_frequency=76e9, bandwidth=2e9, duration=50e-6, samples=128)
 
 
-class Displacement(nn.Module):
-    """Moves the wall along the boresight [m]."""
+class Stage(NamedTuple):
+    """A fit, from where the one before ended; rates in cells and beamwidths."""
+
+    kernel: Surrogate | str
+    steps: int
+    rate: float
+    final_rate: float
+
+
+STAGES = {
+    "exact": (Stage("exact", 30, 0.3, 0.015),),
+    "gaussian": (Stage("gaussian", 70, 0.5, 0.01),),
+    "dirichlet": (Stage("dirichlet", 70, 0.5, 0.01),),
+    "surrogate": (
+        Stage(Surrogate(range_width=8.0, angle_width=1.5), 45, 1.0, 0.1),
+        Stage("response", 25, 0.15, 0.01),
+    ),
+}
+ANNEALING = 0.8  # of the first stage
+
+
+class Place(nn.Module):
+    """Where the panel is, off the truth: along the line of sight, and on the arc about the radar.
+
+    Attributes:
+        cells: Parameter [range cells].
+        beamwidths: Parameter [beamwidths in u].
+    """
 
     applies_to = "scene"
 
-    def __init__(self, start: float) -> None:
+    def __init__(self, cells: float, beamwidths: float, beamwidth: float) -> None:
         super().__init__()
-        self.distance = nn.Parameter(torch.tensor(start, dtype=torch.float64))
+        self.cells = nn.Parameter(torch.tensor(cells, dtype=torch.float64))
+        self.beamwidths = nn.Parameter(torch.tensor(beamwidths, dtype=torch.float64))
+        self._beamwidth = beamwidth
 
     def forward(self, scene: Scene) -> Scene:
-        """The scene with the wall moved."""
-        place = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) * (DISTANCE + self.distance)
-        return scene.replace("wall", pose=rigid(torch.eye(3, dtype=torch.float64), place))
+        """The scene with the panel moved; it goes on facing the radar."""
+        distance = DISTANCE + WAVEFORM.range_resolution * self.cells
+        angle = torch.asin((self._beamwidth * self.beamwidths).clamp(-0.95, 0.95))
+        zero = torch.zeros_like(angle)
+        place = distance * torch.stack([torch.sin(angle), zero, torch.cos(angle)])
+        turn = rotation_from_vector(torch.stack([zero, angle, zero]))
+        return scene.replace("panel", pose=rigid(turn, place))
 
 
 @dataclass(frozen=True)
@@ -104,80 +140,75 @@ class Task:
     @staticmethod
     def draw(seed: int) -> "Task":
         """Speckle and noise of a seed."""
-        receivers = linear_array(4, WAVEFORM.wavelength / 2)
-        transmitter = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Isotropic())
-        radar = Radar(transmitter, receivers, WAVEFORM, torch.zeros(1, 3, dtype=torch.float64))
-        grid = radar.grid(0.5, 6.0)
-        wall = Object(plate(SIZE, SIZE), RoughDielectric(permittivity=4.0))
+        rail = torch.zeros(LOOKS, 3, dtype=torch.float64)
+        rail[:, 1] = RAIL_STEP * (torch.arange(LOOKS) - 0.5 * (LOOKS - 1))
+        receivers = linear_array(16, WAVEFORM.wavelength / 2)
+        transmitter = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
+        radar = Radar(transmitter, receivers, WAVEFORM, rail)
+        grid = _grid(radar, oversample=2)
+        panel = Object(plate(SIZE, SIZE), RoughDielectric(permittivity=4.0))
         with torch.no_grad():
-            scene = Displacement(0.0)(Scene({"wall": wall}))
+            scene = Place(0.0, 0.0, radar.beamwidth[0])(Scene({"panel": panel}))
             points = rough_points(scene, DENSITY, seed)
             found = simulate(scene, radar, grid, points=points, snr_db=SNR_DB, seed=seed)
         assert found.beat is not None
         return Task(seed, radar, grid, scene, points, found.beat)
 
-    def exact(self, start: float, rate: float, by_spectrum: bool) -> float:
-        """Where the exact chain takes the wall from a start [m]."""
-        module, rates = Displacement(start), Optimizer(rate=rate)
-        optimizer = rates.build(module)
-        measured = exact_spectrum(self.beat, self.radar, self.grid)
-        scale = self.beat.abs().square().mean()
-        for step in range(STEPS):
-            rates.apply(optimizer, step / STEPS)
-            optimizer.zero_grad()
-            paths = trace_field(
-                module(self.scene),
-                self.radar.link(),
+    def fit(self, method: str, cells: float, beamwidths: float) -> tuple[float, float]:
+        """Where a method takes the panel from a start [range cells, beamwidths off the truth]."""
+        radar, grid = self.radar, self.grid
+        if method == "dirichlet":
+            radar = replace(radar, window="rectangular")
+            grid = _grid(radar, oversample=3)
+        module = Place(cells, beamwidths, radar.beamwidth[0])
+        for stage in STAGES[method]:
+            reconstruct(
+                self.scene,
+                radar,
+                Capture.from_beat(self.beat, radar),
+                [module],
+                grid=grid,
+                loss=LOSS,
+                surrogate=stage.kernel,
+                annealing=ANNEALING,
+                optimizer=Optimizer(rate=stage.rate, final_rate=stage.final_rate),
+                steps=stage.steps,
+                samples=10_000,
+                boundary_samples=2_000,
+                boundary=stage.kernel != "exact",
+                depth=1,
                 points=self.points,
                 seed=self.seed,
-                boundary=False,
             )
-            beat = beat_signal(paths, self.radar, tolerance=1e-6)
-            if by_spectrum:
-                value = LOSS(exact_spectrum(beat, self.radar, self.grid), measured)
-            else:
-                value = (beat - self.beat).abs().square().mean() / scale
-            value.backward()
-            optimizer.step()
-        return float(module.distance.detach())
-
-    def surrogate(self, start: float, rate: float) -> float:
-        """Where the library's reconstruction takes the wall from a start [m]."""
-        module = Displacement(start)
-        reconstruct(
-            self.scene,
-            self.radar,
-            Capture.from_beat(self.beat, self.radar),
-            [module],
-            grid=self.grid,
-            loss=LOSS,
-            surrogate=Surrogate(range_width=6.0),
-            optimizer=Optimizer(rate=rate),
-            steps=STEPS,
-            samples=20_000,
-            boundary_samples=2_000,
-            seed=self.seed,
-        )
-        return float(module.distance.detach())
-
-    def fit(self, method: str, start: float) -> float:
-        """Dispatch by method name."""
-        if method == "surrogate":
-            return self.surrogate(start, RATES[method])
-        return self.exact(start, RATES[method], by_spectrum=method == "exact")
+        return float(module.cells.detach()), float(module.beamwidths.detach())
 
 
-def converged(method: str, offset: float, seed: int) -> bool:
-    """Whether the fits of a seed from both sides end at the truth."""
-    task, cell = _task(seed), WAVEFORM.range_resolution
-    ends = (task.fit(method, side * offset * cell) / cell for side in (1.0, -1.0))
-    return all(abs(end) <= CONVERGED for end in ends)
+def _grid(radar: Radar, oversample: int) -> Grid:
+    """Fine in range, at the Nyquist step in direction."""
+    fine, coarse = (radar.grid(0.9, 5.25, oversample=o) for o in (oversample, 1))
+    return replace(fine, u_start=coarse.u_start, u_step=coarse.u_step, u_count=coarse.u_count)
+
+
+def errors(method: str, axis: str, offset: float, seed: int) -> tuple[float, float]:
+    """The larger |error| of the fits of a seed from both sides: range cells, beamwidths.
+
+    The second side is left out once the first has failed.
+    """
+    worst = 0.0, 0.0
+    for side in (1.0, -1.0):
+        start = (side * offset, 0.0) if axis == "cells" else (0.0, side * offset)
+        end = _task(seed).fit(method, *start)
+        worst = max(worst[0], abs(end[0])), max(worst[1], abs(end[1]))
+        if max(worst) > CONVERGED:
+            break
+    return worst
 
 
 def _one_thread() -> None:
     import drjit as dr
 
     dr.set_thread_count(1)
+    torch.set_num_threads(1)
 
 
 @lru_cache(maxsize=SEEDS)
@@ -185,80 +216,140 @@ def _task(seed: int) -> Task:
     return Task.draw(seed)
 
 
-def success_counts(offsets: dict[str, Sequence[float]], seeds: int) -> dict[str, dict[float, int]]:
-    """Converged seeds by method and offset [range cells].
+Found = dict[float, list[tuple[float, float]]]  # offset → errors of the seeds tried
 
-    A method stops at the first offset from which fewer than a quarter of the seeds converge.
-    """
-    counts: dict[str, dict[float, int]] = {}
-    quiet = not sys.stdout.isatty()
+
+def trial(pool: ProcessPoolExecutor, method: str, axis: str, offset: float, seeds: int) -> list:
+    """Errors of the seeds at one offset, until one more has failed than may."""
+    jobs = [pool.submit(partial(errors, method, axis, offset), s) for s in range(1, seeds + 1)]
+    rows: list[tuple[float, float]] = []
+    for job in jobs:
+        rows.append(job.result())
+        if failures(rows) > seeds * MAY_FAIL:
+            for waiting in jobs:
+                waiting.cancel()
+            break
+    return rows
+
+
+def failures(rows: Sequence[tuple[float, float]]) -> int:
+    """Seeds that did not converge."""
+    return sum(max(row) > CONVERGED for row in rows)
+
+
+def all_trials(
+    offsets: dict[str, dict[str, Sequence[float]]], seeds: int
+) -> dict[str, dict[str, Found]]:
+    """Errors by axis, method and offset; a method stops at the end of its basin."""
+    found: dict[str, dict[str, Found]] = {axis: {} for axis in AXES}
     # Each fit is small: a process per core does more than threads inside of one.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn"), _one_thread) as pool:
         for method, listed in offsets.items():
-            counts[method] = {}
-            for offset in track(listed, f"{method:10}", transient=True, disable=quiet):
-                fit = partial(converged, method, offset)
-                counts[method][offset] = sum(pool.map(fit, range(1, seeds + 1)))
-                if counts[method][offset] < seeds / 4:
-                    break
-    return counts
+            for axis, values in listed.items():
+                rows = found[axis].setdefault(method, {})
+                for offset in values:
+                    rows[offset] = trial(pool, method, axis, offset, seeds)
+                    print(f"{method}, {offset:g} {axis}: {_share(rows[offset])}", flush=True)
+                    if failures(rows[offset]) > seeds * MAY_FAIL:
+                        break
+    return found
 
 
-def basin(counts: dict[float, int], seeds: int) -> float:
+def basin(found: Found, seeds: int) -> float:
     """Largest offset up to which all but a twentieth of the seeds converge; 0 if none."""
-    held = takewhile(lambda offset: counts[offset] >= seeds - seeds * MAY_FAIL, sorted(counts))
+    held = takewhile(lambda at: failures(found[at]) <= seeds * MAY_FAIL, sorted(found))
     return max(held, default=0.0)
 
 
-def table(counts: dict[str, dict[float, int]], seeds: int) -> Table:
-    """Offset × method → seeds converged."""
-    title = f"Seeds of {seeds} that converge, by starting offset in range cells"
+def bound(rows: Sequence[tuple[float, float]], axis: int, seeds: int) -> float:
+    """What all but a twentieth of the seeds stay within."""
+    ordered = sorted(row[axis] for row in rows)
+    return ordered[len(ordered) - 1 - int(seeds * MAY_FAIL)]
+
+
+def table(found: dict[str, Found], axis: str) -> Table:
+    """Offset × method → seeds converged of those tried."""
+    title = f"Seeds that converge, of those tried, by starting offset in {axis}"
     grid = Table(title=title, title_justify="left")
     grid.add_column("offset", justify="right")
-    for method in counts:
+    for method in found:
         grid.add_column(method, justify="right")
-    for offset in sorted({offset for of in counts.values() for offset in of}):
-        grid.add_row(f"{offset:g}", *(str(of.get(offset, "")) for of in counts.values()))
+    for offset in sorted({offset for of in found.values() for offset in of}):
+        cells = (_share(of[offset]) if offset in of else "" for of in found.values())
+        grid.add_row(f"{offset:g}", *cells)
     return grid
 
 
-def picture(counts: dict[str, dict[float, int]], seeds: int, path: Path) -> None:
-    """Share of the seeds that converge against the offset, as PNG."""
-    figure = Figure(figsize=(6, 3.5), layout="constrained")
-    axes = figure.add_subplot(xlabel="starting offset [range cells]", ylabel="converged")
-    for method, of in counts.items():
-        axes.plot(list(of), [100 * count / seeds for count in of.values()], "o-", label=method)
-    axes.axhline(100 * (1 - MAY_FAIL), color="gray", linestyle=":", linewidth=1)
-    axes.axvline(REQUIRED, color="gray", linestyle="--", linewidth=1)
-    axes.yaxis.set_major_formatter("{x:.0f} %")
-    axes.legend()
+def _share(rows: Sequence[tuple[float, float]]) -> str:
+    return f"{len(rows) - failures(rows)}/{len(rows)}"
+
+
+def picture(found: dict[str, dict[str, Found]], path: Path) -> None:
+    """Share of the tried seeds that converge against the offset, as PNG."""
+    figure = Figure(figsize=(9, 3.5), layout="constrained")
+    for axis, axes in zip(AXES, figure.subplots(1, 2, sharey=True), strict=True):
+        for method, of in found[axis].items():
+            share = [100 * (1 - failures(rows) / len(rows)) for rows in of.values()]
+            axes.plot(list(of), share, "o-", label=method)
+        axes.axhline(100 * (1 - MAY_FAIL), color="gray", linestyle=":", linewidth=1)
+        axes.axvline(REQUIRED[axis], color="gray", linestyle="--", linewidth=1)
+        axes.set_xlabel(f"starting offset [{axis}]")
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_major_formatter("{x:.0f} %")
+        axes.legend(title="converged")
     FigureCanvasAgg(figure).print_png(path)
 
 
 def measure(
-    out: Path, offsets: dict[str, Sequence[float]] | None = None, seeds: int = SEEDS
+    out: Path, offsets: dict[str, dict[str, Sequence[float]]] | None = None, seeds: int = SEEDS
 ) -> dict[str, Any]:
     """All metrics and the picture; fewer offsets and seeds in tests only."""
     start = perf_counter()
-    counts = success_counts(offsets or OFFSETS, seeds)
+    found = all_trials(offsets or OFFSETS, seeds)
     out.mkdir(parents=True, exist_ok=True)
-    picture(counts, seeds, out / "basin.png")
-    metrics = {
-        "basin_cells": {method: basin(of, seeds) for method, of in counts.items()},
-        "largest_offset_tried": {method: max(of) for method, of in counts.items()},
+    picture(found, out / "basin.png")
+    metrics: dict[str, Any] = {
+        f"basin_{axis}": {method: basin(of, seeds) for method, of in found[axis].items()}
+        for axis in AXES
+    }
+    for i, axis in enumerate(AXES):
+        rows = found[axis].get("surrogate", {}).get(REQUIRED[axis])
+        metrics[f"final_error_{axis}"] = bound(rows, i, seeds) if rows else None
+    metrics |= {
         "converged": {
-            method: {f"{offset:g}": count for offset, count in of.items()}
-            for method, of in counts.items()
+            axis: {
+                method: {f"{offset:g}": _share(rows) for offset, rows in of.items()}
+                for method, of in found[axis].items()
+            }
+            for axis in AXES
         },
         "seeds": seeds,
         "range_cell_m": WAVEFORM.range_resolution,
-        "steps": STEPS,
+        "beamwidth_u": _task(1).radar.beamwidth[0],
         "seconds": perf_counter() - start,
     }
     (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-    Console().print(table(counts, seeds))
+    for axis in AXES:
+        Console().print(table(found[axis], axis))
     return metrics
+
+
+def verdicts(metrics: dict[str, Any]) -> list[str]:
+    """What must hold, and whether it does."""
+    lines = []
+    for axis, least in REQUIRED.items():
+        holds = metrics[f"basin_{axis}"]["surrogate"] >= least
+        lines.append(f"basin_{axis}.surrogate >= {least:g}: {_holds(holds)}")
+    error = metrics["final_error_cells"]
+    holds = error is not None and error <= REQUIRED_ERROR
+    lines.append(f"final_error_cells <= {REQUIRED_ERROR:g}: {_holds(holds)}")
+    return lines
+
+
+def _holds(holds: bool) -> str:
+    return "holds" if holds else "DOES NOT HOLD"
 
 
 def main() -> None:
@@ -267,10 +358,13 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("out/basin"))
     out = parser.parse_args().out
     metrics = measure(out)
-    for method, cells in metrics["basin_cells"].items():
-        print(f"basin_cells.{method} = {cells:g}")
-    verdict = "holds" if metrics["basin_cells"]["surrogate"] >= REQUIRED else "DOES NOT HOLD"
-    print(f"must hold: basin_cells.surrogate >= {REQUIRED}: {verdict}")
+    for axis in AXES:
+        for method, value in metrics[f"basin_{axis}"].items():
+            print(f"basin_{axis}.{method} = {value:g}")
+    for axis in AXES:
+        print(f"final_error_{axis} = {metrics[f'final_error_{axis}']}")
+    for line in verdicts(metrics):
+        print(f"must hold: {line}")
     print(f"wrote {out / 'metrics.json'} and {out / 'basin.png'} in {metrics['seconds']:.0f} s")
 
 

@@ -6,7 +6,7 @@ import torch
 from invertwin.errors import InputError
 from invertwin.radar import Surrogate
 from invertwin.scene import PerfectConductor, RoughDielectric, Scene, plate
-from invertwin.simulation import simulate
+from invertwin.simulation import simulate, surrogate_correlation
 from scenes import float64, occluder, radar, relative, thing
 
 
@@ -94,3 +94,55 @@ def test_a_mean_spectrum_has_no_noise():
     device = radar()
     with pytest.raises(InputError, match="no noise with a surrogate"):
         simulate(occluder(), device, device.grid(0.5, 2.5), seed=0, surrogate=Surrogate(), snr_db=9)
+
+
+def test_the_surrogate_correlates_with_the_mean_over_looks():
+    """One look is mostly speckle; looks averaged over are the surrogate's map."""
+    device = radar()
+    grid = device.grid(0.7, 1.7, 0.7)
+    scene = Scene({"plate": thing(plate(0.6, 0.4), (0.1, 0.0, 1.2), (0.0, 0.5, 0.0))})
+
+    def found(**options):
+        settings = {"samples": 100_000, "density": 600.0, "seed": 0} | options
+        return surrogate_correlation(scene, device, grid, **settings)
+
+    assert found(looks=24) >= 0.9
+    assert found(looks=1) < found(looks=24)
+    # Another place is another map.
+    away = scene.replace("plate", pose=thing(plate(1, 1), (-0.4, 0.0, 1.5)).pose)
+    assert surrogate_correlation(away, device, grid, seed=0, density=600.0) >= 0.9
+    assert found(looks=24, surrogate="gaussian") < found(looks=24)
+
+
+def test_looks_of_conductors_are_all_the_same():
+    device = radar()
+    scene = Scene({"plate": thing(plate(0.2, 0.2), (0, 0, 1.2), material=PerfectConductor())})
+    settings = {"seed": 0, "samples": 5_000}
+    grid = device.grid(0.7, 1.7, 0.7)
+    few, many = (
+        surrogate_correlation(scene, device, grid, looks=looks, **settings) for looks in (1, 4)
+    )
+    assert few == pytest.approx(many, rel=1e-5)
+
+
+@pytest.mark.parametrize("options", [{"looks": 0}, {"surrogate": "exact"}])
+def test_a_correlation_needs_looks_and_a_surrogate(options):
+    device = radar()
+    with pytest.raises(InputError, match="expected looks >= 1 and a surrogate"):
+        surrogate_correlation(occluder(), device, device.grid(0.5, 2.5), seed=0, **options)
+
+
+def test_one_switch():
+    device = radar()
+    grid = device.grid(0.5, 2.5)
+    settings = {"seed": 0, "samples": 2_000, "density": 100.0}
+    exact, named, smooth, same = (
+        simulate(occluder(), device, grid, surrogate=surrogate, **settings)
+        for surrogate in (None, "exact", "response", Surrogate())
+    )
+    assert exact.beat is not None
+    assert torch.allclose(exact.spectrum, named.spectrum, rtol=1e-6)
+    assert smooth.beat is None
+    assert torch.allclose(smooth.spectrum, same.spectrum, rtol=1e-5)
+    with pytest.raises(InputError, match="expected a Surrogate or one of exact"):
+        simulate(occluder(), device, grid, surrogate="sharp", **settings)

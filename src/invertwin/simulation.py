@@ -176,13 +176,16 @@ def surrogate_correlation(
         )
     if all(item.material.coherent for item in scene.objects.values()):
         looks = 1
-    settings = {"samples": samples, "depth": depth}
     with torch.no_grad():
         mean = torch.zeros(radar.frame_count, *grid.shape, dtype=torch.float64)
         for look in range(looks):
-            found = simulate(scene, radar, grid, seed=seed + look, density=density, **settings)
+            found = simulate(
+                scene, radar, grid, seed=seed + look, samples=samples, density=density, depth=depth
+            )
             mean += found.spectrum / looks
-        twin = simulate(scene, radar, grid, seed=seed, surrogate=smooth, **settings)
+        twin = simulate(
+            scene, radar, grid, seed=seed, surrogate=smooth, samples=samples, depth=depth
+        )
         a, b = (power.double() - power.double().mean() for power in (mean, twin.spectrum))
         norms = a.norm() * b.norm()
     return float((a * b).sum() / norms) if norms > 0 else 0.0

@@ -134,8 +134,11 @@ def _joined(parts: Sequence[schema.Part]) -> Mesh:
 
 
 def surrogate(table: schema.Surrogate) -> Surrogate:
-    """The smooth model of the `[surrogate]` table, at its starting widths."""
-    return Surrogate(**table.model_dump())
+    """The smooth model of the `[surrogate]` table, at its starting widths.
+
+    Of the exact chain the response, its mean over phases.
+    """
+    return Surrogate(**table.model_dump(exclude={"exact"}))
 
 
 def loss(table: schema.Loss) -> SpectrumLoss:

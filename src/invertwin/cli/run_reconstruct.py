@@ -10,13 +10,21 @@ from rich.console import Console
 from invertwin.cli import build
 from invertwin.cli.fits.fitting import calibrated, fit, restored
 from invertwin.cli.fits.problem import FULL, INTERIOR, problem_of
-from invertwin.cli.fits.scores import heldout, misfit, sharp_spectrum, summary, without_history
+from invertwin.cli.fits.scores import (
+    agreement,
+    heldout,
+    misfit,
+    sharp_spectrum,
+    summary,
+    without_history,
+)
 from invertwin.cli.fits.writing import COLUMNS, draw, status, tables_of, write_report
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table
 from invertwin.cli.run_file import need
+from invertwin.cli.run_openradar import run_openradar
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
-from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema import OpenRadarData, RunFile, SimulatedData
 from invertwin.scene.files import save_mesh
 
 
@@ -25,6 +33,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
 
     Starts that an interrupted run has finished are not fitted again.
     """
+    if isinstance(run.data, OpenRadarData):
+        return run_openradar(run, folder, console)
     begin = time.perf_counter()
     settings = need(run, "reconstruct", "reconstruct")
     problem, calibration = calibrated(problem_of(run, console), folder, console)
@@ -56,6 +66,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         "start_loss_sharp": misfit(run, maps["start"], maps["measured"]),
         "loss_sharp": misfit(run, maps["twin"], maps["measured"]),
         "parameters": best["values"],
+        **agreement(problem, twin, radar),
         **({"calibration": calibration} if calibration else {}),
         **heldout(problem, rows[modes[0]], best),
         "starts": without_history(rows[modes[0]]),

@@ -22,7 +22,12 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
-from invertwin.simulation import Simulation, simulate, simulate_chirps
+from invertwin.simulation import (
+    Simulation,
+    simulate,
+    simulate_chirps,
+    surrogate_correlation,
+)
 
 _SURROGATE_SAMPLES = 2_000_000
 _LABELS = {
@@ -40,7 +45,7 @@ _LABELS = {
     "mover_velocity_m_s": "strongest bin that moves, range rate [m/s]",
     "mover_azimuth_deg": "strongest bin that moves, azimuth [°]",
     "raw_bytes": "raw samples [bytes]",
-    "correlation_with_surrogate": "correlation with the surrogate's map",
+    "surrogate_correlation": "correlation of the surrogate with the mean of 16 exact looks",
     "wall_seconds": "time of the exact simulation [s]",
 }
 
@@ -115,7 +120,13 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
         "paths": len(found.paths),
         "bins": list(grid.shape),
         **_peak(found.spectrum, grid),
-        "correlation_with_surrogate": _correlation(found.spectrum, smooth),
+        "surrogate_correlation": surrogate_correlation(
+            scene,
+            radar.frames([0]),
+            grid,
+            seed=run.seed,
+            density=_simulated(run).density,
+        ),
         "wall_seconds": seconds,
     }
     if run.raw is not None:
@@ -221,8 +232,3 @@ def _peak(spectrum: torch.Tensor, grid: Grid) -> dict[str, float | None]:
         "peak_u": float(grid.u[u]),
         "peak_v": float(grid.v[v]),
     }
-
-
-def _correlation(a: torch.Tensor, b: torch.Tensor) -> float:
-    pair = torch.stack([a.double().flatten(), b.double().flatten()])
-    return float(torch.corrcoef(pair)[0, 1])

@@ -31,7 +31,7 @@ from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Scene
 
 # Cells of a map that an echo and its neighbours fill; and those that the noise is taken from.
-_GUARD, _TRAINING = 3, 6
+_GUARD, _TRAINING = 2, 2
 _FALSE_ALARM = 1e-6
 _FLOOR = 1e-4  # of the peak: below it levels are noise
 _TINY = 1e-12  # of the peak: keeps the derivative of a magnitude finite

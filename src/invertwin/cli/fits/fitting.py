@@ -17,7 +17,14 @@ from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
-from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, nuisances_of, steps_of
+from invertwin.cli.fits.problem import (
+    FULL,
+    INTERIOR,
+    Problem,
+    density_of,
+    nuisances_of,
+    steps_of,
+)
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.run_file import need
 from invertwin.cli.runs import PARTS, RunFolder
@@ -47,7 +54,7 @@ def calibrated(
             problem,
             alone,
             nuisances,
-            _Bar(console, "calibration", steps),
+            Bar(console, "calibration", steps),
             folder.file(checkpoint),
             steps=steps,
             optimizer=replace(build.optimizer(problem.run.optimizer), rate=rate),
@@ -82,7 +89,7 @@ def fit(
         problem,
         scene,
         [*build.parameters(problem.run.parameters, scene), *nuisances_of(problem)],
-        _Bar(console, name, steps_of(problem)),
+        Bar(console, name, steps_of(problem)),
         folder.file(checkpoint),
         steps=steps_of(problem),
         boundary=mode == FULL,
@@ -117,16 +124,17 @@ def _reconstruct(
     problem: Problem,
     scene: Scene,
     modules: Sequence[nn.Module],
-    bar: "_Bar",
+    bar: "Bar",
     checkpoint: Any,
     **changes: Any,
 ) -> Reconstruction:
-    settings = need(problem.run, "reconstruct", "reconstruct")
+    settings, table = need(problem.run, "reconstruct", "reconstruct"), problem.run.surrogate
     options = {
         "grid": problem.grid,
         "loss": build.loss(problem.run.loss),
         "optimizer": build.optimizer(problem.run.optimizer),
-        "surrogate": build.surrogate(problem.run.surrogate),
+        "surrogate": None if table.exact else build.surrogate(table),
+        "density": density_of(problem.run),
         "annealing": settings.annealing,
         "seed": problem.run.seed,
         "samples": settings.samples,
@@ -185,7 +193,7 @@ def _interrupted_between_steps() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-class _Bar:
+class Bar:
     """Progress with the loss and the first parameters: a bar, or lines where no terminal is."""
 
     def __init__(self, console: Console, name: str, steps: int):
@@ -200,7 +208,7 @@ class _Bar:
         )
         self._task = self._bar.add_task("", total=steps)
 
-    def __enter__(self) -> "_Bar":
+    def __enter__(self) -> "Bar":
         if self._console.is_terminal:
             self._bar.start()
         return self

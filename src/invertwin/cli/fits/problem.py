@@ -11,13 +11,15 @@ from invertwin.cli import build
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import RadarParameter, RunFile, SimulatedData
+from invertwin.cli.schema import MoverParameter, RadarParameter, RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
 FULL, INTERIOR = "full", "interior_only"
+
+_DENSITY = 2_000.0  # points per m²
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,12 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     scene, truth = build.scene(run), build.true_scene(run)
     build.parameters(run.parameters, scene)  # their errors come before any work
     data = need(run, "data", "reconstruct")
+    for i, parameter in enumerate(run.parameters):
+        if isinstance(parameter, MoverParameter):
+            raise InputError(
+                f'parameters[{i}].kind: expected "mover" with data.kind = "openradar" only, got '
+                f'"{data.kind}"; use "translation", "pose" or another kind'
+            )
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
         grid = build.grid(table, radar)
@@ -86,6 +94,11 @@ def sought_objects(run: RunFile) -> list[str]:
 def steps_of(problem: Problem) -> int:
     """The budget of a fit."""
     return need(problem.run, "reconstruct", "reconstruct").steps
+
+
+def density_of(run: RunFile) -> float:
+    """Rough points per m² of the exact chain: those of simulated data, or enough of them."""
+    return run.data.density if isinstance(run.data, SimulatedData) else _DENSITY
 
 
 def annealed_until(run: RunFile) -> float | None:

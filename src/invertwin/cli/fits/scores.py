@@ -9,14 +9,16 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.cli import build
-from invertwin.cli.fits.problem import INTERIOR, Problem
+from invertwin.cli.fits.problem import INTERIOR, Problem, density_of
 from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import MaterialParameter, Parameter, RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import surrogate_spectrum
+from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
+from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Scene
+from invertwin.simulation import surrogate_correlation
 
 
 def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
@@ -102,19 +104,40 @@ def sharp_spectrum(
 ) -> torch.Tensor:
     """The surrogate's map of a scene without extra widths."""
     settings = need(problem.run, "reconstruct", "reconstruct")
-    sharp = replace(build.surrogate(problem.run.surrogate), range_width=0.0, angle_width=0.0)
     with torch.no_grad():
         return surrogate_spectrum(
             scene,
             radar,
             problem.grid,
-            sharp,
+            sharp_surrogate(problem),
             samples=4 * settings.samples,
             boundary_samples=0,
             seed=problem.run.seed,
             depth=settings.depth,
             range_offset=offset,
         )
+
+
+def agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
+    """How well the surrogate is the mean of the exact chain, one bounce, first frame."""
+    if not isinstance(radar.waveform, SampledWaveform):
+        return {}
+    found = surrogate_correlation(
+        twin,
+        radar.frames([0]),
+        problem.grid,
+        seed=problem.run.seed,
+        surrogate=sharp_surrogate(problem),
+        density=density_of(problem.run),
+    )
+    return {"surrogate_correlation": found}
+
+
+def sharp_surrogate(problem: Problem) -> Surrogate:
+    """The run's kernels without extra widths, mean over phases."""
+    return replace(
+        build.surrogate(problem.run.surrogate), range_width=0.0, angle_width=0.0, phases="mean"
+    )
 
 
 def misfit(run: RunFile, simulated: torch.Tensor, measured: torch.Tensor) -> float | None:

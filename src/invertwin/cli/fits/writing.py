@@ -46,6 +46,7 @@ _LABELS = {
     "start_loss_sharp": "loss without extra width, start",
     "loss_sharp": "loss without extra width, twin",
     "loss": "loss at the last step",
+    "surrogate_correlation": "correlation of the surrogate with the mean of 16 exact looks, twin",
     "heldout_error_m": "held-out object, distance to the survey [m]",
     "heldout_error_worst_m": "held-out object, the same of the worst start [m]",
     "backprojection_error_m": "held-out object, by backprojection instead [m]",

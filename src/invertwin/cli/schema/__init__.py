@@ -27,6 +27,7 @@ from invertwin.cli.schema.inversion import (
     TranslationParameter,
     VerticesParameter,
 )
+from invertwin.cli.schema.mover import MoverParameter, OpenRadarData
 from invertwin.cli.schema.objects import (
     Body,
     Box,
@@ -164,9 +165,11 @@ __all__ = [
     "MeasuredData",
     "MaterialValue",
     "Medium",
+    "MoverParameter",
     "Multilayer",
     "NonNegative",
     "Ofdm",
+    "OpenRadarData",
     "Optimizer",
     "Orientation",
     "OwnBoard",

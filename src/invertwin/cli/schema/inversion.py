@@ -1,9 +1,10 @@
 """The tables of the data and of what is sought in them."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, Tag, model_validator
 
+from invertwin.cli.schema.mover import MoverParameter, OpenRadarData
 from invertwin.cli.schema.recording import ArraysData, Dca1000Data
 from invertwin.cli.schema.section import (
     TAG_MARK,
@@ -21,6 +22,8 @@ from invertwin.cli.schema.section import (
     fail,
     tag_by,
 )
+from invertwin.errors import InputError
+from invertwin.radar.surrogate import chosen_surrogate
 
 
 class SimulatedData(Section):
@@ -72,7 +75,8 @@ Data = Annotated[
     | Annotated[CaptureData, Tag(TAG_MARK + "capture")]
     | Annotated[Dca1000Data, Tag(TAG_MARK + "dca1000")]
     | Annotated[ArraysData, Tag(TAG_MARK + "arrays")]
-    | Annotated[RailSarData, Tag(TAG_MARK + "rail_sar")],
+    | Annotated[RailSarData, Tag(TAG_MARK + "rail_sar")]
+    | Annotated[OpenRadarData, Tag(TAG_MARK + "openradar")],
     tag_by("kind"),
 ]
 
@@ -153,7 +157,8 @@ Parameter = Annotated[
     | Annotated[ScaleParameter, Tag(TAG_MARK + "scale")]
     | Annotated[VerticesParameter, Tag(TAG_MARK + "vertices")]
     | Annotated[MaterialParameter, Tag(TAG_MARK + "material")]
-    | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")],
+    | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")]
+    | Annotated[MoverParameter, Tag(TAG_MARK + "mover")],
     tag_by("kind"),
 ]
 
@@ -178,16 +183,48 @@ class Starts(Section):
 
 
 class Surrogate(Section):
-    """Kernels of the smooth model; the extra widths anneal to zero, in cells."""
+    """Kernels of the smooth model; the extra widths anneal to zero, in cells.
 
-    range_kernel: Literal["response", "gaussian"] = "response"
-    """response = that of waveform and window"""
+    A name may stand for the table: surrogate = "exact", "response", "annealed", "gaussian",
+    "dirichlet" or "random_phase", before the first table.
+    """
+
+    range_kernel: Literal["response", "gaussian", "dirichlet"] = "response"
+    """response = that of waveform and window; dirichlet = without a window"""
     angle_kernel: Literal["response", "airy"] = "response"
     """response = that of arrays and window"""
     range_width: NonNegative = 0.0
     """extra blur at the first step, in range cells; falls to 0"""
     angle_width: NonNegative = 0.0
     """extra blur at the first step, in beamwidths; falls to 0"""
+    phases: Literal["mean", "random"] = "mean"
+    """random = the paper's field (gaussian, airy), blind to silhouettes on average"""
+    exact: bool = False
+    """fit the exact chain instead; rough surfaces need boundary = false"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, data: Any) -> Any:
+        if not isinstance(data, str):
+            return data
+        try:
+            chosen = chosen_surrogate(data)
+        except InputError as error:
+            fail(str(error))
+        if chosen is None:
+            return {"exact": True}
+        return {k: v for k, v in vars(chosen).items() if k in cls.model_fields}
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Surrogate":
+        kernels = (self.range_kernel, self.angle_kernel)
+        if self.phases == "random" and (kernels != ("gaussian", "airy") or self.angle_width > 0):
+            fail(
+                'expected range_kernel = "gaussian", angle_kernel = "airy" and no angle_width with '
+                f'phases = "random", got "{kernels[0]}", "{kernels[1]}" and {self.angle_width:g}; '
+                'write surrogate = "random_phase"'
+            )
+        return self
 
 
 class Loss(Section):
