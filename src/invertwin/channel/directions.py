@@ -33,7 +33,10 @@ class Directions:
         self.index = to_float(geometry.index)
 
     def draw(self, point: Place, back: Any, numbers: list[Any]) -> tuple[Any, Any]:
-        """A unit direction from four uniform numbers, and its density per solid angle."""
+        """A unit direction from four uniform numbers, and its density per solid angle.
+
+        Where total reflection leaves no direction, the density is infinite.
+        """
         import drjit as dr
 
         mi = tracer()
@@ -59,6 +62,10 @@ class Directions:
         for (direction, cap), away in zip(caps, outside, strict=True):
             inside = away & (dr.squared_norm(omega - direction) <= 2 * cap)
             density += dr.select(inside, share / (2 * dr.pi * cap), 0.0)
+        if self.bodies:
+            lost = dr.squared_norm(omega) < 0.5
+            omega = dr.select(lost, mi.Vector3f(facing), omega)
+            density = dr.select(lost, dr.inf, density)
         return omega, density
 
     def _caps(self, point: Place) -> tuple[list[tuple[Any, Any]], list[Any]]:
@@ -100,7 +107,7 @@ class Directions:
             limit += share
         if self.bodies:
             omega = dr.select(numbers[1] >= limit, self._refracted(point, back, numbers), omega)
-        return omega
+        return mi.Vector3f(omega)
 
     def _sides(self, point: Place, back: Any) -> tuple[Any, Any, Any]:
         """Refractive index here and beyond, and standard deviation of the refracted lobe."""
@@ -114,7 +121,7 @@ class Directions:
         return dr.select(outside, 1.0, body), dr.select(outside, body, 1.0), spread
 
     def _refracted(self, point: Place, back: Any, numbers: list[Any]) -> Any:
-        """A direction beyond the surface about Snell's; along the normal if there is none."""
+        """A direction beyond the surface about Snell's; zero if there is none."""
         import drjit as dr
 
         mi = tracer()
@@ -125,8 +132,7 @@ class Directions:
         x, y = ((gauss[k] - here * local[k]) / beyond for k in range(2))
         rest = 1 - x * x - y * y
         z = -dr.mulsign(dr.sqrt(dr.maximum(rest, 0.0)), local.z)
-        straight = mi.Vector3f(0.0, 0.0, -dr.sign(local.z))
-        return frame.to_world(dr.select(rest > 1e-6, mi.Vector3f(x, y, z), straight))
+        return dr.select(rest > 1e-6, frame.to_world(mi.Vector3f(x, y, z)), mi.Vector3f(0.0))
 
     def _refraction_density(self, point: Place, back: Any, omega: Any) -> Any:
         import drjit as dr
