@@ -1,5 +1,7 @@
 """The forward model: two chains of one shape and one unit, and what it refuses."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -117,7 +119,7 @@ def test_the_surrogate_correlates_with_the_mean_over_looks():
 def test_looks_of_conductors_are_all_the_same():
     device = radar()
     scene = Scene({"plate": thing(plate(0.2, 0.2), (0, 0, 1.2), material=PerfectConductor())})
-    settings = {"seed": 0, "samples": 5_000}
+    settings: dict[str, Any] = {"seed": 0, "samples": 5_000}
     grid = device.grid(0.7, 1.7, 0.7)
     few, many = (
         surrogate_correlation(scene, device, grid, looks=looks, **settings) for looks in (1, 4)
@@ -126,7 +128,7 @@ def test_looks_of_conductors_are_all_the_same():
 
 
 @pytest.mark.parametrize("options", [{"looks": 0}, {"surrogate": "exact"}])
-def test_a_correlation_needs_looks_and_a_surrogate(options):
+def test_a_correlation_needs_looks_and_a_surrogate(options: dict[str, Any]):
     device = radar()
     with pytest.raises(InputError, match="expected looks >= 1 and a surrogate"):
         surrogate_correlation(occluder(), device, device.grid(0.5, 2.5), seed=0, **options)
@@ -135,7 +137,7 @@ def test_a_correlation_needs_looks_and_a_surrogate(options):
 def test_one_switch():
     device = radar()
     grid = device.grid(0.5, 2.5)
-    settings = {"seed": 0, "samples": 2_000, "density": 100.0}
+    settings: dict[str, Any] = {"seed": 0, "samples": 2_000, "density": 100.0}
     exact, named, smooth, same = (
         simulate(occluder(), device, grid, surrogate=surrogate, **settings)
         for surrogate in (None, "exact", "response", Surrogate())
