@@ -153,6 +153,7 @@ def test_materials_without_a_diffuse_share_are_refused(frame):
             MovingBody("ball", scene, RADAR, echo)
 
 
+@pytest.mark.slow
 def test_a_twin_finds_place_and_motion_in_the_exact_chain():
     """A ball that fills several range cells, at mean power: 12 looks of other phases."""
     place, velocity, radius = (-0.4, 0.0, 2.6), (0.0, 0.0, 1.6), 0.3
