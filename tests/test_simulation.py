@@ -1,5 +1,7 @@
 """The forward model: two chains of one shape and one unit, and what it refuses."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -103,21 +105,21 @@ def test_the_surrogate_correlates_with_the_mean_over_looks():
     scene = Scene({"plate": thing(plate(0.6, 0.4), (0.1, 0.0, 1.2), (0.0, 0.5, 0.0))})
 
     def found(**options):
-        settings = {"samples": 100_000, "density": 600.0, "seed": 0} | options
+        settings = {"samples": 100_000, "density": 600.0, "seed": 0, "depth": 1} | options
         return surrogate_correlation(scene, device, grid, **settings)
 
     assert found(looks=24) >= 0.9
     assert found(looks=1) < found(looks=24)
     # Another place is another map.
     away = scene.replace("plate", pose=thing(plate(1, 1), (-0.4, 0.0, 1.5)).pose)
-    assert surrogate_correlation(away, device, grid, seed=0, density=600.0) >= 0.9
+    assert surrogate_correlation(away, device, grid, seed=0, density=600.0, depth=1) >= 0.9
     assert found(looks=24, surrogate="gaussian") < found(looks=24)
 
 
 def test_looks_of_conductors_are_all_the_same():
     device = radar()
     scene = Scene({"plate": thing(plate(0.2, 0.2), (0, 0, 1.2), material=PerfectConductor())})
-    settings = {"seed": 0, "samples": 5_000}
+    settings: dict[str, Any] = {"seed": 0, "samples": 5_000}
     grid = device.grid(0.7, 1.7, 0.7)
     few, many = (
         surrogate_correlation(scene, device, grid, looks=looks, **settings) for looks in (1, 4)
@@ -126,7 +128,7 @@ def test_looks_of_conductors_are_all_the_same():
 
 
 @pytest.mark.parametrize("options", [{"looks": 0}, {"surrogate": "exact"}])
-def test_a_correlation_needs_looks_and_a_surrogate(options):
+def test_a_correlation_needs_looks_and_a_surrogate(options: dict[str, Any]):
     device = radar()
     with pytest.raises(InputError, match="expected looks >= 1 and a surrogate"):
         surrogate_correlation(occluder(), device, device.grid(0.5, 2.5), seed=0, **options)
@@ -135,7 +137,7 @@ def test_a_correlation_needs_looks_and_a_surrogate(options):
 def test_one_switch():
     device = radar()
     grid = device.grid(0.5, 2.5)
-    settings = {"seed": 0, "samples": 2_000, "density": 100.0}
+    settings: dict[str, Any] = {"seed": 0, "samples": 2_000, "density": 100.0}
     exact, named, smooth, same = (
         simulate(occluder(), device, grid, surrogate=surrogate, **settings)
         for surrogate in (None, "exact", "response", Surrogate())

@@ -109,6 +109,7 @@ def test_a_mover_needs_that_recording(write, monkeypatch, capsys):
     assert 'data.kind = "openradar" only, got "simulated"' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_run_as_used_runs_again(write, data_folder, tmp_path, monkeypatch):
     """Defaults are filled in, the board among them, and the file is still accepted."""
     monkeypatch.setenv("INVERTWIN_DATA", str(data_folder))

@@ -125,9 +125,9 @@ def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
     vertices = body(scene)["ball"].vertices.detach()
     assert float(vertices.norm(dim=1).min()) == pytest.approx(echo.range, abs=1e-3)
     with torch.no_grad():
-        body.spin += 3.0
-        body.velocity += float64(0.7, 0.0)
-        body.size += float64(0.5, 0.1, -0.2)
+        body.spin.add_(3.0)
+        body.velocity.add_(float64(0.7, 0.0))
+        body.size.add_(float64(0.5, 0.1, -0.2))
     twin = body.moving(scene)["ball"]
     assert twin.velocity is not None
     step = 1e-6
@@ -153,6 +153,7 @@ def test_materials_without_a_diffuse_share_are_refused(frame):
             MovingBody("ball", scene, RADAR, echo)
 
 
+@pytest.mark.slow
 def test_a_twin_finds_place_and_motion_in_the_exact_chain():
     """A ball that fills several range cells, at mean power: 12 looks of other phases."""
     place, velocity, radius = (-0.4, 0.0, 2.6), (0.0, 0.0, 1.6), 0.3
@@ -186,7 +187,7 @@ def test_a_body_that_leaves_the_view_is_an_error(frame):
     echo = strongest_mover(frame, found)
     scene, body = start(echo)
     with torch.no_grad():
-        body.size += float64(math.nan, 0.0, 0.0)
+        body.size.add_(float64(math.nan, 0.0, 0.0))
     with pytest.raises(InputError):
         fit_mover(
             body, scene, found.around(echo, 4), steps=1, samples=100, seed=1, optimizer=Optimizer()

@@ -276,7 +276,9 @@ def test_gradients_of_moving_points(point_paths):
     velocity = torch.tensor([[0.01, 0.0, -0.03], [0.02, 0.01, 0.0]], dtype=torch.float64)
     inputs = [paths.coefficient.clone(), paths.first.clone(), velocity]
     inputs = [value.requires_grad_() for value in inputs]
-    assert torch.autograd.gradcheck(signal, inputs, eps=1e-5, atol=1e-4, rtol=1e-4)
+    assert torch.autograd.gradcheck(
+        signal, inputs, eps=1e-5, atol=1e-4, rtol=1e-4, check_forward_ad=True
+    )
 
 
 def test_motion_that_no_ramp_follows_is_refused(point_paths):

@@ -128,6 +128,6 @@ def test_wrong_velocities_windows_and_grids_are_refused(unchecked):
         moving_power(paths, VELOCITIES[:1], radar, grid, chirps, rates)
     with pytest.raises(InputError, match="got 'kaiser'"):
         moving_power(paths, VELOCITIES, radar, grid, chirps, rates, window="kaiser")
+    flat = replace(grid, u_count=1)
     with pytest.raises(InputError, match="resolves u"):
-        flat = replace(grid, u_count=1)
         moving_power(paths, VELOCITIES, radar, flat, chirps, rates)

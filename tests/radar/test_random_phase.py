@@ -1,6 +1,7 @@
 """The paper's random-phase field: right on average, and blind to silhouettes on average."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -146,7 +147,7 @@ def test_of_a_scene():
     radar = small_radar()
     grid = radar.grid(0.5, 2.5, 0.8)
     field = Surrogate("gaussian", "airy", phases="random")
-    settings = {"samples": 1_500, "boundary_samples": 300, "depth": 1}
+    settings: dict[str, Any] = {"samples": 1_500, "boundary_samples": 300, "depth": 1}
     move = Translation("occluder")
     first, again, other = (
         surrogate_spectrum(move(occluder()), radar, grid, field, seed=seed, **settings)

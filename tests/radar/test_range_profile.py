@@ -6,6 +6,7 @@ from dataclasses import replace
 import mpmath
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 
 from invertwin.channel.paths import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
@@ -177,12 +178,13 @@ def test_gradient_at_77_ghz_equals_autodiff_of_the_plain_sum(track):
 @pytest.mark.parametrize("samples", [63, 64])
 def test_tensor_operations_give_the_same(samples, track):
     """The path that CUDA tensors take, on the CPU: values and gradients."""
-    radar = replace(track, waveform=FMCW(76.5e9, 1e9, 40e-6, samples))
+    wave = FMCW(76.5e9, 1e9, 40e-6, samples)
+    radar = replace(track, waveform=wave)
     paths = two_bounces(radar, 60)
     grads, signals = [], []
     for forward in (
         lambda moved: beat_signal(moved, radar),
-        lambda moved: tensor_beat(moved, radar, radar.waveform, 1e-9),
+        lambda moved: tensor_beat(moved, radar, wave, 1e-9),
     ):
         leaves = [
             value.clone().requires_grad_()
@@ -195,10 +197,18 @@ def test_tensor_operations_give_the_same(samples, track):
     assert (signals[1] - signals[0]).norm() < 1e-8 * signals[0].norm()
     for found, expected in zip(*reversed(grads), strict=True):
         assert (found - expected).norm() < 1e-7 * expected.norm()
+    tangents = []
+    for forward in (beat_signal, lambda moved, radar: tensor_beat(moved, radar, wave, 1e-9)):
+        with forward_ad.dual_level():
+            late = forward_ad.make_dual(paths.delay, 1e-12 * torch.ones_like(paths.delay))
+            signal = forward(replace(paths, delay=late), radar)
+            tangents.append(forward_ad.unpack_dual(signal).tangent)
+    assert tangents[0] is not None
+    assert (tangents[1] - tangents[0]).norm() < 1e-7 * tangents[0].norm()
     empty = torch.zeros(0, dtype=torch.int64)
     columns = {n: getattr(paths, n)[empty] for n in vars(paths) if n not in ("kind", "velocity")}
     none = replace(paths, **columns)
-    assert not tensor_beat(none, radar, radar.waveform, 1e-9).any()
+    assert not tensor_beat(none, radar, wave, 1e-9).any()
 
 
 @pytest.mark.gpu

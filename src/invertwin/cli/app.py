@@ -1,4 +1,4 @@
-"""The command line `invertwin`: simulate, reconstruct, look, gradcheck, demo, doctor, keys."""
+"""The command line `invertwin`: from run files and recordings to folders of results."""
 
 import os
 import sys
@@ -239,8 +239,26 @@ def gradcheck(
 
         with console.status("tracing") as status:
             say = status.update if console.is_terminal else _now_and_then()
-            table = run_gradcheck(runs, {file.stem: file for file in files}, folder, say)
-        _print([table])
+            tables = run_gradcheck(runs, {file.stem: file for file in files}, folder, say)
+        _print(tables)
+
+
+@app.command(name="loss-scan")
+def loss_scan(
+    file: FileArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    seed: SeedOption = None,
+    backend: BackendOption = None,
+) -> None:
+    """Show the losses of signals and of the surrogate along a line."""
+    runs = _load([file], seed, "loss-scan", ("loss_scan", "radar", "grid", "data"))
+    with _folder(out or _default(file), runs, overwrite, False) as folder:
+        from invertwin.cli.run_loss_scan import run_loss_scan
+
+        with about_file(file):
+            tables = run_loss_scan(runs[file.stem], folder)
+        _print(tables)
 
 
 @app.command()

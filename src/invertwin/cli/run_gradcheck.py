@@ -13,8 +13,10 @@ from invertwin.channel.paths import Grid
 from invertwin.cli import build, pictures
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about_file, need, to_toml
+from invertwin.cli.run_methods import compare, methods_table
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import Gradcheck, RunFile
+from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Direction, GradientReport, gradcheck
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
@@ -45,6 +47,10 @@ _LEGEND = (
     "their step is halved, noise included. order: how the gap to the differences grows with their "
     "step; 2 for a right gradient, 0 for a wrong one. pairs: difference pairs averaged."
 )
+_METHODS = (
+    "Derivatives summed over elevation (range × azimuth) and over range (elevation × azimuth). "
+    "Red: grows with θ; blue: falls. One colour scale for all that have a unit of power."
+)
 _UNITS = {
     "translation": "1/m",
     "rotation": "1/rad",
@@ -59,14 +65,15 @@ def run_gradcheck(
     files: Mapping[str, Path],
     folder: RunFolder,
     say: Callable[[str], None],
-) -> Table:
-    """Checks every run file, writes the folder, and returns the table to print.
+) -> list[Table]:
+    """Checks every run file, writes the folder, and returns the tables to print.
 
     Scenes that an interrupted run has finished are not computed again.
     """
     begin = time.perf_counter()
     scenes: dict[str, Any] = {}
-    parts = []
+    parts: list[Picture] = []
+    methods: list[Table] = []
     for name, run in runs.items():
         part = f"{PARTS}/{name}.json"
         found = folder.read_json(part)
@@ -79,19 +86,26 @@ def run_gradcheck(
             Picture(run.title or name, (folder.path / f"{name}_scene.png").read_bytes()),
             Picture(name, (folder.path / f"{name}.png").read_bytes(), note=_note(run, found)),
         ]
+        if "methods" in found:
+            methods.append(methods_table(name, found["methods"]))
+            png = (folder.path / f"{name}_methods.png").read_bytes()
+            parts.append(Picture(methods[-1].title, png, note=_METHODS))
     seconds = time.perf_counter() - begin
     rows = [_row(*item) for item in scenes.items()]
     table = Table("Agreement with central differences", COLUMNS, rows, _LEGEND)
-    folder.write_json(
-        "metrics.json", {"task": "gradcheck", "scenes": scenes, "wall_seconds": seconds}
-    )
+    metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": seconds}
+    if len(scenes) == 1 and methods:
+        metrics["methods"] = next(iter(scenes.values()))["methods"]
+    folder.write_json("metrics.json", metrics)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
     folder.write_text(
         "report.html",
-        report_html("Gradient check", f"{count} checked.", "", [table, *parts], _again(runs)),
+        report_html(
+            "Gradient check", f"{count} checked.", "", [table, *methods, *parts], _again(runs)
+        ),
     )
     folder.remove([f"{PARTS}/{name}.json" for name in runs])
-    return table
+    return [table, *methods]
 
 
 def _again(runs: Mapping[str, RunFile]) -> Again:
@@ -107,20 +121,27 @@ def _check(
 ) -> dict[str, Any]:
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
+    if run.surrogate.exact:
+        raise InputError(
+            "surrogate.exact: expected a smooth map to differentiate, got the exact chain; remove "
+            "it: silhouettes of single rough points have no derivative"
+        )
     scene = build.scene(run)
     radar = build.radar(need(run, "radar", "gradcheck"))
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
+    direction = _direction(settings)
+    step = math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0
     report = gradcheck(
         scene,
         radar,
         grid,
-        _direction(settings),
+        direction,
         surrogate=build.surrogate(run.surrogate),
         depth=settings.depth,
         samples=settings.samples,
         boundary_samples=settings.boundary_samples,
         repeats=settings.repeats,
-        step=math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0,
+        step=step,
         difference_samples=settings.difference_samples,
         noise=settings.noise,
         max_pairs=settings.max_pairs,
@@ -133,6 +154,11 @@ def _check(
     unit = _UNITS.get(table.kind, f"per unit of {table.value}")
     folder.write_bytes(f"{name}.png", _maps(report, grid, unit))
     folder.write_bytes(f"{name}_scene.png", _picture(scene, radar, settings.parameter.object))
+    others = {}
+    if run.methods is not None:
+        compared = compare(run, scene, radar, grid, direction, step, report, say)
+        folder.write_bytes(f"{name}_methods.png", compared.picture)
+        others["methods"] = compared.found
     return {
         "full": asdict(report.full),
         "interior": asdict(report.interior),
@@ -141,6 +167,7 @@ def _check(
         "step_agreement": report.step_agreement,
         "pairs": report.pairs,
         "seconds": time.perf_counter() - begin,
+        **others,
     }
 
 

@@ -125,6 +125,7 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
             radar.frames([0]),
             grid,
             seed=run.seed,
+            depth=1,
             density=_simulated(run).density,
         ),
         "wall_seconds": seconds,

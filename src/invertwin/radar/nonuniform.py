@@ -113,7 +113,7 @@ def phase_cycles(
 
 
 class NonUniformSum(torch.autograd.Function):
-    """Σ_i strengths_ki exp(j (n − N//2) rate_i), with gradients in both (type 2)."""
+    """Σ_i strengths_ki exp(j (n − N//2) rate_i), with derivatives in both, either mode."""
 
     @staticmethod
     def forward(
@@ -124,7 +124,8 @@ class NonUniformSum(torch.autograd.Function):
         tolerance: float,
     ) -> Complex128[Tensor, "sum sample"]:
         ctx.save_for_backward(strengths, rate)
-        ctx.tolerance = tolerance
+        ctx.save_for_forward(strengths, rate)
+        ctx.samples, ctx.tolerance = samples, tolerance
         if len(rate) == 0:
             return strengths.new_zeros(len(strengths), samples)
         return _transform(1, rate, strengths, samples, tolerance)
@@ -145,6 +146,21 @@ class NonUniformSum(torch.autograd.Function):
         if with_rate:
             of_rate = (strengths.conj() * sums[len(strengths) :]).imag.sum(0)
         return sums[: len(strengths)], of_rate, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
+        strengths, rate = ctx.saved_tensors
+        samples, tolerance = ctx.samples, ctx.tolerance
+        change = strengths.new_zeros(len(strengths), samples)
+        if len(rate) == 0:
+            return change
+        if tangents[0] is not None:
+            change = change + _transform(1, rate, tangents[0], samples, tolerance)
+        if tangents[1] is not None:
+            place = torch.arange(samples, dtype=torch.float64, device=rate.device) - samples // 2
+            turned = _transform(1, rate, strengths * tangents[1], samples, tolerance)
+            change = change + 1j * place * turned
+        return change
 
 
 def _transform(kind: int, rate: Tensor, values: Tensor, samples: int, tolerance: float) -> Tensor:

@@ -128,6 +128,7 @@ def agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
         problem.grid,
         seed=problem.run.seed,
         surrogate=sharp_surrogate(problem),
+        depth=1,
         density=density_of(problem.run),
     )
     return {"surrogate_correlation": found}

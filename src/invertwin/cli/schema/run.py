@@ -22,12 +22,13 @@ from invertwin.cli.schema.objects import SceneFile, SceneObject, Truth
 from invertwin.cli.schema.recording import Chirps, Impairments, Raw
 from invertwin.cli.schema.section import Section, Seed, fail
 from invertwin.cli.schema.sensor import Grid, Radar
+from invertwin.cli.schema.studies import LossScan, Methods
 
 
 class RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
-    task: Literal["simulate", "reconstruct", "gradcheck", "demo"]
+    task: Literal["simulate", "reconstruct", "gradcheck", "loss-scan", "demo"]
     """what the file is for"""
     title: str = ""
     """heading of the report"""
@@ -71,6 +72,10 @@ class RunFile(Section):
     """losses along a line"""
     gradcheck: Gradcheck | None = None
     """the gradient check"""
+    methods: Methods | None = None
+    """other ways to its derivative, to compare"""
+    loss_scan: LossScan | None = None
+    """losses of signals and of the surrogate along a line"""
 
     @model_validator(mode="after")
     def _names_exist(self) -> "RunFile":
@@ -91,7 +96,7 @@ class RunFile(Section):
         for i, parameter in enumerate(self.parameters):
             if not isinstance(parameter, RadarParameter):
                 used.append((f"parameters[{i}].object", parameter.object))
-        for section in ("starts", "landscape", "calibration"):
+        for section in ("starts", "landscape", "calibration", "loss_scan"):
             if getattr(self, section) is not None:
                 used.append((f"{section}.object", getattr(self, section).object))
         if self.gradcheck is not None and self.gradcheck.parameter.object is not None:
