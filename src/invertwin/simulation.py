@@ -8,6 +8,7 @@ from jaxtyping import Complex128, Float
 from torch import Tensor
 
 from invertwin.channel.bridge import use_backend
+from invertwin.channel.chains import RoughChains
 from invertwin.channel.paths import Grid, Paths
 from invertwin.channel.tracer import RoughPoints, rough_points, trace_field
 from invertwin.errors import InputError
@@ -51,12 +52,13 @@ def simulate(
     *,
     seed: int,
     surrogate: Surrogate | str | None = None,
-    depth: int = 1,
+    depth: int = 3,
     samples: int = 400_000,
     boundary_samples: int = 50_000,
     boundary: bool = True,
     density: float = 20_000.0,
     points: RoughPoints | None = None,
+    chains: RoughChains | None = None,
     snr_db: float | None = None,
     noise_figure_db: float | None = None,
     backend: str | None = None,
@@ -72,19 +74,19 @@ def simulate(
         grid: Bins, see ``Radar.grid``.
         seed: Places, phases and noise.
         surrogate: The smooth model, or its name among ``SURROGATES``; None, "exact" = exact chain.
-        depth: Most bounces of a path; of the exact chain, one.
+        depth: Most bounces of a path.
         samples: Surrogate: rays over all frames. Exact: samples per frame on conductors.
         boundary_samples: Silhouette samples (surrogate and conductors).
         boundary: Off for fixed-visibility gradients.
         density: Points per m² of rough surfaces (exact).
         points: Rough points to reuse, so that speckle stays while the scene moves (exact).
+        chains: Rough chains of several bounces to reuse, likewise.
         snr_db: Noise relative to the mean signal power per sample (exact).
         noise_figure_db: Thermal noise of a receiver instead (exact).
         backend: See ``deposit_power``.
 
     Raises:
-        InputError: An object in motion: a frame is one instant. Noise on a mean spectrum. Several
-            bounces in the exact chain.
+        InputError: An object in motion: a frame is one instant. Noise on a mean spectrum.
     """
     smooth = chosen_surrogate(surrogate)
     with use_backend(backend):
@@ -107,10 +109,11 @@ def simulate(
                     boundary=boundary,
                 )
             )
-        if depth != 1:
+        moving = [name for name, item in scene.objects.items() if item.velocity is not None]
+        if moving:
             raise InputError(
-                f"expected depth 1 for the exact chain, got {depth}; its paths have one bounce: "
-                "give depth=1, or simulate with a surrogate"
+                f"expected objects at rest, got velocities on {', '.join(moving)}; a frame is one "
+                "instant: use scene.at(time), or simulate_chirps for motion within a frame"
             )
         paths = trace_field(
             scene,
@@ -118,15 +121,11 @@ def simulate(
             samples=samples,
             density=density,
             points=points,
+            depth=depth,
+            chains=chains,
             boundary_samples=boundary_samples,
             seed=seed,
             boundary=boundary,
-        )
-    if paths.velocity is not None:
-        names = [n for n, o in scene.objects.items() if o.velocity is not None]
-        raise InputError(
-            f"expected objects at rest, got velocities on {', '.join(names)}; a frame is one "
-            "instant: use scene.at(time), or simulate_chirps for motion within a frame"
         )
     beat = beat_signal(paths, radar)
     if snr_db is not None or noise_figure_db is not None:
@@ -143,7 +142,7 @@ def surrogate_correlation(
     surrogate: Surrogate | str = "response",
     looks: int = 16,
     samples: int = 400_000,
-    depth: int = 1,
+    depth: int = 3,
     density: float = 20_000.0,
 ) -> float:
     """How well a surrogate's map is that of the exact chain, the mean over looks at the scene.

@@ -60,6 +60,7 @@ range_width = 2.0
 angle_width = 1.0
 
 [reconstruct]
+depth = 1
 steps = 8
 samples = 20_000
 boundary_samples = 4_000
@@ -74,6 +75,7 @@ distance = [0.05, 0.08]
 GRADCHECK = """
 [gradcheck]
 parameter = { kind = "translation", object = "plate", axis = [1.0, 0.0, 0.0] }
+depth = 2
 step = 1e-2
 samples = 50_000
 boundary_samples = 20_000

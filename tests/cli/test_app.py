@@ -145,7 +145,7 @@ def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
     scenes = read_metrics(out)["scenes"]
     assert set(scenes) == {"first", "second"}
     for scene in scenes.values():
-        for kind in ("full", "interior"):
+        for kind in ("full", "interior", "no_interior_edges"):
             assert set(scene[kind]) >= {"relative_l1", "relative_l2", "correlation"}
         assert scene["full"]["relative_l1"] < scene["interior"]["relative_l1"]
         assert scene["difference_noise"] > 0

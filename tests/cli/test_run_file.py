@@ -10,6 +10,7 @@ from invertwin.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]
 ROUGH = {"kind": "rough_dielectric", "permittivity": 4.0}
+SCALE = {"kind": "scale", "object": "letter"}
 
 
 def letter(**changes):
@@ -103,8 +104,20 @@ def radar(**changes):
             ["gradcheck.parameter: ", "`axis` with kind = translation", "add it"],
         ),
         (
-            run(gradcheck={"parameter": {"kind": "scale", "object": "letter"}, "step_deg": 1.0}),
+            run(gradcheck={"parameter": SCALE, "step_deg": 1.0}),
             ["gradcheck: ", "no `step_deg` with kind = scale", "remove it"],
+        ),
+        (
+            run(reconstruct={"steps": 3, "depth": 0}),
+            ["reconstruct.depth: ", "greater than or equal to 1", "got 0"],
+        ),
+        (
+            run(data={"kind": "simulated", "density": 1e3, "depth": 17}),
+            ["data.depth: ", "less than or equal to 16", "got 17"],
+        ),
+        (
+            run(gradcheck={"parameter": SCALE, "step": 1e-3, "depth": 2.5}),
+            ["gradcheck.depth: ", "an integer", "got 2.5"],
         ),
         (
             run(task="reconstrct"),

@@ -33,6 +33,7 @@ def test_a_right_gradient_passes_and_reports():
     assert report.full.correlation > 0.999
     assert report.full.order > 1
     assert report.interior.relative_l1 > 0.1
+    assert report.no_interior_edges is None
     assert report.difference_noise <= 0.02
     assert report.step_agreement < 0.1
     assert 4 <= report.pairs <= 6

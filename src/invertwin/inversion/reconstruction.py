@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from invertwin.capture.capture import Capture
 from invertwin.channel.bridge import use_backend
+from invertwin.channel.chains import RoughChains, rough_chains
 from invertwin.channel.paths import Grid
 from invertwin.channel.tracer import RoughPoints, rough_points
 from invertwin.errors import InputError
@@ -26,6 +27,7 @@ from invertwin.simulation import simulate
 
 Status = Literal["converged", "budget", "diverged"]
 
+_CHAINS = 200_000  # of each length, where the exact chain is fitted
 _DIVERGED = 1e3  # times the first loss
 _WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
 _WINDOW = 20  # steps over which convergence is judged
@@ -179,6 +181,9 @@ def reconstruct(
     smooth = chosen_surrogate(surrogate)
     if smooth is None and points is None:
         points = rough_points(scene, density, seed)
+    chains = None
+    if smooth is None and depth > 1:
+        chains = rough_chains(scene, radar.link(), count=_CHAINS, depth=depth, seed=seed)
     listed = [parameters] if isinstance(parameters, nn.Module) else list(parameters)
     fit = _Fit(
         scene=scene,
@@ -189,6 +194,7 @@ def reconstruct(
         loss=loss or SpectrumLoss(),
         surrogate=smooth,
         points=points,
+        chains=chains,
         annealing=annealing,
         seed=seed,
         depth=depth,
@@ -288,6 +294,7 @@ class _Fit:
     loss: Callable[[Tensor, Tensor], Tensor]
     surrogate: Surrogate | None
     points: RoughPoints | None
+    chains: RoughChains | None
     annealing: float
     seed: int
     depth: int
@@ -326,16 +333,21 @@ class _Fit:
         """The surrogate with the extra widths of a step; None for the exact chain."""
         if self.surrogate is None:
             return None
-        left = max(0.0, 1 - step / max(1.0, self.annealing * self.steps))
+        left = max(0.0, 1 - step / self.widths_end)
         return replace(
             self.surrogate,
             range_width=self.surrogate.range_width * left,
             angle_width=self.surrogate.angle_width * left,
         )
 
+    @property
+    def widths_end(self) -> float:
+        """The step from which there are no extra widths: the last one at the latest."""
+        return max(1.0, min(self.annealing * self.steps, self.steps - 1))
+
     def annealed(self, step: int) -> bool:
         """Whether the extra widths are zero from this step on."""
-        return self.surrogate is None or step >= self.annealing * self.steps
+        return self.surrogate is None or step >= self.widths_end
 
     def evaluate(self, step: int) -> Tensor:
         """The loss of a step."""
@@ -381,6 +393,7 @@ class _Fit:
             boundary_samples=self.boundary_samples,
             boundary=self.boundary,
             points=self.points,
+            chains=self.chains,
         )
         return found.spectrum.to(torch.float32)
 

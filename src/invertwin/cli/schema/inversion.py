@@ -34,8 +34,8 @@ class SimulatedData(Section):
     """rough points per m²"""
     samples: Count = 200_000
     """coherent paths"""
-    depth: Depth = 1
-    """most bounces of a path"""
+    depth: Depth = 3
+    """most bounces of a path; with [chirps] it is one"""
     snr_db: float | None = None
     """signal to noise per sample; without it no noise"""
     noise_figure_db: float | None = None
