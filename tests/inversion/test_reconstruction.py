@@ -13,8 +13,10 @@ import torch
 from torch import nn
 
 from invertwin.errors import InputError
-from invertwin.inversion import Optimizer, Reconstruction, SpectrumLoss, reconstruct
+from invertwin.inversion import Optimizer, Reconstruction, SpectrumLoss, reconstruct, reconstruction
+from invertwin.inversion.nuisances import RangeBias
 from invertwin.inversion.regularization import Laplacian
+from invertwin.radar import Surrogate
 from invertwin.scene import Scene
 from invertwin.scene.parameters import RadarPose, Translation, Vertices
 
@@ -308,3 +310,56 @@ def test_an_unknown_object_is_the_users_mistake_not_divergence(case):
 def test_bad_optimizers_are_named(options, unchecked):
     with pytest.raises(InputError, match="expected kind 'adam' or 'sgd' and rate > 0"):
         Optimizer(**options)
+
+
+@pytest.mark.parametrize("annealing", [0.5, 1.0])
+def test_widths_fall_to_the_exact_response(case, annealing, monkeypatch):
+    """The last step has none of the extra width, even if all steps anneal."""
+    kernels = []
+    original = reconstruction.surrogate_spectrum
+
+    def spied(scene, device, grid, kernel, **options):
+        kernels.append(kernel)
+        return original(scene, device, grid, kernel, **options)
+
+    monkeypatch.setattr(reconstruction, "surrogate_spectrum", spied)
+    reconstruct(
+        case.scene,
+        case.radar,
+        case.capture,
+        case.parameters(),
+        **case.settings(**FAST, annealing=annealing, surrogate="annealed"),
+    )
+    widths = [(kernel.range_width, kernel.angle_width) for kernel in kernels[: FAST["steps"]]]
+    assert widths[0] == (3.0, 1.5)
+    assert widths == sorted(widths, reverse=True)
+    assert kernels[FAST["steps"] - 1] == Surrogate()
+
+
+def test_the_exact_chain_as_the_model(case):
+    """By the same switch; it fits a realisation, and holds visibility fixed."""
+    settings = case.settings(**FAST, depth=1, surrogate="exact", density=300.0)
+    with pytest.raises(InputError, match="boundary=False for fixed visibility"):
+        reconstruct(case.scene, case.radar, case.capture, case.parameters(), **settings)
+    fits = [
+        reconstruct(
+            case.scene,
+            case.radar,
+            case.capture,
+            case.parameters(),
+            **(settings | {"surrogate": name, "boundary": False}),
+        )
+        for name in ("exact", None)
+    ]
+    first, second = (moved(fit) for fit in fits)
+    assert float(first.norm()) > 0
+    assert torch.allclose(first, second, rtol=1e-3)
+    with pytest.raises(InputError, match="no range bias with the exact chain"):
+        reconstruct(
+            case.scene,
+            case.radar,
+            case.capture,
+            case.parameters(),
+            nuisances=[RangeBias()],
+            **(settings | {"boundary": False}),
+        )
