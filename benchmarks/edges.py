@@ -19,9 +19,12 @@ import os
 import statistics
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -31,7 +34,7 @@ from rich.table import Table
 from torch import Tensor
 
 from invertwin.channel import boundary_walk
-from invertwin.channel.bridge import backend, flatten, one_torch_thread, opaque, tracer
+from invertwin.channel.bridge import backend, flatten, one_torch_thread, tracer
 from invertwin.channel.edges import InteriorEdgeSampler
 from invertwin.channel.kernel import Inputs
 from invertwin.channel.paths import Grid
@@ -45,6 +48,7 @@ from invertwin.scene.shapes import plate, sphere
 SAMPLES, SEEDS = 100_000, 40
 WARM_UP = 3
 DEPTH = 2
+FAMILIES = 3  # among which samples are shared: shadows from both antennas, and interior ones
 REQUIRED = 1.0
 WAYS = {"weighted": True, "uniform": False}
 WAVEFORM = FMCW(start_frequency=76e9, bandwidth=2e9, duration=50e-6, samples=512)
@@ -128,17 +132,31 @@ class Estimator:
         """The derivative [1/m] of the power over all bins, and the seconds that it took."""
         import drjit as dr
 
-        mi = tracer()
-        start = perf_counter()
-        sampler = InteriorEdgeSampler(self.shot, samples, seed, weighted=weighted)
-        found = sampler.draw(dr.arange(mi.UInt32, sampler.size) + opaque(0))
-        vertices = mi.Float(self.inputs.vertices)
+        vertices = tracer().Float(self.inputs.vertices)
         dr.enable_grad(vertices)
         attached = replace(self.inputs, vertices=vertices)
-        walk = Walk(self.shot, self.inputs, seed)
-        chains = boundary_walk._interior_segment(self.shot, attached, walk, found, DEPTH)
-        total = chains.weighted(lambda path, exists: dr.select(exists, 1.0, 0.0))
-        dr.backward_from(chains.speed * total)
+        start = perf_counter()
+        # The samplers of the first family find nothing, so that all samples are of the second.
+        with (
+            patch.object(boundary_walk, "EdgeSampler", lambda *_: SimpleNamespace(size=0)),
+            patch.object(
+                boundary_walk,
+                "InteriorEdgeSampler",
+                partial(InteriorEdgeSampler, weighted=weighted),
+            ),
+        ):
+            for chains in boundary_walk.boundary_chains(
+                self.shot,
+                attached,
+                Walk(self.shot, self.inputs, seed),
+                samples=FAMILIES * samples,
+                depth=DEPTH,
+                seed=seed,
+                interior=True,
+                chunks=lambda size: [dr.arange(tracer().UInt32, size)] if size else [],
+            ):
+                total = chains.weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
+                dr.backward_from(chains.speed * total)
         gradient = np.array(dr.grad(vertices)).reshape(-1, 3)
         seconds = perf_counter() - start
         return gradient[self.moving.numpy()].sum(axis=0, dtype=np.float64), seconds

@@ -31,7 +31,7 @@ from torch import Tensor
 from invertwin.channel.bridge import backend, flatten, tracer
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
-from invertwin.channel.sampling import Shot, visible
+from invertwin.channel.rays import Shot, visible
 from invertwin.channel.tracer import trace_power
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene

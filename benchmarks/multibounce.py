@@ -1,0 +1,333 @@
+"""Paths of two and three bounces in a closed room, beside Sionna RT in the same run.
+
+    python benchmarks/multibounce.py [-o DIR]
+
+The room is that of Sionna RT's `box` scene (10 × 10 × 5 m, 12 triangles), of metal that scatters
+with coefficient 0.5; transmitter and receiver are 4.1 m apart. Both sides start as many samples
+from the transmitter, with a new seed each step, in turns; ratios are medians over steps of their
+time over ours (> 1: we are faster).
+
+- We (`deposit_power`) join every vertex of a chain to the receiver and sum the paths into a map of
+  range × angle; the step adds the derivative by all vertices, which move from step to step (tree
+  rebuilt), the samples of shadow edges included (a convex room has no shadows to find with them).
+- They (`PathSolver`, loop mode `evaluated`) list paths that end with a diffuse reflection; the step
+  adds the derivative of the total power by the scattering coefficient, the one that their diffuse
+  paths have. With specular reflection on, as in our room, a vertex is diffuse with probability 1/4;
+  `forward_ratio_sionna_diffuse` and `step_ratio_sionna_diffuse` are with it off: every vertex
+  is diffuse, and ends a path. The list is long enough for all paths.
+
+Further, on a scene with shadows (a ball before a wall and above a floor, depth 3):
+
+- `step.tracing_share`: time of a step of 10³ samples over that of one of 10⁵, in turns. At 10³ the
+  kernels take no time; what is left is Python, Dr.Jit's tracing, uploads and the tree.
+- `step.new_kernels`: kernels of further steps, with other vertices, seeds and depths 2, 3, 5, that
+  were not among those of the first steps: what would be compiled then. A kernel from Dr.Jit's cache
+  on disk counts too.
+
+Prints a table and writes `metrics.json` into DIR (default `out/multibounce`). Sionna RT comes with
+the extra `bench`; without it those rows stay empty.
+"""
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from edges import Task, bodies, placed, single
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from throughput import WAVEFORM, sionna_version
+
+from invertwin.channel.bridge import backend, tracer
+from invertwin.channel.deposit import deposit_power
+from invertwin.radar import Radar
+from invertwin.scene import Object, RoughConductor, Scene
+from invertwin.scene.antenna import linear_array
+from invertwin.scene.shapes import box
+
+SAMPLES, MEMORY_SAMPLES = 1_000_000, 10_000_000
+STEPS = 9
+WARM_UP = 3
+DEPTHS = (2, 3)
+FEW, MANY = 1_000, 100_000  # samples of the steps whose tracing share is taken
+SIZE = (10.0, 10.0, 5.0)  # [m]; the floor is at z = 0
+SCATTERING = 0.5
+TRANSMITTER, RECEIVER = (-2.0, 0.5, 2.0), (2.0, 1.5, 2.0)
+REQUIRED = {
+    "forward_ratio_sionna": (">=", 2.0),
+    "step_ratio_sionna": (">=", 1.0),
+    "peak_memory_gb": ("<=", 1.0),
+    "tracing_share": ("<=", 0.2),
+    "new_kernels": ("<=", 0),
+}
+
+
+def room() -> Task:
+    """The room, and a 16-element array in it."""
+    walls = Object(box(SIZE), RoughConductor(scattering=SCATTERING), placed(0, 0, SIZE[2] / 2))
+    receivers = linear_array(16, WAVEFORM.wavelength / 2)
+    offset = torch.tensor(RECEIVER, dtype=torch.float64) - torch.tensor(TRANSMITTER)
+    radar = Radar(
+        single(0.0),
+        replace(receivers, positions=receivers.positions + offset),
+        replace(WAVEFORM, samples=512),
+        torch.tensor([TRANSMITTER], dtype=torch.float64),
+    )
+    return Task(Scene({"room": walls}), radar, radar.grid(1.0, 32.0, u_max=1.0), "room")
+
+
+def step(task: Task, number: int, samples: int, depth: int) -> tuple[float, float]:
+    """Seconds of forward and backward with new vertices and a new seed."""
+    scene, vertices = task.moved(number)
+    start = perf_counter()
+    power = deposit_power(
+        scene,
+        task.radar.link(),
+        task.grid,
+        samples=samples,
+        boundary_samples=samples // 10,
+        seed=number,
+        depth=depth,
+    )
+    middle = perf_counter()
+    (power / power.detach().mean()).square().mean().backward()
+    end = perf_counter()
+    assert vertices.grad is not None
+    assert vertices.grad.norm() > 0
+    return middle - start, end - middle
+
+
+class Theirs:
+    """Steps of Sionna RT in its `box` scene; raises ModuleNotFoundError where not installed."""
+
+    def __init__(self) -> None:
+        mi = tracer()
+        rt = import_module("sionna.rt")
+        self.scene = rt.load_scene(rt.scene.box)
+        self.scene.frequency = WAVEFORM.center_frequency
+        (walls,) = self.scene.objects.values()
+        self.material = walls.radio_material
+        antenna = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+        self.scene.tx_array = self.scene.rx_array = antenna
+        self.scene.add(rt.Transmitter("tx", mi.Point3f(*TRANSMITTER)))
+        self.scene.add(rt.Receiver("rx", mi.Point3f(*RECEIVER)))
+        self.solver = rt.PathSolver()
+        self.solver.loop_mode = "evaluated"
+
+    def step(
+        self, number: int, samples: int, depth: int, *, specular: bool = True
+    ) -> tuple[float, float, int]:
+        """Seconds of forward and backward with a new seed, and the number of paths."""
+        import drjit as dr
+
+        coefficient = tracer().Float(SCATTERING)
+        dr.enable_grad(coefficient)
+        self.material.scattering_coefficient = coefficient
+        start = perf_counter()
+        paths = self.solver(
+            self.scene,
+            max_depth=depth,
+            samples_per_src=samples,
+            max_num_paths_per_src=depth * samples,
+            los=False,
+            specular_reflection=specular,
+            diffuse_reflection=True,
+            refraction=False,
+            seed=number + 1,
+        )
+        dr.eval(paths.a, paths.tau)
+        dr.sync_thread()
+        middle = perf_counter()
+        dr.backward(sum(dr.sum(dr.square(part), axis=None) for part in paths.a))
+        gradient = np.array(dr.grad(coefficient))
+        end = perf_counter()
+        assert np.isfinite(gradient).all()
+        assert gradient.any()
+        return middle - start, end - middle, int(np.array(paths.valid).sum())
+
+
+def compared(depth: int, samples: int, steps: int, theirs: Theirs | None) -> dict[str, Any]:
+    """Medians of our steps and theirs, in turns."""
+    task = room()
+    ours, listed, diffuse = [], [], []
+    for number in range(WARM_UP + steps):
+        ours.append(step(task, number, samples, depth))
+        if theirs is not None:
+            listed.append(theirs.step(number, samples, depth))
+            diffuse.append(theirs.step(number, samples, depth, specular=False))
+    forward, backward = (statistics.median(part) for part in zip(*ours[WARM_UP:], strict=True))
+    both = statistics.median(sum(pair) for pair in ours[WARM_UP:])
+    found: dict[str, Any] = {
+        "forward_s": forward,
+        "backward_s": backward,
+        "samples_per_second": (samples + samples // 10) / both,
+    }
+    for suffix, other in {"": listed, "_diffuse": diffuse}.items():
+        pairs = list(zip(ours, other, strict=False))[WARM_UP:]
+        ratios: dict[str, float | None] = {"forward": None, "step": None}
+        if pairs:
+            ratios["forward"] = statistics.median(b[0] / a[0] for a, b in pairs)
+            ratios["step"] = statistics.median((b[0] + b[1]) / (a[0] + a[1]) for a, b in pairs)
+            found[f"paths_sionna{suffix}"] = other[-1][2]
+            found[f"forward_s_sionna{suffix}"] = statistics.median(b[0] for _, b in pairs)
+            found[f"backward_s_sionna{suffix}"] = statistics.median(b[1] for _, b in pairs)
+        found |= {f"{name}_ratio_sionna{suffix}": ratio for name, ratio in ratios.items()}
+    return found
+
+
+def repeated(steps: int) -> dict[str, Any]:
+    """What repeating a step costs beside its kernels."""
+    task = Task.build(bodies()["ball"])
+
+    def timed(number: int, samples: int) -> float:
+        return sum(step(task, number, samples, 3))
+
+    known: set[str] = set()
+    for number in range(WARM_UP):
+        timed(number, FEW)
+        known |= kernels(lambda number=number: timed(number, MANY))
+    shares = [timed(n, FEW) / timed(n, MANY) for n in range(WARM_UP, WARM_UP + 3 * steps)]
+    later: set[str] = set()
+    for number, depth in enumerate((3, 2, 5, 3), start=100):
+        later |= kernels(lambda number=number, depth=depth: step(task, number, MANY, depth))
+    return {"tracing_share": statistics.median(shares), "new_kernels": len(later - known)}
+
+
+def kernels(act: Callable[[], Any]) -> set[str]:
+    """Which kernels run during an action, whether compiled then or found in a cache."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        act()
+        history = dr.kernel_history([dr.KernelType.JIT])
+        dr.kernel_history_clear()
+    return {str(kernel["hash"]) for kernel in history}
+
+
+def peak_memory(samples: int, depth: int) -> float:
+    """Peak resident memory of a fresh process that does three steps [GB]."""
+    command = [sys.executable, __file__, "--memory", str(samples), str(depth)]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def memory_of_steps(samples: int, depth: int) -> float:
+    """Peak resident memory of this process after three steps [GB]."""
+    task = room()
+    for number in range(3):
+        step(task, number, samples, depth)
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+def measure(
+    samples: int = SAMPLES, memory_samples: int = MEMORY_SAMPLES, steps: int = STEPS
+) -> dict[str, Any]:
+    """All metrics; the sizes are smaller in tests only."""
+    metrics: dict[str, Any] = {
+        "samples": samples,
+        "memory_samples": memory_samples,
+        "steps": steps,
+        "backend": backend(),
+        "cpu_count": os.cpu_count(),
+        "load_average": os.getloadavg()[0],
+        "sionna_rt_version": sionna_version(),
+    }
+    # First, since on Linux a child's peak counts from its parent's size when it was started.
+    peaks = {depth: peak_memory(memory_samples, depth) for depth in DEPTHS}
+    metrics["step"] = repeated(steps)
+    try:
+        theirs = Theirs()
+    except ModuleNotFoundError:
+        theirs = None
+    for depth in DEPTHS:
+        metrics[f"depth{depth}"] = compared(depth, samples, steps, theirs)
+        metrics[f"depth{depth}"]["peak_memory_gb"] = peaks[depth]
+    return metrics
+
+
+def table(metrics: dict[str, Any]) -> Table:
+    """What was counted, and what must hold."""
+    m = metrics
+    grid = Table(
+        title=f"Closed room, {m['samples']} samples; medians of {m['steps']} steps after warm-up; "
+        f"backend {m['backend']}; {m['cpu_count']} CPU cores, load average "
+        f"{m['load_average']:.1f} at the start",
+        title_justify="left",
+    )
+    grid.add_column("metric", no_wrap=True)
+    grid.add_column("value", justify="right", no_wrap=True)
+    grid.add_column("must hold", justify="right", no_wrap=True)
+    grid.add_column("what was counted")
+
+    def row(part: str, key: str, shown: str, text: str = "") -> None:
+        value = m[part].get(key)
+        verdict = ""
+        if key in REQUIRED:
+            sign, limit = REQUIRED[key]
+            held = value is not None and (value >= limit if sign == ">=" else value <= limit)
+            verdict = f"{sign} {limit:g} " + ("yes" if held else "—" if value is None else "NO")
+        grid.add_row(
+            f"{part}.{key}", "—" if value is None else format(value, shown), verdict, escape(text)
+        )
+
+    version = m["sionna_rt_version"]
+    for part in (f"depth{depth}" for depth in DEPTHS):
+        row(part, "samples_per_second", ".3g", "forward + backward by all vertices")
+        row(part, "forward_s", ".3f")
+        row(part, "backward_s", ".3f")
+        row(part, "peak_memory_gb", ".2f", f"three steps of {m['memory_samples']} samples")
+        for suffix in ("", "_diffuse"):
+            if version is None:
+                text = "Sionna RT is not installed: pip install 'invertwin[bench]'"
+            else:
+                row(part, f"forward_s_sionna{suffix}", ".3f")
+                row(part, f"backward_s_sionna{suffix}", ".3f", "by the scattering coefficient")
+                text = (
+                    f"Sionna RT {version}, {m[part][f'paths_sionna{suffix}']} paths, specular "
+                    f"reflection {'off' if suffix else 'on'}: a list of paths; ours: a map"
+                )
+            row(part, f"forward_ratio_sionna{suffix}", ".2f", text)
+            row(part, f"step_ratio_sionna{suffix}", ".2f")
+    row("step", "tracing_share", ".2f", f"step of {FEW} samples over step of {MANY}, depth 3")
+    row("step", "new_kernels", "d", "in further steps: new vertices, seeds, depths 2, 3, 5")
+    return grid
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/multibounce"))
+    parser.add_argument(
+        "--memory",
+        type=int,
+        nargs=2,
+        metavar=("N", "DEPTH"),
+        help="only print the peak memory [GB] of N samples",
+    )
+    arguments = parser.parse_args()
+    if arguments.memory:
+        print(memory_of_steps(*arguments.memory))
+        return
+    metrics = measure()
+    Console(width=None if sys.stdout.isatty() else 140).print(table(metrics))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "metrics.json"
+    path.write_text(json.dumps(metrics, indent=2) + "\n")
+    print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""The multi-bounce benchmark in small: it runs and compares like with like."""
+
+import json
+import sys
+
+import pytest
+from rich.console import Console
+
+SMALL = {"samples": 20_000, "memory_samples": 20_000, "steps": 1}
+
+
+def test_the_room_is_that_of_the_description(multibounce):
+    vertices = multibounce.room().scene["room"].vertices
+    assert vertices.amin(dim=0).tolist() == [-5.0, -5.0, 0.0]
+    assert vertices.amax(dim=0).tolist() == [5.0, 5.0, 5.0]
+
+
+@pytest.mark.slow
+def test_every_metric_is_there_without_sionna(multibounce, monkeypatch):
+    monkeypatch.setitem(sys.modules, "sionna", None)
+    monkeypatch.setattr(multibounce, "sionna_version", lambda: None)
+    monkeypatch.setattr(multibounce, "MANY", 5_000)
+    metrics = multibounce.measure(**SMALL)
+    for depth in ("depth2", "depth3"):
+        assert metrics[depth]["forward_ratio_sionna"] is None
+        assert metrics[depth]["step_ratio_sionna"] is None
+        assert metrics[depth]["samples_per_second"] > 0
+        assert 0.1 < metrics[depth]["peak_memory_gb"] < 5
+    assert 0 < metrics["step"]["tracing_share"] < 2
+    assert metrics["step"]["new_kernels"] == 0
+    json.dumps(metrics)
+    console = Console(width=200, record=True)
+    console.print(multibounce.table(metrics))
+    assert "invertwin[bench]" in console.export_text()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of Sionna RT
+def test_both_trace_the_same_room(multibounce):
+    pytest.importorskip("sionna.rt", reason="needs the extra `bench`")
+    theirs = multibounce.Theirs()
+    (walls,) = theirs.scene.objects.values()
+    box = walls.mi_mesh.bbox()
+    ours = multibounce.room().scene["room"].vertices
+    assert ours.amin(dim=0).tolist() == pytest.approx([float(x) for x in box.min])
+    assert ours.amax(dim=0).tolist() == pytest.approx([float(x) for x in box.max])
+    assert len(multibounce.room().scene["room"].mesh.faces) == walls.mi_mesh.face_count()
+    found = multibounce.compared(2, 20_000, 1, theirs)
+    # Every vertex is diffuse with probability 1/4, and sees the receiver; or is, and does.
+    assert found["paths_sionna"] == pytest.approx(2 * 20_000 / 4, rel=0.05)
+    assert found["paths_sionna_diffuse"] == pytest.approx(2 * 20_000, rel=0.01)
+    assert found["forward_ratio_sionna"] > 0
+    assert found["step_ratio_sionna"] > 0
