@@ -54,7 +54,9 @@ def test_paths_in_bins_are_what_the_kernel_deposits(radar, grid):
     expected = deposit_power(
         scene(0.2), link, grid, samples=20_000, boundary_samples=0, seed=3, boundary=False
     )
-    torch.testing.assert_close(found.float(), expected, rtol=1e-3, atol=1e-3 * expected.max())
+    torch.testing.assert_close(
+        found.float(), expected, rtol=1e-3, atol=1e-3 * float(expected.max())
+    )
 
 
 def distance(found, truth):
