@@ -153,7 +153,7 @@ class Estimator:
                 depth=DEPTH,
                 seed=seed,
                 interior=True,
-                chunks=lambda size: [dr.arange(tracer().UInt32, size)] if size else [],
+                chunks=lambda size: iter([dr.arange(tracer().UInt32, size)] if size else []),
             ):
                 total = chains.weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
                 dr.backward_from(chains.speed * total)

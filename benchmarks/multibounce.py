@@ -21,7 +21,7 @@ Further, on a scene with shadows (a ball before a wall and above a floor, depth 
 - `step.tracing_share`: time of a step of 10³ samples over that of one of 10⁵, in turns. At 10³ the
   kernels take no time; what is left is Python, Dr.Jit's tracing, uploads and the tree.
 - `step.new_kernels`: kernels of further steps, with other vertices, seeds and depths 2, 3, 5, that
-  were not among those of the first steps: what would be compiled then. A kernel from Dr.Jit's cache
+  were not among those of the first two: what would be compiled then. A kernel from Dr.Jit's cache
   on disk counts too.
 
 Prints a table and writes `metrics.json` into DIR (default `out/multibounce`). Sionna RT comes with
@@ -150,7 +150,8 @@ class Theirs:
         dr.eval(paths.a, paths.tau)
         dr.sync_thread()
         middle = perf_counter()
-        dr.backward(sum(dr.sum(dr.square(part), axis=None) for part in paths.a))
+        power: Any = sum(dr.sum(dr.square(part), axis=None) for part in paths.a)
+        dr.backward(power)
         gradient = np.array(dr.grad(coefficient))
         end = perf_counter()
         assert np.isfinite(gradient).all()
@@ -194,14 +195,13 @@ def repeated(steps: int) -> dict[str, Any]:
     def timed(number: int, samples: int) -> float:
         return sum(step(task, number, samples, 3))
 
-    known: set[str] = set()
-    for number in range(WARM_UP):
-        timed(number, FEW)
-        known |= kernels(lambda number=number: timed(number, MANY))
-    shares = [timed(n, FEW) / timed(n, MANY) for n in range(WARM_UP, WARM_UP + 3 * steps)]
-    later: set[str] = set()
-    for number, depth in enumerate((3, 2, 5, 3), start=100):
+    known, later = set[str](), set[str]()
+    for number in range(2):
+        known |= kernels(lambda number=number: step(task, number, MANY, 3))
+    for number, depth in enumerate((3, 2, 5, 3), start=2):
         later |= kernels(lambda number=number, depth=depth: step(task, number, MANY, depth))
+    pairs = [(timed(number, FEW), timed(number, MANY)) for number in range(WARM_UP + 3 * steps)]
+    shares = [few / many for few, many in pairs[WARM_UP:]]
     return {"tracing_share": statistics.median(shares), "new_kernels": len(later - known)}
 
 
