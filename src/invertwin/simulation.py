@@ -59,6 +59,7 @@ def simulate(
     density: float = 20_000.0,
     points: RoughPoints | None = None,
     chains: RoughChains | None = None,
+    chain_count: int = 200_000,
     snr_db: float | None = None,
     noise_figure_db: float | None = None,
     backend: str | None = None,
@@ -81,6 +82,7 @@ def simulate(
         density: Points per m² of rough surfaces (exact).
         points: Rough points to reuse, so that speckle stays while the scene moves (exact).
         chains: Rough chains of several bounces to reuse, likewise.
+        chain_count: How many to draw of each length instead (exact).
         snr_db: Noise relative to the mean signal power per sample (exact).
         noise_figure_db: Thermal noise of a receiver instead (exact).
         backend: See ``deposit_power``.
@@ -123,6 +125,7 @@ def simulate(
             points=points,
             depth=depth,
             chains=chains,
+            chain_count=chain_count,
             boundary_samples=boundary_samples,
             seed=seed,
             boundary=boundary,

@@ -68,6 +68,7 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
             samples=data.samples,
             depth=data.depth,
             density=data.density,
+            chain_count=data.chains,
             snr_db=None if front else data.snr_db,
             noise_figure_db=None if front else data.noise_figure_db,
         )

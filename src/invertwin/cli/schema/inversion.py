@@ -36,6 +36,8 @@ class SimulatedData(Section):
     """coherent paths"""
     depth: Depth = 3
     """most bounces of a path; with [chirps] it is one"""
+    chains: Count = 200_000
+    """paths of two bounces to draw, and of each number above"""
     snr_db: float | None = None
     """signal to noise per sample; without it no noise"""
     noise_figure_db: float | None = None
