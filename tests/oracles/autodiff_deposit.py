@@ -39,7 +39,7 @@ def gradients(
     dr.enable_grad(list(tables.values()))
     inputs, out = trace.inputs(tables), mi.Float(0)
     for records in trace.records():
-        vertex = replay._vertex(trace.shot, inputs, records, mi.UInt32(0))
+        vertex = replay._vertex(trace.shot, inputs, records, mi.UInt32(0), records.depth)
         path, arriving = vertex.path(), vertex.arriving
         power = dr.select(vertex.seen, path.power * (arriving / dr.detach(arriving)), 0)
         length = 0.5 * (vertex.leg + vertex.connection.distance)

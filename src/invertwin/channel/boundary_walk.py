@@ -10,7 +10,7 @@ from typing import Any
 
 from invertwin.channel import kernel, walk
 from invertwin.channel.bins import Contribution
-from invertwin.channel.bridge import tracer
+from invertwin.channel.bridge import opaque, tracer
 from invertwin.channel.edges import (
     EdgePoints,
     EdgeSampler,
@@ -161,11 +161,11 @@ def _interior_segment(
     ahead = kernel.place(fixed, points.face, shadow.b1, shadow.b2)
     to_behind, distance = kernel.leg(ahead.position, behind.position)
     inside = kernel.medium(fixed, ahead, behind, to_behind, mi.Bool(True))
-    choices = depth - 1
+    choices = opaque(depth - 1)
     count = 1 + (points.index // 2) % choices
     ends_at_receiver = (points.index % 2) == 1
     kept = dr.exp(-inside.attenuation * distance)
-    throughput = fixed.scale * choices * kept / dr.square(distance)
+    throughput = fixed.scale * mi.Float(choices) * kept / dr.square(distance)
     distance = inside.index * distance
     lanes = dr.width(points.face)
     zero = dr.zeros(mi.Float, lanes)
@@ -191,7 +191,7 @@ def _interior_segment(
             path, exists = walk.connect(shot, fixed, state, point, state["to_receiver"])
             visit(state, path, exists)
 
-        return chain.run(state, depth - count, connected)
+        return chain.run(state, choices + 1 - count, connected)
 
     for sign, share, excess in points.sides(fixed):
         state = walk.start(

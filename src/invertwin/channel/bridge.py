@@ -42,7 +42,12 @@ def backend() -> str:
     Raises:
         InputError: A name that is not known, or CUDA asked for where there is none.
     """
-    name = _chosen[-1] if _chosen else os.environ.get("INVERTWIN_BACKEND", "auto")
+    if _chosen:
+        return _chosen[-1]
+    return _resolved(os.environ.get("INVERTWIN_BACKEND", "auto"))
+
+
+def _resolved(name: str) -> str:
     if name not in ("cpu", "cuda", "auto"):
         raise InputError(
             f"expected backend 'cpu', 'cuda' or 'auto', got {name!r}; "
@@ -58,12 +63,8 @@ def backend() -> str:
 @contextmanager
 def use_backend(name: str | None) -> Iterator[None]:
     """Choose ``cpu``, ``cuda`` or ``auto`` inside a ``with`` block; ``None`` changes nothing."""
-    if name is None:
-        yield
-        return
-    _chosen.append(name)
+    _chosen.append(backend() if name is None else _resolved(name))
     try:
-        backend()
         yield
     finally:
         _chosen.pop()
@@ -86,12 +87,18 @@ def one_torch_thread() -> Iterator[None]:
 def tracer() -> Any:
     """The ``mitsuba`` module, set to the backend in force."""
     name = backend()
-    doctor.require(name)
-    import mitsuba as mi
-
+    mi = _loaded(name)
     if mi.variant() != _VARIANTS[name]:
         mi.set_variant(_VARIANTS[name])
     return mi
+
+
+@cache
+def _loaded(name: str) -> Any:
+    doctor.require(name)
+    import mitsuba
+
+    return mitsuba
 
 
 def to_float(values: Tensor) -> Any:

@@ -45,7 +45,7 @@ def deposit_power(
     reference: tuple[Scene, Link] | None = None,
     boundary: bool = True,
     interior_edges: bool = True,
-    memory_budget: float = 0.5e9,
+    memory_budget: float = 0.25e9,
     backend: str | None = None,
 ) -> Float32[Tensor, "frame range u v"]:
     """Expected received over transmitted power in every bin of a map, per frame.
@@ -156,6 +156,7 @@ class _Deposit(torch.autograd.Function):
                     trace.shot, inputs, records, lambda *path: bins.gather(seed, grid, *path)
                 )
                 dr.eval([dr.grad(table) for table in tables.values()])
+                del records  # before the next ones are made
             for chains in trace.boundary(inputs):
                 total = chains.weighted(lambda *path: bins.gather(seed, grid, *path)[0])
                 if dr.grad_enabled(chains.speed):
@@ -200,6 +201,7 @@ class _Deposit(torch.autograd.Function):
                     lambda *path: bins.scatter_derivative(out, grid, *path),
                 )
                 dr.eval(out)
+                del records
             for chains in trace.boundary(inputs):
                 point_tangents()
                 chains.deposit(

@@ -45,8 +45,8 @@ class _Vertex:
         return Contribution(self.frame, power, length, found.seen.x, found.seen.y)
 
 
-def _vertex(shot: Shot, inputs: Inputs, records: Records, number: Any) -> _Vertex:
-    """Evaluate vertex ``number`` (from 0) of every chain."""
+def _vertex(shot: Shot, inputs: Inputs, records: Records, number: Any, depth: Any) -> _Vertex:
+    """Evaluate vertex ``number`` (from 0 to ``depth`` − 1) of every chain."""
     import drjit as dr
 
     mi = tracer()
@@ -87,7 +87,7 @@ def _vertex(shot: Shot, inputs: Inputs, records: Records, number: Any) -> _Verte
     )
     goes_on, scattered = mi.Bool(False), mi.Float(1.0)
     if not single:
-        goes_on = active & (number + 1 < records.depth)
+        goes_on = active & (number + 1 < depth)
         goes_on &= read("throughput", number + 1, goes_on) != 0
         transmitter = inputs.antenna(frame, False, active)
         onward = dr.select(goes_on, located(number + 1, goes_on).position, transmitter)
@@ -142,10 +142,11 @@ def pull(
     import drjit as dr
 
     mi = tracer()
+    depth = opaque(records.depth)
 
     def sweep(number: Any, power_sum: Any, range_sum: Any) -> tuple[Any, Any]:
         with dr.resume_grad():
-            vertex = _vertex(shot, inputs, records, number)
+            vertex = _vertex(shot, inputs, records, number, depth)
             path = vertex.path()
             power, length, u, v = (
                 dr.select(vertex.seen, bar, 0.0) for bar in gather(path, vertex.seen)
@@ -187,9 +188,9 @@ def pull(
         if records.depth == 1:
             sweep(mi.UInt32(0), zero, zero)
             return
-        depth = dr.zeros(mi.UInt32, records.lanes) + opaque(records.depth)
+        first = dr.zeros(mi.UInt32, records.lanes) + depth
         dr.while_loop(
-            (depth, zero, dr.zeros(mi.Float, records.lanes)),
+            (first, zero, dr.zeros(mi.Float, records.lanes)),
             lambda left, *_: left > 0,
             lambda left, power, length: (left - 1, *sweep(left - 1, power, length)),
             mode="symbolic",
@@ -206,10 +207,11 @@ def push(
     import drjit as dr
 
     mi = tracer()
+    depth = opaque(records.depth)
 
     def sweep(number: Any, growth: Any, longer: Any) -> tuple[Any, Any]:
         with dr.resume_grad():
-            vertex = _vertex(shot, inputs, records, number)
+            vertex = _vertex(shot, inputs, records, number, depth)
             path = vertex.path()
             values = (
                 vertex.arriving, vertex.leg, path.power, vertex.connection.distance,
@@ -254,10 +256,9 @@ def push(
         if records.depth == 1:
             sweep(mi.UInt32(0), zero, zero)
             return
-        end = opaque(records.depth)
         dr.while_loop(
             (dr.zeros(mi.UInt32, records.lanes), zero, dr.zeros(mi.Float, records.lanes)),
-            lambda number, *_: number < end,
+            lambda number, *_: number < depth,
             lambda number, growth, longer: (number + 1, *sweep(number, growth, longer)),
             mode="symbolic",
         )

@@ -156,5 +156,7 @@ def chunks(size: int, chunk: int) -> Iterator[Any]:
     import drjit as dr
 
     mi = tracer()
+    # Of one size but for the last, so that a chunk takes the memory of the one before.
+    chunk = max(1, -(-size // max(1, -(-size // chunk))))
     for start in range(0, size, chunk):
         yield dr.arange(mi.UInt32, min(chunk, size - start)) + opaque(start)

@@ -92,9 +92,11 @@ class Walk:
             self._extend(state, point)
             return (state,)
 
-        (state,) = dr.while_loop(
-            (state,), lambda state: state["active"], body, labels=("state",), mode="symbolic"
-        )
+        # Without a second recording of the body, which would gain the kernel nothing.
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+            (state,) = dr.while_loop(
+                (state,), lambda state: state["active"], body, labels=("state",), mode="symbolic"
+            )
         return state
 
     def step(self, state: State) -> State:
