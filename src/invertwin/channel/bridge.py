@@ -5,7 +5,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor
 from invertwin import doctor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.scene.material import Surface
+from invertwin.scene.material import Material, Surface
 from invertwin.scene.scene import Object, Scene
 
 _VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
@@ -247,12 +247,26 @@ def _require_solid(name: str, triangles: Tensor, is_open: bool) -> None:
         )
 
 
+def _surface(material: Material, frequency: float) -> Surface:
+    """What a material does; remembered where it is frozen and of plain numbers."""
+    frozen = getattr(type(material), "__dataclass_params__", None)
+    plain = all(isinstance(value, int | float | str) for value in vars(material).values())
+    if plain and frozen is not None and frozen.frozen:
+        return _remembered(material, frequency)
+    return material.surface(frequency)
+
+
+@lru_cache(maxsize=64)
+def _remembered(material: Material, frequency: float) -> Surface:
+    return material.surface(frequency)
+
+
 def _surfaces(objects: list[Object], frequency: float) -> tuple[dict[str, Tensor], Tensor]:
     """The rows of all surfaces, and the row of every triangle."""
     columns: dict[str, list[Tensor]] = {field.name: [] for field in fields(Surface)}
     face_surface, offset = [], 0
     for item in objects:
-        surface, count = item.material.surface(frequency), len(item.mesh.faces)
+        surface, count = _surface(item.material, frequency), len(item.mesh.faces)
         per_face = surface.diffuse.ndim == 1
         if per_face and len(surface.diffuse) != count:
             raise InputError(
