@@ -2,6 +2,7 @@
 
 from invertwin.inversion.gradcheck import Agreement, Direction, GradientReport
 from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.measures import Likeness, compare_shapes, volume_iou
 from invertwin.inversion.mover import (
     Echo,
     MotionMap,
@@ -21,6 +22,7 @@ __all__ = [
     "Echo",
     "GradientReport",
     "Laplacian",
+    "Likeness",
     "MotionMap",
     "MovingBody",
     "Optimizer",
@@ -28,8 +30,10 @@ __all__ = [
     "Reconstruction",
     "Regularizer",
     "SpectrumLoss",
+    "compare_shapes",
     "fit_mover",
     "motion_map",
     "reconstruct",
     "strongest_mover",
+    "volume_iou",
 ]

@@ -1,0 +1,280 @@
+"""Bodies with joints: rigid parts or skin that follows a tree of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.pose import rotation_from_vector
+from invertwin.scene.scene import Scene
+
+_DO = "give arrays of one template"
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTemplate:
+    """A mesh in its rest pose, its tree of joints, and how much each joint moves each vertex.
+
+    Attributes:
+        vertices: rest positions [m].
+        faces: vertex indices of every triangle.
+        weights: share of every joint in every vertex, rows that add up to 1.
+        parents: joint that each joint hangs on, always an earlier one; −1 for the first, the root.
+        joints: rest positions of the joints [m].
+        shape_directions: how the vertices follow shape coordinates [m]; None has none.
+        joint_directions: how the joints follow them [m].
+        pose_directions: how the rest positions follow the rotations, last axis the elements of
+            R − I of all joints but the root's, row by row; None does not follow.
+
+    Raises:
+        InputError: shapes that do not fit together, NaN, weights that are negative or do not add
+            up to 1, or parents that are not a tree.
+    """
+
+    vertices: Float64[Tensor, "v 3"]
+    faces: Int64[Tensor, "f 3"]
+    weights: Float64[Tensor, "v j"]
+    parents: tuple[int, ...]
+    joints: Float64[Tensor, "j 3"]
+    shape_directions: Float64[Tensor, "v 3 n"] | None = None
+    joint_directions: Float64[Tensor, "j 3 n"] | None = None
+    pose_directions: Float64[Tensor, "v 3 p"] | None = None
+
+    def __post_init__(self) -> None:
+        mesh = Mesh(self.vertices, self.faces)
+        rows, parents = len(mesh.vertices), tuple(int(p) for p in self.parents)
+        count = len(parents)
+        if not count or parents[0] != -1 or any(not 0 <= p < k for k, p in enumerate(parents) if k):
+            raise InputError(
+                "expected parents −1 for the first joint and an earlier joint for each other, "
+                f"got {parents}; sort the joints from the root outwards"
+            )
+        weights = checked_tensor(self.weights, (rows, count), "skinning weights", _DO)
+        off = float((weights.sum(1) - 1).abs().max())
+        if float(weights.min()) < 0 or off > 1e-3:
+            raise InputError(
+                "expected skinning weights >= 0 that add up to 1 at each vertex, "
+                f"got a least one of {float(weights.min()):.3g} and sums {off:.3g} off; "
+                "normalise them"
+            )
+        set_ = object.__setattr__
+        set_(self, "vertices", mesh.vertices)
+        set_(self, "faces", mesh.faces)
+        set_(self, "weights", weights / weights.sum(1, keepdim=True))
+        set_(self, "parents", parents)
+        set_(self, "joints", checked_tensor(self.joints, (count, 3), "joints [m]", _DO))
+        if (self.shape_directions is None) != (self.joint_directions is None):
+            raise InputError(
+                "expected shape directions of vertices and of joints, got one of them; give both"
+            )
+        if self.shape_directions is not None:
+            shapes = checked_tensor(self.shape_directions, (rows, 3, None), "shape directions", _DO)
+            places = (count, 3, shapes.shape[2])
+            set_(self, "shape_directions", shapes)
+            set_(
+                self,
+                "joint_directions",
+                checked_tensor(self.joint_directions, places, "joint directions", _DO),
+            )
+        if self.pose_directions is not None:
+            columns = (rows, 3, 9 * (count - 1))
+            poses = checked_tensor(self.pose_directions, columns, "pose directions", _DO)
+            set_(self, "pose_directions", poses)
+
+    @property
+    def shape_count(self) -> int:
+        """Number of shape coordinates."""
+        return 0 if self.shape_directions is None else self.shape_directions.shape[2]
+
+    def posed(
+        self, rotations: Float64[Tensor, "j 3 3"], shape: Float64[Tensor, " n"] | None = None
+    ) -> tuple[Float64[Tensor, "v 3"], Float64[Tensor, "j 3"]]:
+        """Vertices and joints [m] after every joint has turned relative to its parent.
+
+        Linear blend skinning: ``x = Σ_j w_j (R_j (v − p_j) + t_j)``, R_j and t_j rotation and
+        place of joint j in the object's frame, p_j its rest position.
+
+        Args:
+            rotations: of every joint in the frame of its parent.
+            shape: shape coordinates; None is the template's own shape.
+        """
+        rest, places = self.vertices, self.joints
+        if shape is not None and self.shape_directions is not None:
+            rest = rest + self.shape_directions @ shape
+            places = places + self.joint_directions @ shape  # type: ignore[operator]
+        if self.pose_directions is not None:
+            turned = rotations[1:] - torch.eye(3, dtype=torch.float64)
+            rest = rest + self.pose_directions @ turned.flatten()
+        frames, moved = [rotations[0]], [places[0]]
+        for joint, parent in enumerate(self.parents[1:], start=1):
+            moved.append(moved[parent] + frames[parent] @ (places[joint] - places[parent]))
+            frames.append(frames[parent] @ rotations[joint])
+        turns, posed = torch.stack(frames), torch.stack(moved)
+        shifts = posed - torch.einsum("jab,jb->ja", turns, places)
+        blended = torch.einsum("vj,jab->vab", self.weights, turns)
+        return torch.einsum("vab,vb->va", blended, rest) + self.weights @ shifts, posed
+
+
+class SkinnedBody(nn.Module):
+    """Replaces an object's mesh by a body template with turned joints.
+
+    Attributes:
+        rotation: parameter [j, 3], rotation vector of every joint in the frame of its parent
+            [rad].
+        shape: parameter [n], shape coordinates of the template.
+    """
+
+    applies_to = "scene"
+
+    def __init__(
+        self,
+        object: str,
+        template: BodyTemplate,
+        rotation: ArrayLike | None = None,
+        shape: ArrayLike | None = None,
+        sought: Sequence[int] | None = None,
+    ) -> None:
+        """Shape `object` by a body, from these joint angles at the start.
+
+        Args:
+            object: name of the object; its pose places the body.
+            template: the body.
+            rotation: rotation vectors [j, 3] (rad); None is the rest pose.
+            shape: shape coordinates [n]; None is zero.
+            sought: joints that the fit may turn; None is all.
+
+        Raises:
+            InputError: wrong shapes, NaN, or a joint that the template does not have.
+        """
+        super().__init__()
+        self.object, self.template = object, template
+        count, shapes = len(template.parents), template.shape_count
+        turns = torch.zeros(count, 3) if rotation is None else rotation
+        turns = checked_tensor(turns, (count, 3), "joint rotations [rad]", "give one per joint")
+        given = torch.zeros(shapes) if shape is None else shape
+        given = checked_tensor(given, (shapes,), "shape coordinates", "give the template's")
+        chosen = range(count) if sought is None else sought
+        wrong = [k for k in chosen if not 0 <= k < count]
+        if wrong:
+            raise InputError(
+                f"expected joints in [0, {count - 1}], got {wrong}; count the template's from 0"
+            )
+        self._sought = torch.zeros(count, 1, dtype=torch.float64)
+        self._sought[list(chosen)] = 1.0
+        self.rotation = nn.Parameter(turns.detach().clone())
+        self.shape = nn.Parameter(given.detach().clone(), requires_grad=shapes > 0)
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object's mesh replaced."""
+        vertices, _ = self._posed()
+        return scene.replace(self.object, mesh=Mesh(vertices, self.template.faces))
+
+    def joints(self) -> Float64[Tensor, "j 3"]:
+        """Present places of the joints in the object's frame [m]."""
+        return self._posed()[1]
+
+    def values(self) -> dict[str, Tensor]:
+        """Joint rotations [rad] and shape coordinates by name, for progress and reports."""
+        named = {f"{self.object}.joint_rotation": self.rotation.detach().clone()}
+        if self.template.shape_count:
+            named[f"{self.object}.shape"] = self.shape.detach().clone()
+        return named
+
+    def _posed(self) -> tuple[Tensor, Tensor]:
+        free = self.rotation * self._sought + self.rotation.detach() * (1 - self._sought)
+        rotations = torch.stack([rotation_from_vector(vector) for vector in free])
+        return self.template.posed(rotations, self.shape)
+
+
+def articulated_template(
+    parts: Sequence[Mesh], parents: Sequence[int], joints: ArrayLike
+) -> BodyTemplate:
+    """A body of rigid parts, part k turning about joint k.
+
+    Args:
+        parts: a mesh for every joint, in the rest pose and one common frame.
+        parents: joint that each joint hangs on, −1 for the first.
+        joints: rest positions [j, 3] of the joints [m].
+
+    Raises:
+        InputError: numbers of parts and joints that differ, or parents that are not a tree.
+    """
+    if not parts or len(parts) != len(parents):
+        raise InputError(
+            f"expected a mesh for each of {len(parents)} joints, got {len(parts)}; give one each"
+        )
+    sizes = [len(part.vertices) for part in parts]
+    owner = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(sizes))
+    starts = np.cumsum([0, *sizes[:-1]])
+    return BodyTemplate(
+        torch.cat([part.vertices for part in parts]),
+        torch.cat([part.faces + int(first) for part, first in zip(parts, starts, strict=True)]),
+        torch.nn.functional.one_hot(owner, len(parts)).double(),
+        tuple(parents),
+        checked_tensor(joints, (len(parts), 3), "joints [m]", "give one per part"),
+    )
+
+
+def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
+    """A body in the layout of SMPL's ``.npz`` files, which users obtain under its own licence.
+
+    Read are ``v_template`` [v, 3], ``f``, ``weights`` [v, j], ``kintree_table`` [2, j],
+    ``J_regressor`` [j, v], ``shapedirs`` [v, 3, n] and, if there, ``posedirs`` [v, 3, 9 (j − 1)].
+
+    Args:
+        file: path of the file.
+        shapes: shape coordinates that are kept, the first ones.
+
+    Raises:
+        InputError: no such file, pickled objects in it, or arrays missing or of wrong shapes.
+    """
+    path = Path(file)
+    if not path.is_file():
+        raise InputError(f"expected a body model, got no file {path}; give the path of a .npz file")
+    names = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs")
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            missing = [name for name in names if name not in content.files]
+            if missing:
+                raise InputError(
+                    f"expected {', '.join(names)} in {path.name}, got no {', '.join(missing)}; "
+                    "give a file of SMPL's layout"
+                )
+            kept = [*names, *(name for name in ("posedirs",) if name in content.files)]
+            arrays = {name: content[name] for name in kept}
+    except (OSError, ValueError, EOFError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"expected plain arrays in {path.name}, got {type(error).__name__}; "
+            "save sparse matrices and pickled objects as arrays with numpy.savez first"
+        ) from None
+    rest = checked_tensor(arrays["v_template"], (None, 3), "v_template", _DO)
+    table = arrays["kintree_table"].astype(np.int64)
+    if table.ndim != 2 or len(table) != 2:
+        raise InputError(
+            f"expected kintree_table of shape [2, any], got {list(table.shape)}; "
+            "give a file of SMPL's layout"
+        )
+    count = table.shape[1]
+    directions = checked_tensor(arrays["shapedirs"], (len(rest), 3, None), "shapedirs", _DO)
+    directions = directions[..., : checked_count(shapes, "shape coordinates", 1)]
+    regressor = checked_tensor(arrays["J_regressor"], (count, len(rest)), "J_regressor", _DO)
+    return BodyTemplate(
+        rest,
+        torch.from_numpy(arrays["f"].astype(np.int64)),
+        checked_tensor(arrays["weights"], (len(rest), count), "weights", _DO),
+        # The root's parent is a number without meaning, 2³² − 1 in most files.
+        (-1, *(int(parent) for parent in table[0, 1:])),
+        regressor @ rest,
+        directions,
+        torch.einsum("jv,van->jan", regressor, directions),
+        torch.from_numpy(arrays["posedirs"].astype(np.float64)) if "posedirs" in arrays else None,
+    )

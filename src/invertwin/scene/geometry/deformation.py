@@ -1,0 +1,86 @@
+"""Smooth deformations: a few control points move many vertices."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike
+from invertwin.scene.geometry.lattice import Lattice, tensor_product
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Scene
+
+
+class LatticeDeformation(nn.Module):
+    """Moves an object's points by cubic B-splines over a lattice of control points.
+
+    The displacement field is twice continuously differentiable, whatever the mesh; equal offsets
+    everywhere are a translation by them.
+
+    Attributes:
+        offsets: parameter [x+2, y+2, z+2, 3] in the object's frame, metres: those of the
+            lattice's nodes and of one more on every side.
+    """
+
+    applies_to = "scene"
+
+    def __init__(
+        self, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int] = (4, 4, 4)
+    ) -> None:
+        """Deform `object`, by zero at the start.
+
+        Args:
+            object: name of the object.
+            low: corner of a box that holds the object's mesh, in its frame [m].
+            high: the opposite corner [m].
+            counts: nodes of the lattice along x, y and z.
+
+        Raises:
+            InputError: a box without volume, or fewer than two nodes along an axis.
+        """
+        super().__init__()
+        self.object = object
+        self.lattice = Lattice.between(low, high, counts)
+        shape = [n + 2 for n in self.lattice.counts]
+        self.offsets = nn.Parameter(torch.zeros(*shape, 3, dtype=torch.float64))
+
+    def displacement(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p 3"]:
+        """Displacement [m] of points inside of the box, in the object's frame.
+
+        Raises:
+            InputError: points outside of it.
+        """
+        slack = 1e-9 * (self.lattice.high - self.lattice.low)
+        place = points.detach()
+        out = ((place < self.lattice.low - slack) | (place > self.lattice.high + slack)).any(1)
+        if bool(out.any()):
+            raise InputError(
+                f"expected points of {self.object!r} in the lattice's box, got {int(out.sum())} "
+                "outside; choose low and high around the mesh"
+            )
+        # Control points begin one step before the first node: that of cell i is number i of them.
+        index, t = self.lattice.cell(points)
+        return tensor_product(self.offsets, index, _cubic_spline(t))
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object deformed.
+
+        Raises:
+            InputError: the object's mesh leaves the box.
+        """
+        mesh = scene[self.object].mesh
+        vertices = mesh.vertices + self.displacement(mesh.vertices)
+        return scene.replace(self.object, mesh=Mesh(vertices, mesh.faces))
+
+    def values(self) -> dict[str, Tensor]:
+        """Offsets [m] of the control points by name, for progress and reports."""
+        return {f"{self.object}.control_offsets": self.offsets.detach().clone()}
+
+
+def _cubic_spline(t: Tensor) -> Tensor:
+    """Weights of the four control points around places t in [0, 1] of a cell; they add up to 1."""
+    r = 1 - t
+    inner = (3 * t**3 - 6 * t**2 + 4) / 6, (3 * r**3 - 6 * r**2 + 4) / 6
+    return torch.stack([r**3 / 6, *inner, t**3 / 6], dim=-1)

@@ -1,0 +1,190 @@
+"""Signed distances, on a grid and as a neural field: shapes whose topology is free."""
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor, nn
+
+from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.scene.geometry.iso_surface import iso_surface
+from invertwin.scene.geometry.lattice import Lattice, tensor_product
+from invertwin.scene.scene import Scene
+
+
+class _Distance(nn.Module):
+    """A field whose zero is the object's surface."""
+
+    applies_to = "scene"
+
+    def __init__(self, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int]) -> None:
+        super().__init__()
+        self.object = object
+        self.lattice = Lattice.between(low, high, counts)
+
+    def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
+        """The field at points in the object's frame [m]: negative inside."""
+        raise NotImplementedError
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object's mesh replaced by the present surface, meshed anew.
+
+        The material must not have values per triangle, nor the object velocities per vertex.
+
+        Raises:
+            InputError: no surface in the box.
+        """
+        return scene.replace(self.object, mesh=iso_surface(self.distance, self.lattice))
+
+
+class DistanceGrid(_Distance):
+    """An object's surface as the zero of values at the nodes of a grid.
+
+    Between nodes the field is that of cubic convolution (Catmull–Rom): it has the nodes' values
+    and a continuous gradient.
+
+    Attributes:
+        value: parameter [x, y, z], metres; negative inside.
+    """
+
+    def __init__(
+        self, object: str, low: ArrayLike, high: ArrayLike, value: Float64[Tensor, "x y z"]
+    ) -> None:
+        """Shape `object` by a grid, from these values at the start.
+
+        Args:
+            object: name of the object.
+            low: corner of the grid in the object's frame [m].
+            high: the opposite corner [m].
+            value: signed distances at the nodes [m], at least two along each axis.
+
+        Raises:
+            InputError: wrong shapes, NaN, or a box without volume.
+        """
+        given = checked_tensor(
+            value, (None, None, None), "signed distances [m]", "give one for each node"
+        )
+        super().__init__(object, low, high, tuple(given.shape))
+        self.value = nn.Parameter(given.detach().clone())
+
+    @classmethod
+    def sampled(
+        cls,
+        object: str,
+        low: ArrayLike,
+        high: ArrayLike,
+        counts: Sequence[int],
+        distance: Callable[[Tensor], Tensor],
+    ) -> "DistanceGrid":
+        """The grid that holds a signed distance, a function of points [p, 3], at its nodes.
+
+        Raises:
+            InputError: as above.
+        """
+        lattice = Lattice.between(low, high, counts)
+        with torch.no_grad():
+            value = distance(lattice.nodes.reshape(-1, 3))
+        return cls(object, low, high, value.reshape(lattice.counts))
+
+    def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
+        """The field at points in the object's frame [m]: negative inside."""
+        index, t = self.lattice.cell(points)
+        return tensor_product(_extended(self.value), index, _cubic_convolution(t))
+
+
+class NeuralDistance(_Distance):
+    """An object's surface as the zero of a small network of sines, a ball at the start.
+
+    ``f(x) = |x − c| − r + h · net((x − c)/h)``, c and h the middle and the half diagonal of the
+    box; the network's last layer starts at zero.
+
+    Attributes:
+        layers: linear layers of the network, sin(frequency · layer) after the first, sin(layer)
+            after the others.
+    """
+
+    def __init__(
+        self,
+        object: str,
+        low: ArrayLike,
+        high: ArrayLike,
+        counts: Sequence[int],
+        *,
+        radius: float,
+        width: int = 32,
+        depth: int = 2,
+        frequency: float = 8.0,
+        seed: int = 0,
+    ) -> None:
+        """Shape `object` by a network, from a ball in the middle of the box at the start.
+
+        Args:
+            object: name of the object.
+            low: corner of the box in the object's frame [m].
+            high: the opposite corner [m].
+            counts: nodes along x, y and z at which the field is meshed.
+            radius: of the ball [m].
+            width: sines of a layer.
+            depth: layers of sines.
+            frequency: of the first layer's sines, in radians over the box's half diagonal: higher
+                for finer detail.
+            seed: of the network.
+
+        Raises:
+            InputError: a box without volume, or a number that is not positive.
+        """
+        super().__init__(object, low, high, counts)
+        self.radius = checked_number(radius, "radius [m]", 0.0, open_low=True)
+        self.frequency = checked_number(frequency, "frequency", 0.0, open_low=True)
+        size = checked_count(width, "width of a layer", 1)
+        widths = [3, *[size] * checked_count(depth, "layers of sines", 1), 1]
+        generator = torch.Generator().manual_seed(seed)
+        self.layers = nn.ModuleList()
+        for k, (fan_in, fan_out) in enumerate(pairwise(widths)):
+            layer = nn.Linear(fan_in, fan_out, dtype=torch.float64)
+            # Sitzmann et al. 2020: the sines' arguments have a spread of one in every layer.
+            bound = 1 / fan_in if k == 0 else math.sqrt(6 / fan_in)
+            bound = 0.0 if k == len(widths) - 2 else bound
+            for values in (layer.weight, layer.bias):
+                start = torch.rand(values.shape, generator=generator, dtype=torch.float64)
+                values.data = bound * (2 * start - 1)
+            self.layers.append(layer)
+
+    def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
+        """The field at points in the object's frame [m]: negative inside."""
+        center = (self.lattice.low + self.lattice.high) / 2
+        half = float((self.lattice.high - self.lattice.low).norm()) / 2
+        away = points - center
+        hidden, scale = away / half, self.frequency
+        for layer in list(self.layers)[:-1]:
+            hidden, scale = torch.sin(scale * layer(hidden)), 1.0
+        return (
+            torch.linalg.vector_norm(away, dim=1)
+            - self.radius
+            + (half * self.layers[-1](hidden)[:, 0])
+        )
+
+
+def _extended(values: Tensor) -> Tensor:
+    """One more node on every side, by a straight line through the last two."""
+    for axis in range(3):
+        first, second = values.narrow(axis, 0, 1), values.narrow(axis, 1, 1)
+        count = values.shape[axis]
+        last, before = values.narrow(axis, count - 1, 1), values.narrow(axis, count - 2, 1)
+        values = torch.cat([2 * first - second, values, 2 * last - before], dim=axis)
+    return values
+
+
+def _cubic_convolution(t: Tensor) -> Tensor:
+    """Weights of the four nodes around places t in [0, 1] of a cell: 0, 1, 0, 0 at t = 0."""
+    return 0.5 * torch.stack(
+        [
+            -t + 2 * t**2 - t**3,
+            2 - 5 * t**2 + 3 * t**3,
+            t + 4 * t**2 - 3 * t**3,
+            -(t**2) + t**3,
+        ],
+        dim=-1,
+    )

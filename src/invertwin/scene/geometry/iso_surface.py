@@ -1,0 +1,89 @@
+"""From a field to a mesh, and derivatives back: marching cubes and the implicit relation."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float64
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.mesh import Mesh
+
+Field = Callable[[Float64[Tensor, "p 3"]], Float64[Tensor, " p"]]
+
+_POLISH = 4  # Newton steps from marching cubes, whose error is of second order, to the field's zero
+_CHUNK = 65_536  # points of the field at a time
+_FLAT = 1e-6  # least slope of a distance, whose own is 1
+
+
+def iso_surface(field: Field, lattice: Lattice) -> Mesh:
+    """The surface where a field is zero, as a mesh whose vertices follow the field.
+
+    Values and topology are those of marching cubes, moved onto the field's zero; the derivative of
+    a vertex V with unit normal n = ∇f/|∇f| is ``dV = −n df/|∇f|``, in reverse and in forward mode.
+    Vertices slide along the surface when the field changes: only the normal part is theirs, and it
+    is the part that moves the surface. A surface that leaves the box is open there.
+
+    Source: f(V(θ), θ) = 0, differentiated along the normal; derivations §8.
+
+    Args:
+        field: negative inside, positive outside; its parameters may carry gradients, and points
+            are given in the object's frame [m].
+        lattice: nodes on which the field is looked at; thinner parts are missed.
+
+    Raises:
+        InputError: a field that is not finite, or has one sign at all nodes.
+    """
+    nodes = lattice.nodes.reshape(-1, 3)
+    with torch.no_grad():
+        parts = [field(part).detach() for part in nodes.split(_CHUNK)]
+    values = torch.cat(parts).reshape(lattice.counts)
+    if not bool(torch.isfinite(values).all()):
+        raise InputError("expected a finite field, got NaN or infinity; lower the learning rate")
+    if not bool(values.min() < 0 < values.max()):
+        raise InputError(
+            "expected a field with both signs in its box, got values in "
+            f"[{float(values.min()):.3g}, {float(values.max()):.3g}]; "
+            "start with a surface inside of the box"
+        )
+    corners, faces, _, _ = marching_cubes(
+        values.numpy(), 0.0, gradient_direction="descent", allow_degenerate=False
+    )
+    start = lattice.low + torch.from_numpy(corners).double() * lattice.spacing
+    vertices = follow(field, _polished(field, start, lattice))
+    return Mesh(vertices, torch.from_numpy(faces.astype("int64")))
+
+
+def follow(field: Field, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p 3"]:
+    """Points of the surface as they are, with the derivative dV = −n df/|∇f|."""
+    fixed = points.detach()
+    _, slope = _value_and_slope(field, fixed)
+    direction = slope / slope.square().sum(1, keepdim=True).clamp_min(_FLAT**2)
+    value = field(fixed)
+    return fixed - direction * (value - value.detach())[:, None]
+
+
+def _polished(field: Field, points: Tensor, lattice: Lattice) -> Tensor:
+    reach = 0.5 * float(lattice.spacing.min())
+    for _ in range(_POLISH):
+        value, slope = _value_and_slope(field, points)
+        step = slope * (value / slope.square().sum(1).clamp_min(_FLAT**2))[:, None]
+        length = step.norm(dim=1, keepdim=True)
+        points = points - step * (reach / length.clamp_min(reach))
+        points = points.clamp(lattice.low, lattice.high)
+    return points
+
+
+def _value_and_slope(field: Field, points: Tensor) -> tuple[Tensor, Tensor]:
+    """The field and its gradient in space, both without derivatives."""
+    values, slopes = [], []
+    for part in points.split(_CHUNK):
+        place = part.detach().requires_grad_()
+        with torch.enable_grad():
+            value = field(place)
+            (slope,) = torch.autograd.grad(value.sum(), place)
+        values.append(value.detach())
+        slopes.append(slope.detach())
+    return torch.cat(values), torch.cat(slopes)

@@ -1,0 +1,165 @@
+"""Linear shape spaces: a mean, and the directions in which shapes of a kind differ."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
+from invertwin.scene.files import load_mesh
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Scene
+
+_TRAINED = 79  # vehicles behind the public space: σ of mode k is its singular value over √79
+_LEVELS = {"coarse": ("default_dodec", "dodec_mean.obj"), "fine": ("default1", "body_mean.obj")}
+_ORIGINAL = "github.com/mleotta/vehicle3d"
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeSpace:
+    """Meshes ``mean + Σ z_k σ_k component_k`` of equal triangles.
+
+    Attributes:
+        mean: vertices of the mean shape [m].
+        components: directions of the vertices, most important first.
+        deviations: standard deviation σ along each [m].
+        faces: vertex indices of every triangle.
+
+    Raises:
+        InputError: shapes that do not fit together, NaN, or a negative deviation.
+    """
+
+    mean: Float64[Tensor, "v 3"]
+    components: Float64[Tensor, "v 3 k"]
+    deviations: Float64[Tensor, " k"]
+    faces: Int64[Tensor, "f 3"]
+
+    def __post_init__(self) -> None:
+        do = "give mean [v, 3], components [v, 3, k], deviations [k] of one space"
+        mesh = Mesh(self.mean, self.faces)
+        rows = len(mesh.vertices)
+        parts = checked_tensor(self.components, (rows, 3, None), "components", do)
+        sizes = checked_tensor(self.deviations, (parts.shape[2],), "deviations [m]", do)
+        if bool((sizes < 0).any()) or not len(sizes):
+            raise InputError(f"expected deviations >= 0, got {sizes.tolist()}; {do}")
+        for name, value in (
+            ("mean", mesh.vertices),
+            ("components", parts),
+            ("deviations", sizes),
+            ("faces", mesh.faces),
+        ):
+            object.__setattr__(self, name, value)
+
+    def mesh(self, latent: Float64[Tensor, " n"]) -> Mesh:
+        """The shape of the first n coordinates z, in standard deviations.
+
+        Raises:
+            InputError: more coordinates than the space has.
+        """
+        count = len(latent)
+        if count > len(self.deviations):
+            raise InputError(
+                f"expected at most {len(self.deviations)} coordinates of the shape space, "
+                f"got {count}; give fewer"
+            )
+        offsets = self.components[..., :count] @ (latent * self.deviations[:count])
+        return Mesh(self.mean + offsets, self.faces)
+
+    def latent(self, vertices: Float64[Tensor, "v 3"]) -> Float64[Tensor, " k"]:
+        """The coordinates z of the space's shape that is closest to vertices of its order."""
+        basis = (self.components * self.deviations).flatten(0, 1)
+        return torch.linalg.lstsq(basis, (vertices - self.mean).reshape(-1, 1)).solution[:, 0]
+
+
+class LinearShape(nn.Module):
+    """Replaces an object's mesh by one of a linear shape space.
+
+    Attributes:
+        latent: parameter [k], in standard deviations.
+    """
+
+    applies_to = "scene"
+
+    def __init__(self, object: str, space: ShapeSpace, initial: ArrayLike | int) -> None:
+        """Shape `object` by a space, from these coordinates at the start.
+
+        Args:
+            object: name of the object; its pose is kept.
+            space: the shape space.
+            initial: coordinates in standard deviations, or how many, from the mean shape.
+
+        Raises:
+            InputError: none or too many coordinates, or NaN.
+        """
+        super().__init__()
+        self.object, self.space = object, space
+        start = (
+            torch.zeros(checked_count(initial, "coordinates", 1), dtype=torch.float64)
+            if isinstance(initial, int)
+            else checked_tensor(initial, (None,), "coordinates", "give numbers, or how many")
+        )
+        space.mesh(start.detach())
+        self.latent = nn.Parameter(start.detach().clone())
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object's mesh replaced."""
+        return scene.replace(self.object, mesh=self.space.mesh(self.latent))
+
+    def values(self) -> dict[str, Tensor]:
+        """Coordinates by name, for progress and reports."""
+        return {f"{self.object}.latent": self.latent.detach().clone()}
+
+
+def load_vehicle_space(folder: str | Path, level: Literal["coarse", "fine"] = "fine") -> ShapeSpace:
+    """The public learned space of vehicles, bodies without wheels.
+
+    The frame is that of the files: x ahead, y to the left, z up, metres.
+
+    Args:
+        folder: holds ``vehicle3d_pca.npz``, ``body_mean.obj`` and ``dodec_mean.obj``.
+        level: ``fine`` has 127 vertices and 78 modes, ``coarse`` 16 and 14.
+
+    Raises:
+        InputError: no such level, files missing, or arrays that do not fit.
+    """
+    if level not in _LEVELS:
+        raise InputError(f"expected level 'coarse' or 'fine', got {level!r}; choose one")
+    name, mean_file = _LEVELS[level]
+    file = Path(folder) / "vehicle3d_pca.npz"
+    if not file.is_file():
+        raise InputError(
+            f"expected the vehicle space {file.name} in {folder}, got no such file; "
+            f"set INVERTWIN_DATA to the folder that holds vehicle_prior/ ({_ORIGINAL})"
+        )
+    with np.load(file, allow_pickle=False) as arrays:
+        wanted = [f"{name}_{part}" for part in ("mean", "pc", "sv")]
+        missing = [key for key in wanted if key not in arrays.files]
+        if missing:
+            raise InputError(f"expected {missing[0]} in {file.name}, got none; load the original")
+        mean, components, singular = (arrays[key].astype(np.float64) for key in wanted)
+    mesh = load_mesh(Path(folder) / mean_file)
+    count = len(mesh.vertices)
+    # Rows hold the body's vertices, then the wheels', then points in the plane of images.
+    vertices = torch.from_numpy(mean[: 3 * count].reshape(count, 3))
+    return ShapeSpace(
+        vertices,
+        torch.from_numpy(components[: 3 * count].reshape(count, 3, -1)),
+        torch.from_numpy(singular / np.sqrt(_TRAINED)),
+        _reordered(mesh, vertices),
+    )
+
+
+def _reordered(mesh: Mesh, vertices: Tensor) -> Tensor:
+    """The mesh's triangles in the numbers of the same vertices in another order."""
+    gaps, index = torch.cdist(mesh.vertices, vertices).min(dim=1)
+    if float(gaps.max()) > 1e-4 or len(index.unique()) != len(vertices):
+        raise InputError(
+            "expected the mean shape and its mesh to have the same vertices, got some "
+            f"{float(gaps.max()):.3g} m apart; load files of one release"
+        )
+    return index[mesh.faces]

@@ -1,0 +1,121 @@
+"""Free vertices whose gradients are smoothed: large steps without crumpling."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.sparse import coo_array, csc_array, eye_array
+from scipy.sparse.linalg import SuperLU, splu
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import checked_number
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Scene
+
+
+class SmoothVertices(nn.Module):
+    """Moves every vertex by ``(I + λL)⁻¹ u``, L the graph Laplacian of the mesh.
+
+    A step of gradient descent on u is a step ``−η (I + λL)⁻² ∂loss/∂x`` of the vertices: rough
+    parts of the gradient are held back, and every shape can still be reached.
+
+    Source: Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geometry".
+    Differs from the source: u belongs to the displacement, not to the positions, so that zero is
+    the first shape; the optimiser is whichever fits u.
+
+    Attributes:
+        latent: parameter u [v, 3] in the object's frame, metres.
+    """
+
+    applies_to = "scene"
+
+    def __init__(self, object: str, mesh: Mesh, smoothing: float = 20.0) -> None:
+        """Move the vertices of `object`, by zero at the start.
+
+        Args:
+            object: name of the object.
+            mesh: its mesh, whose edges say which vertices are neighbours.
+            smoothing: λ; detail below about √λ edge lengths is held back.
+
+        Raises:
+            InputError: a negative λ.
+        """
+        super().__init__()
+        self.object = object
+        amount = checked_number(smoothing, "smoothing λ", 0.0)
+        count = len(mesh.vertices)
+        self._faces = mesh.faces.clone()
+        self._smoother = Smoother(mesh.faces, count, amount)
+        self.latent = nn.Parameter(torch.zeros(count, 3, dtype=torch.float64))
+
+    @property
+    def offsets(self) -> Float64[Tensor, "v 3"]:
+        """Displacements of the vertices in the object's frame [m]."""
+        return _Smoothed.apply(self.latent, self._smoother)  # type: ignore[return-value]
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the vertices moved.
+
+        Raises:
+            InputError: the object has other triangles than the mesh this was created with.
+        """
+        mesh = scene[self.object].mesh
+        if len(mesh.vertices) != len(self.latent) or not torch.equal(mesh.faces, self._faces):
+            raise InputError(
+                f"expected the triangles of {self.object!r} as they were "
+                f"({len(self.latent)} vertices), got {len(mesh.vertices)}; "
+                "create SmoothVertices with the object's own mesh"
+            )
+        return scene.replace(self.object, mesh=Mesh(mesh.vertices + self.offsets, mesh.faces))
+
+    def values(self) -> dict[str, Tensor]:
+        """Vertex offsets [m] by name, for progress and reports."""
+        return {f"{self.object}.offsets": self.offsets.detach().clone()}
+
+
+class Smoother:
+    """The factorised matrix I + λL, symmetric and positive definite; copies factorise anew."""
+
+    def __init__(self, faces: Tensor, count: int, amount: float) -> None:
+        self._given = faces, count, amount
+        self._factors: SuperLU = splu(
+            csc_array(eye_array(count) + amount * laplacian(faces, count))
+        )
+
+    def __reduce__(self) -> tuple:
+        return type(self), self._given
+
+    def solve(self, values: Tensor) -> Tensor:
+        """(I + λL)⁻¹ times columns, without derivatives."""
+        return torch.from_numpy(self._factors.solve(np.asfortranarray(values.detach().numpy())))
+
+
+def laplacian(faces: Tensor, count: int) -> csc_array:
+    """The graph Laplacian: degrees on the diagonal, −1 for every edge."""
+    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = pairs.sort(dim=1).values.unique(dim=0).numpy()
+    edges = edges[edges[:, 0] != edges[:, 1]]  # triangles that are a line
+    ends = np.concatenate([edges, edges[:, ::-1]])
+    joined = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    degree = np.bincount(ends[:, 0], minlength=count).astype(np.float64)
+    diagonal = coo_array((degree, (np.arange(count), np.arange(count))), shape=(count, count))
+    return csc_array(diagonal - joined)
+
+
+class _Smoothed(torch.autograd.Function):
+    """(I + λL)⁻¹ u; the matrix is symmetric, so its adjoint is itself."""
+
+    @staticmethod
+    def forward(ctx: Any, latent: Tensor, smoother: Smoother) -> Tensor:
+        ctx.smoother = smoother
+        return smoother.solve(latent)
+
+    @staticmethod
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor, None]:
+        return _Smoothed.apply(outputs[0], ctx.smoother), None  # type: ignore[return-value]
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        return ctx.smoother.solve(tangents[0])
