@@ -47,6 +47,8 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "limitations.md"
 MECHANISMS = {
     "power paths, interior": "interior",
     "power paths, boundary": "boundary",
+    "2+ bounces, interior": "chain interior",
+    "2+ bounces, boundary": "chain boundary",
     "coherent field": "coherent",
     "rough field": "rough",
 }
@@ -102,7 +104,8 @@ def on_radar(module: nn.Module, values: Callable[[Tensor], dict[str, Tensor]]) -
 
 
 def material(name: str, start: float) -> Moves:
-    module = MaterialValues("wall", **{name: start})
+    values: dict[str, Any] = {name: start}
+    module = MaterialValues("wall", **values)
     raw = module.raw[name].detach()
     return on_scene(module, lambda theta: {f"raw.{name}": raw + theta})
 
@@ -176,6 +179,7 @@ def power_case(parameter: str) -> Found:
         surrogate=Surrogate("gaussian", range_width=2.0, angle_width=1.0),
         samples=200_000 * radar.frame_count,
         boundary_samples=50_000 * radar.frame_count,
+        depth=1,
         repeats=2,
         difference_samples=300_000 * radar.frame_count,
         noise=0.01,
@@ -186,7 +190,7 @@ def power_case(parameter: str) -> Found:
     )
 
 
-def biased(theta: Tensor, scene: Scene, seed: int, boundary: bool) -> Tensor:
+def biased(theta: Tensor, scene: Scene, seed: int, boundary: bool, depth: int = 1) -> Tensor:
     radar = power_radar()
     return surrogate_spectrum(
         scene,
@@ -196,16 +200,17 @@ def biased(theta: Tensor, scene: Scene, seed: int, boundary: bool) -> Tensor:
         samples=50_000,
         boundary_samples=0,
         seed=seed,
+        depth=depth,
         boundary=boundary,
         range_offset=functional_call(RangeBias(), {"bias": theta}, ()),
     ).double()
 
 
-def bias_case() -> Found:
+def bias_case(depth: int = 1) -> Found:
     """The bias moves the map itself, so that one seed suffices."""
     scene, zero = occluder(wall=ROUGH, occluder=ROUGH), torch.zeros((), dtype=torch.float64)
-    maps = [biased(zero + sign * 1e-4, scene, 0, True) for sign in (1, -1)]
-    both = [pushed(lambda theta, on=on: biased(theta, scene, 0, on)) for on in (True, False)]
+    maps = [biased(zero + sign * 1e-4, scene, 0, True, depth) for sign in (1, -1)]
+    both = [pushed(lambda theta, on=on: biased(theta, scene, 0, on, depth)) for on in (True, False)]
     return Found(both[0], both[1], (maps[0] - maps[1]) / 2e-4, 0.0)
 
 
@@ -286,20 +291,20 @@ def case(parameter: str, mechanism: str) -> Found:
 def test_the_table_is_whole():
     named = {parameter for parameter, _ in CELLS}
     assert named == {*MOVES, "range bias", "clock offset", *REFUSALS}
-    assert len(CELLS) == 4 * len(named)
-    assert set(CELLS.values()) == {"supported", "zero", "refused", "–"}
+    assert len(CELLS) == len(MECHANISMS) * len(named)
+    assert set(CELLS.values()) == {"supported", "zero", "refused", "unresolved", "–"}
 
 
-def selected(word: str) -> list[Any]:
+def selected(word: str, *, chains: bool = False) -> list[Any]:
     slow = {"pose", "scale", "vertices", "radar position"}
     return [
         pytest.param(
             *cell,
             id=re.sub(r"\W+", "_", " ".join(cell)),
-            marks=pytest.mark.slow if cell[1] == "coherent" and cell[0] in slow else (),
+            marks=pytest.mark.slow if chains or (cell[1] == "coherent" and cell[0] in slow) else (),
         )
         for cell, said in CELLS.items()
-        if said == word
+        if said == word and cell[1].startswith("chain") == chains
     ]
 
 
@@ -326,11 +331,14 @@ def test_zero(parameter, mechanism):
 
 def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     """Use a scene and a radar as the mechanism does."""
-    if mechanism in ("interior", "boundary"):
+    if mechanism.endswith(("interior", "boundary")):
         grid = radar.grid(0.4, 2.8, 0.6)
         counts: dict[str, Any] = {"samples": 1_000, "boundary_samples": 100, "seed": 0}
-        on = mechanism == "boundary"
-        surrogate_spectrum(scene, radar, grid, Surrogate(), boundary=on, **counts)
+        counts |= {
+            "boundary": mechanism.endswith("boundary"),
+            "depth": 2 if mechanism.startswith("chain") else 1,
+        }
+        surrogate_spectrum(scene, radar, grid, Surrogate(), **counts)
         return
     paths = trace_field(
         scene, radar.link(), samples=1_000, density=100.0, boundary_samples=100, seed=0
@@ -368,9 +376,10 @@ NAMES = {
     "conductivity": "expected a material with conductivity",
     "diffuse fraction": "expected a material with diffuse",
 }
+REFUSED = [cell for cell, said in CELLS.items() if said == "refused"]
 
 
-@pytest.mark.parametrize(("parameter", "mechanism"), selected("refused"))
+@pytest.mark.parametrize(("parameter", "mechanism"), REFUSED)
 def test_refused(parameter, mechanism):
     surface = METAL if mechanism == "coherent" else ROUGH
     scene, radar = occluder(wall=surface, occluder=surface), power_radar()
@@ -404,6 +413,7 @@ def test_a_pattern_of_ones_own_is_refused_too():
             samples=100,
             boundary_samples=0,
             seed=0,
+            depth=1,
         )
 
 
@@ -416,7 +426,7 @@ def test_a_lobe_that_starts_at_nothing_has_its_derivative():
         surface = RoughDielectric(4.0, 0.0, 1 - share)
         moved = scene.replace("wall", material=surface)
         return deposit_power(
-            moved, radar.link(), grid, samples=50_000, boundary_samples=0, seed=0
+            moved, radar.link(), grid, samples=50_000, boundary_samples=0, seed=0, depth=1
         ).double()
 
     rate = pushed(value)
