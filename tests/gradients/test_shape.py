@@ -1,0 +1,215 @@
+"""Every parameterisation of shape through the whole map: derivative against differences."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+from invertwin.inversion.gradcheck import gradcheck
+from invertwin.radar import Radar, Surrogate
+from invertwin.scene import Mesh, Scene, box, plate, sphere
+from invertwin.scene.geometry import (
+    BodyTemplate,
+    DistanceGrid,
+    LatticeDeformation,
+    LinearShape,
+    NeuralDistance,
+    ShapeSpace,
+    SkinnedBody,
+    SmoothVertices,
+    articulated_template,
+)
+from scenes import float64, radar, thing
+
+Direction = Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]
+LOW, HIGH = [-0.45, -0.4, -0.35], [0.45, 0.4, 0.35]
+
+
+def before_a_wall(mesh: Mesh) -> Scene:
+    """An object 1 m away, turned a little, before a wall 2 m away."""
+    return Scene(
+        {
+            "wall": thing(plate(2.4, 2.4, divisions=2), (0, 0, 2)),
+            "object": thing(mesh, (0.05, 0.02, 1.1), (0.1, 0.2, 0.05)),
+        }
+    )
+
+
+def noise(shape: torch.Size, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def along(module: nn.Module, **changes: Tensor) -> Direction:
+    """The module's parameters, moved by θ times these changes."""
+    start = {name: value.detach() for name, value in module.named_parameters()}
+
+    def direction(scene: Scene, seen: Radar, theta: Tensor) -> tuple[Scene, Radar]:
+        moved = {name: start[name] + theta * change for name, change in changes.items()}
+        return torch.func.functional_call(module, moved, (scene,)), seen
+
+    return direction
+
+
+def meshed(module: Any, scene: Scene, **changes: Tensor) -> Direction:
+    """The same for a field. Differences follow the first mesh's points along their normals.
+
+    Differences with common random numbers need triangles that stay the same ones, so the ends do
+    not mesh anew; where the changed field is zero on those normals is found here, by itself.
+    """
+    inner = along(module, **changes)
+    mesh = module(scene)["object"].mesh
+    points = mesh.vertices.detach()
+    start = {name: value.detach() for name, value in module.named_parameters()}
+
+    class Distance(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.shape = module
+
+        def forward(self, places: Tensor) -> Tensor:
+            return module.distance(places)
+
+    def value(theta: Tensor, places: Tensor) -> Tensor:
+        moved = {f"shape.{name}": start[name] + theta * c for name, c in changes.items()}
+        return torch.func.functional_call(Distance(), moved, (places,))
+
+    def slopes(theta: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+        at = places.detach().requires_grad_()
+        with torch.enable_grad():
+            found = value(theta, at)
+            (slope,) = torch.autograd.grad(found.sum(), at)
+        return found.detach(), slope
+
+    _, slope = slopes(torch.zeros((), dtype=torch.float64), points)
+    normals = slope / slope.norm(dim=1, keepdim=True)
+
+    def direction(scene: Scene, seen: Radar, theta: Tensor) -> tuple[Scene, Radar]:
+        if forward_ad.unpack_dual(theta).tangent is not None:
+            return inner(scene, seen, theta)
+        places = points
+        for _ in range(8):
+            found, slope = slopes(theta, places)
+            places = places - normals * (found / (slope * normals).sum(1))[:, None]
+        assert float(slopes(theta, places)[0].abs().max()) < 1e-9
+        return scene.replace("object", mesh=Mesh(places, mesh.faces)), seen
+
+    return direction
+
+
+def arm() -> BodyTemplate:
+    """Two bars with a gap at the elbow: parts that cut through each other have no derivative."""
+    upper, lower = box([0.24, 0.1, 0.1]), box([0.3, 0.08, 0.08])
+    parts = [
+        Mesh(upper.vertices - float64([0.2, 0, 0]), upper.faces),
+        Mesh(lower.vertices + float64([0.21, 0, 0]), lower.faces),
+    ]
+    return articulated_template(parts, (-1, 0), [[-0.3, 0, 0], [0, 0, 0]])
+
+
+def skin() -> BodyTemplate:
+    """A tall rounded body whose weights change smoothly from one joint to the next."""
+    ball = sphere(0.1, 3)
+    vertices = ball.vertices * float64([1.0, 3.0, 1.0])
+    share = torch.sigmoid(vertices[:, 1] / 0.05)
+    weights = torch.stack([1 - share, share], dim=1)
+    return BodyTemplate(vertices, ball.faces, weights, (-1, 0), float64([[0, -0.3, 0], [0, 0, 0]]))
+
+
+def space() -> ShapeSpace:
+    """A box that gets wider, and higher on one side."""
+    mesh = box([0.5, 0.3, 0.2], divisions=2)
+    wider = mesh.vertices * float64([1, 0, 0])
+    higher = mesh.vertices * float64([0, 1, 0]) * (mesh.vertices[:, :1] > 0)
+    return ShapeSpace(
+        mesh.vertices, torch.stack([wider, higher], dim=-1), float64([0.5, 0.5]), mesh.faces
+    )
+
+
+def distance_grid() -> tuple[Scene, Direction]:
+    def ellipsoid(points: Tensor) -> Tensor:
+        return 0.2 * ((points / float64([0.3, 0.2, 0.2])).norm(dim=1) - 1)
+
+    module = DistanceGrid.sampled("object", LOW, HIGH, (13, 12, 11), ellipsoid)
+    scene = before_a_wall(sphere(0.2, 1))
+    # Values on one side fall: the surface moves outwards there.
+    change = -(module.lattice.nodes[..., 0] > 0.1).double()
+    return module(scene), meshed(module, scene, value=change)
+
+
+def neural_distance() -> tuple[Scene, Direction]:
+    module = NeuralDistance(
+        "object", LOW, HIGH, (13, 12, 11), radius=0.22, width=8, frequency=3.0, seed=1
+    )
+    weights = dict(module.named_parameters())
+    name = "layers.2.weight"
+    weights[name].data = 0.03 * noise(weights[name].shape)
+    scene = before_a_wall(sphere(0.2, 1))
+    change = noise(weights[name].shape, 4)
+    return module(scene), meshed(module, scene, **{name: change})
+
+
+def latent() -> tuple[Scene, Direction]:
+    module = LinearShape("object", space(), [0.1, 0.2])
+    return module(before_a_wall(box(0.1))), along(module, latent=float64([5.0, -10.0]))
+
+
+def joint_angle() -> tuple[Scene, Direction]:
+    module = SkinnedBody("object", arm(), [[0, 0, 0.1], [0.0, 0.2, 0.5]])
+    turn = float64([[0, 0, 0], [0, 0.5, 3.0]])
+    return module(before_a_wall(box(0.1))), along(module, rotation=turn)
+
+
+def skinning() -> tuple[Scene, Direction]:
+    module = SkinnedBody("object", skin(), [[0, 0, 0.1], [0.0, 0.2, 0.5]])
+    turn = float64([[0, 0, 2.0], [0, 1.0, 4.0]])
+    return module(before_a_wall(box(0.1))), along(module, rotation=turn)
+
+
+def lattice() -> tuple[Scene, Direction]:
+    scene = before_a_wall(sphere(0.2, 3))
+    module = LatticeDeformation("object", LOW, HIGH, (3, 3, 3))
+    return scene, along(module, offsets=noise(module.offsets.shape, 2))
+
+
+def smooth_vertices() -> tuple[Scene, Direction]:
+    ball = sphere(0.2, 3)
+    module = SmoothVertices("object", ball, 10.0)
+    return before_a_wall(ball), along(module, latent=6.0 * noise(module.latent.shape, 3))
+
+
+CASES = [
+    distance_grid, neural_distance, latent, joint_angle, skinning, lattice, smooth_vertices
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES, ids=[case.__name__ for case in CASES])
+def test_gradient_is_that_of_converged_differences(case):
+    scene, direction = case()
+    device = radar()
+    report = gradcheck(
+        scene,
+        device,
+        device.grid(0.4, 2.8, 0.6, oversample=1),
+        direction,
+        surrogate=Surrogate("gaussian", range_width=2.0, angle_width=1.0),
+        depth=1,
+        samples=400_000,
+        boundary_samples=200_000,
+        repeats=3,
+        step=2e-3 if "distance" in case.__name__ else 6e-3,
+        difference_samples=1_000_000,
+        noise=0.008,
+        max_pairs=24,
+        seed=1,
+    )
+    print(
+        f"L1 {report.full.relative_l1:.4f}, interior {report.interior.relative_l1:.3f}, "
+        f"noise {report.difference_noise:.4f}, {report.pairs} pairs"
+    )
+    assert report.difference_noise < 0.01
+    assert report.full.relative_l1 < 0.03
+    assert report.interior.relative_l1 > 3 * report.full.relative_l1
