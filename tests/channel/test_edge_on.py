@@ -45,7 +45,9 @@ def rate(tilt: float) -> Tensor:
             Scene({"wall": wall, "box": item}), link(), GRID,
             samples=100_000, boundary_samples=100_000, seed=0,
         )  # fmt: skip
-        return forward_ad.unpack_dual(out).tangent.ravel()
+        tangent = forward_ad.unpack_dual(out).tangent
+    assert tangent is not None
+    return tangent.ravel()
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["face seen", "face turned away"])
