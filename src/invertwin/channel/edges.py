@@ -16,6 +16,9 @@ from invertwin.channel.rays import NEAR, Shot, scrambled, uniform_pair
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
 _FEW_EDGES = 2000  # up to here float32 can place a sample along the edge by its rest in the CDF
+# Boundary rays pass beside the edge by this much of its distance from the origin, fifteen roundings:
+# a fine mesh's own triangles, nearly edge-on, would else lie in their way.
+_BESIDE = 1e-6
 _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 
 
@@ -135,10 +138,11 @@ class EdgeSampler:
         y = y0 + (y1 - y0) * along
         origin = shot.point(self.centre, frame)
         away = y - origin
-        before = passage(shot, self.inputs, origin, y, mi.Bool(True))
         sides = _sides(shot, self.inputs, edge, y0, y1, away)
+        beside = y + sides.outwards * (_BESIDE * dr.norm(y))
+        before = passage(shot, self.inputs, origin, beside, mi.Bool(True))
         valid = (before.share > 0) & sides.unlike
-        ray = mi.Ray3f(y + away * NEAR, dr.normalize(away))
+        ray = mi.Ray3f(beside + away * NEAR, dr.normalize(away))
         hit = land(shot, self.inputs, ray, valid, (index, self.dice), coherent=True)
         valid &= hit.valid & _not_grazing(shot, hit.face, away, hit.valid)
         found = EdgePoints(
@@ -263,9 +267,10 @@ class InteriorEdgeSampler:
         omega, density = self._direction(index, edge, y0, y1)
         sides = _sides(shot, self.inputs, edge, y0, y1, omega)
         valid = sides.unlike
+        beside = mi.Point3f(y + sides.outwards * (_BESIDE * dr.norm(y)))
         hits = []
         for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
-            ray = mi.Ray3f(mi.Point3f(y + omega * (sign * NEAR * dr.norm(y))), omega * sign)
+            ray = mi.Ray3f(beside + omega * (sign * NEAR * dr.norm(y)), omega * sign)
             hit = land(shot, self.inputs, ray, valid, (index, dice), coherent=False)
             valid &= hit.valid & _not_grazing(shot, hit.face, omega, hit.valid)
             hits.append(hit)
@@ -339,6 +344,7 @@ class _Sides:
     open_excess: Any
     covered: Any
     covered_excess: Any
+    outwards: Any  # unit direction off the covered side; zero where there is something on both
 
     @property
     def unlike(self) -> Any:
@@ -384,7 +390,9 @@ def _sides(shot: Shot, inputs: Inputs, edge: Any, y0: Any, y1: Any, direction: A
         for index, on in enumerate((height * most < 0, height * most > 0)):
             shares[index] = dr.select(on, shares[index] * share, shares[index])
             lengths[index] = dr.select(on, lengths[index] + excess, lengths[index])
-    return _Sides(opposite, shares[0], lengths[0], shares[1], lengths[1])
+    free = (shares[0] == 1) & (lengths[0] == 0)
+    outwards = dr.select(free, -dr.mulsign(dr.normalize(plane), most), 0.0)
+    return _Sides(opposite, shares[0], lengths[0], shares[1], lengths[1], mi.Vector3f(outwards))
 
 
 def _not_grazing(shot: Shot, face: Any, direction: Any, active: Any) -> Any:
