@@ -25,9 +25,12 @@ from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum,
 from invertwin.scene import (
     AntennaArray,
     Cosine,
+    Dielectric,
+    Material,
     PerfectConductor,
     RoughDielectric,
     Scene,
+    Slab,
     Table,
     linear_array,
 )
@@ -54,6 +57,8 @@ MECHANISMS = {
 }
 ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
 METAL = PerfectConductor()
+COATED = Dielectric(4.0, 0.5, scattering=0.6, rms_slope=0.4)
+BOARD = Slab(2.7, 0.05, thickness=3e-3, scattering=0.8, rms_slope=0.4)
 
 
 def table() -> dict[tuple[str, str], str]:
@@ -103,11 +108,15 @@ def on_radar(module: nn.Module, values: Callable[[Tensor], dict[str, Tensor]]) -
     return lambda scene, radar, theta: (scene, functional_call(module, values(theta), (radar,)))
 
 
-def material(name: str, start: float) -> Moves:
+def material(name: str, start: float, wall: Material | None = None) -> Moves:
+    """A value of the wall's material, which is another one if ``wall`` is given."""
     values: dict[str, Any] = {name: start}
     module = MaterialValues("wall", **values)
     raw = module.raw[name].detach()
-    return on_scene(module, lambda theta: {f"raw.{name}": raw + theta})
+    moves = on_scene(module, lambda theta: {f"raw.{name}": raw + theta})
+    if wall is None:
+        return moves
+    return lambda scene, radar, theta: moves(scene.replace("wall", material=wall), radar, theta)
 
 
 def turned(axis: list[float]) -> Callable[[Tensor], Tensor]:
@@ -138,9 +147,13 @@ MOVES: dict[str, Moves] = {
         lambda theta: {"translation": STILL, "rotation": turned([0.2, 0.9, 0.1])(theta)},
     ),
     "permittivity": material("permittivity", 4.0),
-    "conductivity": material("conductivity", 0.5),
+    # As lossy as it is dense, so that the derivative is no small difference of two angles.
+    "conductivity": material("conductivity", 10.0),
     "diffuse fraction": material("diffuse", 0.6),
     "lobe width": material("lobe_width", 0.5),
+    "thickness": material("thickness", 3e-3, BOARD),
+    "roughness": material("rms_slope", 0.4, COATED),
+    "scattering coefficient": material("scattering", 0.6, COATED),
 }
 
 
@@ -292,7 +305,7 @@ def test_the_table_is_whole():
     named = {parameter for parameter, _ in CELLS}
     assert named == {*MOVES, "range bias", "clock offset", *REFUSALS}
     assert len(CELLS) == len(MECHANISMS) * len(named)
-    assert set(CELLS.values()) == {"supported", "zero", "refused", "unresolved", "–"}
+    assert set(CELLS.values()) == {"supported", "zero", "refused", "–"}
 
 
 def selected(word: str, *, chains: bool = False) -> list[Any]:

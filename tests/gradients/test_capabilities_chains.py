@@ -27,7 +27,10 @@ from scenes import relative, thing
 
 SAMPLES, MOST = 1_000_000, 24
 IN_THE_ROOM = {"vertices", "radar position", "clock offset"}
-MATERIALS = {"permittivity", "conductivity", "diffuse fraction", "lobe width"}
+MATERIALS = {
+    "permittivity", "conductivity", "diffuse fraction", "lobe width", "thickness", "roughness",
+    "scattering coefficient",
+}  # fmt: skip
 
 
 def alcove() -> Scene:
@@ -74,6 +77,8 @@ def chain_case(parameter: str) -> tuple[Found, Tensor]:
     scene, kernels = alcove(), Surrogate("gaussian", range_width=1.5)
     grid, frames = radar.grid(1.0, 2.9, oversample=1), radar.frame_count
     step = 0.1 if parameter in MATERIALS else 2e-2
+    if parameter == "thickness":  # a tenth would be half a fringe of the sheet
+        step = 5e-3
     if parameter in IN_THE_ROOM:
         scene, kernels, step = room(), Surrogate("gaussian", range_width=2.0), 3e-2
         grid = radar.grid(0.9, 4.2, oversample=1)

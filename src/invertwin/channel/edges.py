@@ -16,8 +16,8 @@ from invertwin.channel.rays import NEAR, Shot, scrambled, uniform_pair
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
 _FEW_EDGES = 2000  # up to here float32 can place a sample along the edge by its rest in the CDF
-# Boundary rays pass beside the edge by this much of its distance from the origin, fifteen roundings:
-# a fine mesh's own triangles, nearly edge-on, would else lie in their way.
+# Boundary rays pass beside the edge, by this much of its distance from the origin (fifteen
+# roundings): a fine mesh's own triangles, nearly edge-on, would else lie in their way.
 _BESIDE = 1e-6
 _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 

@@ -207,7 +207,8 @@ class _SignalProjector(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, matrix: Tensor, _: None) -> Tensor:  # type: ignore[override]
         # The derivative is its own adjoint.
-        return _projector_change(*ctx.saved_tensors, matrix)
+        values, vectors, chosen = ctx.saved_tensors
+        return _projector_change(values, vectors, chosen, matrix)
 
 
 def _projector_change(values: Tensor, vectors: Tensor, chosen: Tensor, change: Tensor) -> Tensor:
