@@ -143,22 +143,6 @@ class PatternTable:
         return rows_of_gain[0] + (rows_of_gain[1] - rows_of_gain[0]) * along
 
 
-@dataclass(frozen=True)
-class Contribution:
-    """Received over transmitted power per sample, and where it falls."""
-
-    frame: Any
-    power: Any
-    range: Any
-    u: Any
-    v: Any
-
-    @property
-    def attached(self) -> tuple[Any, Any, Any, Any]:
-        """The four values that may carry derivatives."""
-        return self.power, self.range, self.u, self.v
-
-
 def _rows(table: Any, index: Any, active: Any = True) -> Any:
     import drjit as dr
 
