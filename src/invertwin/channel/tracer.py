@@ -22,7 +22,14 @@ from invertwin.channel.boundary import (
     silhouettes_move,
 )
 from invertwin.channel.bridge import Geometry, flatten, to_torch, tracer, use_backend
-from invertwin.channel.chains import Chain, RoughChains, chain_view, rough_chains, tabulated
+from invertwin.channel.chains import (
+    Chain,
+    RoughChains,
+    chain_view,
+    passed,
+    rough_chains,
+    tabulated,
+)
 from invertwin.channel.kernel import Inputs
 from invertwin.channel.paths import Grid, Link, Paths
 from invertwin.channel.rays import Shot, face_areas, visible
@@ -330,6 +337,12 @@ def trace_field(
         if any(geometry.coherent):
             if boundary:
                 require_edges(geometry, link, boundary_samples)
+                if geometry.sheets and silhouettes_move(geometry, link):
+                    raise InputError(
+                        "expected no sheets where a derivative of coherent fields moves "
+                        "silhouettes, got some; use power paths, or boundary=False for fixed "
+                        "visibility"
+                    )
             parts.append(_coherent(geometry, link, shot, samples, seed))
             if boundary and boundary_samples:
 
@@ -387,10 +400,11 @@ def _coherent(geometry: Geometry, link: Link, shot: Shot, samples: int, seed: in
     )
     points, position, normal, jacobian = _seen(geometry, link, shot, points)
     found = view(geometry, link, points.frame, points.face, position, normal)
-    coefficient = found.mirror * (jacobian * points.weight)
+    share, excess = _through_sheets(geometry, link, shot, points.frame, position)
+    coefficient = found.mirror * (jacobian * points.weight * share.sqrt())
     return _paths(
         points.frame,
-        found.length,
+        found.length + excess,
         position,
         "coherent",
         coefficient=coefficient,
@@ -410,11 +424,12 @@ def _rough(geometry: Geometry, link: Link, shot: Shot, fixed: RoughPoints) -> Pa
     )
     points, position, normal, jacobian = _seen(geometry, link, shot, points)
     found = view(geometry, link, points.frame, points.face, position, normal)
-    amplitude = (found.power * jacobian / fixed.density).sqrt()
+    share, excess = _through_sheets(geometry, link, shot, points.frame, position)
+    amplitude = (found.power * share * jacobian / fixed.density).sqrt()
     coefficient = torch.polar(amplitude, points.weight)
     return _paths(
         points.frame,
-        found.length,
+        found.length + excess,
         position,
         "rough",
         coefficient=coefficient,
@@ -456,11 +471,28 @@ def _seen(
         position, normal, _ = points.place(geometry)
         to_tx, to_rx = link.tx[points.frame] - position, link.rx[points.frame] - position
         keep = (normal * to_tx).sum(1) * (normal * to_rx).sum(1) > 0
-        keep &= visible(shot, link.tx[points.frame], position)
-        if not link.shared_visibility:
-            keep &= visible(shot, link.rx[points.frame], position)
+        if geometry.sheets:
+            share, _ = _through_sheets(geometry, link, shot, points.frame, position)
+            keep &= share > 0
+        else:
+            keep &= visible(shot, link.tx[points.frame], position)
+            if not link.shared_visibility:
+                keep &= visible(shot, link.rx[points.frame], position)
     points = points.keep(keep)
     return points, *points.place(geometry)
+
+
+def _through_sheets(
+    geometry: Geometry, link: Link, shot: Shot, frame: Tensor, position: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Share of the power that passes sheets on both legs (1 without any), and the length added."""
+    if not geometry.sheets:
+        return torch.ones_like(position[:, 0]), torch.zeros_like(position[:, 0])
+    share, excess = passed(geometry, shot, link.tx[frame], position)
+    if link.shared_visibility and torch.equal(link.tx, link.rx):
+        return share * share, excess + excess
+    other, more = passed(geometry, shot, link.rx[frame], position)
+    return share * other, excess + more
 
 
 def _boundary_paths(
