@@ -23,8 +23,8 @@ second seed has failed.
 
 `final_error_cells` and `final_error_beamwidths` are what 19 of 20 seeds stay within after the last
 stage, from the required offsets. All fits are `invertwin.reconstruct` with one loss.
-Surrogates take as many steps, the exact chain fewer. Only the exact chain's rate was compared with others (0.1 and 1
-on two seeds); those of fixed width may do better at rates of their own.
+Surrogates take as many steps, the exact chain fewer. Only the exact chain's rate was compared with
+others (0.1 and 1 on two seeds); those of fixed width may do better at rates of their own.
 """
 
 import argparse
