@@ -42,12 +42,12 @@ def test_a_wrong_one_is_named(line, message, tmp_path):
 
 
 def test_the_exact_chain_is_fitted_where_visibility_is_fixed(tmp_path, monkeypatch, capsys):
-    text = named('surrogate = "exact"').replace("steps = 8", "steps = 3\ndepth = 1")
+    text = named('surrogate = "exact"').replace("steps = 8", "steps = 3")
     (tmp_path / "exact.toml").write_text(text)
     out = tmp_path / "out"
     assert call(monkeypatch, "reconstruct", tmp_path / "exact.toml", "-o", out) == 2
     assert "boundary=False for fixed visibility" in " ".join(capsys.readouterr().err.split())
-    text = text.replace("depth = 1", "depth = 1\nboundary = false")
+    text = text.replace("steps = 3", "steps = 3\nboundary = false")
     (tmp_path / "exact.toml").write_text(text)
     assert call(monkeypatch, "reconstruct", tmp_path / "exact.toml", "-o", out) == 0
     metrics = read_metrics(out)

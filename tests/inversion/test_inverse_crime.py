@@ -58,7 +58,7 @@ def test_run_files_fit_exact_or_recorded_signals(file, monkeypatch):
         assert run.task not in ("reconstruct", "demo")
         return
     if not isinstance(run.data, SimulatedData):
-        assert run.data.kind in ("capture", "rail_sar")
+        assert run.data.kind in ("capture", "rail_sar", "openradar", "dca1000", "arrays")
         return
     from invertwin.cli import run_simulate
 
