@@ -313,7 +313,6 @@ class Topology:
         lone_owner = face_object[beside[alone, 0]]
         self.open_objects = [bool((lone_owner == owner).any()) for owner in owners]
         self.device_faces = to_index(faces)
-        self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
         self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
         self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]

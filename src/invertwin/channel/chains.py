@@ -273,7 +273,6 @@ def rough_chains(
             index, mi.UInt32(0) * index, face, b.x, b.y, back, dr.ones(mi.Float, count), distance
         )
         state["weight"] = 2 * area / (pmf * count)
-        state["lane"] = index
         columns: list[list[Tensor]] = []
         chain = walk.Walk(shot, inputs, seed)
         for number in range(1, depth + 1):

@@ -6,6 +6,7 @@ The loop is compiled once for any depth, and keeps no vertex unless asked to: th
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from invertwin.channel import kernel
@@ -67,8 +68,12 @@ class Walk:
     def __init__(self, shot: Shot, inputs: Inputs, seed: int) -> None:
         self.shot = shot
         self.inputs = inputs
-        self.directions = Directions(shot)
         self.seed = scrambled(seed, 7)
+
+    @cached_property
+    def directions(self) -> Directions:
+        """How chains go on; paths of one bounce never ask."""
+        return Directions(self.shot)
 
     def run(self, state: State, depth: Any, visit: Callable[[State, Place], None]) -> State:
         """Walk up to ``depth`` vertices (a number, or one per lane); returns the last state.
@@ -81,6 +86,7 @@ class Walk:
         if isinstance(depth, int) and depth == 1:
             visit(state, self._place(state))
             return state
+        directions = self.directions  # uploaded before the loop is recorded
         last = opaque(depth) if isinstance(depth, int) else depth
         lanes = dr.width(state["index"])
         state = {**state, "last": mi.UInt32(last) + dr.zeros(mi.UInt32, lanes)}
@@ -89,7 +95,7 @@ class Walk:
             state = dict(state)
             point = self._place(state)
             visit(state, point)
-            self._extend(state, point)
+            self._extend(state, point, directions)
             return (state,)
 
         # Without a second recording of the body, which would gain the kernel nothing.
@@ -102,20 +108,20 @@ class Walk:
     def step(self, state: State) -> State:
         """One more vertex, outside any loop."""
         state = {**state, "last": state["number"] + 1}
-        self._extend(state, self._place(state))
+        self._extend(state, self._place(state), self.directions)
         return state
 
     def _place(self, state: State) -> Place:
         return kernel.place(self.inputs, state["face"], state["b1"], state["b2"], state["active"])
 
-    def _extend(self, state: State, point: Place) -> None:
+    def _extend(self, state: State, point: Place, directions: Directions) -> None:
         """Draw the next vertex into the state; chains that miss or are too long end."""
         import drjit as dr
 
         mi = tracer()
         active = state["active"] & (state["number"] < state["last"])
         back = state["back"]
-        omega, density = self.directions.draw(point, back, self._numbers(state))
+        omega, density = directions.draw(point, back, self._numbers(state))
         scattered = kernel.scattered(
             self.inputs, point.surface, point.normal, back, mi.Vector3f(omega), active
         )
