@@ -1,6 +1,7 @@
 """Scene to paths to channel impulse response: the only room that knows the ray tracer."""
 
 from invertwin.channel.bridge import backend, use_backend
+from invertwin.channel.density import deposit_density
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid, Link, Paths
 from invertwin.channel.tracer import RoughPoints, rough_points, trace_field, trace_power
@@ -11,6 +12,7 @@ __all__ = [
     "Paths",
     "RoughPoints",
     "backend",
+    "deposit_density",
     "deposit_power",
     "rough_points",
     "trace_field",

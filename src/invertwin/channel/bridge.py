@@ -184,10 +184,16 @@ def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geom
         in_motion: Whether objects may move; their velocities are kept then.
 
     Raises:
-        InputError: An object in motion where a frame is one instant, or a derivative with
-            respect to a velocity.
+        InputError: An object in motion where a frame is one instant, a derivative with respect
+            to a velocity, or an object that is a cloud.
     """
     objects = list(scene.objects.values())
+    clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
+    if clouds:
+        raise InputError(
+            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; only power "
+            "(deposit_power, the surrogate) is computed of clouds: mesh them for exact signals"
+        )
     moving = [n for n, o in scene.objects.items() if _moves(o)]
     differentiable = [n for n, o in scene.objects.items() if differentiated(o.velocity)]
     if differentiable or (moving and not in_motion):

@@ -22,11 +22,12 @@ from invertwin.channel.bridge import (
     tracer,
     use_backend,
 )
+from invertwin.channel.density import deposit_density
 from invertwin.channel.kernel import DIFFERENTIABLE
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.trace import Settings, Trace
 from invertwin.errors import InputError
-from invertwin.scene.scene import Scene
+from invertwin.scene.scene import Object, Scene
 
 _BYTES_PER_VERTEX = 21  # one record: triangle, two barycentrics, throughput, length, seen
 _DEEPEST = 16
@@ -54,7 +55,8 @@ def deposit_power(
     turn, with ``f`` the radar equation of the chain: 1/R² for every leg, the scattering
     distribution of the material and both cosines for every point.
     Differentiable in both modes with respect to vertices, material values and radar poses;
-    moving silhouettes included unless ``boundary`` is off.
+    moving silhouettes included unless ``boundary`` is off. Objects that are clouds add the power
+    of ``deposit_density``, each with all ``samples``.
 
     Args:
         scene: What is seen.
@@ -95,8 +97,16 @@ def deposit_power(
         )
     if sampling not in ("rays", "area"):
         raise InputError(f"expected sampling 'rays' or 'area', got {sampling!r}; choose one")
+    surfaces, clouds = _sorted(scene)
+    soft = [
+        deposit_density(item, link, grid, samples=samples, seed=seed, backend=backend)
+        for item in clouds
+    ]
+    if surfaces is None:
+        return torch.stack(soft).sum(0)
     with use_backend(backend), one_torch_thread():
-        geometry = flatten(scene, link.wavelength)
+        geometry = flatten(surfaces, link.wavelength)
+        fixed = None if reference is None else _sorted(reference[0])[0]
         settings = Settings(
             geometry=geometry,
             link=link,
@@ -105,7 +115,9 @@ def deposit_power(
             boundary_samples=boundary_samples if boundary else 0,
             seed=seed,
             sampling=sampling,
-            reference=(flatten(reference[0], link.wavelength), reference[1]) if reference else None,
+            reference=(flatten(fixed, link.wavelength), reference[1])
+            if reference and fixed
+            else None,
             depth=depth,
             interior_edges=interior_edges,
             chunk=max(1, int(memory_budget) // (_BYTES_PER_VERTEX * depth)),
@@ -118,7 +130,15 @@ def deposit_power(
                 "expected an antenna pattern without derivatives, got one that carries them; "
                 "power paths do not differentiate patterns: detach its values"
             )
-        return _Deposit.apply(settings, *settings.tables)  # type: ignore[no-any-return]
+        hard = _Deposit.apply(settings, *settings.tables)
+    return hard + torch.stack(soft).sum(0) if soft else hard  # type: ignore[no-any-return]
+
+
+def _sorted(scene: Scene) -> tuple[Scene | None, list[Object]]:
+    """The surfaces of a scene, if any, and its clouds."""
+    clouds = [item for item in scene.objects.values() if item.cloud is not None]
+    surfaces = {name: item for name, item in scene.objects.items() if item.cloud is None}
+    return (Scene(surfaces) if surfaces else None), clouds
 
 
 class _Deposit(torch.autograd.Function):

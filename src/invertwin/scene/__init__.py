@@ -9,9 +9,11 @@ from invertwin.scene.antenna import (
     linear_array,
     planar_array,
 )
+from invertwin.scene.cloud import Cloud
 from invertwin.scene.files import load_mesh, load_scene_xml, save_mesh
 from invertwin.scene.geometry import (
     BodyTemplate,
+    DensityGrid,
     DistanceGrid,
     LatticeDeformation,
     LinearShape,
@@ -77,8 +79,10 @@ __all__ = [
     "ITU_MATERIALS",
     "AntennaArray",
     "BodyTemplate",
+    "Cloud",
     "Compose",
     "Cosine",
+    "DensityGrid",
     "Dielectric",
     "DistanceGrid",
     "FieldCoefficients",

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number, checked_tensor
+from invertwin.scene.cloud import Cloud
 from invertwin.scene.material import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import compose, rigid
@@ -26,6 +27,8 @@ class Object:
         pose: rigid transform from the object's frame to the world; None is the identity.
         velocity: world velocity [m/s] of the whole object [3] or of each vertex [v, 3];
             None is at rest.
+        cloud: where given, power paths see this density, in the object's frame, instead of the
+            mesh, which then only marks the place: poses turn about its middle.
 
     Raises:
         InputError: wrong types or shapes, NaN, or a pose that is not rigid.
@@ -35,6 +38,7 @@ class Object:
     material: Material
     pose: Float64[Tensor, "4 4"] | None = None
     velocity: Float64[Tensor, "3"] | Float64[Tensor, "v 3"] | None = None
+    cloud: Cloud | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.mesh, Mesh):
@@ -58,6 +62,11 @@ class Object:
         if self.velocity is not None:
             velocity = _checked_velocity(self.velocity, len(self.mesh.vertices))
             object.__setattr__(self, "velocity", velocity)
+        if not (self.cloud is None or isinstance(self.cloud, Cloud)):
+            raise InputError(
+                f"expected a Cloud or None, got {type(self.cloud).__name__}; "
+                "build one with Cloud(low, high, density)"
+            )
 
     @property
     def transform(self) -> Float64[Tensor, "4 4"]:
@@ -154,7 +163,7 @@ class Scene:
 
         Args:
             name: the object.
-            changes: new values of `mesh`, `material`, `pose` or `velocity`.
+            changes: new values of `mesh`, `material`, `pose`, `velocity` or `cloud`.
 
         Raises:
             InputError: no such object or field.

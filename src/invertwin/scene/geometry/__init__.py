@@ -7,6 +7,7 @@ from invertwin.scene.geometry.body import (
     load_smpl,
 )
 from invertwin.scene.geometry.deformation import LatticeDeformation
+from invertwin.scene.geometry.density import DensityGrid
 from invertwin.scene.geometry.distance import DistanceGrid, NeuralDistance
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice
@@ -15,6 +16,7 @@ from invertwin.scene.geometry.smooth_vertices import SmoothVertices
 
 __all__ = [
     "BodyTemplate",
+    "DensityGrid",
     "DistanceGrid",
     "Lattice",
     "LatticeDeformation",

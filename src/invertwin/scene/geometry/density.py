@@ -1,0 +1,155 @@
+"""A density of soft scatterers on a grid: a shape without a surface, until it is meshed."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float64
+from skimage.measure import marching_cubes
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.scene.cloud import Cloud
+from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Scene
+
+# Starts are kept this far above zero, in units of one over a node spacing: below, softplus is so
+# flat that a density could not come back.
+_FAINTEST = 1e-3
+
+
+class DensityGrid(nn.Module):
+    """An object seen as a cloud of soft scatterers, by densities at the nodes of a grid.
+
+    ``σ = softplus(value) / h``, h the mean spacing of the nodes: at a value of 0 one cell holds
+    back half of the power, and rates of about 0.1 suit all grids alike.
+
+    Attributes:
+        value: parameter [x, y, z].
+        albedo: of the cloud.
+    """
+
+    applies_to = "scene"
+
+    def __init__(
+        self,
+        object: str,
+        low: ArrayLike,
+        high: ArrayLike,
+        density: Float64[Tensor, "x y z"],
+        albedo: float = 1.0,
+    ) -> None:
+        """Let `object` be a cloud, of these densities at the start.
+
+        Args:
+            object: name of the object; its mesh is not seen any more.
+            low: corner of the box in the object's frame [m].
+            high: the opposite corner [m].
+            density: extinction at the nodes [1/m], at least two along each axis. What is below
+                0.001 of one over a spacing starts there.
+            albedo: see ``Cloud``.
+
+        Raises:
+            InputError: wrong shapes, NaN, a negative density, or a box without volume.
+        """
+        super().__init__()
+        given = checked_tensor(
+            density, (None, None, None), "densities [1/m]", "give one for each node"
+        ).detach()
+        if bool((given < 0).any()):
+            raise InputError(
+                f"expected densities of at least 0, got a least of {float(given.min()):.3g}; "
+                "the density is an extinction [1/m]"
+            )
+        self.object = object
+        self.lattice = Lattice.between(low, high, tuple(given.shape))
+        self.albedo = checked_number(albedo, "albedo", 0.0, open_low=True)
+        scaled = (given * self._unit).clamp_min(_FAINTEST)
+        # log(exp(s) − 1), the inverse of softplus, without overflow.
+        self.value = nn.Parameter(scaled + torch.log(-torch.expm1(-scaled)))
+
+    @classmethod
+    def even(
+        cls,
+        object: str,
+        low: ArrayLike,
+        high: ArrayLike,
+        counts: Sequence[int],
+        depth: float = 0.5,
+    ) -> "DensityGrid":
+        """The same density everywhere: a way through the box along its longest side has ∫σ ds.
+
+        Args:
+            object: name of the object.
+            low: corner of the box in the object's frame [m].
+            high: the opposite corner [m].
+            counts: nodes along x, y and z.
+            depth: that ∫σ ds; faint, since what is opaque hides what lies behind it from the fit.
+
+        Raises:
+            InputError: as above.
+        """
+        lattice = Lattice.between(low, high, counts)
+        density = checked_number(depth, "optical depth", 0.0, open_low=True) / float(
+            (lattice.high - lattice.low).max()
+        )
+        filled = torch.full(lattice.counts, density, dtype=torch.float64)
+        return cls(object, low, high, filled)
+
+    @property
+    def _unit(self) -> float:
+        return float(self.lattice.spacing.mean())
+
+    @property
+    def density(self) -> Float64[Tensor, "x y z"]:
+        """Extinction at the nodes [1/m]."""
+        return nn.functional.softplus(self.value) / self._unit
+
+    @property
+    def cloud(self) -> Cloud:
+        """The present cloud, in the object's frame."""
+        return Cloud(self.lattice.low, self.lattice.high, self.density, self.albedo)
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object seen as the present cloud."""
+        return scene.replace(self.object, cloud=self.cloud)
+
+    def mesh(self, level: float | None = None) -> Mesh:
+        """The closed surface of equal density, by marching cubes; without gradients.
+
+        Args:
+            level: the density on it [1/m]; None = half of the mean of the densest hundredth of
+                the nodes.
+
+        Raises:
+            InputError: no density, or all of it, is above the level.
+        """
+        density = self.density.detach()
+        if level is None:
+            dense = density.flatten().sort(descending=True).values
+            level = 0.5 * float(dense[: max(1, len(dense) // 100)].mean())
+        if not float(density.min()) < level < float(density.max()):
+            raise InputError(
+                f"expected a level between the densities {float(density.min()):.3g} and "
+                f"{float(density.max()):.3g} [1/m], got {level:.3g}; give another"
+            )
+        # A layer without density around closes what reaches the faces of the box.
+        padded = nn.functional.pad(density, (1, 1, 1, 1, 1, 1))
+        corners, faces, _, _ = marching_cubes(
+            padded.numpy(), level, gradient_direction="descent", allow_degenerate=False
+        )
+        places = torch.from_numpy(corners).double() - 1
+        vertices = self.lattice.low + places * self.lattice.spacing
+        return Mesh(vertices, torch.from_numpy(faces.astype("int64")))
+
+    def meshed(self, scene: Scene, level: float | None = None) -> Scene:
+        """The scene with the object as a mesh again: the surface of equal density.
+
+        The material must not have values per triangle, nor the object velocities per vertex.
+
+        Raises:
+            InputError: as ``mesh``.
+        """
+        with torch.no_grad():
+            return scene.replace(self.object, mesh=self.mesh(level), cloud=None)
