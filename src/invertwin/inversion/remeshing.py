@@ -1,0 +1,332 @@
+"""New triangles for the surface of a fit: even ones between stages, and distances to it."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from invertwin.scene.checks import checked_number
+from invertwin.scene.mesh import Mesh
+
+_ROUNDS = 5  # of split, collapse, flip, relax; the lengths settle within these
+_LONG, _SHORT = 4 / 3, 4 / 5  # of the target: edges that are split, edges that are collapsed
+_FLAT = 0.5  # least cosine between two triangles whose edge is flipped: corners stay
+_SAMPLES = 20_000  # on a surface, to find the triangles that may be closest
+_CANDIDATES = 8
+_CHUNK = 4_000_000  # pairs of points and triangles at a time
+
+
+def remeshed(mesh: Mesh, edge: float) -> Mesh:
+    """The same surface with edges of about one length; topology and borders stay.
+
+    Too long edges are split, too short ones collapsed, others flipped where vertices then have
+    closer to six neighbours, and vertices moved along the surface to the middle of theirs.
+    Details finer than the target length are lost. Vertices of borders, and of edges with more than
+    two triangles, stay.
+
+    Source: Botsch and Kobbelt 2004, "A Remeshing Approach to Multiresolution Modeling".
+
+    Args:
+        mesh: the surface; derivatives end here.
+        edge: target length [m].
+
+    Raises:
+        InputError: a length that is not positive.
+    """
+    length = checked_number(edge, "edge length [m]", 0.0, open_low=True)
+    surface = _Surface(mesh)
+    for _ in range(_ROUNDS):
+        surface.split(_LONG * length)
+        surface.collapse(_SHORT * length, _LONG * length)
+        surface.flip()
+        surface.relax(mesh)
+    return surface.mesh()
+
+
+def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
+    """Distance of points to a surface [m], negative where it winds around them.
+
+    Parts of a closed mesh may overlap: their union is inside. Across a hole in a mesh the sign
+    changes where half of the directions meet the surface.
+
+    Args:
+        mesh: the surface.
+        points: in the mesh's frame [m].
+    """
+    places = points.detach().numpy()
+    gap = np.linalg.norm(places - closest_points(mesh, places), axis=1)
+    corners = mesh.vertices.detach().numpy()[mesh.faces.numpy()]
+    tree, sign = KDTree(places), np.zeros(len(places))
+    # No sign changes within a ball that does not reach the surface: few points need the sum.
+    order = np.argsort(-gap)
+    step = max(1, _CHUNK // len(corners))
+    while len(order):
+        chosen, taken = [], np.zeros(len(places), dtype=bool)
+        for row in order:
+            if not taken[row]:
+                near = tree.query_ball_point(places[row], 0.999 * gap[row])
+                chosen.append((row, near))
+                taken[near] = True
+                taken[row] = True
+                if len(chosen) == step:
+                    break
+        rows = [row for row, _ in chosen]
+        inside = _winding(corners, places[rows]) > 0.5
+        for (row, near), within in zip(chosen, inside, strict=True):
+            sign[[row, *near]] = -1.0 if within else 1.0
+        order = order[sign[order] == 0]
+    return torch.from_numpy(sign * gap)
+
+
+def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Points of a surface closest to others [p, 3].
+
+    Exact among the triangles of the nearest of some 20 000 points of the surface; another triangle
+    may be nearer by the square of their spacing over twice the distance.
+    """
+    corners = mesh.vertices.detach().numpy()[mesh.faces.numpy()]
+    area = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    spacing = max(float(np.sqrt(area.sum() / _SAMPLES)), 1e-12)
+    places, owners = [], []
+    longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(1)
+    pieces = np.clip(np.ceil(longest / spacing), 1, 256).astype(int)
+    for count in np.unique(pieces):
+        rows = np.nonzero(pieces == count)[0]
+        # Centres of the small triangles that a triangle is cut into, along both directions.
+        i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
+        keep = i + j < count
+        a, b = (i[keep] + 1 / 3) / count, (j[keep] + 1 / 3) / count
+        weights = np.stack([1 - a - b, a, b], axis=1)
+        places.append(np.einsum("sk,rkx->rsx", weights, corners[rows]).reshape(-1, 3))
+        owners.append(np.repeat(rows, len(weights)))
+    cloud, owner = np.concatenate(places), np.concatenate(owners)
+    _, nearest = KDTree(cloud).query(points, min(_CANDIDATES, len(cloud)))
+    faces = owner[np.asarray(nearest).reshape(len(points), -1)]
+    best, gap = np.zeros((len(points), 3)), np.full(len(points), np.inf)
+    for column in faces.T:
+        place = _closest_on_triangles(points, corners[column])
+        away = np.linalg.norm(points - place, axis=1)
+        nearer = away < gap
+        best[nearer], gap[nearer] = place[nearer], away[nearer]
+    return best
+
+
+def _closest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Of every triangle [p, 3, 3] the point closest to its own point: inside, or on a side."""
+    best, gap = np.zeros_like(points), np.full(len(points), np.inf)
+    for k in range(3):
+        start, along = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
+        size = np.maximum((along * along).sum(1), 1e-300)
+        t = np.clip(((points - start) * along).sum(1) / size, 0, 1)
+        place = start + t[:, None] * along
+        away = ((points - place) ** 2).sum(1)
+        nearer = away < gap
+        best[nearer], gap[nearer] = place[nearer], away[nearer]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    square = (normal * normal).sum(1)
+    height = ((points - corners[:, 0]) * normal).sum(1) / np.maximum(square, 1e-300)
+    foot = points - height[:, None] * normal
+    inside = square > 0
+    for k in range(3):
+        side = np.cross(corners[:, (k + 1) % 3] - corners[:, k], foot - corners[:, k])
+        inside &= (side * normal).sum(1) >= 0
+    best[inside] = foot[inside]
+    return best
+
+
+def _winding(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How often a surface winds around points: its solid angle over 4π.
+
+    Source: Van Oosterom and Strackee 1983; Jacobson, Kavan and Sorkine 2013.
+    """
+    total = np.zeros(len(points))
+    step = max(1, _CHUNK // len(points))
+    for part in np.array_split(corners, -(-len(corners) // step)):
+        a, b, c = (part[None, :, k] - points[:, None] for k in range(3))
+        la, lb, lc = (np.linalg.norm(v, axis=2) for v in (a, b, c))
+        volume = (a * np.cross(b, c)).sum(2)
+        flat = la * lb * lc + (a * b).sum(2) * lc + (b * c).sum(2) * la + (c * a).sum(2) * lb
+        total += np.arctan2(volume, flat).sum(1) / (2 * np.pi)
+    return total
+
+
+class _Surface:
+    """Triangles that change: which are around every vertex, and where the vertices are."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.places = list(mesh.vertices.detach().numpy().copy())
+        rows = [tuple(face) for face in mesh.faces.tolist() if len(set(face)) == 3]
+        self.faces: dict[int, tuple[int, int, int]] = dict(enumerate(rows))
+        self.around: list[set[int]] = [set() for _ in self.places]
+        self.next = len(rows)
+        for number, face in self.faces.items():
+            for vertex in face:
+                self.around[vertex].add(number)
+        edges, counts = self._edges()
+        self.fixed = set(edges[counts != 2].ravel().tolist())
+
+    def mesh(self) -> Mesh:
+        """What there is now, without vertices that no triangle has."""
+        used, faces = np.unique(np.array(list(self.faces.values())), return_inverse=True)
+        return Mesh(
+            torch.from_numpy(np.array(self.places)[used]),
+            torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)),
+        )
+
+    def split(self, longest: float) -> None:
+        """Halve edges until none is longer."""
+        while True:
+            found = False
+            for a, b in self._sorted(lambda length: length > longest, -1):
+                found = True
+                middle = len(self.places)
+                self.places.append(0.5 * (self.places[a] + self.places[b]))
+                self.around.append(set())
+                both = self.around[a] & self.around[b]
+                if len(both) != 2:
+                    self.fixed.add(middle)
+                for number in both:
+                    face = self.faces[number]
+                    self._remove(number)
+                    self._add(_with(face, a, middle))
+                    self._add(_with(face, b, middle))
+            if not found:
+                return
+
+    def collapse(self, shortest: float, longest: float) -> None:
+        """Draw the ends of short edges together, where the surface stays one."""
+        for a, b in self._sorted(lambda length: length < shortest, 1):
+            both = self.around[a] & self.around[b]
+            if len(both) != 2 or a in self.fixed or b in self.fixed:
+                continue
+            here, there = self._neighbours(a), self._neighbours(b)
+            thirds = here & there
+            if len(thirds) != 2 or any(len(self.around[t]) < 4 for t in thirds):
+                continue
+            middle = 0.5 * (self.places[a] + self.places[b])
+            ring = np.array([self.places[v] for v in (here | there) - {a, b}])
+            if ((ring - middle) ** 2).sum(1).max() > longest**2:
+                continue
+            rest = (self.around[a] | self.around[b]) - both
+            if self._folds(rest, (a, b), middle):
+                continue
+            for number in both:
+                self._remove(number)
+            for number in list(self.around[b]):
+                face = self.faces[number]
+                self._remove(number)
+                self._add(_with(face, b, a))
+            self.places[a] = middle
+
+    def flip(self) -> None:
+        """Turn edges where that brings the numbers of neighbours closer to six."""
+        for a, b in self._edges()[0].tolist():
+            both = list(self.around[a] & self.around[b])
+            if len(both) != 2:
+                continue
+            if _runs(self.faces[both[1]], a, b):
+                both.reverse()
+            first, second = (self.faces[number] for number in both)
+            if not _runs(first, a, b) or not _runs(second, b, a):
+                continue
+            c, d = sum(first) - a - b, sum(second) - a - b
+            if c == d or self.around[c] & self.around[d]:
+                continue
+            now = [len(self.around[v]) - 6 for v in (a, b, c, d)]
+            then = [now[0] - 1, now[1] - 1, now[2] + 1, now[3] + 1]
+            if sum(map(abs, then)) >= sum(map(abs, now)) or min(then[:2]) < 3 - 6:
+                continue
+            old = [self._normal(face) for face in (first, second)]
+            new = [self._normal(face) for face in ((c, a, d), (d, b, c))]
+            units = [n / max(float(np.linalg.norm(n)), 1e-300) for n in (*old, *new)]
+            if units[0] @ units[1] < _FLAT or units[2] @ units[3] < _FLAT:
+                continue
+            if units[2] @ units[0] <= 0 or units[3] @ units[1] <= 0:
+                continue
+            for number in both:
+                self._remove(number)
+            self._add((c, a, d))
+            self._add((d, b, c))
+
+    def relax(self, onto: Mesh) -> None:
+        """Move vertices along the surface to the middle of their neighbours."""
+        places, edges = np.array(self.places), self._edges()[0]
+        faces = np.array(list(self.faces.values()))
+        normals = np.zeros_like(places)
+        across = np.cross(
+            places[faces[:, 1]] - places[faces[:, 0]], places[faces[:, 2]] - places[faces[:, 0]]
+        )
+        for k in range(3):
+            np.add.at(normals, faces[:, k], across)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        middle, count = np.zeros_like(places), np.zeros((len(places), 1))
+        for one, other in ((0, 1), (1, 0)):
+            np.add.at(middle, edges[:, one], places[edges[:, other]])
+            np.add.at(count, edges[:, one], 1)
+        step = middle / np.maximum(count, 1) - places
+        step -= (step * normals).sum(1, keepdims=True) * normals
+        free = np.array([bool(ring) for ring in self.around])
+        free[list(self.fixed)] = False
+        places[free] = closest_points(onto, (places + step)[free])
+        self.places = list(places)
+
+    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Edges as pairs of vertices, and how many triangles each has."""
+        faces = np.array(list(self.faces.values()))
+        pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        return np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
+
+    def _sorted(self, chosen: Callable[[Any], Any], order: int) -> Iterator[tuple[int, int]]:
+        """Edges of chosen lengths, by length, that are still there when their turn comes."""
+        edges, places = self._edges()[0], np.array(self.places)
+        length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
+        rows = np.nonzero(chosen(length))[0]
+        for row in rows[np.argsort(order * length[rows], kind="stable")]:
+            a, b = edges[row].tolist()
+            if self.around[a] & self.around[b] and chosen(
+                np.linalg.norm(self.places[a] - self.places[b])
+            ):
+                yield a, b
+
+    def _neighbours(self, vertex: int) -> set[int]:
+        return {v for number in self.around[vertex] for v in self.faces[number]} - {vertex}
+
+    def _folds(self, numbers: set[int], moved: tuple[int, int], place: np.ndarray) -> bool:
+        """Whether a triangle would turn over, or lose its area, with two vertices at a place."""
+        rows = np.array([self.faces[number] for number in numbers])
+        before = np.array([[self.places[v] for v in row] for row in rows.tolist()])
+        after = before.copy()
+        after[np.isin(rows, moved)] = place
+        old, new = (np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in (before, after))
+        sizes = np.linalg.norm(old, axis=1) * np.linalg.norm(new, axis=1)
+        return bool(((old * new).sum(1) <= 0.2 * sizes).any())
+
+    def _normal(self, face: tuple[int, int, int]) -> np.ndarray:
+        a, b, c = (self.places[v] for v in face)
+        return np.cross(b - a, c - a)
+
+    def _add(self, face: tuple[int, int, int]) -> None:
+        self.faces[self.next] = face
+        for vertex in face:
+            self.around[vertex].add(self.next)
+        self.next += 1
+
+    def _remove(self, number: int) -> None:
+        for vertex in self.faces.pop(number):
+            self.around[vertex].discard(number)
+
+
+def _with(face: tuple[int, int, int], old: int, new: int) -> tuple[int, int, int]:
+    a, b, c = (new if vertex == old else vertex for vertex in face)
+    return a, b, c
+
+
+def _runs(face: tuple[int, int, int], a: int, b: int) -> bool:
+    """Whether a triangle runs from a to b."""
+    return (a, b) in ((face[0], face[1]), (face[1], face[2]), (face[2], face[0]))
