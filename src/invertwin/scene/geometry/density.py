@@ -137,7 +137,7 @@ class DensityGrid(nn.Module):
         # A layer without density around closes what reaches the faces of the box.
         padded = nn.functional.pad(density, (1, 1, 1, 1, 1, 1))
         corners, faces, _, _ = marching_cubes(
-            padded.numpy(), level, gradient_direction="descent", allow_degenerate=False
+            padded.numpy(), level, gradient_direction="ascent", allow_degenerate=False
         )
         places = torch.from_numpy(corners).double() - 1
         vertices = self.lattice.low + places * self.lattice.spacing

@@ -1,0 +1,74 @@
+"""Densities on a grid: values, the cloud they make, and the surface of a level."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.inversion.measures import volume_iou
+from invertwin.scene import DensityGrid, Object, RoughDielectric, Scene, plate, sphere
+
+BOX = [-0.5] * 3, [0.5] * 3
+
+
+def ball(radius: float = 0.3, count: int = 21) -> Tensor:
+    """A soft ball: 20 per metre inside, 0 outside, half of it on the sphere."""
+    axis = torch.linspace(-0.5, 0.5, count, dtype=torch.float64)
+    distance = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).norm(dim=0)
+    return 20 * torch.sigmoid((radius - distance) / 0.02)
+
+
+def test_densities_come_back_and_are_never_negative() -> None:
+    given = ball()
+    grid = DensityGrid("item", *BOX, given)
+    faintest = 1e-3 / 0.05  # of one over a spacing
+    torch.testing.assert_close(grid.density.detach(), given.clamp_min(faintest))
+    with torch.no_grad():
+        grid.value -= 50.0
+    assert float(grid.density.detach().min()) >= 0
+    assert grid.cloud.density.requires_grad
+
+
+def test_an_even_start_has_the_depth_it_was_given() -> None:
+    grid = DensityGrid.even("item", [0, 0, 0], [2, 1, 1], (9, 5, 5), depth=0.3)
+    torch.testing.assert_close(
+        2 * grid.density.detach(), torch.full((9, 5, 5), 0.3, dtype=torch.float64)
+    )
+
+
+def test_the_object_becomes_a_cloud_and_a_mesh_again() -> None:
+    scene = Scene({"item": Object(plate(1.0, 1.0), RoughDielectric(4.0))})
+    grid = DensityGrid("item", *BOX, ball())
+    soft = grid(scene)
+    assert soft["item"].cloud is not None
+    assert soft["item"].mesh is scene["item"].mesh
+    hard = grid.meshed(soft, level=10.0)
+    assert hard["item"].cloud is None
+    assert volume_iou(hard["item"].mesh, sphere(0.3), voxel=0.02) > 0.95
+    assert not hard["item"].mesh.vertices.requires_grad
+
+
+def test_what_reaches_the_box_is_closed() -> None:
+    grid = DensityGrid("item", *BOX, ball(radius=0.6))
+    mesh = grid.mesh()
+    edges = torch.cat([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    _, counts = edges.sort(dim=1).values.unique(dim=0, return_counts=True)
+    assert bool((counts == 2).all())
+    corners = mesh.vertices[mesh.faces]
+    volume = (corners[:, 0] * torch.linalg.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert 0.75 < float(volume) < 1.0  # outwards
+
+
+@pytest.mark.parametrize(
+    ("density", "message"),
+    [(torch.full((3, 3, 3), -1.0), "at least 0"), (torch.full((3, 3, 1), 1.0), ">= 2")],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_densities_are_refused(density: Tensor, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        DensityGrid("item", *BOX, density.double())
+
+
+def test_a_level_beyond_the_densities_is_refused() -> None:
+    with pytest.raises(InputError, match="level"):
+        DensityGrid("item", *BOX, ball()).mesh(level=30.0)
