@@ -12,6 +12,7 @@ from invertwin.inversion.mover import (
     strongest_mover,
 )
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
+from invertwin.inversion.prior import LatentNorm, Training, train_prior
 from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
 
@@ -22,6 +23,7 @@ __all__ = [
     "Echo",
     "GradientReport",
     "Laplacian",
+    "LatentNorm",
     "Likeness",
     "MotionMap",
     "MovingBody",
@@ -30,10 +32,12 @@ __all__ = [
     "Reconstruction",
     "Regularizer",
     "SpectrumLoss",
+    "Training",
     "compare_shapes",
     "fit_mover",
     "motion_map",
     "reconstruct",
     "strongest_mover",
+    "train_prior",
     "volume_iou",
 ]

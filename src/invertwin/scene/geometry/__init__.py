@@ -11,22 +11,31 @@ from invertwin.scene.geometry.density import DensityGrid
 from invertwin.scene.geometry.distance import DistanceGrid, NeuralDistance
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.geometry.prior import PriorShape, ShapePrior, load_prior
 from invertwin.scene.geometry.shape_space import LinearShape, ShapeSpace, load_vehicle_space
 from invertwin.scene.geometry.smooth_vertices import SmoothVertices
+from invertwin.scene.geometry.vehicles import Car, car_distance, car_mesh, sample_car
 
 __all__ = [
     "BodyTemplate",
+    "Car",
     "DensityGrid",
     "DistanceGrid",
     "Lattice",
     "LatticeDeformation",
     "LinearShape",
     "NeuralDistance",
+    "PriorShape",
+    "ShapePrior",
     "ShapeSpace",
     "SkinnedBody",
     "SmoothVertices",
     "articulated_template",
+    "car_distance",
+    "car_mesh",
     "iso_surface",
+    "load_prior",
     "load_smpl",
     "load_vehicle_space",
+    "sample_car",
 ]

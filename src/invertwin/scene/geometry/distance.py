@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.scene.geometry.iso_surface import iso_surface
-from invertwin.scene.geometry.lattice import Lattice, tensor_product
+from invertwin.scene.geometry.lattice import Lattice, cubic
 from invertwin.scene.scene import Scene
 
 
@@ -90,8 +90,7 @@ class DistanceGrid(_Distance):
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
         """The field at points in the object's frame [m]: negative inside."""
-        index, t = self.lattice.cell(points)
-        return tensor_product(_extended(self.value), index, _cubic_convolution(t))
+        return cubic(self.value, self.lattice, points)
 
 
 class NeuralDistance(_Distance):
@@ -165,26 +164,3 @@ class NeuralDistance(_Distance):
             - self.radius
             + (half * self.layers[-1](hidden)[:, 0])
         )
-
-
-def _extended(values: Tensor) -> Tensor:
-    """One more node on every side, by a straight line through the last two."""
-    for axis in range(3):
-        first, second = values.narrow(axis, 0, 1), values.narrow(axis, 1, 1)
-        count = values.shape[axis]
-        last, before = values.narrow(axis, count - 1, 1), values.narrow(axis, count - 2, 1)
-        values = torch.cat([2 * first - second, values, 2 * last - before], dim=axis)
-    return values
-
-
-def _cubic_convolution(t: Tensor) -> Tensor:
-    """Weights of the four nodes around places t in [0, 1] of a cell: 0, 1, 0, 0 at t = 0."""
-    return 0.5 * torch.stack(
-        [
-            -t + 2 * t**2 - t**3,
-            2 - 5 * t**2 + 3 * t**3,
-            t + 4 * t**2 - 3 * t**3,
-            -(t**2) + t**3,
-        ],
-        dim=-1,
-    )

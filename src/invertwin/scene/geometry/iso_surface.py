@@ -18,7 +18,9 @@ _CHUNK = 65_536  # points of the field at a time
 _FLAT = 1e-6  # least slope of a distance, whose own is 1
 
 
-def iso_surface(field: Field, lattice: Lattice) -> Mesh:
+def iso_surface(
+    field: Field, lattice: Lattice, values: Float64[Tensor, "x y z"] | None = None
+) -> Mesh:
     """The surface where a field is zero, as a mesh whose vertices follow the field.
 
     Values and topology are those of marching cubes, moved onto the field's zero; the derivative of
@@ -32,14 +34,16 @@ def iso_surface(field: Field, lattice: Lattice) -> Mesh:
         field: negative inside, positive outside; its parameters may carry gradients, and points
             are given in the object's frame [m].
         lattice: nodes on which the field is looked at; thinner parts are missed.
+        values: the field at the nodes, where it is known already; None asks the field.
 
     Raises:
         InputError: a field that is not finite, or has one sign at all nodes.
     """
-    nodes = lattice.nodes.reshape(-1, 3)
-    with torch.no_grad():
-        parts = [field(part).detach() for part in nodes.split(_CHUNK)]
-    values = torch.cat(parts).reshape(lattice.counts)
+    if values is None:
+        nodes = lattice.nodes.reshape(-1, 3)
+        with torch.no_grad():
+            parts = [field(part).detach() for part in nodes.split(_CHUNK)]
+        values = torch.cat(parts).reshape(lattice.counts)
     if not bool(torch.isfinite(values).all()):
         raise InputError("expected a finite field, got NaN or infinity; lower the learning rate")
     if not bool(values.min() < 0 < values.max()):
@@ -49,7 +53,7 @@ def iso_surface(field: Field, lattice: Lattice) -> Mesh:
             "start with a surface inside of the box"
         )
     corners, faces, _, _ = marching_cubes(
-        values.numpy(), 0.0, gradient_direction="descent", allow_degenerate=False
+        values.detach().numpy(), 0.0, gradient_direction="descent", allow_degenerate=False
     )
     start = lattice.low + torch.from_numpy(corners).double() * lattice.spacing
     vertices = follow(field, _polished(field, start, lattice))

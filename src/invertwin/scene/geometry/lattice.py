@@ -1,6 +1,6 @@
 """Uniform nodes in an axis-aligned box, and values between them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -62,17 +62,28 @@ class Lattice:
     @property
     def nodes(self) -> Float64[Tensor, "x y z 3"]:
         """Places of all nodes [m]."""
-        axes = [
+        return torch.stack(torch.meshgrid(*self.axes, indexing="ij"), dim=-1)
+
+    @property
+    def axes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Places of the nodes [m] along x, y and z."""
+        x, y, z = (
             torch.linspace(float(a), float(b), n, dtype=torch.float64)
             for a, b, n in zip(self.low, self.high, self.counts, strict=True)
-        ]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+        )
+        return x, y, z
 
     def cell(self, points: Float64[Tensor, "p 3"]) -> tuple[Tensor, Tensor]:
         """Cell of each point [p, 3], outside the nearest one, and the place in it in cells."""
         place = (points - self.low) / self.spacing
         last = torch.tensor(self.counts) - 2
         index = place.detach().floor().long().clamp_min(0).minimum(last)
+        return index, place - index
+
+    def along(self, axis: int, places: Float64[Tensor, " n"]) -> tuple[Tensor, Tensor]:
+        """The same along one axis: cell and place in it of coordinates [m]."""
+        place = (places - self.low[axis]) / self.spacing[axis]
+        index = place.floor().long().clamp(0, self.counts[axis] - 2)
         return index, place - index
 
 
@@ -86,3 +97,56 @@ def tensor_product(
     x, y, z = (index[:, k, None] + steps for k in range(3))
     near = values[x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]]
     return torch.einsum("pi,pj,pk,pijk...->p...", weights[:, 0], weights[:, 1], weights[:, 2], near)
+
+
+def cubic(
+    values: Float64[Tensor, "x y z"], lattice: Lattice, points: Float64[Tensor, "p 3"]
+) -> Float64[Tensor, " p"]:
+    """Cubic convolution (Catmull–Rom) of values at a lattice's nodes, continued outside."""
+    index, t = lattice.cell(points)
+    return tensor_product(_extended(values), index, _cubic_convolution(t))
+
+
+def cubic_slices(
+    values: Float64[Tensor, "x y z"], lattice: Lattice, wanted: Lattice
+) -> Iterator[Float64[Tensor, "y z"]]:
+    """The same at the nodes of another lattice, one plane of constant x after another.
+
+    No more than a plane is held; weights along the axes are applied one axis after the other.
+    """
+    extended, places = _extended(values), wanted.axes
+    index, t = zip(*(lattice.along(k, place) for k, place in enumerate(places)), strict=True)
+    across = [_matrix(index[k], t[k], extended.shape[k]) for k in (1, 2)]
+    weights = _cubic_convolution(t[0])
+    for first, weight in zip(index[0].tolist(), weights, strict=True):
+        plane = torch.einsum("i,iyz->yz", weight, extended[first : first + 4])
+        yield across[0] @ plane @ across[1].T
+
+
+def _matrix(index: Tensor, t: Tensor, count: int) -> Tensor:
+    """Weights [places, nodes] of a cubic convolution along one axis."""
+    matrix = torch.zeros(len(index), count, dtype=torch.float64)
+    return matrix.scatter(1, index[:, None] + torch.arange(4), _cubic_convolution(t))
+
+
+def _extended(values: Tensor) -> Tensor:
+    """One more node on every side, by a straight line through the last two."""
+    for axis in range(3):
+        first, second = values.narrow(axis, 0, 1), values.narrow(axis, 1, 1)
+        count = values.shape[axis]
+        last, before = values.narrow(axis, count - 1, 1), values.narrow(axis, count - 2, 1)
+        values = torch.cat([2 * first - second, values, 2 * last - before], dim=axis)
+    return values
+
+
+def _cubic_convolution(t: Tensor) -> Tensor:
+    """Weights of the four nodes around places t in [0, 1] of a cell: 0, 1, 0, 0 at t = 0."""
+    return 0.5 * torch.stack(
+        [
+            -t + 2 * t**2 - t**3,
+            2 - 5 * t**2 + 3 * t**3,
+            t + 4 * t**2 - 3 * t**3,
+            -(t**2) + t**3,
+        ],
+        dim=-1,
+    )

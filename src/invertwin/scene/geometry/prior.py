@@ -1,0 +1,285 @@
+"""A learned prior of shapes: few numbers decode to a signed distance, and that to a mesh."""
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_tensor
+from invertwin.scene.geometry.iso_surface import iso_surface
+from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Scene
+
+LIMIT = 6.0  # standard deviations within which a latent decodes to something like its kind
+_MODEL = "vehicle_prior.npz"
+_FORMAT = "invertwin shape prior 1"
+_SPACING = 0.1  # of the nodes at which shapes are meshed unless asked otherwise [m]
+
+
+class Decoder(nn.Module):
+    """Latent → signed distance [m] at the nodes of half a grid, y ≥ 0; the other half mirrors it.
+
+    ``d = mean + basis · (straight · z + leave · tanh(enter · z))``: a network of the latent weighs
+    learned fields, so that decoding costs one product with a matrix.
+    """
+
+    def __init__(self, latent: int, width: int, features: int, nodes: int) -> None:
+        super().__init__()
+        self.enter = nn.Linear(latent, width)
+        self.leave = nn.Linear(width, features)
+        self.straight = nn.Linear(latent, features, bias=False)
+        self.basis = nn.Linear(features, nodes)
+
+    def forward(self, latent: Float[Tensor, "*any latent"]) -> Float[Tensor, "*any nodes"]:
+        """Distances at the nodes, x slowest."""
+        bent = self.leave(torch.tanh(self.enter(latent)))
+        return self.basis(self.straight(latent) + bent)
+
+
+class ShapePrior:
+    """A kind of shapes with mirror symmetry in y, as a decoder of latents with unit variance.
+
+    Latents of the shapes it was trained on have zero mean and unit variance along each coordinate,
+    so ½ |z|² is the negative logarithm of their density, and z = 0 is the mean shape. Coordinates
+    come in order of how much they change.
+
+    Attributes:
+        decoder: the network, float64, without gradients.
+        lattice: the decoder's nodes, both halves.
+    """
+
+    limit = LIMIT
+
+    def __init__(self, decoder: Decoder, lattice: Lattice) -> None:
+        """A prior from its network and the nodes that it decodes to.
+
+        Raises:
+            InputError: a network for another number of nodes, or nodes that do not mirror in y.
+        """
+        x, y, z = lattice.counts
+        mirrors = y % 2 == 1 and bool(torch.isclose(lattice.low[1], -lattice.high[1]))
+        if not mirrors or decoder.basis.out_features != x * (y + 1) // 2 * z:
+            raise InputError(
+                "expected a decoder of half the nodes of a lattice that mirrors in y, got "
+                f"{decoder.basis.out_features} for {lattice.counts}; give those of one prior"
+            )
+        self.decoder = decoder.double().requires_grad_(False)
+        self.lattice = lattice
+
+    @property
+    def latent_size(self) -> int:
+        """Coordinates of a shape."""
+        return self.decoder.enter.in_features
+
+    @property
+    def low(self) -> Float64[Tensor, "3"]:
+        """Corner of the box that holds all shapes [m]."""
+        return self.lattice.low
+
+    @property
+    def high(self) -> Float64[Tensor, "3"]:
+        """The opposite corner [m]."""
+        return self.lattice.high
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Nodes at which shapes are meshed unless asked otherwise, about 0.1 m apart."""
+        x, y, z = (math.ceil(float(a)) + 1 for a in (self.high - self.low) / _SPACING - 1e-9)
+        return x, y, z
+
+    def values(self, latent: Float64[Tensor, " k"]) -> Float64[Tensor, "x y z"]:
+        """Signed distances at the decoder's nodes [m], negative inside.
+
+        Raises:
+            InputError: a latent of another size, not finite, or out of range.
+        """
+        x, y, z = self.lattice.counts
+        half = self.decoder(self._checked(latent)).reshape(x, (y + 1) // 2, z)
+        return torch.cat([half[:, 1:].flip(1), half], dim=1)
+
+    def distance(
+        self, points: Float64[Tensor, "p 3"], latent: Float64[Tensor, " k"]
+    ) -> Float64[Tensor, " p"]:
+        """The field at points in the shape's frame [m], negative inside.
+
+        Raises:
+            InputError: as above.
+        """
+        return cubic(self.values(latent), self.lattice, points)
+
+    def slices(
+        self, latent: Float64[Tensor, " k"], counts: Sequence[int]
+    ) -> Iterator[Float64[Tensor, "y z"]]:
+        """The field at the nodes of a lattice in the box, plane after plane along x [m].
+
+        Only one plane is held at a time.
+
+        Raises:
+            InputError: as above, or fewer than two nodes along an axis.
+        """
+        wanted = Lattice.between(self.low, self.high, counts)
+        return cubic_slices(self.values(latent), self.lattice, wanted)
+
+    def decode(
+        self, latent: Float64[Tensor, " k"], counts: Sequence[int]
+    ) -> Float64[Tensor, "x y z"]:
+        """The whole field at the nodes of a lattice in the box [m].
+
+        Raises:
+            InputError: as above.
+        """
+        return torch.stack(list(self.slices(latent, counts)))
+
+    def mesh(self, latent: Float64[Tensor, " k"], counts: Sequence[int] | None = None) -> Mesh:
+        """The surface of a latent, whose vertices follow it (see :func:`iso_surface`).
+
+        Args:
+            latent: coordinates in standard deviations.
+            counts: nodes along x, y and z at which the field is meshed; None = `counts`.
+
+        Raises:
+            InputError: as above.
+        """
+        wanted = Lattice.between(self.low, self.high, self.counts if counts is None else counts)
+        values = self.values(latent)
+        with torch.no_grad():
+            known = torch.stack(list(cubic_slices(values, self.lattice, wanted)))
+        return iso_surface(lambda points: cubic(values, self.lattice, points), wanted, known)
+
+    def mean_mesh(self, counts: Sequence[int] | None = None) -> Mesh:
+        """The surface of z = 0."""
+        return self.mesh(torch.zeros(self.latent_size, dtype=torch.float64), counts)
+
+    def save(self, file: str | Path) -> None:
+        """Write the prior as a ``.npz`` of numbers, the network in half precision."""
+        weights = {
+            name: w.numpy().astype(np.float16) for name, w in self.decoder.state_dict().items()
+        }
+        box = {"low": self.low.numpy(), "high": self.high.numpy()}
+        np.savez_compressed(
+            file, format=_FORMAT, counts=np.array(self.lattice.counts), **box, **weights
+        )
+
+    def _checked(self, latent: Tensor) -> Tensor:
+        """The latent, if it is one that decodes.
+
+        Raises:
+            InputError: another size, not finite, or out of range.
+        """
+        do = f"give {self.latent_size} numbers in standard deviations"
+        given = checked_tensor(latent, (self.latent_size,), "latent", do)
+        most = float(given.detach().abs().max())
+        if most > self.limit:
+            raise InputError(
+                f"expected a latent within ±{self.limit:g} standard deviations, got {most:.3g}; "
+                "raise the weight of its regulariser or lower the learning rate"
+            )
+        return given
+
+
+class PriorShape(nn.Module):
+    """Replaces an object's mesh by one that a prior decodes, meshed anew at every step.
+
+    The material must not have values per triangle, nor the object velocities per vertex.
+
+    Attributes:
+        latent: parameter [k], in standard deviations.
+    """
+
+    applies_to = "scene"
+
+    def __init__(
+        self,
+        object: str,
+        prior: ShapePrior | None = None,
+        initial: ArrayLike | None = None,
+        counts: Sequence[int] | None = None,
+    ) -> None:
+        """Shape `object` by a prior, from these coordinates at the start.
+
+        Args:
+            object: name of the object; its pose is kept.
+            prior: the prior; None is the packaged one of vehicles.
+            initial: coordinates in standard deviations; None is the mean shape.
+            counts: nodes along x, y and z at which the field is meshed; None = the prior's.
+
+        Raises:
+            InputError: coordinates of another number, not finite, or out of range.
+        """
+        super().__init__()
+        self.object = object
+        self.prior = load_prior() if prior is None else prior
+        self.lattice = Lattice.between(
+            self.prior.low, self.prior.high, self.prior.counts if counts is None else counts
+        )
+        start = torch.zeros(self.prior.latent_size) if initial is None else initial
+        start = checked_tensor(start, (None,), "latent", "give numbers in standard deviations")
+        self.prior.values(start.detach())
+        self.latent = nn.Parameter(start.detach().clone())
+
+    def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
+        """The present field at points in the object's frame [m]: negative inside."""
+        return self.prior.distance(points, self.latent)
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object's mesh replaced by the decoded one.
+
+        Raises:
+            InputError: a latent that has run out of range.
+        """
+        return scene.replace(self.object, mesh=self.prior.mesh(self.latent, self.lattice.counts))
+
+    def values(self) -> dict[str, Tensor]:
+        """Coordinates by name, for progress and reports."""
+        return {f"{self.object}.latent": self.latent.detach().clone()}
+
+
+@lru_cache(maxsize=1)
+def _packaged() -> ShapePrior:
+    with resources.as_file(resources.files("invertwin.scene.geometry") / _MODEL) as file:
+        return _read(file)
+
+
+def load_prior(file: str | Path | None = None) -> ShapePrior:
+    """A prior from a file that `ShapePrior.save` or ``invertwin train-prior`` wrote.
+
+    Args:
+        file: the file; None is the prior of vehicles that comes with the package. It decodes
+            bodies without wheels: x ahead, y to the left, z up, the origin on the ground below the
+            middle of the wheelbase, metres.
+
+    Raises:
+        InputError: no such file, or not a prior.
+    """
+    return _packaged() if file is None else _read(Path(file))
+
+
+def _read(path: Path) -> ShapePrior:
+    do = "give a file of invertwin train-prior"
+    if not path.is_file():
+        raise InputError(f"expected a shape prior, got no file {path}; {do}")
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in arrays.files}
+        if str(found.pop("format")) != _FORMAT:
+            raise ValueError("another format")
+        low, high, counts = (found.pop(name) for name in ("low", "high", "counts"))
+        weights = {name: torch.from_numpy(w.astype(np.float64)) for name, w in found.items()}
+        width, latent = weights["enter.weight"].shape
+        nodes, features = weights["basis.weight"].shape
+        decoder = Decoder(latent, width, features, nodes).double()
+        decoder.load_state_dict(weights)
+    except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, OSError, BadZipFile):
+        raise InputError(f"expected a shape prior in {path.name}, got another file; {do}") from None
+    if not all(bool(torch.isfinite(w).all()) for w in weights.values()):
+        raise InputError(f"expected finite numbers in {path.name}, got NaN or infinity; {do}")
+    return ShapePrior(decoder, Lattice.between(low, high, [int(n) for n in counts]))
