@@ -137,7 +137,7 @@ def test_starts_are_as_far_off_as_asked_and_repeat():
     scene, truth = build.scene(run), build.true_scene(run)
     found = build.starts(run.starts, scene, truth, 0)
     again = build.starts(run.starts, scene, truth, 0)
-    for start, same in zip(found, again, strict=True):
+    for start, same in zip([s.scene for s in found], [s.scene for s in again], strict=True):
         rest = build.residual(start["box"], truth["box"])
         assert 0.3 <= rest.distance <= 0.4
         assert math.radians(15) <= rest.angle <= math.radians(25)

@@ -1,8 +1,9 @@
 """From the tables of a run file to the library's values: scenes, parameters, starts."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -13,10 +14,12 @@ from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import unknown_object
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
+from invertwin.cli.shape_tables import shape_mesh, shape_module, shape_terms
 from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
-from invertwin.inversion.regularization import Laplacian
+from invertwin.inversion.regularization import Regularizer
+from invertwin.inversion.stages import Build
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import (
     Mesh,
@@ -33,7 +36,6 @@ from invertwin.scene.parameters import (
     RadarPose,
     Scale,
     Translation,
-    Vertices,
 )
 
 
@@ -67,14 +69,17 @@ def true_scene(run: schema.RunFile) -> Scene:
     found = scene(run)
     for name, truth in run.truth.items():
         changes = {key: value for key, value in truth if value is not None}
+        parts = changes.pop("parts", None)
         with about(f"truth.{name}"):
             if name in run.scene:
-                item = _object(run.scene[name].model_copy(update=changes))
+                item = _object(run.scene[name].model_copy(update=changes), parts)
             else:
                 # Objects of a file stand where it puts them: they are scaled and placed from there.
                 made_of = changes.pop("material", None)
                 item, place = found[name], schema.Placement(**changes)
                 mesh = Mesh(item.mesh.vertices * place.scale, item.mesh.faces)
+                if parts is not None:
+                    mesh = _joined(parts)
                 item = replace(item, mesh=mesh, pose=_pose(place))
                 if made_of is not None:
                     item = replace(item, material=material(made_of, mesh))
@@ -88,9 +93,9 @@ def _from_file(table: schema.SceneFile) -> Scene:
     return load_scene_xml(table.file, materials, others)
 
 
-def _object(table: schema.SceneObject) -> Object:
+def _object(table: schema.SceneObject, parts: Sequence[schema.Part] | None = None) -> Object:
     velocity = None if table.velocity is None else _float64(table.velocity)
-    mesh = _mesh(table)
+    mesh = _mesh(table) if parts is None else _joined(parts)
     return Object(mesh, material(table.material, mesh), _pose(table), velocity)
 
 
@@ -119,7 +124,7 @@ def _mesh(table: schema.Placement) -> Mesh:
         case schema.Parts():
             mesh = _joined(table.parts)
         case _:
-            raise InputError(f"expected a shape, got {type(table).__name__}; add `shape`")
+            mesh = shape_mesh(table)
     return Mesh(mesh.vertices * table.scale, mesh.faces)
 
 
@@ -151,45 +156,81 @@ def optimizer(table: schema.Optimizer) -> Optimizer:
     return Optimizer(**table.model_dump(exclude_none=True))
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where a fit starts.
+
+    Attributes:
+        scene: Objects where they are thought to be.
+        joints: Rotation vectors [j, 3] (rad) of bodies, by object.
+    """
+
+    scene: Scene
+    joints: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+def builders(tables: Sequence[schema.Parameter], start: Start) -> dict[str, Build]:
+    """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order."""
+    return {
+        name: partial(_module, table, f"parameters[{i}]", start)
+        for i, (name, table) in enumerate(named(tables).items())
+    }
+
+
+def named(tables: Sequence[schema.Parameter]) -> dict[str, schema.Parameter]:
+    """The `[[parameters]]` tables by what stages and variants call them."""
+    names = [getattr(table, "name", None) or table.kind for table in tables]
+    # Twice the same kind without names is fine where nothing calls them by name.
+    names = [f"{n}_{i}" if n in names[:i] else n for i, n in enumerate(names)]
+    return dict(zip(names, tables, strict=True))
+
+
 def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Module]:
-    """The modules of the `[[parameters]]` tables; each starts as the identity.
+    """The modules of the `[[parameters]]` tables; each starts as the object is, or as it says.
 
     Raises:
         InputError: A material value that the object's material does not have, or that starts at
-            the end of its range.
+            the end of its range; a box that does not hold the object.
     """
-    modules: list[nn.Module] = []
-    for i, table in enumerate(tables):
-        match table:
-            case schema.TranslationParameter():
-                modules.append(Translation(table.object, axes="".join(table.axes)))
-            case schema.PoseParameter():
-                axes, turns = "".join(table.axes), "".join(table.rotation_axes)
-                modules.append(Pose(table.object, axes=axes, rotation_axes=turns))
-            case schema.ScaleParameter():
-                modules.append(Scale(table.object))
-            case schema.VerticesParameter():
-                count = len(scene[table.object].mesh.vertices)
-                modules.append(Vertices(table.object, count))
-            case schema.MaterialParameter():
-                with about(f"parameters[{i}].values, material of {table.object}"):
-                    modules.append(fitted(table, scene[table.object].material))
-            case schema.RadarParameter():
-                modules.append(RadarPose())
-    return modules
+    return [make(scene) for make in builders(tables, Start(scene)).values()]
 
 
-def regularizers(tables: Sequence[schema.Parameter], scene: Scene) -> list[Laplacian]:
-    """The Laplacian terms of the vertex parameters."""
-    return [
-        Laplacian(scene, table.object, table.laplacian)
-        for table in tables
-        if isinstance(table, schema.VerticesParameter) and table.laplacian > 0
-    ]
+def _module(table: schema.Parameter, path: str, start: Start, scene: Scene) -> nn.Module:
+    match table:
+        case schema.TranslationParameter():
+            return Translation(table.object, axes="".join(table.axes))
+        case schema.PoseParameter():
+            axes, turns = "".join(table.axes), "".join(table.rotation_axes)
+            return Pose(table.object, axes=axes, rotation_axes=turns)
+        case schema.ScaleParameter():
+            return Scale(table.object)
+        case schema.MaterialParameter():
+            with about(f"{path}.values, material of {table.object}"):
+                return fitted(table, scene[table.object].material)
+        case schema.RadarParameter():
+            return RadarPose()
+    with about(path):
+        return shape_module(table, scene[table.object].mesh, start.joints)
 
 
-def starts(table: schema.Starts, scene: Scene, truth: Scene, seed: int) -> list[Scene]:
-    """The scenes from which the fits of the `[starts]` table start.
+def regularizers(
+    tables: Mapping[str, schema.Parameter], modules: Mapping[str, nn.Module], scene: Scene
+) -> list[Regularizer]:
+    """The terms that shapes add to the loss.
+
+    Args:
+        tables: All parameters, by name.
+        modules: Those of a fit, by name.
+        scene: Where it starts.
+    """
+    terms: list[Regularizer] = []
+    for name, module in modules.items():
+        terms += shape_terms(tables[name], module, scene)
+    return terms
+
+
+def starts(table: schema.Starts, scene: Scene, truth: Scene, seed: int) -> list[Start]:
+    """From where the fits of the `[starts]` table start.
 
     Args:
         table: How many, how far from the truth.
@@ -219,7 +260,7 @@ def starts(table: schema.Starts, scene: Scene, truth: Scene, seed: int) -> list[
         turn = moved.transform[:3, :3]
         # The object as known may have another size: it is its centre that is placed.
         place = moved.center - turn @ scene[table.object].mesh.center
-        found.append(scene.replace(table.object, pose=rigid(turn, place)))
+        found.append(Start(scene.replace(table.object, pose=rigid(turn, place))))
     return found
 
 

@@ -15,7 +15,10 @@ from invertwin.cli.schema import RunFile, Section
 from invertwin.errors import InputError
 
 COLUMNS = ("key", "value", "default", "unit or meaning")
-_NAMED = {"scene": "scene.<name>", "truth": "truth.<name>", "parameters": "[parameters]"}
+_NAMED = {
+    **{name: f"{name}.<name>" for name in ("scene", "truth", "variants")},
+    **{name: f"[{name}]" for name in ("parameters", "stages")},
+}
 _WORDS = {float: "number", int: "integer", bool: "true or false", str: "text"}
 _SIGNS = {Gt: ("gt", ">"), Ge: ("ge", "≥"), Lt: ("lt", "<"), Le: ("le", "≤")}
 

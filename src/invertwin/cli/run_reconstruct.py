@@ -8,8 +8,9 @@ from typing import Any
 from rich.console import Console
 
 from invertwin.cli import build
-from invertwin.cli.fits.fitting import calibrated, fit, restored
-from invertwin.cli.fits.problem import FULL, INTERIOR, problem_of
+from invertwin.cli.fits.fitting import calibrated, fit, outcome
+from invertwin.cli.fits.likeness import is_shape_key
+from invertwin.cli.fits.problem import modes_of, problem_of
 from invertwin.cli.fits.scores import (
     agreement,
     heldout,
@@ -18,7 +19,14 @@ from invertwin.cli.fits.scores import (
     summary,
     without_history,
 )
-from invertwin.cli.fits.writing import COLUMNS, draw, status, tables_of, write_report
+from invertwin.cli.fits.writing import (
+    COLUMNS,
+    draw,
+    draw_shapes,
+    status,
+    tables_of,
+    write_report,
+)
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table
 from invertwin.cli.run_file import need
@@ -36,24 +44,23 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     if isinstance(run.data, OpenRadarData):
         return run_openradar(run, folder, console)
     begin = time.perf_counter()
-    settings = need(run, "reconstruct", "reconstruct")
+    need(run, "reconstruct", "reconstruct")
     problem, calibration = calibrated(problem_of(run, console), folder, console)
-    scenes = [problem.scene]
+    starts = [build.Start(problem.scene)]
     if run.starts is not None:
-        scenes = build.starts(run.starts, problem.scene, problem.truth, run.seed)
-    modes = [FULL] if settings.boundary else [INTERIOR]
-    if settings.also_interior_only and settings.boundary:
-        modes.append(INTERIOR)
-    single = len(scenes) * len(modes) == 1
+        starts = build.starts(run.starts, problem.scene, problem.truth, run.seed)
+    modes = modes_of(run)
+    single = len(starts) * len(modes) == 1
     rows: dict[str, list[dict[str, Any]]] = {}
     for mode in modes:
         rows[mode] = [
-            fit(problem, scene, i, mode, folder, console, CHECKPOINT if single else None)
-            for i, scene in enumerate(scenes)
+            fit(problem, start, i, mode, folder, console, CHECKPOINT if single else None)
+            for i, start in enumerate(starts)
         ]
     best = min(rows[modes[0]], key=lambda row: _finite(row["loss"]))
-    start = scenes[best["start"]]
-    twin, radar, offset = restored(problem, start, folder, best["checkpoint"])
+    begun = starts[best["start"]]
+    found = outcome(problem, begun, best, modes[0], folder)
+    start, twin, radar, offset = begun.scene, found.twin, found.radar, found.offset
     maps = {
         "measured": problem.capture.spectrum(problem.grid).float(),
         "start": sharp_spectrum(problem, start, problem.radar, None),
@@ -62,7 +69,11 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     metrics = {
         "task": run.task,
         **summary(problem, rows, modes),
-        **{key: best[key] for key in COLUMNS if key in best and key != "seconds"},
+        **{
+            key: best[key]
+            for key in best
+            if (key in COLUMNS or is_shape_key(key)) and key != "seconds"
+        },
         "start_loss_sharp": misfit(run, maps["start"], maps["measured"]),
         "loss_sharp": misfit(run, maps["twin"], maps["measured"]),
         "parameters": best["values"],
@@ -71,8 +82,10 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         **heldout(problem, rows[modes[0]], best),
         "starts": without_history(rows[modes[0]]),
     }
-    if len(modes) > 1:
-        metrics["starts_interior_only"] = without_history(rows[INTERIOR])
+    for mode in modes[1:]:
+        metrics[f"starts_{mode}"] = without_history(rows[mode])
+        same = rows[mode][best["start"]]
+        metrics |= {f"{key}_{mode}": same[key] for key in same if is_shape_key(key)}
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         console.print("computing the loss landscape")
         png, found = landscape(run, problem.truth, problem.radar, problem.grid, problem.capture)
@@ -83,6 +96,9 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     tables = tables_of(problem, metrics, start, twin, rows)
     draw(problem, folder, rows, metrics, start, twin, radar, maps)
     save_mesh(folder.file("twin.ply"), twin)
+    if run.measures is not None:
+        draw_shapes(problem, folder, rows, start, twin)
+        save_mesh(folder.file("twin.glb"), twin)
     if not single:
         shutil.copyfile(folder.path / best["checkpoint"], folder.file(CHECKPOINT))
     folder.write_json("metrics.json", metrics)

@@ -44,6 +44,8 @@ class Optimizer:
         final_rate: At the last step (cosine in between), of ``rate``; None = ``rate`` / 20.
             The rates of all parameters fall alike.
         momentum: Of SGD.
+        module_rates: Rates of the modules that are fitted, in their order; None, and modules
+            beyond the last = ``rate``, and ``rotation_rate`` for rotations.
     """
 
     kind: Literal["adam", "sgd"] = "adam"
@@ -51,6 +53,7 @@ class Optimizer:
     rotation_rate: float | None = None
     final_rate: float | None = None
     momentum: float = 0.9
+    module_rates: tuple[float | None, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in ("adam", "sgd") or not self.rate > 0:
@@ -62,11 +65,13 @@ class Optimizer:
     def build(self, modules: nn.Module) -> torch.optim.Optimizer:
         """The torch optimiser over the modules' parameters."""
         groups: dict[float, list[nn.Parameter]] = {}
-        for name, parameter in modules.named_parameters():
-            if parameter.requires_grad:
-                turns = name.endswith("rotation") and self.rotation_rate is not None
-                ratio = self.rotation_rate / self.rate if turns else 1.0  # type: ignore[operator]
-                groups.setdefault(ratio, []).append(parameter)
+        for i, module in enumerate(modules.children()):
+            own = self.module_rates[i] if i < len(self.module_rates) else None
+            for name, parameter in module.named_parameters():
+                if parameter.requires_grad:
+                    turns = name.endswith("rotation") and self.rotation_rate is not None
+                    rate = own or (self.rotation_rate if turns else self.rate)
+                    groups.setdefault(rate / self.rate, []).append(parameter)  # type: ignore[operator]
         listed = [{"params": group, "ratio": ratio} for ratio, group in groups.items()]
         if self.kind == "adam":
             return torch.optim.Adam(listed, lr=self.rate)
@@ -131,6 +136,8 @@ def reconstruct(
     checkpoint_every: int = 10,
     resume: bool = False,
     backend: str | None = None,
+    watch: Callable[[Scene], dict[str, float]] | None = None,
+    watch_every: int = 10,
     progress: Callable[[dict[str, Any]], None] | None = None,
 ) -> Reconstruction:
     """Find the parameters of a scene whose simulated spectrum equals a measured one.
@@ -169,6 +176,9 @@ def reconstruct(
         checkpoint_every: [steps].
         resume: Go on from ``checkpoint`` if it is there.
         backend: See ``deposit_power``.
+        watch: Numbers about the twin, such as its distance from a known truth, which join the
+            row of every ``watch_every``-th step; they do not change the fit.
+        watch_every: [steps].
         progress: Called with every row of the history.
 
     Source: §4.2 of the paper.
@@ -204,6 +214,8 @@ def reconstruct(
         frames_per_step=frames_per_step,
         regularizers=tuple(regularizers),
         steps=steps,
+        watch=watch,
+        watch_every=watch_every,
     )
     sought = [p for p in fit.modules.parameters() if p.requires_grad]
     if not sought or steps < 1:
@@ -216,11 +228,13 @@ def reconstruct(
     path = Path(checkpoint) if checkpoint is not None else None
     if resume and path is not None and path.exists():
         state.load(path, fit)
-    with use_backend(backend):
-        status = _descend(fit, state, rates, tolerance, path, checkpoint_every, progress)
-        status = _judged(fit, state, status)
-    if path is not None:
-        state.save(path, fit)
+    if state.ended is None:
+        with use_backend(backend):
+            status = _descend(fit, state, rates, tolerance, path, checkpoint_every, progress)
+            state.ended = _judged(fit, state, status)
+        if path is not None:
+            state.save(path, fit)
+    status = state.ended
     with torch.no_grad():
         moved, seen, _ = fit.applied()
     loss_then = state.history[-1]["loss"]
@@ -238,6 +252,7 @@ class _State:
     step: int = 0
     history: list[dict[str, Any]] = field(default_factory=list)
     best: tuple[int, float, dict[str, Tensor]] | None = None
+    ended: Status | None = None
 
     def keep_if_better(self, loss: float, fit: "_Fit") -> None:
         """Remember the state of the lowest loss; without extra widths beats with."""
@@ -257,6 +272,7 @@ class _State:
             "step": self.step,
             "history": self.history,
             "best": self.best,
+            "ended": self.ended,
             "key": fit.key(),
         }
         torch.save(content, part)
@@ -280,6 +296,7 @@ class _State:
         self.optimizer.load_state_dict(content["optimizer"])
         self.first, self.best = content["first"], content["best"]
         self.step, self.history = content["step"], content["history"]
+        self.ended = content["ended"]
 
 
 @dataclass(frozen=True)
@@ -304,6 +321,8 @@ class _Fit:
     frames_per_step: int | None
     regularizers: tuple[Regularizer, ...]
     steps: int
+    watch: Callable[[Scene], dict[str, float]] | None
+    watch_every: int
 
     def key(self) -> list[Any]:
         """What must be equal for a checkpoint to be of this fit."""
@@ -324,6 +343,13 @@ class _Fit:
             if kind == "range":
                 offset = module()
         return scene, radar, offset
+
+    def watched(self, step: int) -> dict[str, float]:
+        """What is watched of the twin after so many steps."""
+        if self.watch is None or step % self.watch_every:
+            return {}
+        with torch.no_grad():
+            return self.watch(self.applied()[0])
 
     def parameters(self) -> dict[str, Tensor]:
         """A copy of the present parameters."""
@@ -428,8 +454,9 @@ def _descend(
         state.keep_if_better(number, fit)
         value.backward()
         state.optimizer.step()
-        state.history.append({"step": state.step, "loss": number, "values": _values(fit.modules)})
+        row = {"step": state.step, "loss": number, "values": _values(fit.modules)}
         state.step += 1
+        state.history.append(row | fit.watched(state.step))
         if progress:
             progress(state.history[-1])
         if checkpoint is not None and state.step % every == 0:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import trimesh
 from torch import Tensor
+from trimesh.exchange.gltf import export_glb
 
 from invertwin.errors import InputError
 from invertwin.scene import shapes
@@ -59,12 +60,14 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
-    """Write a mesh, or all objects of a scene in the world, as a binary PLY file in float64.
+    """Write a mesh, or all objects of a scene in the world: PLY in float64, or GLB in float32.
+
+    A GLB file keeps the objects apart, by name.
 
     The file appears complete or not at all: a failure leaves an existing one as it was.
 
     Args:
-        path: the file, ending in .ply, in an existing folder.
+        path: the file, ending in .ply or .glb, in an existing folder.
         shape: what to write.
 
     Raises:
@@ -72,11 +75,16 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         OSError: the file system refuses the write.
     """
     file = Path(path)
-    if file.suffix.lower() != ".ply":
-        raise InputError(f"expected a file name ending in .ply, got {file.name}; rename the output")
+    if file.suffix.lower() not in (".ply", ".glb"):
+        raise InputError(
+            f"expected a file name ending in .ply or .glb, got {file.name}; rename the output"
+        )
     if not file.parent.is_dir():
         raise InputError(f"expected an existing folder, got {file.parent}; create it first")
-    content = _ply(_joined(shape) if isinstance(shape, Scene) else shape)
+    if file.suffix.lower() == ".glb":
+        content = _glb(shape)
+    else:
+        content = _ply(_joined(shape) if isinstance(shape, Scene) else shape)
     temporary = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
         temporary.write_bytes(content)
@@ -148,6 +156,19 @@ def _joined(scene: Scene) -> Mesh:
         faces.append(item.mesh.faces + count)
         count += len(item.mesh.vertices)
     return Mesh(torch.cat(vertices), torch.cat(faces))
+
+
+def _glb(shape: Mesh | Scene) -> bytes:
+    parts = (
+        {"mesh": (shape.vertices, shape.faces)}
+        if isinstance(shape, Mesh)
+        else {name: (item.vertices, item.mesh.faces) for name, item in shape.objects.items()}
+    )
+    written = trimesh.Scene()
+    for name, (vertices, faces) in parts.items():
+        mesh = trimesh.Trimesh(vertices.detach().numpy(), faces.numpy(), process=False)
+        written.add_geometry(mesh, geom_name=name, node_name=name)
+    return export_glb(written)
 
 
 def _ply(mesh: Mesh) -> bytes:

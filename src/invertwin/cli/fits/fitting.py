@@ -3,9 +3,10 @@
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -17,19 +18,22 @@ from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
+from invertwin.cli.fits.likeness import CURVE, watch_of
 from invertwin.cli.fits.problem import (
     FULL,
-    INTERIOR,
     Problem,
     density_of,
     nuisances_of,
+    stages_of,
     steps_of,
+    varied,
 )
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.run_file import need
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
+from invertwin.inversion.stages import reconstruct_in_stages, stage_checkpoint
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
@@ -50,15 +54,21 @@ def calibrated(
         checkpoint = f"{PARTS}/calibration.pt"
         rate = table.rate or problem.run.optimizer.rate
         steps = table.steps or steps_of(problem)
-        found = _reconstruct(
-            problem,
-            alone,
-            nuisances,
-            Bar(console, "calibration", steps),
-            folder.file(checkpoint),
-            steps=steps,
-            optimizer=replace(build.optimizer(problem.run.optimizer), rate=rate),
-        )
+        options = _options(problem)
+        options["optimizer"] = replace(options["optimizer"], rate=rate)
+        with _watched(Bar(console, "calibration", steps)) as advance:
+            found = reconstruct(
+                alone,
+                problem.radar,
+                problem.capture,
+                nuisances,
+                steps=steps,
+                seed=problem.run.seed,
+                checkpoint=folder.file(checkpoint),
+                resume=True,
+                progress=advance,
+                **options,
+            )
         capture = problem.capture.recalibrated(
             problem.capture.clock_offset + float(nuisances[1].shift.detach()),
             problem.capture.range_bias + float(nuisances[0].bias.detach()),
@@ -68,9 +78,24 @@ def calibrated(
     return replace(problem, capture=capture, radar=capture.radar()), row
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What a finished fit has found.
+
+    Attributes:
+        twin: The scene.
+        radar: With the poses of the fit.
+        offset: Range offset [m], where one is fitted along.
+    """
+
+    twin: Scene
+    radar: Radar
+    offset: torch.Tensor | None
+
+
 def fit(
     problem: Problem,
-    scene: Scene,
+    start: build.Start,
     index: int,
     mode: str,
     folder: RunFolder,
@@ -83,22 +108,14 @@ def fit(
     if done is not None:
         return done
     begin = time.perf_counter()
-    name = f"start {index + 1}" + (", interior only" if mode == INTERIOR else "")
+    name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
     checkpoint = checkpoint or f"{part}.pt"
-    found = _reconstruct(
-        problem,
-        scene,
-        [*build.parameters(problem.run.parameters, scene), *nuisances_of(problem)],
-        Bar(console, name, steps_of(problem)),
-        folder.file(checkpoint),
-        steps=steps_of(problem),
-        boundary=mode == FULL,
-        seed=problem.run.seed + index,
-        regularizers=build.regularizers(problem.run.parameters, scene),
-    )
+    problem = varied(problem, mode)
+    bar = Bar(console, name, steps_of(problem))
+    found = _staged(problem, start, index, nuisances_of(problem), bar, folder, checkpoint)
     row = {
         "start": index,
-        **scores(problem, scene, found.scene),
+        **scores(problem, start, found.scene),
         "loss": found.loss,
         "status": found.status,
         "steps": found.steps,
@@ -106,9 +123,58 @@ def fit(
         "values": _values(found.parameters),
         "checkpoint": checkpoint,
         "losses": [step["loss"] for step in found.history],
+        "curve": [[step["step"] + 1, step[CURVE]] for step in found.history if CURVE in step],
     }
     folder.write_json(f"{part}.json", row)
     return row
+
+
+def outcome(
+    problem: Problem, start: build.Start, row: dict[str, Any], mode: str, folder: RunFolder
+) -> Outcome:
+    """Twin, radar and range offset of a finished fit, from its checkpoints."""
+    problem = varied(problem, mode)
+    nuisances = nuisances_of(problem)
+    found = _staged(problem, start, row["start"], nuisances, None, folder, row["checkpoint"])
+    offsets = [module() for module in nuisances if getattr(module, "applies_to", "") == "range"]
+    offset = offsets[-1].detach() if offsets else None
+    return Outcome(found.scene, found.radar, offset)
+
+
+def _staged(
+    problem: Problem,
+    start: build.Start,
+    index: int,
+    nuisances: list[nn.Module],
+    bar: "Bar | None",
+    folder: RunFolder,
+    checkpoint: str,
+) -> Reconstruction:
+    run = problem.run
+    tables = build.named(run.parameters)
+    stages = stages_of(problem)
+    for k in range(len(stages) - 1):
+        folder.file(stage_checkpoint(checkpoint, k))
+    own = {name: getattr(table, "rate", None) for name, table in tables.items()}
+    rates = {name: float(rate) for name, rate in own.items() if rate is not None}
+    with _watched(bar) as advance:
+        return reconstruct_in_stages(
+            start.scene,
+            problem.radar,
+            problem.capture,
+            build.builders(run.parameters, start),
+            stages,
+            rates=rates,
+            regularize=partial(build.regularizers, tables),
+            checkpoint=folder.file(checkpoint),
+            resume=True,  # from its own unfinished part; open_run has settled what may be there
+            seed=run.seed + index,
+            nuisances=nuisances,
+            watch=watch_of(problem),
+            watch_every=run.measures.every if run.measures else 1,
+            progress=advance,
+            **_options(problem),
+        )
 
 
 def _values(modules: nn.ModuleList) -> dict[str, Any]:
@@ -120,47 +186,43 @@ def _values(modules: nn.ModuleList) -> dict[str, Any]:
     return rows
 
 
-def _reconstruct(
-    problem: Problem,
-    scene: Scene,
-    modules: Sequence[nn.Module],
-    bar: "Bar",
-    checkpoint: Any,
-    **changes: Any,
-) -> Reconstruction:
+def _options(problem: Problem) -> dict[str, Any]:
+    """What all fits of a run have in common."""
     settings, table = need(problem.run, "reconstruct", "reconstruct"), problem.run.surrogate
-    options = {
+    return {
         "grid": problem.grid,
         "loss": build.loss(problem.run.loss),
         "optimizer": build.optimizer(problem.run.optimizer),
         "surrogate": None if table.exact else build.surrogate(table),
         "density": density_of(problem.run),
         "annealing": settings.annealing,
-        "seed": problem.run.seed,
         "samples": settings.samples,
         "boundary_samples": settings.boundary_samples,
         "depth": settings.depth,
         "boundary": settings.boundary,
         "frames_per_step": settings.frames_per_step,
         "tolerance": settings.tolerance,
-        "checkpoint": checkpoint,
         "checkpoint_every": settings.checkpoint_every,
-        "resume": True,  # from its own unfinished part; open_run has settled what may be there
     }
+
+
+@contextmanager
+def _watched(bar: "Bar | None") -> Iterator[Callable[[dict[str, Any]], None] | None]:
+    """Progress that is shown; Ctrl-C waits for the end of the step."""
+    if bar is None:
+        yield None
+        return
     with bar, _interrupted_between_steps() as heed:
+        done = 0
 
         def advance(row: dict[str, Any]) -> None:
-            bar.advance(row)
+            nonlocal done
+            # A stage counts its own steps from 0; a resumed one goes on where it was.
+            done += 1 if done else row["step"] + 1
+            bar.advance({**row, "step": done - 1})
             heed()
 
-        return reconstruct(
-            scene,
-            problem.radar,
-            problem.capture,
-            modules,
-            progress=advance,
-            **(options | changes),
-        )
+        yield advance
 
 
 @contextmanager
@@ -231,25 +293,3 @@ class Bar:
         elif done * 10 // self._steps > row["step"] * 10 // self._steps:
             line = f"{self._name}: step {done} of {self._steps}, {text}"
             self._console.print(line, markup=False, soft_wrap=True)
-
-
-def restored(
-    problem: Problem, scene: Scene, folder: RunFolder, checkpoint: str
-) -> tuple[Scene, Radar, torch.Tensor | None]:
-    """Twin, radar and range offset of a finished fit, from its checkpoint."""
-    modules = nn.ModuleList(
-        [*build.parameters(problem.run.parameters, scene), *nuisances_of(problem)]
-    )
-    saved = torch.load(folder.path / checkpoint, weights_only=True)
-    modules.load_state_dict(saved["modules"])
-    radar, offset = problem.radar, None
-    with torch.no_grad():
-        for module in modules:
-            match getattr(module, "applies_to", "scene"):
-                case "scene":
-                    scene = module(scene)
-                case "radar":
-                    radar = module(radar)
-                case "range":
-                    offset = module()
-    return scene, radar, offset

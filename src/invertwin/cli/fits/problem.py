@@ -1,6 +1,8 @@
 """What is to be fitted: scene, data, radar and grid of a run file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 from rich.console import Console
 from torch import nn
@@ -11,9 +13,19 @@ from invertwin.cli import build
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import MoverParameter, RadarParameter, RunFile, SimulatedData
+from invertwin.cli.schema import (
+    MoverParameter,
+    RadarParameter,
+    RunFile,
+    SimulatedData,
+    Variant,
+    VerticesParameter,
+)
+from invertwin.cli.schema import Stage as StageTable
 from invertwin.errors import InputError
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
+from invertwin.inversion.remeshing import remeshed
+from invertwin.inversion.stages import Stage
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
@@ -91,9 +103,84 @@ def sought_objects(run: RunFile) -> list[str]:
     return [p.object for p in run.parameters if not isinstance(p, RadarParameter)]
 
 
+def varied(problem: Problem, mode: str) -> Problem:
+    """The problem of a mode: the run's own, without boundary terms, or a variant."""
+    run = problem.run
+    if mode == FULL:
+        return problem
+    wanted = Variant(boundary=False) if mode == INTERIOR else run.variants[mode]
+    given = wanted.model_dump(exclude_none=True)
+    changes: dict[str, Any] = {}
+    if wanted.stages is not None:
+        changes["stages"] = wanted.stages
+    if wanted.parameters is not None:
+        tables = build.named(run.parameters)
+        changes["parameters"] = [tables[name] for name in tables if name in wanted.parameters]
+    if wanted.smooth is not None:
+        changes["parameters"] = [
+            table.model_copy(update={"smooth": wanted.smooth})
+            if isinstance(table, VerticesParameter)
+            else table
+            for table in changes.get("parameters", run.parameters)
+        ]
+    if "parameters" in changes and wanted.stages is None:
+        kept = build.named(changes["parameters"])
+        changes["stages"] = [
+            stage.model_copy(update={"parameters": [n for n in stage.parameters if n in kept]})
+            for stage in run.stages
+            if not stage.parameters or any(name in kept for name in stage.parameters)
+        ]
+    for section in ("reconstruct", "optimizer", "surrogate"):
+        table = getattr(run, section)
+        update = {key: value for key, value in given.items() if key in type(table).model_fields}
+        changes[section] = table.model_copy(update=update)
+    return replace(problem, run=run.model_copy(update=changes))
+
+
+def stages_of(problem: Problem) -> list[Stage]:
+    """The stages of a fit, as the library takes them."""
+    run = problem.run
+    settings = need(run, "reconstruct", "reconstruct")
+    if not run.stages:
+        return [Stage(settings.steps)]
+    return [_stage(run, table) for table in run.stages]
+
+
+def _stage(run: RunFile, table: StageTable) -> Stage:
+    given = table.model_dump(exclude_none=True)
+    options = {
+        key: given[key]
+        for key in ("samples", "boundary_samples", "frames_per_step")
+        if key in given
+    }
+    rates = {key: given[key] for key in ("rate", "final_rate") if key in given}
+    widths = {key: given[key] for key in ("range_width", "angle_width") if key in given}
+    if rates:
+        options["optimizer"] = build.optimizer(run.optimizer.model_copy(update=rates))
+    if widths and not run.surrogate.exact:
+        options["surrogate"] = build.surrogate(run.surrogate.model_copy(update=widths))
+    remesh = {}
+    if table.remesh is not None:
+        tables = build.named(run.parameters)
+        sought = [tables[name] for name in table.parameters or tables]
+        change = partial(remeshed, edge=table.remesh)
+        remesh = {t.object: change for t in sought if isinstance(t, VerticesParameter)}
+    steps = table.steps or need(run, "reconstruct", "reconstruct").steps
+    return Stage(steps, tuple(table.parameters), table.rebuild, remesh, options)
+
+
 def steps_of(problem: Problem) -> int:
     """The budget of a fit."""
-    return need(problem.run, "reconstruct", "reconstruct").steps
+    return sum(stage.steps for stage in stages_of(problem))
+
+
+def modes_of(run: RunFile) -> list[str]:
+    """The fits of one start: as the run file says, and its variants."""
+    settings = need(run, "reconstruct", "reconstruct")
+    modes = [FULL if settings.boundary else INTERIOR]
+    if settings.also_interior_only and settings.boundary:
+        modes.append(INTERIOR)
+    return [*modes, *run.variants]
 
 
 def density_of(run: RunFile) -> float:
@@ -102,8 +189,10 @@ def density_of(run: RunFile) -> float:
 
 
 def annealed_until(run: RunFile) -> float | None:
-    """The step from which the surrogate has no extra widths; None if it never has."""
+    """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
     settings = need(run, "reconstruct", "reconstruct")
+    if len(run.stages) > 1:
+        return None
     wide = run.surrogate.range_width > 0 or run.surrogate.angle_width > 0
     return settings.annealing * settings.steps if wide else None
 

@@ -9,7 +9,8 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.cli import build
-from invertwin.cli.fits.problem import INTERIOR, Problem, density_of
+from invertwin.cli.fits.likeness import shape_scores
+from invertwin.cli.fits.problem import Problem, density_of
 from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import MaterialParameter, Parameter, RunFile, SimulatedData
@@ -21,7 +22,7 @@ from invertwin.scene import Scene
 from invertwin.simulation import surrogate_correlation
 
 
-def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
+def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
     """How far start and twin are from the truth, where it is known."""
     name = problem.target
     if name is None:
@@ -29,8 +30,12 @@ def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     place = twin[name].center.detach().tolist()
     if name not in problem.known:
         return {"position": place}
+    shapes = shape_scores(problem, start.scene, twin)
+    if not torch.equal(twin[name].mesh.faces, problem.truth[name].mesh.faces):
+        # Other triangles: no vertex is another one's copy, only surfaces can be compared.
+        return {"position": place, **shapes}
     settings = need(problem.run, "reconstruct", "reconstruct")
-    before = build.residual(start[name], problem.truth[name])
+    before = build.residual(start.scene[name], problem.truth[name])
     after = build.residual(twin[name], problem.truth[name])
     rows: dict[str, Any] = {
         "start_distance_m": before.distance,
@@ -47,7 +52,7 @@ def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
         rows |= {"scale_error": abs(after.scale - 1)}
     sought = [p for p in problem.run.parameters if _made_known(problem, p)]
     frequency = problem.radar.waveform.center_frequency
-    return rows | value_errors(sought, twin, problem.truth, frequency)
+    return rows | shapes | value_errors(sought, twin, problem.truth, frequency)
 
 
 def _made_known(problem: Problem, parameter: Parameter) -> bool:
@@ -63,13 +68,11 @@ def summary(
     problem: Problem, rows: dict[str, list[dict[str, Any]]], modes: Sequence[str]
 ) -> dict[str, Any]:
     """Successes with and, where asked for, without boundary terms."""
-    if problem.target not in problem.known:
+    if problem.target not in problem.known or "success" not in rows[modes[0]][0]:
         return {}
-    counts = {mode: sum(row["success"] for row in rows[mode]) for mode in modes}
+    counts = {mode: sum(row.get("success", False) for row in rows[mode]) for mode in modes}
     found = {"successes": counts[modes[0]], "starts_count": len(rows[modes[0]])}
-    if INTERIOR in counts:
-        found["successes_interior_only"] = counts[INTERIOR]
-    return found
+    return found | {f"successes_{mode}": counts[mode] for mode in modes[1:]}
 
 
 def heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) -> dict[str, Any]:
@@ -96,7 +99,9 @@ def heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) 
 
 def without_history(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows of the fits as metrics keep them."""
-    return [{k: v for k, v in row.items() if k not in ("losses", "checkpoint")} for row in rows]
+    return [
+        {k: v for k, v in row.items() if k not in ("losses", "curve", "checkpoint")} for row in rows
+    ]
 
 
 def sharp_spectrum(

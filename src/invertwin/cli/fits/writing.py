@@ -7,11 +7,13 @@ from typing import Any, get_args
 import torch
 
 from invertwin.cli import build, pictures
+from invertwin.cli.fits.likeness import is_shape_key, shape_label
 from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, annealed_until, sought_objects
 from invertwin.cli.report import Again, Picture, Table, report_html, shown
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import MaterialValue, RunFile, SimulatedData
+from invertwin.cli.shape_pictures import convergence_picture, turntable_gif
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
@@ -80,8 +82,10 @@ def tables_of(
                 [row["start"] + 1, *(_ENDS[row[k]] if k == "status" else row[k] for k in keys)]
                 for row in fits
             ]
-            title = f"Starts, {_MODES[mode]}"
+            title = f"Starts, {_mode(mode)}"
             tables.append(Table(title, ["start", *(COLUMNS[key] for key in keys)], cells))
+    if len(rows) > 1 and any(is_shape_key(key) for key in metrics):
+        tables.append(_variants(rows))
     cells = []
     for name in dict.fromkeys(sought_objects(problem.run)):
         scenes = [start, twin, *([problem.truth] if name in problem.known else [])]
@@ -101,6 +105,21 @@ def tables_of(
     moves = [[k + units.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
     tables.append(Table("Moves from the start", ["parameter", "value"], moves))
     return tables
+
+
+def _variants(rows: dict[str, list[dict[str, Any]]]) -> Table:
+    """What each way to fit has made of the shape, means over the starts."""
+    first = next(iter(rows.values()))[0]
+    keys = [k for k in first if is_shape_key(k) and not k.startswith("start_")]
+    cells = [["start", *(first.get(f"start_{key}") for key in keys)]]
+    for mode, fits in rows.items():
+        means = [[row[key] for row in fits if key in row] for key in keys]
+        cells.append([_mode(mode), *(sum(v) / len(v) if v else None for v in means)])
+    return Table("Ways to fit", ["fit", *(shape_label(key) for key in keys)], cells)
+
+
+def _mode(mode: str) -> str:
+    return _MODES.get(mode, mode.replace("_", " "))
 
 
 def _clean(value: float) -> float:
@@ -125,6 +144,9 @@ def _result(run: RunFile, metrics: dict[str, Any]) -> list[list[Any]]:
     for key, label in _LABELS.items():
         if key in metrics and key not in skipped:
             rows.append([label, metrics[key]])
+    for key in metrics:
+        if is_shape_key(key) and not any(key.endswith(f"_{mode}") for mode in _modes(run)):
+            rows.append([shape_label(key), metrics[key]])
     for key, label in _CALIBRATION_LABELS.items():
         if key in metrics.get("calibration", {}):
             value = metrics["calibration"][key]
@@ -132,8 +154,12 @@ def _result(run: RunFile, metrics: dict[str, Any]) -> list[list[Any]]:
     return rows
 
 
+def _modes(run: RunFile) -> list[str]:
+    return [INTERIOR, *run.variants]
+
+
 def _ended(run: RunFile, metrics: dict[str, Any]) -> str:
-    steps = need(run, "reconstruct", "reconstruct").steps
+    steps = metrics["steps"]
     match metrics["status"]:
         case "budget":
             return f"all {steps} steps used"
@@ -184,10 +210,31 @@ def draw(
     titles = {"measured": data, "start": "surrogate, start", "twin": "surrogate, twin"}
     titled = {titles[name]: power.numpy() for name, power in maps.items()}
     folder.write_bytes("spectra.png", pictures.spectra_picture(titled, axes))
-    losses = {_MODES[mode]: [row["losses"] for row in fits] for mode, fits in rows.items()}
+    losses = {_mode(mode): [row["losses"] for row in fits] for mode, fits in rows.items()}
     annealed = annealed_until(problem.run)
     before = metrics["start_loss_sharp"] if annealed else None
     folder.write_bytes("loss.png", pictures.loss_picture(losses, annealed, before))
+
+
+def draw_shapes(
+    problem: Problem,
+    folder: RunFolder,
+    rows: dict[str, list[dict[str, Any]]],
+    start: Scene,
+    twin: Scene,
+) -> None:
+    """Writes the turning picture of the object, and how its measure went over the steps."""
+    table = problem.run.measures
+    assert table is not None
+    scenes = {"truth": problem.truth} if table.object in problem.known else {}
+    scenes |= {"start": start, "twin": twin}
+    up = pictures.frame_of(problem.radar)[:, 1]
+    meshes = {name: pictures.meshes_of(scene)[table.object] for name, scene in scenes.items()}
+    folder.write_bytes("turntable.gif", turntable_gif(meshes, up))
+    curves = {_mode(mode): [row["curve"] for row in fits] for mode, fits in rows.items()}
+    if any(curve for fits in curves.values() for curve in fits):
+        losses = {_mode(mode): [row["losses"] for row in fits] for mode, fits in rows.items()}
+        folder.write_bytes("convergence.png", convergence_picture(losses, curves))
 
 
 def write_report(
@@ -201,7 +248,7 @@ def write_report(
     }
     shown = [
         Picture(name.capitalize(), (folder.path / f"{name}.png").read_bytes(), notes.get(name, ""))
-        for name in ("scene", "spectra", "loss", "landscape")
+        for name in ("scene", "spectra", "loss", "convergence", "landscape")
         if f"{name}.png" in folder.names
     ]
     title = run.title or "Reconstruction"
@@ -248,7 +295,10 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
     which = f"Best of {count} starts: " if count > 1 else ""
     ended = _ended(run, metrics)
     if "position_error_m" not in metrics:
-        return f"{which}{ended}."
+        if "chamfer_m" not in metrics:
+            return f"{which}{ended}."
+        change = f"from {metrics['start_chamfer_m']:.3f} to {metrics['chamfer_m']:.3f} m"
+        return f"{which}Chamfer distance {change}; {ended}."
     turned = f" and {metrics['rotation_error_deg']:.2f}°" if "rotation_error_deg" in metrics else ""
     score = f"{which}{metrics['position_error_m']:.3f} m{turned} from the truth; {ended}."
     limits = _limits(run, metrics)

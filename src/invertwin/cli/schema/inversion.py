@@ -4,7 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Tag, model_validator
 
-from invertwin.cli.schema.mover import MoverParameter, OpenRadarData
+from invertwin.cli.schema.mover import OpenRadarData
+from invertwin.cli.schema.parameters import MaterialValue
 from invertwin.cli.schema.recording import ArraysData, Dca1000Data
 from invertwin.cli.schema.section import (
     TAG_MARK,
@@ -79,88 +80,6 @@ Data = Annotated[
     | Annotated[ArraysData, Tag(TAG_MARK + "arrays")]
     | Annotated[RailSarData, Tag(TAG_MARK + "rail_sar")]
     | Annotated[OpenRadarData, Tag(TAG_MARK + "openradar")],
-    tag_by("kind"),
-]
-
-
-class TranslationParameter(Section):
-    """Moves an object along the given world axes."""
-
-    kind: Literal["translation"]
-    object: str
-    """name in the scene"""
-    axes: WorldAxes = ["x", "y", "z"]
-    """of the world"""
-
-
-class PoseParameter(Section):
-    """Moves an object and turns it about its centre, along and about the given world axes."""
-
-    kind: Literal["pose"]
-    object: str
-    """name in the scene"""
-    axes: WorldAxes = ["x", "y", "z"]
-    """of the world"""
-    rotation_axes: WorldAxes = ["x", "y", "z"]
-    """of the world"""
-
-
-class ScaleParameter(Section):
-    kind: Literal["scale"]
-    object: str
-    """name in the scene"""
-
-
-class VerticesParameter(Section):
-    """Free vertices, held together by a Laplacian term of this weight."""
-
-    kind: Literal["vertices"]
-    object: str
-    """name in the scene"""
-    laplacian: NonNegative = 0.0
-    """weight; 0 = free"""
-
-
-MaterialValue = Literal[
-    "permittivity",
-    "conductivity",
-    "loss_tangent",
-    "thickness",
-    "diffuse",
-    "lobe_width",
-    "scattering",
-    "rms_slope",
-    "lambertian",
-    "directive",
-    "directive_exponent",
-    "backscatter_exponent",
-]
-
-
-class MaterialParameter(Section):
-    """Material values that are sought, from the values of the scene table."""
-
-    kind: Literal["material"]
-    object: str
-    """name in the scene"""
-    values: Annotated[list[MaterialValue], Field(min_length=1)]
-    """which are sought"""
-    layer: Annotated[int, Field(ge=0)] | None = None
-    """of a multilayer, from 0: the layer whose values they are"""
-
-
-class RadarParameter(Section):
-    kind: Literal["radar_pose"]
-
-
-Parameter = Annotated[
-    Annotated[TranslationParameter, Tag(TAG_MARK + "translation")]
-    | Annotated[PoseParameter, Tag(TAG_MARK + "pose")]
-    | Annotated[ScaleParameter, Tag(TAG_MARK + "scale")]
-    | Annotated[VerticesParameter, Tag(TAG_MARK + "vertices")]
-    | Annotated[MaterialParameter, Tag(TAG_MARK + "material")]
-    | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")]
-    | Annotated[MoverParameter, Tag(TAG_MARK + "mover")],
     tag_by("kind"),
 ]
 

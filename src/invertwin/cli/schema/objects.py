@@ -220,6 +220,20 @@ class Text(Placement):
     """m, longest edge of the mesh"""
 
 
+class Vehicle(Placement):
+    """The body of a car of the public learned space: x ahead, y to the left, z up."""
+
+    shape: Literal["vehicle"]
+    folder: InputPath = Field("vehicle_prior", validate_default=True)
+    """path, from the run file's folder, then from INVERTWIN_DATA"""
+    level: Literal["coarse", "fine"] = "fine"
+    """of detail"""
+    coefficients: list[float] = []
+    """of the first modes, in standard deviations; the others are 0"""
+    max_edge: Positive | None = None
+    """m, longest edge of the mesh; without it as in the file"""
+
+
 class File(Placement):
     """A mesh file: OBJ, PLY, STL or glTF."""
 
@@ -234,6 +248,7 @@ Part = Annotated[
     | Annotated[Dihedral, Tag(TAG_MARK + "dihedral")]
     | Annotated[Trihedral, Tag(TAG_MARK + "trihedral")]
     | Annotated[Text, Tag(TAG_MARK + "text")]
+    | Annotated[Vehicle, Tag(TAG_MARK + "vehicle")]
     | Annotated[File, Tag(TAG_MARK + "file")],
     tag_by("shape", "parts", "file"),
 ]
@@ -279,6 +294,10 @@ class TextObject(Text, Body):
     pass
 
 
+class VehicleObject(Vehicle, Body):
+    pass
+
+
 class FileObject(File, Body):
     pass
 
@@ -294,6 +313,7 @@ SceneObject = Annotated[
     | Annotated[DihedralObject, Tag(TAG_MARK + "dihedral")]
     | Annotated[TrihedralObject, Tag(TAG_MARK + "trihedral")]
     | Annotated[TextObject, Tag(TAG_MARK + "text")]
+    | Annotated[VehicleObject, Tag(TAG_MARK + "vehicle")]
     | Annotated[FileObject, Tag(TAG_MARK + "file")]
     | Annotated[PartsObject, Tag(TAG_MARK + "parts")],
     tag_by("shape", "parts", "file"),
@@ -312,7 +332,7 @@ class SceneFile(Section):
 
 
 class Truth(Section):
-    """Where an object really is, and of what: replaces values of its scene table, key by key."""
+    """What an object really is: replaces values of its scene table, key by key."""
 
     position: Vector | None = None
     """m"""
@@ -322,3 +342,5 @@ class Truth(Section):
     """factor"""
     material: Material | None = None
     """what it is really made of"""
+    parts: Annotated[list[Part], Field(min_length=1)] | None = None
+    """its real shape, in place of the scene's and in the same frame"""

@@ -12,16 +12,16 @@ from invertwin.cli.schema.inversion import (
     Landscape,
     Loss,
     Optimizer,
-    Parameter,
-    RadarParameter,
     Reconstruct,
     Starts,
     Surrogate,
 )
 from invertwin.cli.schema.objects import SceneFile, SceneObject, Truth
+from invertwin.cli.schema.parameters import Parameter, RadarParameter
 from invertwin.cli.schema.recording import Chirps, Impairments, Raw
 from invertwin.cli.schema.section import Section, Seed, fail
 from invertwin.cli.schema.sensor import Grid, Radar
+from invertwin.cli.schema.stages import Measures, Stage, Variant
 from invertwin.cli.schema.studies import LossScan, Methods
 
 
@@ -66,6 +66,12 @@ class RunFile(Section):
     """how a gradient becomes a step"""
     reconstruct: Reconstruct | None = None
     """the fit"""
+    stages: list[Stage] = []
+    """[[stages]]: parts of the fit, one after another; without them one"""
+    variants: dict[str, Variant] = {}
+    """[variants.<name>]: other ways to fit, to compare"""
+    measures: Measures | None = None
+    """of the found shape"""
     calibration: Calibration | None = None
     """before the fit"""
     landscape: Landscape | None = None
@@ -90,15 +96,42 @@ class RunFile(Section):
                     )
         return self
 
+    @model_validator(mode="after")
+    def _parameters_are_named(self) -> "RunFile":
+        known = self.parameter_names
+        doubled = next((name for name in known if known.count(name) > 1), None)
+        staged = [("stages", self.stages)]
+        for name, variant in self.variants.items():
+            staged.append((f"variants.{name}.stages", variant.stages or []))
+            _named(variant.parameters or [], known, f"variants.{name}.parameters")
+        for path, stages in staged:
+            for i, stage in enumerate(stages):
+                _named(stage.parameters, known, f"{path}[{i}].parameters")
+        if doubled and (self.stages or self.variants):
+            fail(f'expected parameters of different names, got "{doubled}" twice; add `name`')
+        return self
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """What stages and variants call the parameters."""
+        return [getattr(p, "name", None) or p.kind for p in self.parameters]
+
     def references(self) -> list[tuple[str, str]]:
         """Where the run file names an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
         for i, parameter in enumerate(self.parameters):
             if not isinstance(parameter, RadarParameter):
                 used.append((f"parameters[{i}].object", parameter.object))
-        for section in ("starts", "landscape", "calibration", "loss_scan"):
+        for section in ("starts", "landscape", "calibration", "loss_scan", "measures"):
             if getattr(self, section) is not None:
                 used.append((f"{section}.object", getattr(self, section).object))
         if self.gradcheck is not None and self.gradcheck.parameter.object is not None:
             used.append(("gradcheck.parameter.object", self.gradcheck.parameter.object))
         return used
+
+
+def _named(used: list[str], known: list[str], path: str) -> None:
+    for name in used:
+        if name not in known:
+            got = f'expected names of parameters ({", ".join(known)}), got "{name}"; correct it'
+            fail(got, path)

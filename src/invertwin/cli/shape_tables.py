@@ -1,0 +1,95 @@
+"""Learned and free shapes of a run file: their meshes, modules, and terms of the loss."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from torch import Tensor, nn
+
+from invertwin.cli import schema
+from invertwin.errors import InputError
+from invertwin.inversion.regularization import Laplacian, Regularizer
+from invertwin.inversion.remeshing import remeshed, signed_distance
+from invertwin.scene import Mesh, Scene
+from invertwin.scene.geometry import (
+    DistanceGrid,
+    LatticeDeformation,
+    LinearShape,
+    NeuralDistance,
+    SmoothVertices,
+    load_vehicle_space,
+)
+from invertwin.scene.parameters import Vertices
+
+
+def shape_mesh(table: schema.Placement) -> Mesh:
+    """The mesh of a learned shape, in the object's frame.
+
+    Raises:
+        InputError: Files are missing, or more coefficients than the space has.
+    """
+    match table:
+        case schema.Vehicle():
+            space = load_vehicle_space(table.folder, table.level)
+            mesh = space.mesh(space.mean.new_tensor(table.coefficients))
+            return mesh if table.max_edge is None else remeshed(mesh, table.max_edge)
+    raise InputError(f"expected a shape, got {type(table).__name__}; add `shape`")
+
+
+def shape_module(table: schema.Parameter, mesh: Mesh, joints: Mapping[str, Tensor]) -> nn.Module:
+    """The module of a shape that is sought, from the object's present mesh.
+
+    Args:
+        table: The parameter.
+        mesh: Of its object.
+        joints: Rotation vectors of bodies by object, from which they start.
+
+    Raises:
+        InputError: A box without volume, files are missing, or too many coordinates.
+    """
+    match table:
+        case schema.VerticesParameter():
+            if table.smooth > 0:
+                return SmoothVertices(table.object, mesh, table.smooth)
+            return Vertices(table.object, len(mesh.vertices))
+        case schema.LatticeParameter():
+            return LatticeDeformation(table.object, table.low, table.high, table.counts)
+        case schema.DistanceGridParameter():
+            distance: Callable[[Tensor], Tensor] = partial(signed_distance, mesh)
+            return DistanceGrid.sampled(table.object, table.low, table.high, table.counts, distance)
+        case schema.NeuralDistanceParameter():
+            return NeuralDistance(
+                table.object,
+                table.low,
+                table.high,
+                table.counts,
+                radius=table.radius,
+                width=table.width,
+                depth=table.depth,
+                frequency=table.frequency,
+            )
+        case schema.ShapeSpaceParameter():
+            space = load_vehicle_space(table.folder, table.level)
+            return LinearShape(table.object, space, table.modes)
+    raise InputError(f"expected a shape, got {table.kind}; choose another kind")
+
+
+def shape_terms(table: schema.Parameter, module: nn.Module, scene: Scene) -> list[Regularizer]:
+    """What keeps a shape that is sought plausible.
+
+    Args:
+        table: The parameter.
+        module: Its module.
+        scene: Where the fit starts.
+    """
+    match table:
+        case schema.VerticesParameter() if table.laplacian > 0:
+            return [Laplacian(scene, table.object, table.laplacian)]
+        case schema.ShapeSpaceParameter() if table.weight > 0:
+            return [partial(_latent_energy, module, table.weight)]
+    return []
+
+
+def _latent_energy(module: nn.Module, weight: float, _scene: Scene) -> Tensor:
+    """½ weight |z|²: minus the logarithm of a normal prior."""
+    latent: Tensor = module.latent  # type: ignore[assignment]
+    return 0.5 * weight * latent.square().sum()
