@@ -214,10 +214,10 @@ def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geom
     shapes = torch.cat([item.mesh.vertices.detach() for item in objects])
     topology = _topology(key, [item.mesh.faces for item in objects], faces, owners, shapes)
     rows, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength)
-    skins = rows["refraction"][face_surface].any(1)
-    for number, name in enumerate(scene.objects):
+    skins = rows["refraction"].any(1)
+    for number, name in enumerate(scene.objects) if bool(skins.any()) else ():
         own = topology.face_object == number
-        if bool(skins[own].any()):
+        if bool(skins[face_surface[own]].any()):
             _require_solid(
                 name, vertices.detach()[topology.faces[own]], topology.open_objects[number]
             )
@@ -235,7 +235,7 @@ def flatten(scene: Scene, wavelength: float, *, in_motion: bool = False) -> Geom
             free or bool(weights[:, 2].any()),
         ),
         sheets=bool(rows["transmittance"].any()),
-        bodies=bool(rows["refraction"].any()),
+        bodies=bool(skins.any()),
         coherent=tuple(item.material.coherent for item in objects),
         topology=topology,
         velocities=torch.cat([_velocities(item) for item in objects]) if moving else None,
