@@ -157,7 +157,8 @@ def test_starts_in_a_plane_about_one_axis():
     run = read(starts=table)
     assert run.starts is not None
     scene = build.scene(run)
-    for start in build.starts(run.starts, scene, scene, 7):
+    for begun in build.starts(run.starts, scene, scene, 7):
+        start = begun.scene
         assert abs(float(start["box"].center[1])) < 1e-12
         torch.testing.assert_close(start["box"].transform[1, :3], scene["box"].transform[1, :3])
 

@@ -3,10 +3,12 @@
 from collections.abc import Callable, Mapping
 from functools import partial
 
+import torch
 from torch import Tensor, nn
 
 from invertwin.cli import schema
 from invertwin.errors import InputError
+from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
 from invertwin.scene import Mesh, Scene
@@ -15,7 +17,9 @@ from invertwin.scene.geometry import (
     LatticeDeformation,
     LinearShape,
     NeuralDistance,
+    PriorShape,
     SmoothVertices,
+    load_prior,
     load_vehicle_space,
 )
 from invertwin.scene.parameters import Vertices
@@ -32,6 +36,10 @@ def shape_mesh(table: schema.Placement) -> Mesh:
             space = load_vehicle_space(table.folder, table.level)
             mesh = space.mesh(space.mean.new_tensor(table.coefficients))
             return mesh if table.max_edge is None else remeshed(mesh, table.max_edge)
+        case schema.Learned():
+            prior = load_prior(table.prior)
+            latent = torch.zeros(prior.latent_size, dtype=torch.float64)
+            return prior.mesh(latent if table.latent is None else latent.new_tensor(table.latent))
     raise InputError(f"expected a shape, got {type(table).__name__}; add `shape`")
 
 
@@ -70,6 +78,8 @@ def shape_module(table: schema.Parameter, mesh: Mesh, joints: Mapping[str, Tenso
         case schema.ShapeSpaceParameter():
             space = load_vehicle_space(table.folder, table.level)
             return LinearShape(table.object, space, table.modes)
+        case schema.PriorParameter():
+            return PriorShape(table.object, load_prior(table.file), counts=table.counts)
     raise InputError(f"expected a shape, got {table.kind}; choose another kind")
 
 
@@ -84,12 +94,6 @@ def shape_terms(table: schema.Parameter, module: nn.Module, scene: Scene) -> lis
     match table:
         case schema.VerticesParameter() if table.laplacian > 0:
             return [Laplacian(scene, table.object, table.laplacian)]
-        case schema.ShapeSpaceParameter() if table.weight > 0:
-            return [partial(_latent_energy, module, table.weight)]
+        case schema.ShapeSpaceParameter() | schema.PriorParameter() if table.weight > 0:
+            return [LatentNorm(module, table.weight)]
     return []
-
-
-def _latent_energy(module: nn.Module, weight: float, _scene: Scene) -> Tensor:
-    """½ weight |z|²: minus the logarithm of a normal prior."""
-    latent: Tensor = module.latent  # type: ignore[assignment]
-    return 0.5 * weight * latent.square().sum()

@@ -36,6 +36,13 @@ def shape_label(key: str) -> str:
     return text + ending + (", start" if key.startswith("start_") else "")
 
 
+def short_label(key: str) -> str:
+    """A measure as the head of a narrow column."""
+    if key.startswith("fscore"):
+        return f"F {key.removeprefix('fscore_').removesuffix('cm')} cm"
+    return {"chamfer_m": "Chamfer [m]", "iou": "IoU", "normal_consistency": "normals"}.get(key, key)
+
+
 def shape_scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     """Measures of the found shape, whole and as far as some radar position sees it.
 

@@ -104,35 +104,39 @@ def sought_objects(run: RunFile) -> list[str]:
 
 
 def varied(problem: Problem, mode: str) -> Problem:
-    """The problem of a mode: the run's own, without boundary terms, or a variant."""
+    """The problem of a mode: the run's own, without boundary terms, or a variant.
+
+    Its run file holds the parameters of this fit only.
+    """
     run = problem.run
-    if mode == FULL:
-        return problem
-    wanted = Variant(boundary=False) if mode == INTERIOR else run.variants[mode]
+    wanted = Variant() if mode == FULL else Variant(boundary=False)
+    if mode not in (FULL, INTERIOR):
+        wanted = run.variants[mode]
     given = wanted.model_dump(exclude_none=True)
     changes: dict[str, Any] = {}
-    if wanted.stages is not None:
-        changes["stages"] = wanted.stages
-    if wanted.parameters is not None:
-        tables = build.named(run.parameters)
-        changes["parameters"] = [tables[name] for name in tables if name in wanted.parameters]
+    stages = run.stages if wanted.stages is None else wanted.stages
+    names = wanted.parameters or need(run, "reconstruct", "reconstruct").parameters
+    tables = build.named(run.parameters)
+    if stages and all(stage.parameters for stage in stages):
+        staged = {name for stage in stages for name in stage.parameters}
+        names = [name for name in staged if name in (names or tables)]
+    kept = {name: table for name, table in tables.items() if name in (names or tables)}
     if wanted.smooth is not None:
-        changes["parameters"] = [
-            table.model_copy(update={"smooth": wanted.smooth})
-            if isinstance(table, VerticesParameter)
-            else table
-            for table in changes.get("parameters", run.parameters)
-        ]
-    if "parameters" in changes and wanted.stages is None:
-        kept = build.named(changes["parameters"])
-        changes["stages"] = [
-            stage.model_copy(update={"parameters": [n for n in stage.parameters if n in kept]})
-            for stage in run.stages
-            if not stage.parameters or any(name in kept for name in stage.parameters)
-        ]
+        smooth = {"smooth": wanted.smooth}
+        for name, table in kept.items():
+            if isinstance(table, VerticesParameter):
+                kept[name] = table.model_copy(update=smooth)
+    changes["parameters"] = list(kept.values())
+    # Stages seek what the fit has; one that has nothing left to seek falls out.
+    changes["stages"] = [
+        stage.model_copy(update={"parameters": [n for n in stage.parameters if n in kept]})
+        for stage in stages
+        if not stage.parameters or any(name in kept for name in stage.parameters)
+    ]
     for section in ("reconstruct", "optimizer", "surrogate"):
         table = getattr(run, section)
-        update = {key: value for key, value in given.items() if key in type(table).model_fields}
+        keys = set(type(table).model_fields) - {"parameters"}
+        update = {key: value for key, value in given.items() if key in keys}
         changes[section] = table.model_copy(update=update)
     return replace(problem, run=run.model_copy(update=changes))
 

@@ -7,7 +7,7 @@ from typing import Any, get_args
 import torch
 
 from invertwin.cli import build, pictures
-from invertwin.cli.fits.likeness import is_shape_key, shape_label
+from invertwin.cli.fits.likeness import is_shape_key, shape_label, short_label
 from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, annealed_until, sought_objects
 from invertwin.cli.report import Again, Picture, Table, report_html, shown
 from invertwin.cli.run_file import need, to_toml
@@ -103,19 +103,24 @@ def tables_of(
     tables.append(Table("Parameters", ["parameter", "start", "result", "truth"], cells))
     units = {"translation": " [m]", "rotation": " [rad, rotation vector]", "scale": " [factor]"}
     moves = [[k + units.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
-    tables.append(Table("Moves from the start", ["parameter", "value"], moves))
+    if moves:
+        tables.append(Table("Moves from the start", ["parameter", "value"], moves))
     return tables
 
 
 def _variants(rows: dict[str, list[dict[str, Any]]]) -> Table:
     """What each way to fit has made of the shape, means over the starts."""
     first = next(iter(rows.values()))[0]
-    keys = [k for k in first if is_shape_key(k) and not k.startswith("start_")]
-    cells = [["start", *(first.get(f"start_{key}") for key in keys)]]
+    keys = [
+        key.removeprefix("start_")
+        for key in first
+        if key.startswith("start_") and is_shape_key(key)
+    ]
+    cells = [["start", *(first[f"start_{key}"] for key in keys)]]
     for mode, fits in rows.items():
         means = [[row[key] for row in fits if key in row] for key in keys]
         cells.append([_mode(mode), *(sum(v) / len(v) if v else None for v in means)])
-    return Table("Ways to fit", ["fit", *(shape_label(key) for key in keys)], cells)
+    return Table("Ways to fit", ["fit", *(short_label(key) for key in keys)], cells)
 
 
 def _mode(mode: str) -> str:

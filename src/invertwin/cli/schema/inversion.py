@@ -190,6 +190,8 @@ class Optimizer(Section):
 class Reconstruct(Section):
     steps: Count
     """budget"""
+    parameters: list[str] = []
+    """names of what is sought, where variants seek other things; empty = all"""
     depth: Depth = 3
     """most bounces of a path"""
     samples: Count = 400_000

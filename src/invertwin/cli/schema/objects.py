@@ -234,6 +234,16 @@ class Vehicle(Placement):
     """m, longest edge of the mesh; without it as in the file"""
 
 
+class Learned(Placement):
+    """A car of the learned prior: x ahead, y to the left, z up, on the ground z = 0."""
+
+    shape: Literal["prior"]
+    latent: list[float] | None = None
+    """coordinates; without them the mean car"""
+    prior: InputPath | None = None
+    """file that `invertwin train-prior` wrote; without it the prior of the package"""
+
+
 class File(Placement):
     """A mesh file: OBJ, PLY, STL or glTF."""
 
@@ -249,6 +259,7 @@ Part = Annotated[
     | Annotated[Trihedral, Tag(TAG_MARK + "trihedral")]
     | Annotated[Text, Tag(TAG_MARK + "text")]
     | Annotated[Vehicle, Tag(TAG_MARK + "vehicle")]
+    | Annotated[Learned, Tag(TAG_MARK + "prior")]
     | Annotated[File, Tag(TAG_MARK + "file")],
     tag_by("shape", "parts", "file"),
 ]
@@ -298,6 +309,10 @@ class VehicleObject(Vehicle, Body):
     pass
 
 
+class LearnedObject(Learned, Body):
+    pass
+
+
 class FileObject(File, Body):
     pass
 
@@ -314,6 +329,7 @@ SceneObject = Annotated[
     | Annotated[TrihedralObject, Tag(TAG_MARK + "trihedral")]
     | Annotated[TextObject, Tag(TAG_MARK + "text")]
     | Annotated[VehicleObject, Tag(TAG_MARK + "vehicle")]
+    | Annotated[LearnedObject, Tag(TAG_MARK + "prior")]
     | Annotated[FileObject, Tag(TAG_MARK + "file")]
     | Annotated[PartsObject, Tag(TAG_MARK + "parts")],
     tag_by("shape", "parts", "file"),

@@ -17,6 +17,8 @@ from invertwin.cli.schema.section import (
     tag_by,
 )
 
+_Counts = Annotated[list[Annotated[int, Field(ge=2)]], Field(min_length=3, max_length=3)]
+
 
 class Named(Section):
     """What every parameter may have."""
@@ -69,7 +71,7 @@ class _BoxParameter(ObjectParameter):
     """corner of the box, in the object's frame [m]"""
     high: Vector
     """the opposite corner [m]"""
-    counts: Annotated[list[Annotated[int, Field(ge=2)]], Field(min_length=3, max_length=3)]
+    counts: _Counts
     """nodes along x, y and z"""
 
 
@@ -129,6 +131,18 @@ MaterialValue = Literal[
 ]
 
 
+class PriorParameter(ObjectParameter):
+    """Coordinates of the learned prior of vehicles, from the mean car."""
+
+    kind: Literal["prior"]
+    weight: NonNegative = 0.0
+    """of ½ Σ z²"""
+    file: InputPath | None = None
+    """that `invertwin train-prior` wrote; without it the prior of the package"""
+    counts: _Counts | None = None
+    """nodes along x, y and z at which it is meshed; without it every 0.1 m or so"""
+
+
 class MaterialParameter(ObjectParameter):
     """Material values that are sought, from the values of the scene table."""
 
@@ -151,6 +165,7 @@ Parameter = Annotated[
     | Annotated[LatticeParameter, Tag(TAG_MARK + "lattice")]
     | Annotated[DistanceGridParameter, Tag(TAG_MARK + "distance_grid")]
     | Annotated[NeuralDistanceParameter, Tag(TAG_MARK + "neural_distance")]
+    | Annotated[PriorParameter, Tag(TAG_MARK + "prior")]
     | Annotated[ShapeSpaceParameter, Tag(TAG_MARK + "shape_space")]
     | Annotated[MaterialParameter, Tag(TAG_MARK + "material")]
     | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")]

@@ -104,6 +104,8 @@ class RunFile(Section):
         for name, variant in self.variants.items():
             staged.append((f"variants.{name}.stages", variant.stages or []))
             _named(variant.parameters or [], known, f"variants.{name}.parameters")
+        if self.reconstruct is not None:
+            _named(self.reconstruct.parameters, known, "reconstruct.parameters")
         for path, stages in staged:
             for i, stage in enumerate(stages):
                 _named(stage.parameters, known, f"{path}[{i}].parameters")
