@@ -86,48 +86,95 @@ class SpectrumLoss:
                 f"expected maps of one shape, got {tuple(simulated.shape)} and "
                 f"{tuple(measured.shape)}; use one grid for both"
             )
-        scale = measured.detach().abs().mean()
-        if not scale > 0:
+        if not measured.detach().abs().mean() > 0:
             raise InputError("expected a measured map with power in it, got zeros; check the grid")
-        unit = simulated.detach().abs().mean()
-        unit = torch.where(unit > 0, unit, 1.0) if self.gain == "fitted" else scale
-        pairs = []
-        a, b = simulated / unit, measured.to(simulated) / scale
-        for level in range(self.levels):
-            if level:
-                a, b = _pooled(a), _pooled(b)
-            pairs.append((a, b))
+        pairs = self._pyramid(simulated, measured)
         if self.kind == "likelihood":
             return self._divergence(pairs)
         return self._error([(self._cleared(a), self._cleared(b)) for a, b in pairs])
 
-    def _error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-        norms = [b.detach().square().mean().clamp_min(1e-30) for _, b in pairs]
-        gain = 1.0
-        if self.gain == "fitted":
-            with torch.no_grad():
+    def curvature(
+        self,
+        simulated: Float[Tensor, "frame range u v"],
+        measured: Float[Tensor, "frame range u v"],
+        tangents: Float[Tensor, "p frame range u v"],
+    ) -> Float[Tensor, "p p"]:
+        """The Gauss–Newton matrix of the loss: its second derivatives but for those of the map.
+
+        Along ``tangents``, the derivatives of the simulated map by p parameters. Under ``mse`` it
+        is twice the matrix of squared residuals, under ``likelihood`` the Fisher information of
+        the speckle. A fitted gain is eliminated: what it can explain tells nothing about the
+        parameters.
+        """
+        pairs = self._pyramid(simulated.detach(), measured)
+        # A map's own derivative by the logarithm of the gain is the map.
+        directions = torch.cat([tangents, simulated.detach()[None].to(tangents)])
+        moved = [self._pyramid(direction, measured, like=simulated) for direction in directions]
+        if self.kind == "mse":
+            pairs = [(self._cleared(a), self._cleared(b)) for a, b in pairs]
+            moved = [[(self._cleared(a), b) for a, b in levels] for levels in moved]
+        gain = self._gain(pairs)
+        total = tangents.new_zeros(len(directions), len(directions), dtype=torch.float64)
+        for level, (a, b) in enumerate(pairs):
+            rows = torch.stack([levels[level][0] for levels in moved]).flatten(1).double()
+            if self.kind == "mse":
+                weight = 2 * gain**2 / b.square().mean().clamp_min(1e-30)
+            else:
+                inside = (a > 0).flatten()
+                rows = rows * inside * gain / (gain * a.clamp_min(0.0) + self.floor).flatten()
+                weight = 1.0
+            total = total + weight * (rows @ rows.T) / (rows.shape[1] * len(pairs))
+        own, mixed = total[:-1, :-1], total[:-1, -1:]
+        if self.gain == "fitted" and float(total[-1, -1]) > 0:
+            own = own - mixed @ mixed.T / total[-1, -1]
+        return own
+
+    def _pyramid(
+        self, simulated: Tensor, measured: Tensor, like: Tensor | None = None
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Both maps at all resolutions, in units near one; ``like`` gives the simulated one's."""
+        scale = measured.detach().abs().mean()
+        unit = (simulated if like is None else like).detach().abs().mean()
+        unit = torch.where(unit > 0, unit, 1.0) if self.gain == "fitted" else scale
+        pairs = [(simulated / unit, measured.to(simulated) / scale)]
+        for _ in range(1, self.levels):
+            pairs.append((_pooled(pairs[-1][0]), _pooled(pairs[-1][1])))
+        return pairs
+
+    def _gain(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
+        """The gain that minimises the loss."""
+        gain = torch.ones(())
+        if self.gain == "one":
+            return gain
+        with torch.no_grad():
+            if self.kind == "mse":
+                norms = [b.square().mean().clamp_min(1e-30) for _, b in pairs]
                 both = list(zip(pairs, norms, strict=True))
-                mixed = sum((a * b).mean() / n for (a, b), n in both)
-                power = sum((a * a).mean() / n for (a, _), n in both)
-                gain = (mixed / power.clamp_min(1e-30)).clamp_min(0.0)  # type: ignore[union-attr]
+                mixed = torch.stack([(a * b).mean() / n for (a, b), n in both]).sum()
+                power = torch.stack([(a * a).mean() / n for (a, _), n in both]).sum()
+                return (mixed / power.clamp_min(1e-30)).clamp_min(0.0)
+            for _ in range(_GAIN_STEPS):
+                up, down = torch.zeros(()), torch.zeros(())
+                for a, b in pairs:
+                    lit = a.clamp_min(0.0)
+                    model = gain * lit + self.floor
+                    up = up + (lit * (b.clamp_min(0.0) + self.floor) / model.square()).mean()
+                    down = down + (lit / model).mean()
+                gain = gain * (up / down.clamp_min(1e-30))
+        return gain
+
+    def _error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
+        gain = self._gain(pairs)
+        norms = [b.detach().square().mean().clamp_min(1e-30) for _, b in pairs]
         terms = [(gain * a - b).square().mean() / n for (a, b), n in zip(pairs, norms, strict=True)]
         return torch.stack(terms).mean()
 
     def _divergence(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-        positive = [(a.clamp_min(0.0), b.clamp_min(0.0) + self.floor) for a, b in pairs]
-        gain = torch.ones(())
-        if self.gain == "fitted":
-            with torch.no_grad():
-                for _ in range(_GAIN_STEPS):
-                    up, down = torch.zeros(()), torch.zeros(())
-                    for a, b in positive:
-                        model = gain * a + self.floor
-                        up = up + (a * b / model.square()).mean()
-                        down = down + (a / model).mean()
-                    gain = gain * (up / down.clamp_min(1e-30))
+        gain = self._gain(pairs)
         terms = []
-        for a, b in positive:
-            ratio = b / (gain * a + self.floor)
+        for a, b in pairs:
+            lit, data = a.clamp_min(0.0), b.clamp_min(0.0) + self.floor
+            ratio = data / (gain * lit + self.floor)
             terms.append((ratio - ratio.log() - 1).mean())
         return torch.stack(terms).mean()
 

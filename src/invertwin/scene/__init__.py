@@ -28,9 +28,11 @@ from invertwin.scene.geometry import (
     car_distance,
     car_mesh,
     iso_surface,
+    load_anny,
     load_prior,
     load_smpl,
     load_vehicle_space,
+    person,
     sample_car,
 )
 from invertwin.scene.material import (
@@ -139,6 +141,7 @@ __all__ = [
     "fresnel_transmittance",
     "iso_surface",
     "linear_array",
+    "load_anny",
     "load_mesh",
     "load_prior",
     "load_scene_xml",
@@ -147,6 +150,7 @@ __all__ = [
     "lobe_exponent",
     "lobe_integral",
     "look_at",
+    "person",
     "planar_array",
     "plate",
     "quaternion_from_vector",

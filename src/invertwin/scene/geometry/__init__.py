@@ -1,5 +1,6 @@
 """Shapes that can be fitted: modules that map a scene to a scene with another mesh."""
 
+from invertwin.scene.geometry.anny_body import load_anny
 from invertwin.scene.geometry.body import (
     BodyTemplate,
     SkinnedBody,
@@ -11,6 +12,7 @@ from invertwin.scene.geometry.density import DensityGrid
 from invertwin.scene.geometry.distance import DistanceGrid, NeuralDistance
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.geometry.person import person
 from invertwin.scene.geometry.prior import PriorShape, ShapePrior, load_prior
 from invertwin.scene.geometry.shape_space import LinearShape, ShapeSpace, load_vehicle_space
 from invertwin.scene.geometry.smooth_vertices import SmoothVertices
@@ -34,8 +36,10 @@ __all__ = [
     "car_distance",
     "car_mesh",
     "iso_surface",
+    "load_anny",
     "load_prior",
     "load_smpl",
     "load_vehicle_space",
+    "person",
     "sample_car",
 ]

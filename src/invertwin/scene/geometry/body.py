@@ -1,6 +1,6 @@
 """Bodies with joints: rigid parts or skin that follows a tree of them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,10 +32,11 @@ class BodyTemplate:
         joint_directions: how the joints follow them [m].
         pose_directions: how the rest positions follow the rotations, last axis the elements of
             R − I of all joints but the root's, row by row; None does not follow.
+        names: of the joints; empty where they have none.
 
     Raises:
         InputError: shapes that do not fit together, NaN, weights that are negative or do not add
-            up to 1, or parents that are not a tree.
+            up to 1, parents that are not a tree, or names that are not one for each joint.
     """
 
     vertices: Float64[Tensor, "v 3"]
@@ -46,6 +47,7 @@ class BodyTemplate:
     shape_directions: Float64[Tensor, "v 3 n"] | None = None
     joint_directions: Float64[Tensor, "j 3 n"] | None = None
     pose_directions: Float64[Tensor, "v 3 p"] | None = None
+    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         mesh = Mesh(self.vertices, self.faces)
@@ -70,6 +72,11 @@ class BodyTemplate:
         set_(self, "weights", weights / weights.sum(1, keepdim=True))
         set_(self, "parents", parents)
         set_(self, "joints", checked_tensor(self.joints, (count, 3), "joints [m]", _DO))
+        if self.names and (len(self.names) != count or len(set(self.names)) != count):
+            raise InputError(
+                f"expected a name of its own for each of {count} joints, got {len(self.names)} "
+                f"names, {len(set(self.names))} of them different; give one each or none"
+            )
         if (self.shape_directions is None) != (self.joint_directions is None):
             raise InputError(
                 "expected shape directions of vertices and of joints, got one of them; give both"
@@ -92,6 +99,39 @@ class BodyTemplate:
     def shape_count(self) -> int:
         """Number of shape coordinates."""
         return 0 if self.shape_directions is None else self.shape_directions.shape[2]
+
+    def joint(self, name: str | int) -> int:
+        """Number of a joint, given its name or its number.
+
+        Raises:
+            InputError: no such joint.
+        """
+        if isinstance(name, str):
+            if name not in self.names:
+                known = ", ".join(self.names) or "none: this template's joints have numbers only"
+                raise InputError(f"expected a joint among {known}, got {name!r}; choose one")
+            return self.names.index(name)
+        if not 0 <= name < len(self.parents):
+            raise InputError(
+                f"expected joints in [0, {len(self.parents) - 1}], got {name}; "
+                "count the template's from 0"
+            )
+        return name
+
+    def rotations(self, turns: Mapping[str, ArrayLike]) -> Float64[Tensor, "j 3"]:
+        """Rotation vectors of all joints, given those of some by name; the others are at rest.
+
+        Args:
+            turns: rotation vectors in the frame of the joint's parent (rad).
+
+        Raises:
+            InputError: no such joint, or not three finite numbers.
+        """
+        found = torch.zeros(len(self.parents), 3, dtype=torch.float64)
+        for name, turn in turns.items():
+            what = f"rotation of {name} [rad]"
+            found[self.joint(name)] = checked_tensor(turn, (3,), what, "give x, y and z")
+        return found
 
     def posed(
         self, rotations: Float64[Tensor, "j 3 3"], shape: Float64[Tensor, " n"] | None = None
@@ -139,7 +179,7 @@ class SkinnedBody(nn.Module):
         template: BodyTemplate,
         rotation: ArrayLike | None = None,
         shape: ArrayLike | None = None,
-        sought: Sequence[int] | None = None,
+        sought: Sequence[str | int] | Mapping[str, str] | None = None,
     ) -> None:
         """Shape `object` by a body, from these joint angles at the start.
 
@@ -148,10 +188,13 @@ class SkinnedBody(nn.Module):
             template: the body.
             rotation: rotation vectors [j, 3] (rad); None is the rest pose.
             shape: shape coordinates [n]; None is zero.
-            sought: joints that the fit may turn; None is all.
+            sought: joints that the fit may turn, by name or number, or a mapping from their names
+                to the components of the rotation vector that it may change, such as "y" for an
+                elbow; None is all.
 
         Raises:
-            InputError: wrong shapes, NaN, or a joint that the template does not have.
+            InputError: wrong shapes, NaN, a joint that the template does not have, or axes that
+                are not some of x, y and z.
         """
         super().__init__()
         self.object, self.template = object, template
@@ -161,13 +204,10 @@ class SkinnedBody(nn.Module):
         given = torch.zeros(shapes) if shape is None else shape
         given = checked_tensor(given, (shapes,), "shape coordinates", "give the template's")
         chosen = range(count) if sought is None else sought
-        wrong = [k for k in chosen if not 0 <= k < count]
-        if wrong:
-            raise InputError(
-                f"expected joints in [0, {count - 1}], got {wrong}; count the template's from 0"
-            )
-        self._sought = torch.zeros(count, 1, dtype=torch.float64)
-        self._sought[list(chosen)] = 1.0
+        free = chosen if isinstance(chosen, Mapping) else dict.fromkeys(chosen, "xyz")
+        self._sought = torch.zeros(count, 3, dtype=torch.float64)
+        for name, axes in free.items():
+            self._sought[template.joint(name)] = _axes_mask(axes)
         self.rotation = nn.Parameter(turns.detach().clone())
         self.shape = nn.Parameter(given.detach().clone(), requires_grad=shapes > 0)
 
@@ -181,8 +221,12 @@ class SkinnedBody(nn.Module):
         return self._posed()[1]
 
     def values(self) -> dict[str, Tensor]:
-        """Joint rotations [rad] and shape coordinates by name, for progress and reports."""
-        named = {f"{self.object}.joint_rotation": self.rotation.detach().clone()}
+        """Rotations of the joints that are sought [rad] and shape coordinates, by name."""
+        turns = self.rotation.detach().clone()
+        named = {f"{self.object}.joint_rotation": turns}
+        if self.template.names:
+            free = [int(joint) for joint in self._sought.any(1).nonzero()[:, 0]]
+            named = {f"{self.object}.{self.template.names[joint]}": turns[joint] for joint in free}
         if self.template.shape_count:
             named[f"{self.object}.shape"] = self.shape.detach().clone()
         return named
@@ -191,6 +235,13 @@ class SkinnedBody(nn.Module):
         free = self.rotation * self._sought + self.rotation.detach() * (1 - self._sought)
         rotations = torch.stack([rotation_from_vector(vector) for vector in free])
         return self.template.posed(rotations, self.shape)
+
+
+def _axes_mask(axes: str) -> Tensor:
+    """1 for the axes that are named, 0 for the others."""
+    if not axes or set(axes) - set("xyz"):
+        raise InputError(f"expected axes among x, y and z, got {axes!r}; write them as 'xy'")
+    return torch.tensor([float(axis in axes) for axis in "xyz"], dtype=torch.float64)
 
 
 def articulated_template(

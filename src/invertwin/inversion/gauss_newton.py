@@ -1,0 +1,211 @@
+"""Gauss–Newton for few parameters: one derivative of the map in forward mode for each."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+from jaxtyping import Bool, Float64
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.inversion.loss import SpectrumLoss
+
+Maps = Callable[[], tuple[Tensor, Tensor]]
+
+_MOST = 64  # parameters; each costs a derivative of the map per step
+_TRIES = 4  # dampings of one step
+_EASE, _STRAIN = 0.3, 4.0  # of the damping after a step that helped, and after one that did not
+_LEAST, _LARGEST = 1e-4, 1e6  # of the damping
+_FLAT = 1e-9  # of the largest curvature: below it a parameter does nothing
+
+
+class GaussNewton:
+    """Levenberg–Marquardt steps on the loss of power maps.
+
+    The step d solves ``(H + μ diag H) d = −g``: g the gradient of the loss with all its terms, in
+    reverse mode; H the loss's Gauss–Newton matrix from derivatives of the map by every single
+    parameter, in forward mode, silhouettes included. A step that does not lower the loss, on the
+    same samples, is taken back and tried again with more damping μ.
+
+    Attributes:
+        damping: present μ.
+
+    Source: the Levenberg–Marquardt method.
+    Differs from the source: g and H are estimates from samples; no step is longer than ``reach``.
+    """
+
+    def __init__(
+        self,
+        modules: nn.Module,
+        loss: SpectrumLoss,
+        *,
+        reach: float = 0.3,
+        damping: float = 0.01,
+    ) -> None:
+        """Fit the parameters of `modules` that require a gradient.
+
+        Args:
+            modules: what is fitted.
+            loss: how maps are compared.
+            reach: the longest change of one parameter in a step, in its unit.
+            damping: μ at the first step.
+
+        Raises:
+            InputError: no parameters, more than 64, another loss, or a reach or damping that is
+                not positive.
+        """
+        self._slots = [
+            (module, name, parameter)
+            for module in modules.modules()
+            for name, parameter in module.named_parameters(recurse=False)
+            if parameter.requires_grad
+        ]
+        if not isinstance(loss, SpectrumLoss):
+            raise InputError(
+                f"expected a SpectrumLoss, got {type(loss).__name__}; "
+                "Gauss–Newton needs its second derivatives"
+            )
+        if not self._slots or not (reach > 0 and damping > 0):
+            raise InputError(
+                f"expected parameters to fit, reach > 0 and damping > 0, got {len(self._slots)}, "
+                f"{reach} and {damping}; a reach of 0.3 suits metres and radians"
+            )
+        self.loss, self.reach, self.damping = loss, reach, damping
+
+    def step(self, maps: Maps, penalty: Callable[[], Tensor] | None = None) -> float:
+        """One step, and the loss before it.
+
+        Args:
+            maps: → simulated and measured map under the present parameters; the same samples each
+                time it is called within one step.
+            penalty: → a differentiable term added to the loss, such as that of a regulariser. It
+                takes part in g, and by its own second derivatives in H.
+
+        Raises:
+            InputError: a map that is not finite, or more than 64 parameters that matter.
+        """
+        parameters = [parameter for _, _, parameter in self._slots]
+        simulated, measured = maps()
+        value = self.loss(simulated, measured)
+        if penalty is not None:
+            value = value + penalty()
+        found = torch.autograd.grad(value, parameters, allow_unused=True)
+        slope = _flat(found, parameters)
+        before = float(value.detach())
+        if not bool(torch.isfinite(slope).all()) or before != before:
+            return float("nan")
+        # Along a parameter that the module holds fixed, the derivative is zero to the last bit.
+        free = slope != 0
+        if int(free.sum()) > _MOST:
+            raise InputError(
+                f"expected at most {_MOST} parameters for Gauss–Newton, got {int(free.sum())}; "
+                "use adam for many"
+            )
+        if not bool(free.any()):
+            return before
+        curvature = self._curvature(maps, simulated.detach(), measured, free)
+        if penalty is not None:
+            curvature = curvature + _penalty_curvature(penalty, parameters, free)
+        start = [parameter.detach().clone() for parameter in parameters]
+        for _ in range(_TRIES):
+            self._move(start, self._solved(curvature, slope[free]), free)
+            with torch.no_grad():
+                after = float(self.loss(*maps()))
+                if penalty is not None:
+                    after += float(penalty())
+            if after < before:
+                self.damping = max(self.damping * _EASE, _LEAST)
+                return before
+            self.damping = min(self.damping * _STRAIN, _LARGEST)
+        self._move(start, torch.zeros(int(free.sum()), dtype=torch.float64), free)
+        return before
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint needs besides the parameters."""
+        return {"damping": self.damping}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` gave."""
+        self.damping = float(state["damping"])
+
+    def zero_grad(self) -> None:
+        """Nothing: gradients are not kept in the parameters."""
+
+    def _solved(self, curvature: Tensor, slope: Tensor) -> Float64[Tensor, " p"]:
+        scale = curvature.diagonal().clamp_min(_FLAT * float(curvature.diagonal().max()))
+        change = -torch.linalg.solve(curvature + torch.diag(self.damping * scale), slope)
+        return change * min(1.0, self.reach / float(change.abs().max().clamp_min(1e-300)))
+
+    def _move(self, start: list[Tensor], change: Tensor, free: Tensor) -> None:
+        """Set the parameters to where they were, plus a change of the free ones."""
+        whole = torch.zeros(free.shape, dtype=torch.float64)
+        whole[free] = change
+        with torch.no_grad():
+            parts = whole.split([value.numel() for value in start])
+            for (_, _, parameter), value, part in zip(self._slots, start, parts, strict=True):
+                parameter.copy_(value + part.reshape(value.shape).to(value))
+
+    def _curvature(
+        self, maps: Maps, simulated: Tensor, measured: Tensor, free: Bool[Tensor, " q"]
+    ) -> Float64[Tensor, "p p"]:
+        tangents = []
+        for index in free.nonzero()[:, 0].tolist():
+            with forward_ad.dual_level(), self._along(index):
+                tangent = forward_ad.unpack_dual(maps()[0]).tangent
+            tangents.append(torch.zeros_like(simulated) if tangent is None else tangent)
+        return self.loss.curvature(simulated, measured, torch.stack(tangents))
+
+    @contextmanager
+    def _along(self, index: int) -> Iterator[None]:
+        """Parameters as dual numbers whose tangent is one along a single coordinate."""
+        sizes = [parameter.numel() for _, _, parameter in self._slots]
+        slot = next(k for k in range(len(sizes)) if index < sum(sizes[: k + 1]))
+        module, name, parameter = self._slots[slot]
+        value = parameter.detach()
+        tangent = torch.zeros_like(value)
+        tangent.view(-1)[index - sum(sizes[:slot])] = 1.0
+        delattr(module, name)
+        setattr(module, name, forward_ad.make_dual(value, tangent))
+        try:
+            with torch.no_grad():
+                yield
+        finally:
+            delattr(module, name)
+            setattr(module, name, parameter)
+
+
+def _flat(values: tuple[Tensor | None, ...], like: list[nn.Parameter]) -> Float64[Tensor, " q"]:
+    """Gradients in one row, zeros for those that are not there."""
+    return torch.cat(
+        [
+            (torch.zeros_like(p) if v is None else v).detach().flatten().double()
+            for v, p in zip(values, like, strict=True)
+        ]
+    )
+
+
+def _penalty_curvature(
+    penalty: Callable[[], Tensor], parameters: list[nn.Parameter], free: Bool[Tensor, " q"]
+) -> Float64[Tensor, "p p"]:
+    """Second derivatives of a term of the loss, as far as they are positive."""
+    total = torch.zeros(int(free.sum()), int(free.sum()), dtype=torch.float64)
+    value = penalty()
+    if not value.requires_grad:
+        return total
+    slopes = torch.autograd.grad(value, parameters, create_graph=True, allow_unused=True)
+    row = torch.cat(
+        [
+            (torch.zeros_like(p) if v is None else v).flatten()
+            for v, p in zip(slopes, parameters, strict=True)
+        ]
+    )
+    for k, index in enumerate(free.nonzero()[:, 0].tolist()):
+        if row[index].requires_grad:
+            second = torch.autograd.grad(
+                row[index], parameters, retain_graph=True, allow_unused=True
+            )
+            total[k] = _flat(second, parameters)[free]
+    values, vectors = torch.linalg.eigh((total + total.T) / 2)
+    return vectors @ torch.diag(values.clamp_min(0.0)) @ vectors.T

@@ -1,0 +1,124 @@
+"""A standing person as a skinned body: one closed skin over eleven joints, made of formulas."""
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.scene.checks import checked_number
+from invertwin.scene.geometry.body import BodyTemplate
+from invertwin.scene.geometry.iso_surface import iso_surface
+from invertwin.scene.geometry.lattice import Lattice
+
+# Joints of a person 1.75 m tall who stands with the arms held out, as [m] from the pelvis.
+_JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {
+    "pelvis": (None, (0.0, 0.0, 0.0)),
+    "chest": ("pelvis", (0.0, 0.22, 0.0)),
+    "neck": ("chest", (0.0, 0.52, 0.0)),
+    "left_shoulder": ("chest", (-0.19, 0.45, 0.0)),
+    "left_elbow": ("left_shoulder", (-0.47, 0.45, 0.0)),
+    "right_shoulder": ("chest", (0.19, 0.45, 0.0)),
+    "right_elbow": ("right_shoulder", (0.47, 0.45, 0.0)),
+    "left_hip": ("pelvis", (-0.10, -0.06, 0.0)),
+    "left_knee": ("left_hip", (-0.10, -0.48, 0.0)),
+    "right_hip": ("pelvis", (0.10, -0.06, 0.0)),
+    "right_knee": ("right_hip", (0.10, -0.48, 0.0)),
+}
+# Cones with round ends: joint they belong to, both ends, both radii [m].
+_CONES = [
+    ("pelvis", (-0.06, -0.02, 0.0), (0.06, -0.02, 0.0), 0.115, 0.115),
+    ("pelvis", (0.0, 0.0, 0.0), (0.0, 0.2, 0.0), 0.12, 0.115),
+    ("chest", (0.0, 0.22, 0.0), (0.0, 0.40, 0.0), 0.12, 0.12),
+    ("chest", (-0.13, 0.43, 0.0), (0.13, 0.43, 0.0), 0.075, 0.075),
+    ("neck", (0.0, 0.5, 0.0), (0.0, 0.6, -0.01), 0.055, 0.055),
+    ("neck", (0.0, 0.66, -0.02), (0.0, 0.73, -0.01), 0.085, 0.09),
+]
+_LIMBS = [
+    ("shoulder", (0.19, 0.45, 0.0), (0.47, 0.45, 0.0), 0.06, 0.045),
+    ("elbow", (0.47, 0.45, 0.0), (0.72, 0.45, 0.0), 0.045, 0.033),
+    ("elbow", (0.72, 0.45, 0.0), (0.85, 0.44, -0.01), 0.038, 0.032),
+    ("hip", (0.10, -0.06, 0.0), (0.10, -0.48, 0.0), 0.088, 0.058),
+    ("knee", (0.10, -0.48, 0.0), (0.10, -0.90, 0.0), 0.056, 0.04),
+    ("knee", (0.10, -0.90, 0.02), (0.10, -0.92, -0.16), 0.045, 0.035),
+]
+_FILLET = 0.02  # m, over which parts run into each other
+_BLEND = 0.03  # m, over which the skin passes from one joint to the next
+_TALL = 1.75  # m
+
+
+def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
+    """A person who faces −z, y up, arms held out along ±x, in the frame of the pelvis.
+
+    One closed skin around tapered cylinders that run into each other; its weights pass smoothly
+    from joint to joint. The joints are pelvis, chest, neck, and shoulder, elbow, hip and knee of
+    both sides, ``left_`` at −x; their axes are those of the object in the rest pose: elbows bend
+    about y, knees about x.
+
+    Args:
+        height: [m].
+        spacing: of the triangles' corners [m].
+
+    Raises:
+        InputError: a height or spacing out of range.
+    """
+    tall = checked_number(height, "height [m]", 0.5, 2.5)
+    step = checked_number(spacing, "spacing of the triangles [m]", 0.01, 0.05)
+    low = torch.tensor([-0.93, -1.0, -0.24], dtype=torch.float64)
+    high = torch.tensor([0.93, 0.86, 0.18], dtype=torch.float64)
+    x, y, z = (int(count) for count in ((high - low) * tall / _TALL / step).ceil() + 1)
+    mesh = iso_surface(_distance, Lattice(low, high, (x, y, z)))
+    names = list(_JOINTS)
+    parents = [-1 if parent is None else names.index(parent) for parent, _ in _JOINTS.values()]
+    joints = torch.tensor([place for _, place in _JOINTS.values()], dtype=torch.float64)
+    size = tall / _TALL
+    return BodyTemplate(
+        mesh.vertices * size,
+        mesh.faces,
+        _weights(mesh.vertices),
+        tuple(parents),
+        joints * size,
+        names=tuple(names),
+    )
+
+
+def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:
+    """All cones: joint, ends, radii."""
+    sided = []
+    for name, start, end, first, last in _LIMBS:
+        for side, sign in (("left", -1.0), ("right", 1.0)):
+            ends = [(sign * place[0], *place[1:]) for place in (start, end)]
+            sided.append((f"{side}_{name}", *ends, first, last))
+    return [
+        (
+            name,
+            torch.tensor(start, dtype=torch.float64),
+            torch.tensor(end, dtype=torch.float64),
+            first,
+            last,
+        )
+        for name, start, end, first, last in [*_CONES, *sided]
+    ]
+
+
+def _cone(
+    points: Tensor, start: Tensor, end: Tensor, first: float, last: float
+) -> Float64[Tensor, " p"]:
+    """About the distance to a cone with round ends, negative inside."""
+    axis = end - start
+    share = ((points - start) @ axis / axis.square().sum()).clamp(0.0, 1.0)
+    return (points - start - share[:, None] * axis).norm(dim=1) - (first + share * (last - first))
+
+
+def _distance(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
+    """About the distance to the skin, negative inside: a soft least distance to the parts."""
+    found = torch.stack([_cone(points, *part[1:]) for part in _parts()])
+    return -_FILLET * torch.logsumexp(-found / _FILLET, dim=0)
+
+
+def _weights(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p j"]:
+    """Share of every joint, by the distances to the parts that hang on it."""
+    parts = _parts()
+    nearest = []
+    for name in _JOINTS:
+        own = [_cone(points, *part[1:]) for part in parts if part[0] == name]
+        nearest.append(torch.stack(own).amin(0))
+    return torch.softmax(-torch.stack(nearest, dim=1) / (_BLEND / 2), dim=1)
