@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -51,9 +52,12 @@ def reconstruct_in_stages(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     seed: int = 0,
+    progress: Callable[[dict[str, Any]], None] | None = None,
     **options: Any,
 ) -> Reconstruction:
     """Fit in stages, each a :func:`reconstruct` that goes on from the one before.
+
+    One that diverges keeps its best state, from which the next goes on.
 
     Args:
         scene: Starting scene.
@@ -67,6 +71,7 @@ def reconstruct_in_stages(
         checkpoint: File of the last stage's state; those before have its name and their number.
         resume: Go on from the checkpoints that are there.
         seed: Of the first stage; each later one has the next.
+        progress: Called with every row of the history.
         options: Of every stage's :func:`reconstruct`.
 
     Returns:
@@ -122,6 +127,7 @@ def reconstruct_in_stages(
         settings = {**options, **stage.options}
         own = tuple((rates or {}).get(name) for name in modules)
         optimizer = replace(settings.pop("optimizer", None) or Optimizer(), module_rates=own)
+        counted = partial(_counted, len(history), k)
         found = reconstruct(
             scene,
             radar,
@@ -135,14 +141,17 @@ def reconstruct_in_stages(
                 "regularizers": terms,
                 "checkpoint": file,
                 "resume": resume,
+                "progress": progress and (lambda row, of=counted: progress(of(row))),
             },
         )
-        done = len(history)
-        history += [{**row, "step": done + row["step"], "stage": k} for row in found.history]
-        if found.status == "diverged":
-            break
+        history += [counted(row) for row in found.history]
     assert found is not None
     return replace(found, history=history, steps=len(history))
+
+
+def _counted(before: int, stage: int, row: dict[str, Any]) -> dict[str, Any]:
+    """A row of a stage as one of the whole fit."""
+    return {**row, "step": before + row["step"], "stage": stage}
 
 
 def stage_checkpoint(checkpoint: str, stage: int) -> str:

@@ -213,13 +213,9 @@ def _watched(bar: "Bar | None") -> Iterator[Callable[[dict[str, Any]], None] | N
         yield None
         return
     with bar, _interrupted_between_steps() as heed:
-        done = 0
 
         def advance(row: dict[str, Any]) -> None:
-            nonlocal done
-            # A stage counts its own steps from 0; a resumed one goes on where it was.
-            done += 1 if done else row["step"] + 1
-            bar.advance({**row, "step": done - 1})
+            bar.advance(row)
             heed()
 
         yield advance

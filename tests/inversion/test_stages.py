@@ -1,0 +1,122 @@
+"""Stages: who is free when, what is built anew, and that an interruption changes nothing."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from invertwin.errors import InputError
+from invertwin.inversion import Optimizer, reconstruct
+from invertwin.inversion.remeshing import remeshed
+from invertwin.inversion.stages import Stage, reconstruct_in_stages, stage_checkpoint
+from invertwin.scene import Mesh, SmoothVertices
+from invertwin.scene.parameters import Scale, Translation, Vertices
+
+BUILDERS = {"place": lambda _: Translation("plate"), "size": lambda _: Scale("plate")}
+
+
+def fit(case, stages, builders=BUILDERS, **changes):
+    settings = case.settings(**changes)
+    settings.pop("steps")
+    return reconstruct_in_stages(case.scene, case.radar, case.capture, builders, stages, **settings)
+
+
+def test_one_stage_is_a_reconstruction(case):
+    alone = reconstruct(
+        case.scene, case.radar, case.capture, [Translation("plate")], **case.settings(steps=4)
+    )
+    staged = fit(case, [Stage(4)], {"place": BUILDERS["place"]})
+    assert [row["loss"] for row in staged.history] == [row["loss"] for row in alone.history]
+    assert torch.equal(staged.scene["plate"].vertices, alone.scene["plate"].vertices)
+
+
+def test_only_what_a_stage_names_is_free(case):
+    found = fit(case, [Stage(3, ("place",)), Stage(3, ("size",))])
+    first, last = found.history[2]["values"], found.history[5]["values"]
+    assert first["plate.scale"] == pytest.approx(1.0, abs=0)
+    assert last["plate.translation"] == first["plate.translation"]
+    assert first["plate.translation"] != [0.0, 0.0, 0.0]
+    assert last["plate.scale"] != first["plate.scale"]
+    assert [row["stage"] for row in found.history] == [0, 0, 0, 1, 1, 1]
+    assert [row["step"] for row in found.history] == list(range(6))
+
+
+def test_rates_of_parameters_are_their_own(case):
+    optimizer = Optimizer(rate=1e-9, final_rate=1e-9)
+    found = fit(case, [Stage(1)], rates={"size": 1e-2}, optimizer=optimizer)
+    values = found.history[-1]["values"]
+    assert max(map(abs, values["plate.translation"])) < 1e-8
+    assert abs(values["plate.scale"] - 1) > 5e-3
+
+
+def test_a_rebuilt_stage_begins_on_the_twin_so_far(case):
+    builders = {
+        "place": BUILDERS["place"],
+        "shape": lambda scene: Vertices("plate", len(scene["plate"].mesh.vertices)),
+    }
+    before = fit(case, [Stage(3, ("place",))], builders)
+    found = fit(case, [Stage(3, ("place",)), Stage(1, ("shape",), rebuild=True)], builders)
+    assert len(found.parameters) == 1
+    gap = found.scene["plate"].vertices - before.scene["plate"].vertices
+    assert 0 < float(gap.norm(dim=1).max()) <= 0.02 * 3**0.5 + 1e-9  # one step of Adam
+
+
+def test_meshes_are_made_finer_between_stages(case):
+    builders = {"shape": lambda scene: SmoothVertices("plate", scene["plate"].mesh, 5.0)}
+    change = {"plate": partial(remeshed, edge=0.05)}
+    found = fit(case, [Stage(2), Stage(2, remesh=change)], builders)
+    assert len(found.scene["plate"].mesh.faces) > 2 * len(case.scene["plate"].mesh.faces)
+
+
+def test_interrupted_in_the_second_stage_it_ends_the_same(case, tmp_path):
+    stages = [Stage(4, ("place",)), Stage(6, ("place", "size"))]
+    whole = fit(case, stages)
+    file = tmp_path / "fit.pt"
+    done = []
+
+    def stop(row):
+        done.append(row)
+        if len(done) == 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(case, stages, checkpoint=file, checkpoint_every=2, progress=stop)
+    assert (tmp_path / stage_checkpoint("fit.pt", 0)).exists()
+    again = []
+    resumed = fit(case, stages, checkpoint=file, resume=True, progress=again.append)
+    assert [row["step"] for row in again] == [6, 7, 8, 9]  # from the last checkpoint on
+    assert resumed.steps == 10
+    moved = [f.scene["plate"].vertices - case.scene["plate"].vertices for f in (resumed, whole)]
+    assert torch.allclose(*moved, rtol=1e-4, atol=0)
+    finished = fit(case, stages, checkpoint=file, resume=True, progress=again.append)
+    assert len(again) == 4
+    assert torch.equal(finished.scene["plate"].vertices, resumed.scene["plate"].vertices)
+
+
+def test_what_is_watched_joins_the_history(case):
+    def watch(scene):
+        return {"error": float(case.error(scene).norm())}
+
+    found = fit(case, [Stage(4, ("place",))], watch=watch, watch_every=2)
+    assert ["error" in row for row in found.history] == [False, True, False, True]
+    assert found.history[-1]["error"] == watch(found.scene)["error"]
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        ([], "at least one stage, got none"),
+        ([Stage(1, ("shape",))], r"stage 1 \(place, size\), got 'shape'"),
+        ([Stage(1, ("size",)), Stage(1, ("size",), rebuild=True), Stage(1, ("place",))], "rebuild"),
+    ],
+)
+def test_wrong_stages(case, stages, message):
+    with pytest.raises(InputError, match=message):
+        fit(case, stages)
+
+
+def test_the_mesh_of_a_stage_is_plain(case):
+    """Nothing of a stage's graph is kept by the next."""
+    found = fit(case, [Stage(1, ("size",)), Stage(1, ("size",), rebuild=True)])
+    mesh: Mesh = found.scene["plate"].mesh
+    assert not mesh.vertices.requires_grad
