@@ -1,5 +1,7 @@
 """Every parameterisation of shape through the whole map: derivative against differences."""
 
+import copy
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,17 +12,21 @@ from torch.autograd import forward_ad
 
 from invertwin.inversion.gradcheck import gradcheck
 from invertwin.radar import Radar, Surrogate
-from invertwin.scene import Mesh, Scene, box, plate, sphere
+from invertwin.scene import Mesh, Scene, box, plate, rigid, rotation_from_vector, sphere
 from invertwin.scene.geometry import (
     BodyTemplate,
     DistanceGrid,
+    Lattice,
     LatticeDeformation,
     LinearShape,
     NeuralDistance,
+    PriorShape,
+    ShapePrior,
     ShapeSpace,
     SkinnedBody,
     SmoothVertices,
     articulated_template,
+    load_prior,
 )
 from scenes import float64, radar, thing
 
@@ -151,6 +157,33 @@ def neural_distance() -> tuple[Scene, Direction]:
     return module(scene), meshed(module, scene, **{name: change})
 
 
+def small_prior(size: float = 0.13) -> ShapePrior:
+    """The packaged cars as toys."""
+    cars = load_prior()
+    decoder = copy.deepcopy(cars.decoder)
+    decoder.basis.weight.data *= size
+    decoder.basis.bias.data *= size
+    lattice = Lattice.between(size * cars.low, size * cars.high, cars.lattice.counts)
+    return ShapePrior(decoder, lattice)
+
+
+def prior_distance() -> tuple[Scene, Direction]:
+    prior = small_prior()
+    module = PriorShape(
+        "object", prior, 0.5 * noise(torch.Size([prior.latent_size]), 5), (41, 17, 16)
+    )
+    # Seen from its side and a little from its front.
+    start = before_a_wall(box(0.1))
+    turned = rigid(
+        rotation_from_vector(float64([0.0, 0.6, 0.0]))
+        @ rotation_from_vector(float64([-math.pi / 2, 0.0, 0.0])),
+        float64([0.0, -0.1, 1.1]),
+    )
+    scene = start.replace("object", pose=turned)
+    change = 8.0 * noise(torch.Size([prior.latent_size]), 6)
+    return module(scene), meshed(module, scene, latent=change)
+
+
 def latent() -> tuple[Scene, Direction]:
     module = LinearShape("object", space(), [0.1, 0.2])
     return module(before_a_wall(box(0.1))), along(module, latent=float64([5.0, -10.0]))
@@ -181,7 +214,8 @@ def smooth_vertices() -> tuple[Scene, Direction]:
 
 
 CASES = [
-    distance_grid, neural_distance, latent, joint_angle, skinning, lattice, smooth_vertices
+    distance_grid, neural_distance, prior_distance, latent, joint_angle, skinning, lattice,
+    smooth_vertices,
 ]  # fmt: skip
 
 
