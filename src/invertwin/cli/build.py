@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.cli import schema
+from invertwin.cli.bodies import SoughtBody
 from invertwin.cli.materials import fitted, material
 from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import unknown_object
@@ -162,11 +163,11 @@ class Start:
 
     Attributes:
         scene: Objects where they are thought to be.
-        joints: Rotation vectors [j, 3] (rad) of bodies, by object.
+        bodies: Whose joints are sought, by object.
     """
 
     scene: Scene
-    joints: Mapping[str, Tensor] = field(default_factory=dict)
+    bodies: Mapping[str, SoughtBody] = field(default_factory=dict)
 
 
 def builders(tables: Sequence[schema.Parameter], start: Start) -> dict[str, Build]:
@@ -185,14 +186,18 @@ def named(tables: Sequence[schema.Parameter]) -> dict[str, schema.Parameter]:
     return dict(zip(names, tables, strict=True))
 
 
-def parameters(tables: Sequence[schema.Parameter], scene: Scene) -> list[nn.Module]:
+def parameters(
+    tables: Sequence[schema.Parameter],
+    scene: Scene,
+    bodies: Mapping[str, SoughtBody] | None = None,
+) -> list[nn.Module]:
     """The modules of the `[[parameters]]` tables; each starts as the object is, or as it says.
 
     Raises:
         InputError: A material value that the object's material does not have, or that starts at
             the end of its range; a box that does not hold the object.
     """
-    return [make(scene) for make in builders(tables, Start(scene)).values()]
+    return [make(scene) for make in builders(tables, Start(scene, bodies or {})).values()]
 
 
 def _module(table: schema.Parameter, path: str, start: Start, scene: Scene) -> nn.Module:
@@ -210,7 +215,7 @@ def _module(table: schema.Parameter, path: str, start: Start, scene: Scene) -> n
         case schema.RadarParameter():
             return RadarPose()
     with about(path):
-        return shape_module(table, scene[table.object].mesh, start.joints)
+        return shape_module(table, scene[table.object].mesh, start.bodies)
 
 
 def regularizers(
@@ -229,7 +234,13 @@ def regularizers(
     return terms
 
 
-def starts(table: schema.Starts, scene: Scene, truth: Scene, seed: int) -> list[Start]:
+def starts(
+    table: schema.Starts,
+    scene: Scene,
+    truth: Scene,
+    seed: int,
+    bodies: Mapping[str, SoughtBody] | None = None,
+) -> list[Start]:
     """From where the fits of the `[starts]` table start.
 
     Args:
@@ -237,6 +248,7 @@ def starts(table: schema.Starts, scene: Scene, truth: Scene, seed: int) -> list[
         scene: The scene as known; only the pose of the object is replaced.
         truth: The true scene.
         seed: Used where the table has none; the same seed gives the same starts.
+        bodies: Whose joints are sought, by object.
     """
     generator = torch.Generator().manual_seed(seed if table.seed is None else table.seed)
 
@@ -260,7 +272,13 @@ def starts(table: schema.Starts, scene: Scene, truth: Scene, seed: int) -> list[
         turn = moved.transform[:3, :3]
         # The object as known may have another size: it is its centre that is placed.
         place = moved.center - turn @ scene[table.object].mesh.center
-        found.append(Start(scene.replace(table.object, pose=rigid(turn, place))))
+        begun = scene.replace(table.object, pose=rigid(turn, place))
+        body = (bodies or {}).get(table.object)
+        if body is not None and table.joint_deg > 0:
+            angle = math.radians(table.joint_deg)
+            mesh = body.turned(truth[table.object].mesh, angle, generator)
+            begun = begun.replace(table.object, mesh=mesh, pose=moved.transform)
+        found.append(Start(begun, bodies or {}))
     return found
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from invertwin.cli import build
+from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fits.fitting import calibrated, fit, outcome
 from invertwin.cli.fits.likeness import is_shape_key
 from invertwin.cli.fits.problem import modes_of, problem_of
@@ -46,9 +47,11 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     begin = time.perf_counter()
     need(run, "reconstruct", "reconstruct")
     problem, calibration = calibrated(problem_of(run, console), folder, console)
-    starts = [build.Start(problem.scene)]
+    starts = [build.Start(problem.scene, sought_bodies(run))]
     if run.starts is not None:
-        starts = build.starts(run.starts, problem.scene, problem.truth, run.seed)
+        starts = build.starts(
+            run.starts, problem.scene, problem.truth, run.seed, sought_bodies(run)
+        )
     modes = modes_of(run)
     single = len(starts) * len(modes) == 1
     rows: dict[str, list[dict[str, Any]]] = {}

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.cli import schema
+from invertwin.cli.bodies import SoughtBody, posed
 from invertwin.errors import InputError
 from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
@@ -40,16 +41,20 @@ def shape_mesh(table: schema.Placement) -> Mesh:
             prior = load_prior(table.prior)
             latent = torch.zeros(prior.latent_size, dtype=torch.float64)
             return prior.mesh(latent if table.latent is None else latent.new_tensor(table.latent))
+        case schema.BodyShape():
+            return posed(table)
     raise InputError(f"expected a shape, got {type(table).__name__}; add `shape`")
 
 
-def shape_module(table: schema.Parameter, mesh: Mesh, joints: Mapping[str, Tensor]) -> nn.Module:
+def shape_module(
+    table: schema.Parameter, mesh: Mesh, bodies: Mapping[str, SoughtBody]
+) -> nn.Module:
     """The module of a shape that is sought, from the object's present mesh.
 
     Args:
         table: The parameter.
         mesh: Of its object.
-        joints: Rotation vectors of bodies by object, from which they start.
+        bodies: Bodies whose joints are sought, by object.
 
     Raises:
         InputError: A box without volume, files are missing, or too many coordinates.
@@ -78,6 +83,8 @@ def shape_module(table: schema.Parameter, mesh: Mesh, joints: Mapping[str, Tenso
         case schema.ShapeSpaceParameter():
             space = load_vehicle_space(table.folder, table.level)
             return LinearShape(table.object, space, table.modes)
+        case schema.BodyParameter():
+            return bodies[table.object].module(table.object, mesh)
         case schema.PriorParameter():
             return PriorShape(table.object, load_prior(table.file), counts=table.counts)
     raise InputError(f"expected a shape, got {table.kind}; choose another kind")

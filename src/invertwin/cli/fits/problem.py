@@ -10,6 +10,7 @@ from torch import nn
 from invertwin.capture import Capture
 from invertwin.channel.paths import Grid
 from invertwin.cli import build
+from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
@@ -68,7 +69,7 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     need(run, "parameters", "reconstruct")
     table = need(run, "grid", "reconstruct")
     scene, truth = build.scene(run), build.true_scene(run)
-    build.parameters(run.parameters, scene)  # their errors come before any work
+    build.parameters(run.parameters, scene, sought_bodies(run))  # their errors come before any work
     data = need(run, "data", "reconstruct")
     for i, parameter in enumerate(run.parameters):
         if isinstance(parameter, MoverParameter):

@@ -35,6 +35,11 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
         # Other triangles: no vertex is another one's copy, only surfaces can be compared.
         return {"position": place, **shapes}
     settings = need(problem.run, "reconstruct", "reconstruct")
+    if name in start.bodies:
+        meshes = (scene[name].mesh for scene in (start.scene, twin, problem.truth))
+        angles = start.bodies[name].errors(*meshes)
+        good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
+        return {**angles, "success": good, "position": place, **shapes}
     before = build.residual(start.scene[name], problem.truth[name])
     after = build.residual(twin[name], problem.truth[name])
     rows: dict[str, Any] = {

@@ -30,6 +30,8 @@ COLUMNS = {
     "start_angle_deg": "off at the start [°]",
     "position_error_m": "off at the end [m]",
     "rotation_error_deg": "off at the end [°]",
+    "joint_error_before_deg": "joints off at the start, mean [°]",
+    "joint_error_after_deg": "joints off at the end, mean [°]",
     "scale_error": "size off by",
     **{f"{name}_error": f"{name} off by" for name in get_args(MaterialValue)},
     "success": "within the limits",
@@ -43,6 +45,8 @@ _LABELS = {
     "start_angle_deg": "angle to the truth, start [°]",
     "position_error_m": "distance to the truth, twin [m]",
     "rotation_error_deg": "angle to the truth, twin [°]",
+    "joint_error_before_deg": "joint angles to the truth, mean, start [°]",
+    "joint_error_after_deg": "joint angles to the truth, mean, twin [°]",
     "scale_error": "size, share off the truth",
     **{f"{name}_error": f"{name}, share off the truth" for name in get_args(MaterialValue)},
     "start_loss_sharp": "loss without extra width, start",
@@ -176,6 +180,8 @@ def _ended(run: RunFile, metrics: dict[str, Any]) -> str:
 def _limits(run: RunFile, metrics: dict[str, Any]) -> str:
     """How near the truth counts as a success."""
     settings = need(run, "reconstruct", "reconstruct")
+    if "joint_error_after_deg" in metrics:
+        return f"{settings.joint_limit_deg:g}° (mean over the joints)"
     turned = "rotation_error_deg" in metrics
     angle = f" and {settings.rotation_limit_deg:g}°" if turned else ""
     return f"{settings.position_limit:g} m{angle}"
@@ -299,6 +305,11 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
     count = metrics.get("starts_count", 1)
     which = f"Best of {count} starts: " if count > 1 else ""
     ended = _ended(run, metrics)
+    if "joint_error_after_deg" in metrics:
+        score = f"{which}joints {metrics['joint_error_after_deg']:.1f}° off, mean; {ended}."
+        return (
+            f"{score} {metrics['successes']} of {count} starts end within {_limits(run, metrics)}."
+        )
     if "position_error_m" not in metrics:
         if "chamfer_m" not in metrics:
             return f"{which}{ended}."

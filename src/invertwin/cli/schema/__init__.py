@@ -22,6 +22,8 @@ from invertwin.cli.schema.inversion import (
 from invertwin.cli.schema.mover import MoverParameter, OpenRadarData
 from invertwin.cli.schema.objects import (
     Body,
+    BodyObject,
+    BodyShape,
     Box,
     BoxObject,
     Dielectric,
@@ -61,6 +63,7 @@ from invertwin.cli.schema.objects import (
     VehicleObject,
 )
 from invertwin.cli.schema.parameters import (
+    BodyParameter,
     DistanceGridParameter,
     LatticeParameter,
     MaterialParameter,
@@ -141,6 +144,9 @@ __all__ = [
     "Board",
     "BoardSection",
     "Body",
+    "BodyObject",
+    "BodyParameter",
+    "BodyShape",
     "Box",
     "BoxObject",
     "Calibration",

@@ -99,6 +99,8 @@ class Starts(Section):
     """of the offset"""
     rotation_axis: Vector | None = None
     """without it any axis"""
+    joint_deg: NonNegative = 0.0
+    """turn of each sought joint of a body, about a random axis among its own"""
     seed: Seed | None = None
     """without it the run's"""
 
@@ -216,6 +218,8 @@ class Reconstruct(Section):
     """m, of a success"""
     rotation_limit_deg: Positive = 3.0
     """of a success"""
+    joint_limit_deg: Positive = 5.0
+    """of a success, mean over the sought joints of a body"""
 
 
 class Calibration(Section):

@@ -244,6 +244,22 @@ class Learned(Placement):
     """file that `invertwin train-prior` wrote; without it the prior of the package"""
 
 
+class BodyShape(Placement):
+    """A body with joints and one skin, y up, facing −z, in the frame of its model."""
+
+    shape: Literal["body"]
+    model: Literal["person", "anny"] = "person"
+    """person = made of formulas, arms held out at rest; anny = of the optional extra `anny`"""
+    file: InputPath | None = None
+    """SMPL's layout (.npz), from the run file's folder; in place of a model"""
+    height: Positive = 1.75
+    """m, of `person`"""
+    spacing: Positive = 0.03
+    """m, of the corners of its triangles"""
+    angles_deg: dict[str, Vector] = {}
+    """rotation vectors of joints by name, each in the frame of the joint before; others at rest"""
+
+
 class File(Placement):
     """A mesh file: OBJ, PLY, STL or glTF."""
 
@@ -260,6 +276,7 @@ Part = Annotated[
     | Annotated[Text, Tag(TAG_MARK + "text")]
     | Annotated[Vehicle, Tag(TAG_MARK + "vehicle")]
     | Annotated[Learned, Tag(TAG_MARK + "prior")]
+    | Annotated[BodyShape, Tag(TAG_MARK + "body")]
     | Annotated[File, Tag(TAG_MARK + "file")],
     tag_by("shape", "parts", "file"),
 ]
@@ -313,6 +330,10 @@ class LearnedObject(Learned, Body):
     pass
 
 
+class BodyObject(BodyShape, Body):
+    pass
+
+
 class FileObject(File, Body):
     pass
 
@@ -330,6 +351,7 @@ SceneObject = Annotated[
     | Annotated[TextObject, Tag(TAG_MARK + "text")]
     | Annotated[VehicleObject, Tag(TAG_MARK + "vehicle")]
     | Annotated[LearnedObject, Tag(TAG_MARK + "prior")]
+    | Annotated[BodyObject, Tag(TAG_MARK + "body")]
     | Annotated[FileObject, Tag(TAG_MARK + "file")]
     | Annotated[PartsObject, Tag(TAG_MARK + "parts")],
     tag_by("shape", "parts", "file"),
@@ -358,5 +380,7 @@ class Truth(Section):
     """factor"""
     material: Material | None = None
     """what it is really made of"""
+    angles_deg: dict[str, Vector] | None = None
+    """of a body, all of its joints that are not at rest"""
     parts: Annotated[list[Part], Field(min_length=1)] | None = None
     """its real shape, in place of the scene's and in the same frame"""

@@ -115,6 +115,14 @@ class ShapeSpaceParameter(ObjectParameter):
     """of ½ Σ z²"""
 
 
+class BodyParameter(ObjectParameter):
+    """Joint angles of an object with shape = "body", from those it has."""
+
+    kind: Literal["body"]
+    joints: Annotated[dict[str, WorldAxes], Field(min_length=1)]
+    """by name: the components of the rotation vector that are sought, such as ["y"]"""
+
+
 MaterialValue = Literal[
     "permittivity",
     "conductivity",
@@ -167,6 +175,7 @@ Parameter = Annotated[
     | Annotated[NeuralDistanceParameter, Tag(TAG_MARK + "neural_distance")]
     | Annotated[PriorParameter, Tag(TAG_MARK + "prior")]
     | Annotated[ShapeSpaceParameter, Tag(TAG_MARK + "shape_space")]
+    | Annotated[BodyParameter, Tag(TAG_MARK + "body")]
     | Annotated[MaterialParameter, Tag(TAG_MARK + "material")]
     | Annotated[RadarParameter, Tag(TAG_MARK + "radar_pose")]
     | Annotated[MoverParameter, Tag(TAG_MARK + "mover")],

@@ -1,12 +1,13 @@
 """Bodies with joints: rigid parts or skin that follows a tree of them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
@@ -16,6 +17,8 @@ from invertwin.scene.pose import rotation_from_vector
 from invertwin.scene.scene import Scene
 
 _DO = "give arrays of one template"
+_ALONE = 0.95  # share of a vertex that a joint moves nearly alone
+_REFINED = 4  # Newton steps of least squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +135,52 @@ class BodyTemplate:
             what = f"rotation of {name} [rad]"
             found[self.joint(name)] = checked_tensor(turn, (3,), what, "give x, y and z")
         return found
+
+    def scaled(self, factor: float) -> "BodyTemplate":
+        """The same body in another size."""
+        given = ("vertices", "joints", "shape_directions", "joint_directions", "pose_directions")
+        values = {name: getattr(self, name) for name in given}
+        return replace(self, **{n: v if v is None else v * factor for n, v in values.items()})
+
+    def rotations_of(self, vertices: Float64[Tensor, "v 3"]) -> Float64[Tensor, "j 3"]:
+        """Rotation vectors of all joints that a posed skin shows [rad], the inverse of `posed`.
+
+        Least squares over the vertices; joints that move nothing are left at rest. The skin is of
+        the template's own shape.
+
+        Raises:
+            InputError: other vertices than the template's.
+        """
+        given = checked_tensor(vertices, tuple(self.vertices.shape), "vertices [m]", _DO).detach()
+        turns = self._rigid_turns(given)
+
+        def skin(flat: Tensor) -> Tensor:
+            rows = flat.reshape(-1, 3).unbind()
+            return self.posed(torch.stack([rotation_from_vector(row) for row in rows]))[0].flatten()
+
+        with torch.no_grad():
+            for _ in range(_REFINED):
+                miss = given.flatten() - skin(turns.flatten())
+                slopes = torch.func.jacfwd(skin)(turns.flatten())
+                change = torch.linalg.lstsq(slopes, miss[:, None], driver="gelsd").solution
+                turns = turns + change.reshape(-1, 3)
+        return turns
+
+    def _rigid_turns(self, given: Tensor) -> Tensor:
+        """The same about, from the vertices that one joint moves nearly alone."""
+        frames: list[Tensor] = []
+        for joint, parent in enumerate(self.parents):
+            frames.append(frames[parent] if joint else torch.eye(3, dtype=torch.float64))
+            own = self.weights[:, joint] > _ALONE
+            if int(own.sum()) >= 3:
+                rest, now = (points[own] - points[own].mean(0) for points in (self.vertices, given))
+                u, _, vt = torch.linalg.svd(now.T @ rest)
+                flip = torch.diag(u.new_tensor([1.0, 1.0, float(torch.det(u @ vt).sign())]))
+                frames[joint] = u @ flip @ vt
+        above = [frames[max(parent, 0)] for parent in self.parents]
+        turns = [a.T @ f for a, f in zip(above[1:], frames[1:], strict=True)]
+        matrices = torch.stack([frames[0], *turns]).numpy()
+        return torch.from_numpy(Rotation.from_matrix(matrices).as_rotvec())
 
     def posed(
         self, rotations: Float64[Tensor, "j 3 3"], shape: Float64[Tensor, " n"] | None = None

@@ -41,7 +41,7 @@ _LIMBS = [
     ("knee", (0.10, -0.90, 0.02), (0.10, -0.92, -0.16), 0.045, 0.035),
 ]
 _FILLET = 0.02  # m, over which parts run into each other
-_BLEND = 0.03  # m, over which the skin passes from one joint to the next
+_BLEND = 0.08  # m, over which the skin passes from one joint to the next
 _TALL = 1.75  # m
 
 
@@ -121,4 +121,6 @@ def _weights(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p j"]:
     for name in _JOINTS:
         own = [_cone(points, *part[1:]) for part in parts if part[0] == name]
         nearest.append(torch.stack(own).amin(0))
-    return torch.softmax(-torch.stack(nearest, dim=1) / (_BLEND / 2), dim=1)
+    found = torch.stack(nearest, dim=1)
+    share = (1 - (found - found.amin(1, keepdim=True)) / _BLEND).clamp_min(0.0).square()
+    return share / share.sum(1, keepdim=True)
