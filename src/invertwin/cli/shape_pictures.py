@@ -17,7 +17,8 @@ _TILT = 0.35  # rad, of the eye above the object
 _PAUSE_MS = 120
 _MOST_TRIANGLES = 12_000  # of one view
 
-Curve = Sequence[tuple[int, float]]
+Curve = Sequence[Sequence[float]]
+"""Steps and values, in pairs."""
 
 
 def turntable_gif(meshes: Mapping[str, tuple[NDArray, NDArray]], up: NDArray) -> bytes:

@@ -1,0 +1,137 @@
+"""Shapes in run files: stages, variants, measures and what they leave behind."""
+
+import tomllib
+
+import pytest
+from PIL import Image
+
+from cli.small import RUN, call, read_metrics
+from invertwin.cli import build
+from invertwin.cli.run_file import to_toml, validate
+from invertwin.errors import InputError
+from invertwin.scene.files import load_mesh
+
+HEAD, TAIL = RUN.split("[[parameters]]")
+SHAPES = """
+[[truth.plate.parts]]
+shape = "plate"
+width = 0.3
+height = 0.3
+divisions = 2
+
+[[parameters]]
+kind = "vertices"
+object = "plate"
+smooth = 5.0
+rate = 0.004
+
+[[parameters]]
+name = "field"
+kind = "distance_grid"
+object = "plate"
+low = [-0.3, -0.3, -0.1]
+high = [0.3, 0.3, 0.1]
+counts = [7, 7, 5]
+
+[reconstruct]
+steps = 3
+depth = 1
+samples = 6000
+boundary_samples = 2000
+
+[[stages]]
+parameters = ["vertices"]
+
+[[stages]]
+parameters = ["vertices"]
+remesh = 0.06
+steps = 2
+rate = 0.01
+
+[variants.no_boundary]
+boundary = false
+
+[variants.rough]
+smooth = 0.0
+stages = [{ parameters = ["vertices"], steps = 2 }]
+
+[measures]
+object = "plate"
+seen = true
+every = 1
+"""
+
+
+def shapes(text: str = SHAPES) -> str:
+    return HEAD + text
+
+
+def check(text: str, tmp_path):
+    return validate(tomllib.loads(text), tmp_path / "run.toml")
+
+
+def test_a_shape_is_fitted_in_stages_and_compared(tmp_path, monkeypatch, capsys):
+    (tmp_path / "shape.toml").write_text(shapes())
+    out = tmp_path / "out"
+    assert call(monkeypatch, "reconstruct", tmp_path / "shape.toml", "-o", out) == 0
+    metrics = read_metrics(out)
+    assert metrics["steps"] == 5
+    assert metrics["chamfer_m"] == metrics["chamfer_seen_m"]
+    for key in ("chamfer_m", "fscore_2cm", "normal_consistency"):
+        assert metrics[f"start_{key}"] > 0
+        assert metrics[f"{key}_no_boundary"] > 0
+        assert metrics[f"{key}_rough"] != metrics[key]
+    assert len(load_mesh(out / "twin.ply").faces) > 18 + 2  # finer than at the start, and the wall
+    assert len(load_mesh(out / "twin.glb").faces) == len(load_mesh(out / "twin.ply").faces)
+    with Image.open(out / "turntable.gif") as picture:
+        assert picture.n_frames == 24
+    assert (out / "convergence.png").exists()
+    assert not (out / "parts").exists()
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Ways to fit" in said
+    assert "Chamfer distance from" in said
+    again = validate(tomllib.loads((out / "run.toml").read_text()), tmp_path / "run.toml")
+    assert again == check(shapes(), tmp_path)
+
+
+def test_the_true_shape_stands_where_the_object_stands(tmp_path):
+    run = check(shapes(), tmp_path)
+    truth = build.true_scene(run)["plate"]
+    assert truth.center.tolist() == pytest.approx([0.02, 0.01, 1.2])
+    assert float(truth.vertices[:, 0].max() - truth.vertices[:, 0].min()) == pytest.approx(0.3)
+
+
+def test_a_run_with_stages_survives_the_way_to_toml(tmp_path):
+    run = check(shapes(), tmp_path)
+    assert check(to_toml(run), tmp_path) == run
+
+
+def test_learned_shapes_are_objects_and_parameters(tmp_path):
+    text = shapes(SHAPES).replace(
+        'shape = "plate"\nwidth = 0.4\nheight = 0.3\ndivisions = 3', 'shape = "prior"'
+    )
+    text = text.replace('kind = "vertices"', 'name = "vertices"\nkind = "prior"\nweight = 0.1')
+    text = text.replace("smooth = 5.0\n", "").replace("remesh = 0.06\n", "")
+    run = check(text, tmp_path)
+    scene = build.scene(run)
+    assert len(scene["plate"].mesh.faces) > 200
+    tables = build.named(run.parameters)
+    module = build.builders(run.parameters, build.Start(scene))["vertices"](scene)
+    assert len(build.regularizers(tables, {"vertices": module}, scene)) == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('parameters = ["vertices"]\nremesh', 'parameters = ["vertex"]\nremesh', 'got "vertex"'),
+        ('name = "field"', 'name = "vertices"', 'different names, got "vertices" twice'),
+        ("remesh = 0.06", "remesh = -1.0", r"stages\[1\].remesh"),
+        ('object = "plate"\nseen', 'object = "plane"\nseen', "measures.object"),
+        ("[variants.rough]\n", "[variants.rough]\nlaplacian = 1.0\n", "variants.rough.laplacian"),
+    ],
+)
+def test_wrong_keys_are_named(old, new, message, tmp_path):
+    text = shapes()
+    assert old in text
+    with pytest.raises(InputError, match=message):
+        check(text.replace(old, new, 1), tmp_path)
