@@ -229,3 +229,33 @@ def test_bad_input():
 def test_bad_grid_values(unchecked):
     with pytest.raises(InputError, match=r"expected signed distances \[m\] as numbers of shape"):
         DistanceGrid("ball", LOW, HIGH, torch.ones(4, 4))  # type: ignore[arg-type]
+
+
+def test_smoothing_changes_steps_but_neither_shape_nor_reach():
+    rough, smooth = (
+        DistanceGrid.sampled("ball", LOW, HIGH, (9, 8, 7), ball(0.2), amount)
+        for amount in (0.0, 5.0)
+    )
+    assert torch.allclose(smooth.distances, rough.distances, atol=1e-12)
+    step = torch.zeros_like(smooth.value)
+    step[4, 4, 3] = 1.0
+    with torch.no_grad():
+        smooth.value += step
+    moved = (smooth.distances - rough.distances).detach()
+    # (I + λL) of the move is the step: L by its definition, sums over neighbours.
+    back = moved.clone()
+    for axis in range(3):
+        jump = 5.0 * moved.diff(dim=axis)
+        count = moved.shape[axis]
+        back.narrow(axis, 0, count - 1).sub_(jump)
+        back.narrow(axis, 1, count - 1).add_(jump)
+    assert torch.allclose(back, step, atol=1e-12)
+    assert float(moved.max()) < 0.2
+    weights = torch.linspace(-1, 1, moved.numel(), dtype=torch.float64).reshape(moved.shape)
+    (gradient,) = torch.autograd.grad((smooth.distances * weights).sum(), smooth.value)
+    assert float(gradient[4, 4, 3]) == pytest.approx(float((moved * weights).sum()), rel=1e-9)
+
+
+def test_a_negative_smoothing():
+    with pytest.raises(InputError, match="smoothing"):
+        DistanceGrid.sampled("ball", LOW, HIGH, (9, 8, 7), ball(0.2), -1.0)

@@ -4,13 +4,16 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Float64
+from scipy.fft import dctn, idctn
 from torch import Tensor, nn
 
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice, cubic
+from invertwin.scene.geometry.smooth_vertices import smoothed
 from invertwin.scene.scene import Scene
 
 
@@ -43,31 +46,41 @@ class DistanceGrid(_Distance):
     """An object's surface as the zero of values at the nodes of a grid.
 
     Between nodes the field is that of cubic convolution (Catmull–Rom): it has the nodes' values
-    and a continuous gradient.
+    and a continuous gradient. With smoothing λ the distances are ``(I + λL)⁻¹ value``, L the graph
+    Laplacian of the grid: rough parts of a gradient are held back, as by ``SmoothVertices``.
 
     Attributes:
-        value: parameter [x, y, z], metres; negative inside.
+        value: parameter [x, y, z], metres; without smoothing the distances, negative inside.
     """
 
     def __init__(
-        self, object: str, low: ArrayLike, high: ArrayLike, value: Float64[Tensor, "x y z"]
+        self,
+        object: str,
+        low: ArrayLike,
+        high: ArrayLike,
+        value: Float64[Tensor, "x y z"],
+        smoothing: float = 0.0,
     ) -> None:
-        """Shape `object` by a grid, from these values at the start.
+        """Shape `object` by a grid, from these distances at the start.
 
         Args:
             object: name of the object.
             low: corner of the grid in the object's frame [m].
             high: the opposite corner [m].
             value: signed distances at the nodes [m], at least two along each axis.
+            smoothing: λ; detail of steps below about √λ spacings is held back.
 
         Raises:
-            InputError: wrong shapes, NaN, or a box without volume.
+            InputError: wrong shapes, NaN, a box without volume, or a negative λ.
         """
         given = checked_tensor(
             value, (None, None, None), "signed distances [m]", "give one for each node"
         )
         super().__init__(object, low, high, tuple(given.shape))
-        self.value = nn.Parameter(given.detach().clone())
+        self._smoother = GridSmoother(
+            tuple(given.shape), checked_number(smoothing, "smoothing λ", 0)
+        )
+        self.value = nn.Parameter(self._smoother.roughened(given.detach()))
 
     @classmethod
     def sampled(
@@ -77,6 +90,7 @@ class DistanceGrid(_Distance):
         high: ArrayLike,
         counts: Sequence[int],
         distance: Callable[[Tensor], Tensor],
+        smoothing: float = 0.0,
     ) -> "DistanceGrid":
         """The grid that holds a signed distance, a function of points [p, 3], at its nodes.
 
@@ -86,11 +100,44 @@ class DistanceGrid(_Distance):
         lattice = Lattice.between(low, high, counts)
         with torch.no_grad():
             value = distance(lattice.nodes.reshape(-1, 3))
-        return cls(object, low, high, value.reshape(lattice.counts))
+        return cls(object, low, high, value.reshape(lattice.counts), smoothing)
+
+    @property
+    def distances(self) -> Float64[Tensor, "x y z"]:
+        """Signed distances at the nodes [m]."""
+        if self._smoother.amount == 0:
+            return self.value
+        return smoothed(self.value, self._smoother)
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
         """The field at points in the object's frame [m]: negative inside."""
-        return cubic(self.value, self.lattice, points)
+        return cubic(self.distances, self.lattice, points)
+
+
+class GridSmoother:
+    """I + λL of a grid, L its graph Laplacian, by cosine transforms, which diagonalise it."""
+
+    def __init__(self, shape: tuple[int, ...], amount: float) -> None:
+        self.amount = amount
+        squares = np.zeros(shape)
+        for axis, count in enumerate(shape):
+            rates = 2 - 2 * np.cos(np.pi * np.arange(count) / count)
+            squares += np.moveaxis(
+                np.broadcast_to(rates, (*np.delete(shape, axis), count)), -1, axis
+            )
+        self._factors = 1 + amount * squares
+
+    def solve(self, values: Tensor) -> Tensor:
+        """(I + λL)⁻¹ times values at the nodes, without derivatives."""
+        spectrum = np.asarray(dctn(values.detach().numpy(), norm="ortho")) / self._factors
+        return torch.from_numpy(np.asarray(idctn(spectrum, norm="ortho")))
+
+    def roughened(self, values: Tensor) -> Tensor:
+        """(I + λL) times values at the nodes, without derivatives."""
+        if self.amount == 0:
+            return values.detach().clone()
+        spectrum = np.asarray(dctn(values.detach().numpy(), norm="ortho")) * self._factors
+        return torch.from_numpy(np.asarray(idctn(spectrum, norm="ortho")))
 
 
 class NeuralDistance(_Distance):

@@ -1,6 +1,6 @@
 """Free vertices whose gradients are smoothed: large steps without crumpling."""
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -53,7 +53,7 @@ class SmoothVertices(nn.Module):
     @property
     def offsets(self) -> Float64[Tensor, "v 3"]:
         """Displacements of the vertices in the object's frame [m]."""
-        return _Smoothed.apply(self.latent, self._smoother)  # type: ignore[return-value]
+        return smoothed(self.latent, self._smoother)
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the vertices moved.
@@ -104,18 +104,32 @@ def laplacian(faces: Tensor, count: int) -> csc_array:
     return csc_array(diagonal - joined)
 
 
+@runtime_checkable
+class Solver(Protocol):
+    """Whatever multiplies by a symmetric (I + λL)⁻¹."""
+
+    def solve(self, values: Tensor) -> Tensor:
+        """The product, without derivatives."""
+        ...
+
+
+def smoothed(latent: Tensor, solver: Solver) -> Tensor:
+    """(I + λL)⁻¹ u, with derivatives of any order in both modes."""
+    return _Smoothed.apply(latent, solver)  # type: ignore[return-value]
+
+
 class _Smoothed(torch.autograd.Function):
-    """(I + λL)⁻¹ u; the matrix is symmetric, so its adjoint is itself."""
+    """The matrix is symmetric, so its adjoint is itself."""
 
     @staticmethod
-    def forward(ctx: Any, latent: Tensor, smoother: Smoother) -> Tensor:
-        ctx.smoother = smoother
-        return smoother.solve(latent)
+    def forward(ctx: Any, latent: Tensor, solver: Solver) -> Tensor:
+        ctx.solver = solver
+        return solver.solve(latent)
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor, None]:
-        return _Smoothed.apply(outputs[0], ctx.smoother), None  # type: ignore[return-value]
+        return _Smoothed.apply(outputs[0], ctx.solver), None  # type: ignore[return-value]
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return ctx.smoother.solve(tangents[0])
+        return ctx.solver.solve(tangents[0])
