@@ -68,7 +68,9 @@ def shape_module(
             return LatticeDeformation(table.object, table.low, table.high, table.counts)
         case schema.DistanceGridParameter():
             distance: Callable[[Tensor], Tensor] = partial(signed_distance, mesh)
-            return DistanceGrid.sampled(table.object, table.low, table.high, table.counts, distance)
+            return DistanceGrid.sampled(
+                table.object, table.low, table.high, table.counts, distance, table.smooth
+            )
         case schema.NeuralDistanceParameter():
             return NeuralDistance(
                 table.object,

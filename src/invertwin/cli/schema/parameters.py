@@ -85,6 +85,8 @@ class DistanceGridParameter(_BoxParameter):
     """A signed distance on a grid, whose zero is the surface; starts as the object's mesh."""
 
     kind: Literal["distance_grid"]
+    smooth: NonNegative = 0.0
+    """λ of steps preconditioned by (I + λL)⁻²; 0 = none"""
 
 
 class NeuralDistanceParameter(_BoxParameter):
