@@ -115,8 +115,8 @@ def test_separate_antennas_tend_to_one() -> None:
     assert total(item, link(shared=False)) == pytest.approx(shared, rel=3e-3)
     # Reciprocity: who sends and who receives does not matter.
     ends = ((0.0, 0.0, 0.0),), ((0.6, 0.1, 0.0),)
-    there = total(item, link(*ends, shared=False))
-    back = total(item, link(*ends[::-1], shared=False))
+    there = total(item, link(ends[0], ends[1], shared=False))
+    back = total(item, link(ends[1], ends[0], shared=False))
     assert there == pytest.approx(back, rel=0.01)
 
 
@@ -195,6 +195,7 @@ def test_gradients_equal_differences_that_have_converged(kind: str, shared: bool
     with forward_ad.dual_level():
         theta = forward_ad.make_dual(float64(0.0), float64(1.0))
         forward = forward_ad.unpack_dual(at(theta, count, 5)).tangent
+    assert forward is not None
     assert (forward - narrow).abs().sum() < 0.03 * narrow.abs().sum()
     weights = torch.rand(forward.shape, generator=torch.Generator().manual_seed(1)).double()
     zero = torch.zeros((), dtype=torch.float64, requires_grad=True)

@@ -178,11 +178,6 @@ def point_cloud(
     ranges = grid.ranges[place] + moved[1] * grid.range_step
     us = grid.u[u] + moved[2] * grid.u_step
     vs = grid.v[v] + moved[3] * grid.v_step
-    ahead = (1 - us.square() - vs.square()).clamp(min=0).sqrt()
-    link = radar.link()
-    origin = (0.5 * (link.tx + link.rx)).detach().cpu()
-    local = ranges[:, None] * torch.stack([us, vs, ahead], dim=1)
-    turned = torch.einsum("pij,pj->pi", link.rotations.detach().cpu()[frame], local)
     return PointCloud(
         frame=frame,
         range=ranges,
@@ -190,8 +185,68 @@ def point_cloud(
         u=us,
         v=vs,
         power=power[tuple(cell)],
-        position=origin[frame] + turned,
+        position=_placed(radar, frame, ranges, us, vs),
     )
+
+
+def peaks(
+    power: Float[Tensor, "frame range u v"],
+    detections: Bool[Tensor, "frame range u"],
+    radar: Radar,
+    grid: Grid,
+) -> PointCloud:
+    """One point for each local maximum over range and direction among the detected cells.
+
+    For frames without range rates, such as maps that are compared in a fit; unlike
+    ``point_cloud``, one range may hold many points, since the parts of a body at rest differ in
+    direction alone. Refined by the same parabola; range rates are zero.
+
+    Args:
+        power: Of ``exact_spectrum`` or ``Capture.spectrum``.
+        detections: Cells of the strongest elevation that hold targets.
+        radar: With the poses of the frames.
+        grid: Of the power.
+
+    Raises:
+        InputError: Power with gradients, or shapes that do not fit each other.
+    """
+    _refuse_gradients(power, "peaks")
+    expected = (radar.frame_count, *grid.shape)
+    if tuple(power.shape) != expected or tuple(detections.shape) != expected[:3]:
+        raise InputError(
+            f"expected power of shape {expected} (frame, range, u, v) and detections of shape "
+            f"{expected[:3]}, got {tuple(power.shape)} and {tuple(detections.shape)}; use the "
+            "radar and grid of the spectrum"
+        )
+    outside = grid.u[:, None].square() + grid.v.square() > 1
+    seen = power.to("cpu", torch.float64).masked_fill(outside, 0.0)
+    highest = torch.nn.functional.max_pool3d(seen[:, None], 3, stride=1, padding=1)[:, 0]
+    found = detections.cpu()[..., None] & (seen == highest) & (seen > 0)
+    frame, place, u, v = torch.nonzero(found, as_tuple=True)
+    cell = [frame, torch.zeros_like(frame), place, u, v]
+    moved = [_refinement(seen[:, None], cell, axis, wrap=False) for axis in range(2, 5)]
+    ranges = grid.ranges[place] + moved[0] * grid.range_step
+    us = grid.u[u] + moved[1] * grid.u_step
+    vs = grid.v[v] + moved[2] * grid.v_step
+    return PointCloud(
+        frame=frame,
+        range=ranges,
+        velocity=torch.zeros_like(ranges),
+        u=us,
+        v=vs,
+        power=seen[frame, place, u, v],
+        position=_placed(radar, frame, ranges, us, vs),
+    )
+
+
+def _placed(radar: Radar, frame: Tensor, ranges: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """World positions from ranges and direction cosines of frames."""
+    ahead = (1 - u.square() - v.square()).clamp(min=0).sqrt()
+    link = radar.link()
+    origin = (0.5 * (link.tx + link.rx)).detach().cpu()
+    local = ranges[:, None] * torch.stack([u, v, ahead], dim=1)
+    turned = torch.einsum("pij,pj->pi", link.rotations.detach().cpu()[frame], local)
+    return origin[frame] + turned
 
 
 def _refuse_gradients(power: Tensor, name: str) -> None:

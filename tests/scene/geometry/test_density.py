@@ -24,7 +24,7 @@ def test_densities_come_back_and_are_never_negative() -> None:
     faintest = 1e-3 / 0.05  # of one over a spacing
     torch.testing.assert_close(grid.density.detach(), given.clamp_min(faintest))
     with torch.no_grad():
-        grid.value -= 50.0
+        grid.value.sub_(50.0)
     assert float(grid.density.detach().min()) >= 0
     assert grid.cloud.density.requires_grad
 

@@ -1,0 +1,445 @@
+"""Where a fit may start: pose, size and density from what conventional processing sees.
+
+Detected points or backprojected echoes say where something is, a rectangle in the ground plane how
+it stands; the refinement does the rest. Nothing here is differentiable.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from invertwin.capture.backprojection import backproject
+from invertwin.capture.capture import Capture
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.radar.detection import ordered_statistics_cfar, peaks
+from invertwin.radar.radar import Radar
+from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
+from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
+from invertwin.scene.checks import ArrayLike, checked_number
+from invertwin.scene.geometry import Lattice
+
+_TURNS = 91  # yaws that a rectangle is tried at, over a quarter turn
+_EDGE = 0.02  # share of the points beyond a side of a rectangle
+_RANK = 0.25  # of the training cells: most of them may hold the target itself
+_CHUNK = 20_000  # points of an image at a time
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground plane: which world axis points up.
+
+    Attributes:
+        up: "y" or "z".
+
+    Raises:
+        InputError: another axis.
+    """
+
+    up: str = "y"
+
+    def __post_init__(self) -> None:
+        if self.up not in ("y", "z"):
+            raise InputError(f'expected up to be "y" or "z", got {self.up!r}; choose one')
+
+    @property
+    def vertical(self) -> int:
+        """Index of the axis that points up."""
+        return "xyz".index(self.up)
+
+    @property
+    def level(self) -> tuple[int, int]:
+        """Indices of the two axes of the plane."""
+        return (0, 2) if self.up == "y" else (0, 1)
+
+    def turn(self, yaw: float) -> Float64[Tensor, "3 3"]:
+        """The rotation by a yaw [rad] about the axis that points up."""
+        vector = torch.zeros(3, dtype=torch.float64)
+        vector[self.vertical] = yaw
+        return rotation_from_vector(vector)
+
+
+@dataclass(frozen=True, eq=False)
+class Rectangle:
+    """What stands on the ground, from above.
+
+    Attributes:
+        center: middle of the points' extents [m], world.
+        yaw: turn about the vertical of its sides against the world's axes [rad], in [0, π/2) from
+            a fit.
+        size: extents along its first and second side [m].
+    """
+
+    center: Float64[Tensor, "3"]
+    yaw: float
+    size: tuple[float, float]
+
+
+def detected_points(
+    capture: Capture,
+    grid: Grid,
+    low: ArrayLike,
+    high: ArrayLike,
+    *,
+    false_alarm: float = 1e-6,
+) -> Float64[Tensor, "point 3"]:
+    """Where ordered-statistics CFAR and its local maxima see echoes within a box of the world.
+
+    Along an axis that the grid does not resolve, points lie in the radar's middle plane.
+
+    Args:
+        capture: the data.
+        grid: bins of its maps.
+        low: corner of the box [m].
+        high: the opposite corner [m].
+        false_alarm: probability that a cell of noise is detected.
+
+    Raises:
+        InputError: nothing is detected within the box, or it has no volume.
+    """
+    box = Lattice.between(low, high, (2, 2, 2))
+    power = capture.spectrum(grid).detach().double()
+    strongest = power.amax(3)
+    # A frame at a time: the training cells of all take much memory.
+    detections = torch.stack(
+        [ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_RANK) for frame in strongest]
+    )
+    found = peaks(power, detections, capture.radar(), grid).position
+    kept = _level_box(found, box, capture.radar(), grid)
+    if not len(kept):
+        raise InputError(
+            f"expected echoes within the box from {box.low.tolist()} to {box.high.tolist()}, got "
+            f"none of {len(found)} detections there; enlarge the box or raise false_alarm"
+        )
+    return kept
+
+
+def echo_image(
+    capture: Capture, grid: Grid, points: Float64[Tensor, "*point 3"]
+) -> Float64[Tensor, "*point"]:
+    """Backprojected power at points of the world, spreading undone.
+
+    The mean over frames of the maps at the point's range and direction, times the fourth power of
+    its distance; where no direction is resolved, the coherent sum over the frames
+    (``backproject``).
+
+    Args:
+        capture: the data.
+        grid: bins of its maps.
+        points: in the world [m].
+    """
+    flat = points.reshape(-1, 3)
+    if grid.u_count == grid.v_count == 1:
+        parts = [backproject(capture, part).abs().square() for part in flat.split(_CHUNK)]
+        return torch.cat(parts).reshape(points.shape[:-1])
+    maps = capture.spectrum(grid).detach().double()
+    radar = capture.radar()
+    total = torch.cat([_incoherent(maps, radar, grid, part) for part in flat.split(_CHUNK)])
+    return total.reshape(points.shape[:-1])
+
+
+def image_points(
+    capture: Capture,
+    grid: Grid,
+    low: ArrayLike,
+    high: ArrayLike,
+    *,
+    step: float,
+    share: float = 0.3,
+) -> Float64[Tensor, "point 3"]:
+    """The nodes of a backprojected image that hold a share of its strongest echo.
+
+    Args:
+        capture: the data.
+        grid: bins of its maps.
+        low: corner of the image in the world [m].
+        high: the opposite corner [m].
+        step: of the image [m], about.
+        share: of the strongest node.
+
+    Raises:
+        InputError: a box without volume or echoes, or a step that is not positive.
+    """
+    size = torch.as_tensor(high, dtype=torch.float64) - torch.as_tensor(low, dtype=torch.float64)
+    width = checked_number(step, "step of the image [m]", 0.0, open_low=True)
+    counts = [max(2, round(float(side) / width) + 1) for side in size]
+    nodes = Lattice.between(low, high, counts).nodes
+    if not _resolves_height(capture.radar(), grid):
+        # Nothing tells heights apart: the plane in the middle stands for all.
+        nodes = nodes.mean(_height(capture.radar()), keepdim=True)
+    image = echo_image(capture, grid, nodes)
+    if not float(image.max()) > 0:
+        raise InputError("expected echoes in the image, got none; move the box into the grid")
+    return nodes[image >= share * image.max()]
+
+
+def largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Tensor, "part 3"]:
+    """The largest set of points that are linked by steps of at most a gap [m]."""
+    pairs = KDTree(points.numpy()).sparse_distance_matrix(KDTree(points.numpy()), gap)
+    # Distances of zero are no entries: every point is linked to itself by being a node.
+    _, label = connected_components(pairs, directed=False)
+    labels = torch.from_numpy(label.astype("int64"))
+    return points[labels == torch.bincount(labels).argmax()]
+
+
+def fit_rectangle(
+    points: Float64[Tensor, "point 3"],
+    radar: Radar,
+    *,
+    ground: Ground | None = None,
+    resolution: float = 0.1,
+) -> Rectangle:
+    """The rectangle in the ground plane whose near sides the points lie on: an L shape.
+
+    Every yaw of a quarter turn is tried; the best one has most points close to the two sides
+    that face the radar, Σ 1/max(distance, resolution).
+
+    Source: Zhang et al., Efficient L-shape fitting for vehicle detection using laser scanners,
+    2017, the closeness criterion.
+    Differs from the source: the sides are those that face the radar, and leave out a fiftieth of
+    the points, since radar detections scatter.
+
+    Args:
+        points: in the world [m].
+        radar: its positions tell which sides are near.
+        ground: the plane.
+        resolution: distance below which points are on a side [m].
+
+    Raises:
+        InputError: fewer than three points.
+    """
+    plane = ground or Ground()
+    if len(points) < 3:
+        raise InputError(f"expected at least 3 points, got {len(points)}; use pose = 'position'")
+    best: tuple[float, Rectangle] | None = None
+    for yaw in torch.linspace(0, math.pi / 2, _TURNS, dtype=torch.float64)[:-1].tolist():
+        found = _bounded(points, yaw, plane)
+        axes = plane.turn(yaw)[:, plane.level]
+        offsets = (points - found.center) @ axes
+        away = (radar.positions.detach().mean(0) - found.center) @ axes
+        half = torch.tensor(found.size).double() / 2
+        # The side that faces the radar; where it looks along the side, the nearer of both.
+        near = half - offsets * torch.where(away < 0, -1.0, 1.0)
+        nearest = torch.minimum(half - offsets, half + offsets)
+        sides = torch.where(away.abs() > half, near, nearest).abs().amin(1)
+        score = float((1 / sides.clamp_min(resolution)).sum())
+        if best is None or score > best[0]:
+            best = (score, found)
+    assert best is not None
+    return best[1]
+
+
+def principal_rectangle(
+    points: Float64[Tensor, "point 3"], *, ground: Ground | None = None
+) -> Rectangle:
+    """The rectangle along the points' principal axes in the ground plane."""
+    plane = ground or Ground()
+    flat = points[:, plane.level]
+    _, axes = torch.linalg.eigh(torch.cov(flat.T))
+    first = axes[:, 1]
+    # The image of the first ground axis under a yaw about y is (cos, −sin) in (x, z).
+    sign = -1.0 if plane.up == "y" else 1.0
+    yaw = math.atan2(sign * float(first[1]), float(first[0]))
+    return _bounded(points, yaw, plane)
+
+
+def guess_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
+    """The median of points along each axis [m]: the middle of what is seen of an object."""
+    return points.median(0).values
+
+
+def guess_poses(
+    item: Object, found: Rectangle, radar: Radar, *, ground: Ground | None = None
+) -> list[Float64[Tensor, "4 4"]]:
+    """The four poses in which an object of known size stands in a rectangle.
+
+    Its upright attitude and its height are kept. Each side that faces the radar is put where the
+    rectangle has it, so that the hidden part of the object lies behind; along an axis on which
+    the radar faces no side, the middles agree. A rectangle tells no front from back, nor for
+    certain length from width: ``best_pose`` chooses.
+
+    Args:
+        item: the object; its present pose gives attitude and height.
+        found: the rectangle.
+        radar: its positions.
+        ground: the plane.
+    """
+    plane = ground or Ground()
+    center = item.center.detach()
+    start = item.transform.detach()
+    level = item.vertices.detach() - center
+    where = radar.positions.detach().mean(0)
+    axes = plane.turn(found.yaw)[:, plane.level]
+    half = torch.tensor(found.size).double() / 2
+    away = (where - found.center) @ axes
+    poses = []
+    for quarter in range(4):
+        turn = plane.turn(found.yaw + quarter * math.pi / 2)
+        own = (level @ turn.T) @ axes
+        # Where the object's middle lies when its near side is the rectangle's.
+        near = torch.where(away > 0, half - own.amax(0), -half - own.amin(0))
+        middle = -0.5 * (own.amax(0) + own.amin(0))
+        place = found.center + axes @ torch.where(away.abs() > half, near, middle)
+        place[plane.vertical] = center[plane.vertical]
+        poses.append(rigid(turn, place - turn @ center) @ start)
+    return poses
+
+
+def best_pose(
+    scene: Scene,
+    name: str,
+    poses: Sequence[Float64[Tensor, "4 4"]],
+    radar: Radar,
+    capture: Capture,
+    grid: Grid,
+    *,
+    loss: Callable[[Tensor, Tensor], Tensor],
+    surrogate: Surrogate,
+    samples: int = 100_000,
+    seed: int = 0,
+) -> tuple[Scene, list[float]]:
+    """The scene in the pose whose simulated map is nearest to the data, and all losses.
+
+    Args:
+        scene: with the object anywhere.
+        name: the object.
+        poses: to choose from.
+        radar: of the capture.
+        capture: the data.
+        grid: bins that are compared.
+        loss: (simulated, measured) → a number.
+        surrogate: kernels; extra widths make the choice robust.
+        samples: of one simulation.
+        seed: of the samples.
+
+    Raises:
+        InputError: no poses.
+    """
+    if not poses:
+        raise InputError("expected at least one pose, got none; use guess_poses")
+    measured = surrogate.blur(capture.spectrum(grid).float(), radar, grid)
+    scenes = [scene.replace(name, pose=pose) for pose in poses]
+    losses = []
+    with torch.no_grad():
+        for moved in scenes:
+            simulated = surrogate_spectrum(
+                moved,
+                radar,
+                grid,
+                surrogate,
+                samples=samples,
+                boundary_samples=0,
+                seed=seed,
+                depth=1,
+            )
+            losses.append(float(loss(simulated, measured)) if bool(simulated.any()) else math.inf)
+    return scenes[losses.index(min(losses))], losses
+
+
+def guess_scale(item: Object, found: Rectangle, *, ground: Ground | None = None) -> float:
+    """Length of a rectangle over that of an object, both along their longer side.
+
+    The longer side is the one that is seen from most places; the other often hides its far end.
+    """
+    plane = ground or Ground()
+    extent = item.vertices.detach()[:, plane.level]
+    longest = float((extent.amax(0) - extent.amin(0)).max())
+    return max(found.size) / longest
+
+
+def guess_density(
+    capture: Capture,
+    grid: Grid,
+    item: Object,
+    name: str,
+    low: ArrayLike,
+    high: ArrayLike,
+    counts: Sequence[int],
+    *,
+    depth: float = 1.0,
+) -> DensityGrid:
+    """A density in proportion to the backprojected echoes, for an object as it stands.
+
+    Args:
+        capture: the data.
+        grid: bins of its maps.
+        item: the object; its pose carries the box.
+        name: of the object.
+        low: corner of the box in the object's frame [m].
+        high: the opposite corner [m].
+        counts: nodes along x, y and z.
+        depth: ∫σ ds of a way of one node spacing at the strongest echo.
+
+    Raises:
+        InputError: no echoes in the box.
+    """
+    lattice = Lattice.between(low, high, counts)
+    pose = item.transform.detach()
+    image = echo_image(capture, grid, lattice.nodes @ pose[:3, :3].T + pose[:3, 3])
+    if not float(image.max()) > 0:
+        raise InputError("expected echoes in the box, got none; move the box into the grid")
+    density = depth / float(lattice.spacing.mean()) * image / image.max()
+    return DensityGrid(name, low, high, density)
+
+
+def _bounded(points: Tensor, yaw: float, plane: Ground) -> Rectangle:
+    """The rectangle of a yaw around all but the outermost points."""
+    axes = plane.turn(yaw)[:, plane.level]
+    middle = points.median(0).values
+    places = (points - middle) @ axes
+    low, high = (torch.quantile(places, q, dim=0) for q in (_EDGE, 1 - _EDGE))
+    center = middle + axes @ ((low + high) / 2)
+    first, second = (high - low).tolist()
+    return Rectangle(center, yaw, (first, second))
+
+
+def _incoherent(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tensor:
+    """Mean over frames of the maps at the points, times R⁴."""
+    link = radar.link()
+    total = torch.zeros(len(points), dtype=torch.float64)
+    for frame in range(radar.frame_count):
+        to_tx, to_rx = (points - place[frame].detach() for place in (link.tx, link.rx))
+        ranges = 0.5 * (to_tx.norm(dim=1) + to_rx.norm(dim=1))
+        seen = (to_rx / to_rx.norm(dim=1, keepdim=True)) @ link.rotations[frame].detach()
+        axes = (
+            (seen[:, 1], grid.v_start, grid.v_step, grid.v_count),
+            (seen[:, 0], grid.u_start, grid.u_step, grid.u_count),
+            (ranges, grid.range_start, grid.range_step, grid.range_count),
+        )
+        # In the sampler's units: −1 at the first node, 1 at the last.
+        places = [
+            2 * (value - start) / (step * (count - 1)) - 1 if count > 1 else torch.zeros_like(value)
+            for value, start, step, count in axes
+        ]
+        sampled = torch.nn.functional.grid_sample(
+            maps[frame][None, None],
+            torch.stack(places, dim=1)[None, None, None],
+            align_corners=True,
+        ).reshape(-1)
+        total += sampled * ranges**4 * (seen[:, 2] > 0)
+    return total / radar.frame_count
+
+
+def _resolves_height(radar: Radar, grid: Grid) -> bool:
+    """Whether directions are resolved along more than one axis."""
+    return grid.u_count > 1 and grid.v_count > 1
+
+
+def _height(radar: Radar) -> int:
+    """The world axis that is nearest to the radar's y axis: where heights lie."""
+    link = radar.link()
+    return int(link.rotations.detach()[0, :, 1].abs().argmax())
+
+
+def _level_box(points: Tensor, box: Lattice, radar: Radar, grid: Grid) -> Tensor:
+    """Points within a box; of its height only where heights are resolved."""
+    inside = (points >= box.low) & (points <= box.high)
+    if not _resolves_height(radar, grid):
+        inside[:, _height(radar)] = True
+    return points[inside.all(1)]

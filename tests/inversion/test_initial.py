@@ -1,0 +1,230 @@
+"""Conventional guesses of pose, size and density, on points whose origin is known and on echoes."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from invertwin.capture import Capture
+from invertwin.channel.paths import Grid
+from invertwin.errors import InputError
+from invertwin.inversion.initial import (
+    Ground,
+    best_pose,
+    detected_points,
+    echo_image,
+    fit_rectangle,
+    guess_density,
+    guess_poses,
+    guess_position,
+    guess_scale,
+    image_points,
+    largest_group,
+    principal_rectangle,
+)
+from invertwin.inversion.loss import SpectrumLoss
+from invertwin.radar import FMCW, Radar, Surrogate
+from invertwin.scene import (
+    Isotropic,
+    Mesh,
+    Object,
+    RoughDielectric,
+    Scene,
+    box,
+    linear_array,
+    rigid,
+    rotation_angle,
+)
+from invertwin.scene.antenna import AntennaArray
+from invertwin.simulation import simulate
+from scenes import float64
+
+LOW, HIGH = [-3.0, -1.0, 3.0], [3.0, 1.0, 9.0]
+PLACE = (0.4, 0.0, 6.0)
+SPACING = 0.5 * 3.8e-3
+
+
+def radar_along(count: int = 10, width: float = 4.0) -> Radar:
+    """Poses along x that look along z, with a row of 24 receivers."""
+    single = AntennaArray(float64([[0.0, 0.0, 0.0]]), Isotropic())
+    places = torch.zeros(count, 3, dtype=torch.float64)
+    places[:, 0] = torch.linspace(-width, width, count)
+    waveform = FMCW(77e9, 1e9, 50e-6, 96)
+    return Radar(single, linear_array(24, SPACING), waveform, places)
+
+
+def truck() -> Mesh:
+    """A wide cab before a narrow bed: front and back differ from above."""
+    cab, bed = box((0.8, 0.6, 1.0), 2), box((1.4, 0.4, 0.6), 2)
+    parts = [cab.vertices + float64([0.7, 0.0, 0.0]), bed.vertices - float64([0.4, 0.0, 0.0])]
+    return Mesh(torch.cat(parts), torch.cat([cab.faces, bed.faces + len(cab.vertices)]))
+
+
+def parked(yaw_deg: float) -> Scene:
+    turn = Ground().turn(math.radians(yaw_deg))
+    return Scene({"truck": Object(truck(), RoughDielectric(4.0), rigid(turn, PLACE))})
+
+
+@pytest.fixture(scope="module")
+def seen() -> tuple[Scene, Capture, Grid]:
+    scene, radar = parked(30.0), radar_along()
+    grid = radar.grid(2.0, 10.0)
+    found = simulate(scene, radar, grid, density=1500.0, samples=1000, depth=1, snr_db=10, seed=3)
+    assert found.beat is not None
+    return scene, Capture.from_beat(found.beat, radar), grid
+
+
+def sides(yaw_deg: float, length: float = 4.0, width: float = 1.8, up: str = "y") -> Tensor:
+    """Points on the two sides of a rectangle at PLACE that face the origin, with 2 cm of noise."""
+    plane, generator = Ground(up), torch.Generator().manual_seed(1)
+    axes = plane.turn(math.radians(yaw_deg))[:, plane.level]
+    center = float64(PLACE)
+    if up == "z":
+        center = center[[0, 2, 1]]
+    half = float64([length, width]) / 2
+    facing = -torch.sign(center @ axes)
+    along = 2 * torch.rand(400, 2, generator=generator, dtype=torch.float64) - 1
+    places = torch.cat(
+        [
+            torch.stack([facing[0].expand(150), along[:150, 1]], dim=1),
+            torch.stack([along[150:, 0], facing[1].expand(250)], dim=1),
+        ]
+    )
+    noise = 0.02 * torch.randn(400, 3, generator=generator, dtype=torch.float64)
+    return center + (places * half) @ axes.T + noise
+
+
+@pytest.mark.parametrize("yaw", [10.0, 35.0, 70.0])
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_rectangle_is_found_by_its_near_sides(yaw: float, up: str) -> None:
+    found = fit_rectangle(sides(yaw, up=up), radar_along(), ground=Ground(up), resolution=0.05)
+    assert math.degrees(found.yaw) == pytest.approx(yaw, abs=1.01)
+    assert found.size == pytest.approx((4.0, 1.8), abs=0.25)
+
+
+@pytest.mark.parametrize("yaw", [-100.0, -30.0, 20.0, 65.0])
+def test_one_of_four_poses_is_the_true_one(yaw: float) -> None:
+    points, radar = sides(yaw), radar_along()
+    mesh = box((4.0, 1.5, 1.8))
+    item = Object(mesh, RoughDielectric(4.0), rigid(translation=[20.0, 0.3, -4.0]))
+    found = fit_rectangle(points, radar, resolution=0.05)
+    turn = Ground().turn(math.radians(yaw))
+    errors = [
+        (
+            float((pose[[0, 2], 3] - float64(PLACE)[[0, 2]]).norm()),
+            math.degrees(rotation_angle(pose[:3, :3] @ turn.T)),
+        )
+        for pose in guess_poses(item, found, radar)
+    ]
+    distance, angle = min(errors, key=lambda error: error[1])
+    assert distance < 0.12
+    assert angle < 1.5
+    assert all(float(pose[1, 3]) == pytest.approx(0.3) for pose in guess_poses(item, found, radar))
+    assert guess_scale(item, found) == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_principal_axes_turn_with_the_points(up: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    plane = Ground(up)
+    axes = plane.turn(math.radians(25))[:, plane.level]
+    spread = torch.randn(500, 2, generator=generator, dtype=torch.float64) * float64([2.0, 0.3])
+    found = principal_rectangle(spread @ axes.T + 1.0, ground=plane)
+    assert math.degrees(found.yaw) % 180 == pytest.approx(25, abs=2)
+    assert found.size[0] > 4 * found.size[1]
+
+
+def test_the_largest_group_and_its_middle() -> None:
+    generator = torch.Generator().manual_seed(0)
+    many, few = torch.randn(2, 60, 3, generator=generator, dtype=torch.float64) * 0.1
+    points = torch.cat([many, many[:3], few[:20] + 5.0])
+    group = largest_group(points, 0.5)
+    assert len(group) == 63
+    torch.testing.assert_close(guess_position(group), torch.zeros(3).double(), atol=0.05, rtol=0.0)
+
+
+def test_detections_lie_on_the_object(seen: tuple[Scene, Capture, Grid]) -> None:
+    scene, capture, grid = seen
+    points = detected_points(capture, grid, LOW, HIGH)
+    assert len(points) > 20
+    reach = (points - scene["truck"].center)[:, [0, 2]].norm(dim=1)
+    assert float(reach.median()) < 1.0
+    with pytest.raises(InputError, match="enlarge the box"):
+        detected_points(capture, grid, [-3.0, -1.0, 8.8], [-2.8, 1.0, 9.0])
+
+
+def test_the_image_shows_what_faces_the_radar(seen: tuple[Scene, Capture, Grid]) -> None:
+    scene, capture, grid = seen
+    points = image_points(capture, grid, LOW, HIGH, step=0.1)
+    offset = points.mean(0) - scene["truck"].center
+    assert float(offset[[0, 2]].norm()) < 0.7
+    assert float(offset[2]) < 0.1
+    behind = echo_image(capture, grid, float64([[0.4, 0.0, 6.0], [0.4, 0.0, -6.0]]))
+    assert float(behind[1]) == 0
+
+
+def test_single_channels_are_summed_coherently() -> None:
+    radar = Radar(
+        AntennaArray(float64([[0.0, 0.0, 0.0]]), Isotropic()),
+        AntennaArray(float64([[0.0, 0.0, 0.0]]), Isotropic()),
+        FMCW(5e9, 2e9, 50e-6, 96),
+        torch.stack([torch.linspace(-1, 1, 40), torch.zeros(40), torch.zeros(40)], 1).double(),
+    )
+    grid = radar.grid(1.0, 4.0)
+    place = float64([0.2, 0.0, 2.5])
+    ball = Object(box((0.03, 0.03, 0.03)), RoughDielectric(4.0), rigid(translation=place))
+    found = simulate(Scene({"ball": ball}), radar, grid, density=1e5, samples=1000, depth=1, seed=0)
+    assert found.beat is not None
+    capture = Capture.from_beat(found.beat, radar)
+    points = image_points(capture, grid, [-0.5, -0.01, 2.0], [0.5, 0.01, 3.0], step=0.02, share=0.7)
+    assert float((guess_position(points) - place)[[0, 2]].norm()) < 0.05
+
+
+def test_the_loss_tells_front_from_back(seen: tuple[Scene, Capture, Grid]) -> None:
+    scene, capture, grid = seen
+    radar = capture.radar()
+    rectangle = fit_rectangle(
+        largest_group(detected_points(capture, grid, LOW, HIGH), 1.0), radar, resolution=0.15
+    )
+    anywhere = scene.replace("truck", pose=None)
+    poses = guess_poses(anywhere["truck"], rectangle, radar)
+    chosen, losses = best_pose(
+        anywhere,
+        "truck",
+        poses,
+        radar,
+        capture,
+        grid,
+        loss=SpectrumLoss(kind="likelihood", floor=0.1),
+        surrogate=Surrogate(range_width=1.0, angle_width=0.5),
+        samples=50_000,
+    )
+    assert len(losses) == 4
+    turn = chosen["truck"].transform[:3, :3] @ scene["truck"].transform[:3, :3].T
+    assert math.degrees(rotation_angle(turn)) < 12
+    assert float((chosen["truck"].center - scene["truck"].center).norm()) < 0.25
+
+
+def test_the_density_is_where_the_echoes_are(seen: tuple[Scene, Capture, Grid]) -> None:
+    scene, capture, grid = seen
+    item = scene["truck"]
+    found = guess_density(
+        capture, grid, item, "truck", [-1.5, -0.3, -1.5], [1.5, 0.3, 1.5], (21, 3, 21)
+    )
+    assert found(scene)["truck"].cloud is not None
+    density = found.density.detach()
+    assert float(density.max()) == pytest.approx(1 / float(found.lattice.spacing.mean()))
+    nodes = found.lattice.nodes
+    middle = (density[..., None] * nodes).sum((0, 1, 2)) / density.sum()
+    world = item.transform[:3, :3] @ middle
+    assert float(world[2]) < 0.1  # nearer than the middle: the near sides
+    assert float(middle[[0, 2]].norm()) < 0.7
+
+
+def test_bad_input_is_refused() -> None:
+    radar = radar_along()
+    with pytest.raises(InputError, match="3 points"):
+        fit_rectangle(torch.zeros(2, 3).double(), radar)
+    with pytest.raises(InputError, match="up"):
+        Ground("x")
