@@ -7,6 +7,7 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.inversion.measures import volume_iou
 from invertwin.scene import DensityGrid, Object, RoughDielectric, Scene, plate, sphere
+from invertwin.scene.geometry import without_clouds
 
 BOX = [-0.5] * 3, [0.5] * 3
 
@@ -46,6 +47,17 @@ def test_the_object_becomes_a_cloud_and_a_mesh_again() -> None:
     assert hard["item"].cloud is None
     assert volume_iou(hard["item"].mesh, sphere(0.3), voxel=0.02) > 0.95
     assert not hard["item"].mesh.vertices.requires_grad
+
+
+def test_a_scene_without_clouds() -> None:
+    marker = Object(plate(1.0, 1.0), RoughDielectric(4.0))
+    scene = Scene({"soft": marker, "even": marker, "hard": marker})
+    scene = DensityGrid("soft", *BOX, ball())(scene)
+    scene = DensityGrid.even("even", *BOX, (3, 3, 3))(scene)
+    solid = without_clouds(scene)
+    assert all(item.cloud is None for item in solid.objects.values())
+    assert volume_iou(solid["soft"].mesh, sphere(0.3), voxel=0.02) > 0.9
+    assert solid["even"].mesh is marker.mesh
 
 
 def test_what_reaches_the_box_is_closed() -> None:

@@ -8,7 +8,7 @@ from invertwin.scene.geometry.body import (
     load_smpl,
 )
 from invertwin.scene.geometry.deformation import LatticeDeformation
-from invertwin.scene.geometry.density import DensityGrid
+from invertwin.scene.geometry.density import DensityGrid, cloud_surface, without_clouds
 from invertwin.scene.geometry.distance import DistanceGrid, NeuralDistance
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice
@@ -35,6 +35,7 @@ __all__ = [
     "articulated_template",
     "car_distance",
     "car_mesh",
+    "cloud_surface",
     "iso_surface",
     "load_anny",
     "load_prior",
@@ -42,4 +43,5 @@ __all__ = [
     "load_vehicle_space",
     "person",
     "sample_car",
+    "without_clouds",
 ]

@@ -116,32 +116,12 @@ class DensityGrid(nn.Module):
         return scene.replace(self.object, cloud=self.cloud)
 
     def mesh(self, level: float | None = None) -> Mesh:
-        """The closed surface of equal density, by marching cubes; without gradients.
-
-        Args:
-            level: the density on it [1/m]; None = half of the mean of the densest hundredth of
-                the nodes.
+        """The closed surface of equal density, see ``cloud_surface``.
 
         Raises:
             InputError: no density, or all of it, is above the level.
         """
-        density = self.density.detach()
-        if level is None:
-            dense = density.flatten().sort(descending=True).values
-            level = 0.5 * float(dense[: max(1, len(dense) // 100)].mean())
-        if not float(density.min()) < level < float(density.max()):
-            raise InputError(
-                f"expected a level between the densities {float(density.min()):.3g} and "
-                f"{float(density.max()):.3g} [1/m], got {level:.3g}; give another"
-            )
-        # A layer without density around closes what reaches the faces of the box.
-        padded = nn.functional.pad(density, (1, 1, 1, 1, 1, 1))
-        corners, faces, _, _ = marching_cubes(
-            padded.numpy(), level, gradient_direction="ascent", allow_degenerate=False
-        )
-        places = torch.from_numpy(corners).double() - 1
-        vertices = self.lattice.low + places * self.lattice.spacing
-        return Mesh(vertices, torch.from_numpy(faces.astype("int64")))
+        return cloud_surface(self.cloud, level)
 
     def meshed(self, scene: Scene, level: float | None = None) -> Scene:
         """The scene with the object as a mesh again: the surface of equal density.
@@ -153,3 +133,46 @@ class DensityGrid(nn.Module):
         """
         with torch.no_grad():
             return scene.replace(self.object, mesh=self.mesh(level), cloud=None)
+
+
+def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
+    """The closed surface of equal density, by marching cubes; without gradients.
+
+    Args:
+        cloud: the densities.
+        level: the density on it [1/m]; None = half of the mean of the densest hundredth of the
+            nodes.
+
+    Raises:
+        InputError: no density, or all of it, is above the level.
+    """
+    density = cloud.density.detach()
+    if level is None:
+        dense = density.flatten().sort(descending=True).values
+        level = 0.5 * float(dense[: max(1, len(dense) // 100)].mean())
+    if not float(density.min()) < level < float(density.max()):
+        raise InputError(
+            f"expected a level between the densities {float(density.min()):.3g} and "
+            f"{float(density.max()):.3g} [1/m], got {level:.3g}; give another"
+        )
+    # A layer without density around closes what reaches the faces of the box.
+    padded = nn.functional.pad(density, (1, 1, 1, 1, 1, 1))
+    corners, faces, _, _ = marching_cubes(
+        padded.numpy(), level, gradient_direction="ascent", allow_degenerate=False
+    )
+    places = torch.from_numpy(corners).double() - 1
+    return Mesh(cloud.low + places * cloud.spacing, torch.from_numpy(faces.astype("int64")))
+
+
+def without_clouds(scene: Scene) -> Scene:
+    """The scene with every cloud as the surface of its usual level; for exact signals, pictures.
+
+    An even cloud has no such surface: its object keeps the mesh that marked its place.
+    """
+    for name, item in scene.objects.items():
+        if item.cloud is not None:
+            density = item.cloud.density.detach()
+            even = float(density.max()) <= 2 * float(density.min())
+            mesh = item.mesh if even else cloud_surface(item.cloud)
+            scene = scene.replace(name, mesh=mesh, cloud=None)
+    return scene

@@ -268,7 +268,8 @@ def _read(path: Path) -> ShapePrior:
     if not path.is_file():
         raise InputError(f"expected a shape prior, got no file {path}; {do}")
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        # Opened here: numpy leaves a damaged file open.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in arrays.files}
         if str(found.pop("format")) != _FORMAT:
             raise ValueError("another format")

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from invertwin.errors import InputError
 from invertwin.scene.checks import checked_count, checked_number
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice
@@ -248,8 +249,10 @@ def sample_car(seed: int, kind: str | None = None) -> Car:
         kind: one of `KINDS`; None draws it.
 
     Raises:
-        InputError: a seed that is no count.
+        InputError: a seed that is no count, or an unknown kind.
     """
+    if kind is not None and kind not in KINDS:
+        raise InputError(f"expected a kind of car ({', '.join(KINDS)}), got {kind!r}; choose one")
     random = np.random.default_rng(checked_count(seed, "seed", 0))
     drawn = str(random.choice(list(KINDS), p=_SHARES))
     ranges = {**_COMMON, **KINDS[drawn if kind is None else kind]}
