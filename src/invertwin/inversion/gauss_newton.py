@@ -33,7 +33,8 @@ class GaussNewton:
         damping: present μ.
 
     Source: the Levenberg–Marquardt method.
-    Differs from the source: g and H are estimates from samples; no step is longer than ``reach``.
+    Differs from the source: g and H are estimates from samples; no parameter
+    changes by more than ``reach`` in a step.
     """
 
     def __init__(
@@ -134,9 +135,20 @@ class GaussNewton:
         """Nothing: gradients are not kept in the parameters."""
 
     def _solved(self, curvature: Tensor, slope: Tensor) -> Float64[Tensor, " p"]:
+        """The least of the damped quadratic model within the reach of every parameter."""
         scale = curvature.diagonal().clamp_min(_FLAT * float(curvature.diagonal().max()))
-        change = -torch.linalg.solve(curvature + torch.diag(self.damping * scale), slope)
-        return change * min(1.0, self.reach / float(change.abs().max().clamp_min(1e-300)))
+        model = curvature + torch.diag(self.damping * scale)
+        change, free = torch.zeros_like(slope), torch.ones_like(slope, dtype=torch.bool)
+        while bool(free.any()):
+            # What is at its limit stays there, the others make the best of it.
+            rest = slope[free] + model[free][:, ~free] @ change[~free]
+            change[free] = -torch.linalg.solve(model[free][:, free], rest)
+            beyond = free & (change.abs() > self.reach)
+            if not bool(beyond.any()):
+                break
+            change = change.clamp(-self.reach, self.reach)
+            free = free & ~beyond
+        return change
 
     def _move(self, start: list[Tensor], change: Tensor, free: Tensor) -> None:
         """Set the parameters to where they were, plus a change of the free ones."""

@@ -1,0 +1,190 @@
+"""Gauss–Newton: exact on maps that are quadratic, few steps on real ones, and safe."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.inversion import SpectrumLoss
+from invertwin.inversion.gauss_newton import GaussNewton
+from invertwin.radar import surrogate_spectrum
+from invertwin.scene.parameters import Pose, Translation
+from scenes import float64
+
+SHAPE = (2, 8, 6, 1)
+
+
+def random_map(seed: int) -> Tensor:
+    return torch.rand(SHAPE, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+class Mixture(nn.Module):
+    """A map that is linear in its parameters, one of which is held fixed."""
+
+    def __init__(self, start: list[float]) -> None:
+        super().__init__()
+        self.share = nn.Parameter(float64(start))
+        self.free = float64([1.0, 1.0, 0.0])
+        self.base = 2 + random_map(0)
+        self.parts = torch.stack([random_map(k) for k in (1, 2, 3)])
+
+    def forward(self) -> Tensor:
+        share = self.share * self.free + self.share.detach() * (1 - self.free)
+        return self.base + torch.tensordot(share, self.parts, dims=1)
+
+
+TRUTH = [0.4, -0.3, 0.0]
+
+
+@pytest.mark.parametrize("kind", ["mse", "likelihood"])
+@pytest.mark.parametrize("gain", ["fitted", "one"])
+def test_linear_maps_are_solved_in_a_few_steps(kind, gain):
+    model, measured = Mixture([0.0, 0.0, 0.0]), Mixture(TRUTH)().detach()
+    scale = 3.0 if gain == "fitted" else 1.0
+    solver = GaussNewton(model, SpectrumLoss(kind, gain=gain), damping=1e-4)
+    losses = [solver.step(lambda: (model(), scale * measured)) for _ in range(6)]
+    assert torch.allclose(model.share.detach(), float64(TRUTH), atol=1e-4)
+    assert losses[-1] < 1e-6 * losses[0]
+    assert isinstance(model.share, nn.Parameter)
+
+
+@pytest.mark.parametrize("kind", ["mse", "likelihood"])
+@pytest.mark.parametrize("background", ["none", "level", "static"])
+def test_curvature_is_the_second_derivative_at_the_truth(kind, background):
+    """Where simulation and data agree, Gauss–Newton leaves nothing out."""
+    if kind == "likelihood" and background != "none":
+        return
+    model = Mixture(TRUTH)
+    measured, map_ = model().detach(), model().detach()
+    loss = SpectrumLoss(kind, gain="one", background=background)
+    found = loss.curvature(map_, measured, model.parts)
+
+    def value(share: Tensor) -> Tensor:
+        return loss(model.base + torch.tensordot(share, model.parts, dims=1), measured)
+
+    truth = torch.func.hessian(value)(model.share.detach())
+    assert torch.allclose(found, truth, rtol=1e-5, atol=1e-9)
+
+
+def test_what_a_gain_explains_tells_nothing():
+    measured = random_map(4) + 1
+    tangents = torch.stack([measured, random_map(5)])
+    for kind in ("mse", "likelihood"):
+        found = SpectrumLoss(kind).curvature(measured, measured, tangents)
+        assert abs(float(found[0, 0])) < 1e-6
+        assert float(found[1, 1]) > 1e-4
+
+
+def test_a_fixed_coordinate_stays_to_the_last_bit():
+    model = Mixture([0.1, 0.2, 0.123456789])
+    measured = Mixture(TRUTH)().detach()
+    GaussNewton(model, SpectrumLoss()).step(lambda: (model(), measured))
+    assert float(model.share[2].detach()) == 0.123456789
+    assert float(model.share[0].detach()) != 0.1
+
+
+def test_no_step_is_longer_than_its_reach_and_none_makes_it_worse():
+    measured = Mixture(TRUTH)().detach()
+    model = Mixture([0.0, 0.0, 0.0])
+    GaussNewton(model, SpectrumLoss(), reach=0.01).step(lambda: (model(), measured))
+    assert float(model.share.detach().abs().max()) == pytest.approx(0.01, rel=1e-6)
+
+    class Wrong(Mixture):
+        """Its derivative points the wrong way."""
+
+        def forward(self) -> Tensor:
+            return self.base + torch.tensordot(2 * self.share.detach() - self.share, self.parts, 1)
+
+    wrong = Wrong([0.0, 0.0, 0.0])
+    solver = GaussNewton(wrong, SpectrumLoss(gain="one"))
+    solver.step(lambda: (wrong(), measured))
+    assert torch.equal(wrong.share.detach(), torch.zeros(3, dtype=torch.float64))
+    assert solver.damping > 0.01
+    again = GaussNewton(wrong, SpectrumLoss())
+    again.load_state_dict(solver.state_dict())
+    assert again.damping == solver.damping
+
+
+def test_a_penalty_takes_part_with_its_own_curvature():
+    model = Mixture([0.0, 0.0, 0.0])
+    measured = Mixture([0.0, 0.0, 0.0])().detach()
+    wish = float64([0.2, 0.1, 0.0])
+    heavy = GaussNewton(model, SpectrumLoss(gain="one"), damping=1e-4)
+    for _ in range(3):
+        heavy.step(
+            lambda: (model(), measured),
+            lambda: 1e4 * (model.share * model.free - wish).square().sum(),
+        )
+    assert torch.allclose(model.share.detach(), wish, atol=1e-4)
+
+
+def test_a_displaced_plate_is_found_in_eight_steps(case):
+    """The same plate takes Adam 60 steps (test_reconstruction). The array tells nothing of y."""
+    module = Translation("plate", axes="xz")
+    surrogate = case.settings()["surrogate"]
+    solver = GaussNewton(module, SpectrumLoss(), reach=0.1)
+    for step in range(8):
+        left = max(0.0, 1 - step / 5)
+        kernels = replace(surrogate, range_width=2 * left, angle_width=left)
+
+        def maps(step: int = step, kernels: Any = kernels) -> tuple[Tensor, Tensor]:
+            simulated = surrogate_spectrum(
+                module(case.scene),
+                case.radar,
+                case.grid,
+                kernels,
+                samples=40_000,
+                boundary_samples=10_000,
+                seed=step,
+                depth=1,
+            )
+            measured = case.capture.spectrum(case.grid).float()
+            return simulated, kernels.blur(measured, case.radar, case.grid)
+
+        solver.step(maps)
+    error = case.error(module(case.scene))
+    assert float(error[[0, 2]].norm()) < 0.02
+
+
+def test_bad_input(unchecked):
+    model, many = Mixture([0.0, 0.0, 0.0]), Translation("plate")
+    many.translation = nn.Parameter(torch.zeros(65, dtype=torch.float64))
+    with pytest.raises(InputError, match="expected a SpectrumLoss, got function"):
+        GaussNewton(model, lambda a, b: a)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="reach > 0"):
+        GaussNewton(model, SpectrumLoss(), reach=0.0)
+    with pytest.raises(InputError, match="got 0,"):
+        GaussNewton(nn.ReLU(), SpectrumLoss())
+    solver = GaussNewton(many, SpectrumLoss())
+    with pytest.raises(InputError, match="expected at most 64 parameters"):
+        solver.step(lambda: (many.translation.exp().sum() * random_map(0), random_map(1)))
+
+
+def test_a_map_that_is_not_finite_is_reported_not_followed():
+    model = Mixture([0.1, 0.0, 0.0])
+    measured = Mixture(TRUTH)().detach()
+    found = GaussNewton(model, SpectrumLoss()).step(lambda: (model() * math.nan, measured))
+    assert math.isnan(found)
+    assert float(model.share[0].detach()) == 0.1
+
+
+def test_a_turned_pose_has_free_quaternion_numbers_only(case):
+    module = Pose("plate", axes="z", rotation_axes="y")
+    measured = case.capture.spectrum(case.grid).float()
+
+    def maps() -> tuple[Tensor, Tensor]:
+        simulated = surrogate_spectrum(
+            module(case.scene), case.radar, case.grid, case.settings()["surrogate"],
+            samples=4_000, boundary_samples=1_000, seed=0, depth=1,
+        )  # fmt: skip
+        return simulated, measured
+
+    GaussNewton(module, SpectrumLoss("likelihood")).step(maps)
+    state = module.state_dict()
+    assert torch.equal(state["translation"][:2], torch.zeros(2, dtype=torch.float64))
+    assert torch.equal(state["rotation"][[1, 3]], torch.zeros(2, dtype=torch.float64))
+    assert float(state["translation"][2].abs()) > 0
