@@ -15,7 +15,7 @@ from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import unknown_object
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
-from invertwin.cli.shape_tables import shape_mesh, shape_module, shape_terms
+from invertwin.cli.shape_tables import density_module, shape_mesh, shape_module, shape_terms
 from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
@@ -214,6 +214,9 @@ def _module(table: schema.Parameter, path: str, start: Start, scene: Scene) -> n
                 return fitted(table, scene[table.object].material)
         case schema.RadarParameter():
             return RadarPose()
+        case schema.DensityParameter():
+            with about(path):
+                return density_module(table, scene[table.object])
     with about(path):
         return shape_module(table, scene[table.object].mesh, start.bodies)
 

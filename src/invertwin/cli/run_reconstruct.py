@@ -10,6 +10,7 @@ from rich.console import Console
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fits.fitting import calibrated, fit, outcome
+from invertwin.cli.fits.initial import added, guessed
 from invertwin.cli.fits.likeness import is_shape_key
 from invertwin.cli.fits.problem import modes_of, problem_of
 from invertwin.cli.fits.scores import (
@@ -35,6 +36,7 @@ from invertwin.cli.run_openradar import run_openradar
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
 from invertwin.cli.schema import OpenRadarData, RunFile, SimulatedData
 from invertwin.scene.files import save_mesh
+from invertwin.scene.geometry import without_clouds
 
 
 def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
@@ -47,6 +49,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     begin = time.perf_counter()
     need(run, "reconstruct", "reconstruct")
     problem, calibration = calibrated(problem_of(run, console), folder, console)
+    problem, conventional = guessed(problem, console)
     starts = [build.Start(problem.scene, sought_bodies(run))]
     if run.starts is not None:
         starts = build.starts(
@@ -69,6 +72,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         "start": sharp_spectrum(problem, start, problem.radar, None),
         "twin": sharp_spectrum(problem, twin, radar, offset),
     }
+    start, twin = without_clouds(start), without_clouds(twin)
     metrics = {
         "task": run.task,
         **summary(problem, rows, modes),
@@ -82,6 +86,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         "parameters": best["values"],
         **agreement(problem, twin, radar),
         **({"calibration": calibration} if calibration else {}),
+        **conventional,
         **heldout(problem, rows[modes[0]], best),
         "starts": without_history(rows[modes[0]]),
     }
@@ -96,7 +101,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         metrics["landscape"] = found
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
-    tables = tables_of(problem, metrics, start, twin, rows)
+    tables = [*tables_of(problem, metrics, start, twin, rows), *added(metrics)]
     draw(problem, folder, rows, metrics, start, twin, radar, maps)
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:

@@ -12,8 +12,9 @@ from invertwin.errors import InputError
 from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
-from invertwin.scene import Mesh, Scene
+from invertwin.scene import Mesh, Object, Scene
 from invertwin.scene.geometry import (
+    DensityGrid,
     DistanceGrid,
     LatticeDeformation,
     LinearShape,
@@ -90,6 +91,18 @@ def shape_module(
         case schema.PriorParameter():
             return PriorShape(table.object, load_prior(table.file), counts=table.counts)
     raise InputError(f"expected a shape, got {table.kind}; choose another kind")
+
+
+def density_module(table: schema.DensityParameter, item: Object) -> DensityGrid:
+    """The module of a density: from the object's present cloud, else faint and even.
+
+    Raises:
+        InputError: A box without volume.
+    """
+    if item.cloud is not None:
+        cloud = item.cloud
+        return DensityGrid(table.object, cloud.low, cloud.high, cloud.density.detach())
+    return DensityGrid.even(table.object, table.low, table.high, table.counts)
 
 
 def shape_terms(table: schema.Parameter, module: nn.Module, scene: Scene) -> list[Regularizer]:

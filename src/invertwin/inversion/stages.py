@@ -14,6 +14,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
 from invertwin.inversion.regularization import Regularizer
 from invertwin.radar.radar import Radar
+from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
 
@@ -98,7 +99,8 @@ def reconstruct_in_stages(
     for k, stage in enumerate(stages):
         if found is None or stage.rebuild or stage.remesh:
             if found is not None:
-                scene, radar = found.scene, found.radar
+                # What was a cloud goes on as a mesh.
+                scene, radar = without_clouds(found.scene), found.radar
             for name, change in stage.remesh.items():
                 scene = scene.replace(name, mesh=change(scene[name].mesh))
             # Modules are built in order, each for the scene as those before it leave it.

@@ -6,6 +6,7 @@ from typing import Any
 from invertwin.cli.fits.problem import Problem
 from invertwin.inversion.measures import Likeness, compare_shapes
 from invertwin.scene import Mesh, Scene
+from invertwin.scene.geometry import without_clouds
 
 CURVE = "chamfer_m"
 """What the curves show."""
@@ -65,7 +66,7 @@ def watch_of(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
         return None
 
     def watch(scene: Scene) -> dict[str, float]:
-        found = _placed(scene, table.object)
+        found = _placed(without_clouds(scene), table.object)
         truth = _placed(problem.truth, table.object)
         return {CURVE: compare_shapes(found, truth, seen_from=_eyes(problem, table.seen)).chamfer}
 

@@ -19,18 +19,19 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Scene
+from invertwin.scene.geometry import without_clouds
 from invertwin.simulation import surrogate_correlation
 
 
 def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
     """How far start and twin are from the truth, where it is known."""
-    name = problem.target
+    name, twin = problem.target, without_clouds(twin)
     if name is None:
         return {}
     place = twin[name].center.detach().tolist()
     if name not in problem.known:
         return {"position": place}
-    shapes = shape_scores(problem, start.scene, twin)
+    shapes = shape_scores(problem, without_clouds(start.scene), twin)
     if not torch.equal(twin[name].mesh.faces, problem.truth[name].mesh.faces):
         # Other triangles: no vertex is another one's copy, only surfaces can be compared.
         return {"position": place, **shapes}

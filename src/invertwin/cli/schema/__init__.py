@@ -3,6 +3,7 @@
 Nothing here imports torch or Mitsuba: a wrong key is reported before anything heavy loads.
 """
 
+from invertwin.cli.schema.initial import Initial
 from invertwin.cli.schema.inversion import (
     Calibration,
     CaptureData,
@@ -64,6 +65,7 @@ from invertwin.cli.schema.objects import (
 )
 from invertwin.cli.schema.parameters import (
     BodyParameter,
+    DensityParameter,
     DistanceGridParameter,
     LatticeParameter,
     MaterialParameter,
@@ -156,6 +158,7 @@ __all__ = [
     "Count",
     "Data",
     "Dca1000Data",
+    "DensityParameter",
     "Dielectric",
     "Dihedral",
     "DihedralObject",
@@ -169,6 +172,7 @@ __all__ = [
     "GridTrack",
     "Impairments",
     "Impulse",
+    "Initial",
     "InputPath",
     "Interval",
     "Isotropic",

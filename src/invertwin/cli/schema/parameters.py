@@ -103,6 +103,13 @@ class NeuralDistanceParameter(_BoxParameter):
     """of the first layer, radians over the box's half diagonal"""
 
 
+class DensityParameter(_BoxParameter):
+    """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else faint and
+    even. Rates of about 0.1 suit it; measures and pictures show the surface of its usual level."""
+
+    kind: Literal["density"]
+
+
 class ShapeSpaceParameter(ObjectParameter):
     """Coordinates of the public space of vehicles, from the mean shape."""
 
@@ -175,6 +182,7 @@ Parameter = Annotated[
     | Annotated[LatticeParameter, Tag(TAG_MARK + "lattice")]
     | Annotated[DistanceGridParameter, Tag(TAG_MARK + "distance_grid")]
     | Annotated[NeuralDistanceParameter, Tag(TAG_MARK + "neural_distance")]
+    | Annotated[DensityParameter, Tag(TAG_MARK + "density")]
     | Annotated[PriorParameter, Tag(TAG_MARK + "prior")]
     | Annotated[ShapeSpaceParameter, Tag(TAG_MARK + "shape_space")]
     | Annotated[BodyParameter, Tag(TAG_MARK + "body")]

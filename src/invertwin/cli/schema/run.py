@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import model_validator
 from pydantic_core import PydanticCustomError
 
+from invertwin.cli.schema.initial import Initial
 from invertwin.cli.schema.inversion import (
     Calibration,
     Data,
@@ -58,6 +59,8 @@ class RunFile(Section):
     """[[parameters]]: what is sought"""
     starts: Starts | None = None
     """where fits start; without it where the scene says"""
+    initial: Initial | None = None
+    """where the fit starts by conventional processing, not with [starts]"""
     surrogate: Surrogate = Surrogate()
     """kernels of the smooth model"""
     loss: Loss = Loss()
@@ -124,7 +127,14 @@ class RunFile(Section):
         for i, parameter in enumerate(self.parameters):
             if not isinstance(parameter, RadarParameter):
                 used.append((f"parameters[{i}].object", parameter.object))
-        for section in ("starts", "landscape", "calibration", "loss_scan", "measures"):
+        for section in (
+            "starts",
+            "initial",
+            "landscape",
+            "calibration",
+            "loss_scan",
+            "measures",
+        ):
             if getattr(self, section) is not None:
                 used.append((f"{section}.object", getattr(self, section).object))
         if self.gradcheck is not None and self.gradcheck.parameter.object is not None:

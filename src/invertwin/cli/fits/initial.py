@@ -1,0 +1,140 @@
+"""The start of a fit by conventional processing, and what the fit has added to it."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+from rich.console import Console
+
+from invertwin.cli import build
+from invertwin.cli.fits.likeness import is_shape_key, shape_label
+from invertwin.cli.fits.problem import Problem
+from invertwin.cli.report import Table
+from invertwin.cli.run_file import about
+from invertwin.cli.schema.initial import Initial
+from invertwin.errors import InputError
+from invertwin.inversion.initial import (
+    Ground,
+    best_pose,
+    detected_points,
+    fit_rectangle,
+    guess_density,
+    guess_poses,
+    guess_position,
+    guess_scale,
+    image_points,
+    largest_group,
+    principal_rectangle,
+)
+from invertwin.radar.surrogate import Surrogate
+from invertwin.scene import Mesh, Scene, rigid
+
+# Wide enough for a guess that is off by a cell, sharp enough to tell front from back.
+_KERNELS = Surrogate(range_width=1.0, angle_width=0.5)
+_LABELS = (
+    ("distance to the truth [m]", "start_distance_m", "position_error_m"),
+    ("angle to the truth [°]", "start_angle_deg", "rotation_error_deg"),
+    ("size, share off the truth", "initial_scale_error", "scale_error"),
+    ("loss without extra width", "start_loss_sharp", "loss_sharp"),
+)
+
+
+def guessed(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]]:
+    """The problem with its object where `[initial]` finds it, and how that went.
+
+    Raises:
+        InputError: `[starts]` beside it, no echoes, or too few points.
+    """
+    table = problem.run.initial
+    if table is None:
+        return problem, {}
+    if problem.run.starts is not None:
+        raise InputError(
+            "initial: expected no [starts] beside [initial], got both; a fit starts from one"
+        )
+    console.print(f"looking for {table.object} with a conventional detector")
+    begin = time.perf_counter()
+    with about("initial"):
+        scene, found = _placed(problem, table)
+        scene = _clouded(problem, table, scene)
+    found["initial_seconds"] = time.perf_counter() - begin
+    return replace(problem, scene=scene), found
+
+
+def added(metrics: dict[str, Any]) -> list[Table]:
+    """What the fit has made better: the conventional guess beside the twin."""
+    if "initial_points" not in metrics:
+        return []
+    shapes = [(shape_label(key), f"start_{key}", key) for key in metrics if is_shape_key(key)]
+    rows = [
+        [label, metrics[before], metrics[after]]
+        for label, before, after in (*_LABELS, *shapes)
+        if metrics.get(before) is not None and metrics.get(after) is not None
+    ]
+    legend = (
+        f"The fit started where a conventional detector and a rectangle around its "
+        f"{metrics['initial_points']} echoes put the object."
+    )
+    columns = ["quantity", "conventional guess", "refined twin"]
+    return [Table("What the refinement added", columns, rows, legend)]
+
+
+def _placed(problem: Problem, table: Initial) -> tuple[Scene, dict[str, Any]]:
+    capture, grid, radar = problem.capture, problem.grid, problem.radar
+    if table.method == "points":
+        points = detected_points(
+            capture, grid, table.low, table.high, false_alarm=table.false_alarm
+        )
+    else:
+        points = image_points(capture, grid, table.low, table.high, step=table.step)
+    points = largest_group(points, table.gap)
+    found: dict[str, Any] = {"initial_points": len(points)}
+    plane, scene, name = Ground(table.up), problem.scene, table.object
+    item = scene[name]
+    if table.pose == "position":
+        shift = guess_position(points) - item.center.detach()
+        shift[plane.vertical] = 0.0
+        return scene.replace(name, pose=rigid(translation=shift) @ item.transform), found
+    if table.pose == "axes":
+        rectangle = principal_rectangle(points, ground=plane)
+    else:
+        resolution = radar.waveform.range_resolution
+        rectangle = fit_rectangle(points, radar, ground=plane, resolution=resolution)
+    if table.scale:
+        factor = guess_scale(item, rectangle, ground=plane)
+        middle = item.mesh.center
+        mesh = Mesh(middle + (item.mesh.vertices - middle) * factor, item.mesh.faces)
+        scene = scene.replace(name, mesh=mesh)
+        if name in problem.known:
+            off = build.residual(scene[name], problem.truth[name]).scale
+            found["initial_scale_error"] = abs(off - 1)
+    scene, losses = best_pose(
+        scene,
+        name,
+        guess_poses(scene[name], rectangle, radar, ground=plane),
+        radar,
+        capture,
+        grid,
+        loss=build.loss(problem.run.loss),
+        surrogate=_KERNELS,
+        seed=problem.run.seed,
+    )
+    return scene, found | {"initial_losses": losses, "initial_size_m": list(rectangle.size)}
+
+
+def _clouded(problem: Problem, table: Initial, scene: Scene) -> Scene:
+    """The scene with a density from the backprojected echoes, where one is sought."""
+    for sought in problem.run.parameters:
+        if sought.kind == "density" and sought.object == table.object:
+            item = scene[table.object]
+            grid = guess_density(
+                problem.capture,
+                problem.grid,
+                item,
+                table.object,
+                sought.low,
+                sought.high,
+                sought.counts,
+            )
+            return scene.replace(table.object, cloud=grid.cloud)
+    return scene
