@@ -261,6 +261,29 @@ def loss_scan(
         _print(tables)
 
 
+@app.command(name="train-prior")
+def train_prior(
+    cars: Annotated[int, typer.Option(min=100, help="Cars that are drawn for it.")] = 3000,
+    latent: Annotated[int, typer.Option(min=1, max=64, help="Coordinates of a shape.")] = 24,
+    epochs: Annotated[int, typer.Option(min=1, help="Times that every car is seen.")] = 40,
+    wheels: Annotated[bool, typer.Option("--wheels", help="Cars with wheels.")] = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Train a shape prior on cars of the generator; the packaged one by default."""
+    from invertwin.cli.run_train_prior import run_train_prior
+    from invertwin.inversion import Training
+
+    settings = Training(cars=cars, latent=latent, epochs=epochs, wheels=wheels, seed=seed)
+    again = f"train-prior --cars {cars} --latent {latent} --epochs {epochs} --seed {seed}"
+    again += " --wheels" if wheels else ""
+    with _folder(out or Path("out/train_prior"), {}, overwrite, False) as folder:
+        say = _now_and_then()
+        tables = run_train_prior(settings, folder, again, say)
+        _print(tables)
+
+
 @app.command()
 def keys(
     section: Annotated[

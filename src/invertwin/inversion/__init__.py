@@ -12,7 +12,7 @@ from invertwin.inversion.mover import (
     strongest_mover,
 )
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
-from invertwin.inversion.prior import LatentNorm, Training, train_prior
+from invertwin.inversion.prior import LatentNorm, Trained, Training, train_prior
 from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
 
@@ -32,6 +32,7 @@ __all__ = [
     "Reconstruction",
     "Regularizer",
     "SpectrumLoss",
+    "Trained",
     "Training",
     "compare_shapes",
     "fit_mover",

@@ -21,6 +21,7 @@ _LOW, _HIGH = (-3.4, -1.2, -0.08), (3.2, 1.2, 2.24)  # holds every car of the ge
 _NODES = (67, 31, 30)
 _NEAR = 0.15  # distances up to here count most [m]
 _FAR = 0.02  # weight of those far away
+_PACE = (0.1, 1.0, 10.0)  # learning rates of fields, network and latents, over the given one
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,28 @@ class LatentNorm:
         return 0.5 * self.weight * self.module.latent.square().sum()  # type: ignore[union-attr]
 
 
-def train_prior(
-    settings: Training | None = None, say: Callable[[str], None] = print
-) -> tuple[ShapePrior, list[dict[str, Any]]]:
+@dataclass(frozen=True)
+class Trained:
+    """The outcome of :func:`train_prior`.
+
+    Attributes:
+        prior: The prior.
+        history: A row an epoch: ``epoch``, ``error`` (of the cars of training, as below),
+            ``latent`` (root mean square), ``seconds``.
+        held_out_error: Root mean square of distances near the surface of cars that were not
+            trained on, at their best latents [m].
+        mean_error: The same of the mean shape.
+        latents: Of the cars of training, in the order of their seeds.
+    """
+
+    prior: ShapePrior
+    history: list[dict[str, Any]]
+    held_out_error: float
+    mean_error: float
+    latents: Float64[Tensor, "car latent"]
+
+
+def train_prior(settings: Training | None = None, say: Callable[[str], None] = print) -> Trained:
     """Train a prior on cars of the generator: one latent per car, learned with the decoder.
 
     Latents and decoder start from the principal components of the distances; both are learned on
@@ -101,20 +121,24 @@ def train_prior(
         say: takes a line of the log.
 
     Returns:
-        The prior, and a row an epoch: ``epoch``, ``error`` (root of the weighted mean square of
-        training, m), ``latent`` (root mean square), ``seconds``.
+        The prior and how well it does; the same seed gives the same to rounding.
     """
     plan = Training() if settings is None else settings
     lattice = Lattice.between(_LOW, _HIGH, _NODES)
     say("settings: " + ", ".join(f"{key} {value}" for key, value in asdict(plan).items()))
     begun = time.monotonic()
-    cars = car_distances(lattice, plan.cars, plan.seed, plan.wheels)
-    say(f"{plan.cars} cars at {cars.shape[1]} nodes in {time.monotonic() - begun:.0f} s")
-    decoder, latents = _first(plan, cars)
+    cars = car_distances(lattice, plan.cars + plan.held_out, plan.seed, plan.wheels)
+    say(f"{len(cars)} cars at {cars.shape[1]} nodes in {time.monotonic() - begun:.0f} s")
+    cars, others = cars[: plan.cars], cars[plan.cars :]
+    # What is random must not depend on what was drawn before, nor change what is drawn after.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(plan.seed)
+        decoder, latents = _first(plan, cars)
     rows = _learn(plan, cars, decoder, latents, say)
-    _standardize(decoder, latents)
-    prior = ShapePrior(decoder, lattice)
-    return prior, rows
+    standard = _standardize(decoder, latents)
+    found, mean = _held_out(decoder, others)
+    say(f"held out: error {found:.5f} m, mean shape {mean:.5f} m")
+    return Trained(ShapePrior(decoder, lattice), rows, found, mean, standard)
 
 
 def car_distances(
@@ -129,13 +153,14 @@ def car_distances(
     return distances
 
 
-def _closeness(distances: Tensor) -> Tensor:
-    return _FAR + (1 - _FAR) / (1 + (distances / _NEAR) ** 4)
+def _error(decoder: Decoder, latents: Tensor, truth: Tensor) -> Tensor:
+    """Mean square error of distances [m²], weighted by closeness to the surface."""
+    weight = _FAR + (1 - _FAR) / (1 + (truth / _NEAR) ** 4)
+    return (weight * (decoder(latents) - truth).square()).sum() / weight.sum()
 
 
 def _first(plan: Training, cars: Tensor) -> tuple[Decoder, nn.Parameter]:
     """Decoder and latents of the principal components."""
-    torch.manual_seed(plan.seed)
     mean = cars.mean(0)
     left, singular, right = torch.svd_lowrank(cars - mean, q=max(plan.latent, plan.features) + 8)
     decoder = Decoder(plan.latent, plan.width, plan.features, cars.shape[1])
@@ -161,9 +186,9 @@ def _learn(
     others = [p for p in decoder.parameters() if all(p is not q for q in fields)]
     optimizer = torch.optim.Adam(
         [
-            {"params": fields, "ratio": 0.1},
-            {"params": others, "ratio": 1.0},
-            {"params": [latents], "ratio": 10.0},
+            {"params": fields, "ratio": _PACE[0]},
+            {"params": others, "ratio": _PACE[1]},
+            {"params": [latents], "ratio": _PACE[2]},
         ],
         lr=plan.rate,
     )
@@ -176,8 +201,7 @@ def _learn(
             for group in optimizer.param_groups:
                 group["lr"] = plan.rate * group["ratio"] * 0.5 * (1 + math.cos(math.pi * done))
             truth, z = cars[chosen], latents[chosen]
-            weight = _closeness(truth)
-            error = (weight * (decoder(z) - truth).square()).sum() / weight.sum()
+            error = _error(decoder, z, truth)
             first = first or float(error.detach())
             loss = error / first + plan.regularizer * 0.5 * z.square().sum(1).mean()
             optimizer.zero_grad()
@@ -200,14 +224,14 @@ def _learn(
     return rows
 
 
-def _standardize(decoder: Decoder, latents: nn.Parameter) -> None:
+def _standardize(decoder: Decoder, latents: Tensor) -> Tensor:
     """Latents of zero mean and unit variance in the order of their effect; the decoder follows.
 
     With z = m + T z′ the decoder's first layers take T and m on.
     """
     decoder.double()
     with torch.no_grad():
-        z = latents.double()
+        z = latents.detach().double()
         mean = z.mean(0)
         root = torch.linalg.cholesky(torch.cov((z - mean).T))
         white = torch.linalg.solve_triangular(root, (z - mean).T, upper=False).T
@@ -219,4 +243,22 @@ def _standardize(decoder: Decoder, latents: nn.Parameter) -> None:
         decoder.leave.bias.add_(decoder.straight.weight @ mean)
         for layer in (decoder.enter, decoder.straight):
             layer.weight.copy_(layer.weight @ change)
-        latents.data = white @ turn
+        return white @ turn
+
+
+def _held_out(decoder: Decoder, cars: Tensor) -> tuple[float, float]:
+    """Errors [m] of cars at their best latents, and at the mean."""
+    truth = cars.double()
+    latents = torch.zeros(len(cars), decoder.enter.in_features, dtype=torch.float64)
+    mean = float(_error(decoder, latents, truth).detach())
+    latents.requires_grad_()
+    search = torch.optim.LBFGS([latents], max_iter=40, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        search.zero_grad()
+        value = _error(decoder, latents, truth) / mean + 1e-4 * latents.square().sum(1).mean()
+        value.backward(inputs=[latents])
+        return value
+
+    search.step(loss)  # type: ignore[arg-type]
+    return math.sqrt(float(_error(decoder, latents, truth).detach())), math.sqrt(mean)
