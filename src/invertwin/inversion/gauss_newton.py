@@ -40,7 +40,7 @@ class GaussNewton:
     def __init__(
         self,
         modules: nn.Module,
-        loss: SpectrumLoss,
+        loss: Callable[[Tensor, Tensor], Tensor],
         *,
         reach: float = 0.3,
         damping: float = 0.01,
@@ -49,7 +49,7 @@ class GaussNewton:
 
         Args:
             modules: what is fitted.
-            loss: how maps are compared.
+            loss: how maps are compared, a `SpectrumLoss`.
             reach: the longest change of one parameter in a step, in its unit.
             damping: μ at the first step.
 
@@ -128,7 +128,16 @@ class GaussNewton:
         return {"damping": self.damping}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` gave."""
+        """Restore what `state_dict` gave.
+
+        Raises:
+            InputError: the state of another optimiser.
+        """
+        if "damping" not in state:
+            raise InputError(
+                "expected the state of Gauss–Newton in the checkpoint, got that of another "
+                "optimiser; start without resume"
+            )
         self.damping = float(state["damping"])
 
     def zero_grad(self) -> None:
