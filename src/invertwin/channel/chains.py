@@ -5,7 +5,7 @@ the square root of that, with a phase of its own (derivations §4). Nothing here
 has drawn: chains are fixed, so that a realisation stays while radar and scene move.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
@@ -13,12 +13,29 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import kernel, walk
-from invertwin.channel.bridge import Geometry, flatten, to_float, to_torch, tracer, use_backend
+from invertwin.channel.bridge import (
+    Geometry,
+    flatten,
+    opaque,
+    to_float,
+    to_index,
+    to_torch,
+    tracer,
+    use_backend,
+)
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import Shot, face_areas, next_surface, scrambled, uniform_pair, visible
 from invertwin.scene.scene import Scene
 
 _MOST_SHEETS = 8  # that a segment of an explicit path may pass
+
+# How rough chains are drawn.
+_LANES = 1 << 18  # walked at a time
+_KEPT = 0.25  # of the chains that are drawn; the others carry little
+_REFERENCES = 8  # frames that say how much a chain carries
+_ALIKE = 0.5  # share of the draws that goes to all sequences of objects alike
+_BLIND = 0.1  # share that goes to chains whatever the reference frames see of them
+_AWAY = 0.125  # share of the first points that are lit from the side the antennas do not see
 
 
 @dataclass(frozen=True)
@@ -231,64 +248,202 @@ def rough_chains(
     """Draw the chains that rough surfaces scatter along, once for all frames.
 
     The first point is spread over the surfaces, every object alike; the next ones follow the
-    lobes and aim at other objects. The antennas only suggest directions: nothing is lost that
-    another pose could see.
+    lobes and aim at other objects. After every point, chains that bring much to their last
+    point go on several times and others by chance; of whole chains, the strong ones are kept.
+    Every sequence of objects gets its share, so that a weak echo that takes a narrow way, by a
+    wall to a hidden object and back, is made of many chains, too. One over the chance goes into
+    the weight: the expected power is that of all chains. The antennas only suggest what is worth
+    while: nothing is lost that another pose could see.
 
     Args:
         scene: Surfaces.
-        link: Antennas, whose mean place is where lobes are taken to be lit from.
-        count: Chains to draw, of each length.
+        link: Antennas, of which a few frames say what a chain is worth.
+        count: Chains to draw, of each length; at most a quarter of them are kept.
         depth: Most points of a chain.
         seed: Of places and phases.
         backend: See ``deposit_power``.
 
     Source: derivations §4 (one independent phase per ordered chain).
     """
-    import drjit as dr
-
     if depth < 2:
         return RoughChains(())
-    with use_backend(backend):
-        mi = tracer()
-        geometry = flatten(scene, link.wavelength, in_motion=True)
-        shot = Shot(geometry, link)
-        inputs = kernel.Inputs.of(geometry, link, shot, monostatic=False)
+    with use_backend(backend), torch.no_grad():
+        drawer = _Drawer(flatten(scene, link.wavelength, in_motion=True), link, seed)
+        rounds = -(-count // _LANES)
+        parts = [drawer.draw(turn, count // rounds, depth) for turn in range(rounds)]
+        return RoughChains(tuple(map(drawer.joined, zip(*parts, strict=True))))
+
+
+class _Drawer:
+    """Walks chains, and draws again from them where they carry power (splitting and roulette)."""
+
+    def __init__(self, geometry: Geometry, link: Link, seed: int) -> None:
+        self.geometry, self.link = geometry, link
+        self.shot = Shot(geometry, link)
+        self.inputs = kernel.Inputs.of(geometry, link, self.shot, monostatic=False)
+        self.walk = walk.Walk(self.shot, self.inputs, seed)
+        self.seeds = scrambled(seed, 12), scrambled(seed, 13)
+        self.generator = torch.Generator().manual_seed(seed)
         areas = face_areas(geometry)
         owners = torch.zeros(len(geometry.coherent), dtype=torch.float64)
         owners = owners.index_add(0, geometry.face_object, areas)
         share = areas / owners[geometry.face_object] / len(owners)
-        index = dr.arange(mi.UInt32, count)
-        place, side = uniform_pair(index, scrambled(seed, 12))
-        spread = (mi.Float(index) + place) / count
-        face, pmf = mi.DiscreteDistribution(to_float(share)).sample_pmf(spread)
-        b = mi.warp.square_to_uniform_triangle(
-            mi.Point2f(*uniform_pair(index, scrambled(seed, 13)))
-        )
-        point = kernel.place(inputs, face, b.x, b.y)
-        back, distance = kernel.leg(point.position, mi.Point3f(0.0))
-        turned = back - 2 * dr.dot(back, point.normal) * point.normal
-        back = dr.select(side < 0.5, back, turned)
-        area = dr.gather(mi.Float, to_float(areas), face)
-        state = walk.start(
-            index, mi.UInt32(0) * index, face, b.x, b.y, back, dr.ones(mi.Float, count), distance
-        )
-        state["weight"] = 2 * area / (pmf * count)
-        columns: list[list[Tensor]] = []
-        chain = walk.Walk(shot, inputs, seed)
+        self.areas = to_float(areas)
+        self.faces = tracer().DiscreteDistribution(to_float(share))
+        frames = torch.linspace(0, link.frame_count - 1, min(link.frame_count, _REFERENCES))
+        self.frames = frames.round().long()
+
+    def draw(self, turn: int, lanes: int, depth: int) -> list[Chain]:
+        """Chains of two points and more, without phases, of one of the rounds."""
+        state = self._started(turn * lanes, lanes)
+        places: list[Tensor] = []
+        found = []
         for number in range(1, depth + 1):
-            names = ("face", "b1", "b2", "weight", "active")
-            dr.eval(*(state[name] for name in names))
-            columns.append([to_torch(state[name]) for name in names])
-            if number < depth:
-                state = chain.step(state)
-        generator = torch.Generator().manual_seed(seed)
-        chains = []
-        for number in range(2, depth + 1):
-            alive = columns[number - 1][4].bool()
-            faces, b1, b2 = (
-                torch.stack([columns[k][c] for k in range(number)], dim=1)[alive] for c in range(3)
-            )
-            phase = 2 * torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
-            weight = columns[number - 1][3].double()[alive]
-            chains.append(Chain(faces.long(), b1.double(), b2.double(), weight, phase[alive]))
-        return RoughChains(tuple(chains))
+            if number > 1:
+                state = self.walk.step(state)
+            places, alive, chain = self._walked(state, places)
+            if number > 1:
+                chance = self._shares(chain, received=True) * (lanes * _KEPT)
+                chance = chance.clamp_max(1.0)
+                found.append(
+                    replace(chain, weight=chain.weight / chance).keep(
+                        self._random(len(chance)) < chance
+                    )
+                )
+            if number < depth and len(alive):
+                shares = self._shares(chain, received=False)
+                drawn = (torch.arange(lanes) + self._random(1)) / lanes
+                row = torch.searchsorted(shares.cumsum(0), drawn).clamp_max(len(alive) - 1)
+                weight = chain.weight[row] / (shares[row] * lanes)
+                places = [column[row] for column in (chain.face, chain.b1, chain.b2)]
+                state = self._again(state, alive[row], weight)
+        return found
+
+    def joined(self, parts: tuple[Chain, ...]) -> Chain:
+        """Chains of one length from all rounds, each with a phase."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        face, b1, b2, weight, _ = (torch.cat(column) for column in columns)
+        phase = 2 * torch.pi * self._random(len(weight))
+        return Chain(face, b1, b2, weight / len(parts), phase)
+
+    def _random(self, count: int) -> Tensor:
+        return torch.rand(count, generator=self.generator, dtype=torch.float64)
+
+    def _started(self, start: int, lanes: int) -> walk.State:
+        """First points, and for each a reference frame that lights it, or its mirror image."""
+        import drjit as dr
+
+        mi = tracer()
+        lane = dr.arange(mi.UInt32, lanes)
+        index = lane + opaque(start)
+        place, side = uniform_pair(index, self.seeds[0])
+        face, pmf = self.faces.sample_pmf((mi.Float(lane) + place) / lanes)
+        b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
+        point = kernel.place(self.inputs, face, b.x, b.y)
+        frame = dr.gather(mi.UInt32, to_index(self.frames), index % opaque(len(self.frames)))
+        back, distance = kernel.leg(point.position, self.inputs.antenna(frame, False))
+        turned = back - 2 * dr.dot(back, point.normal) * point.normal
+        back = dr.select(side < _AWAY, turned, back)
+        state = walk.start(index, frame, face, b.x, b.y, back, dr.ones(mi.Float, lanes), distance)
+        area = dr.gather(mi.Float, self.areas, face)
+        state["weight"] = area / (pmf * lanes * dr.select(side < _AWAY, _AWAY, 1 - _AWAY))
+        return state
+
+    def _walked(
+        self, state: walk.State, before: list[Tensor]
+    ) -> tuple[list[Tensor], Tensor, Chain]:
+        """Places of all lanes' points, the lanes that are alive, and their chains."""
+        import drjit as dr
+
+        names = ("face", "b1", "b2", "weight", "active")
+        dr.eval(*(state[name] for name in names))
+        *latest, weight, active = (to_torch(state[name]) for name in names)
+        places = [latest[0].long()[:, None], *(b.double()[:, None] for b in latest[1:])]
+        if before:
+            places = [torch.cat(pair, dim=1) for pair in zip(before, places, strict=True)]
+        alive = active.bool().nonzero()[:, 0]
+        face, b1, b2 = (column[alive] for column in places)
+        weight = weight.double()[alive]
+        return places, alive, Chain(face, b1, b2, weight, torch.zeros_like(weight))
+
+    def _again(self, state: walk.State, parent: Tensor, weight: Tensor) -> walk.State:
+        """Lanes that go on from others; each has its own number, and so its own way."""
+        import drjit as dr
+
+        mi = tracer()
+        at = to_index(parent)
+        columns = {
+            name: dr.gather(type(column), column, at)
+            if name != "back"
+            else mi.Vector3f(*(dr.gather(mi.Float, column[k], at) for k in range(3)))
+            for name, column in state.items()
+            if name in ("face", "b1", "b2", "back", "number")
+        }
+        return {
+            **state,
+            **columns,
+            "weight": to_float(weight),
+            "active": dr.full(mi.Bool, True, len(parent)),
+        }
+
+    def _shares(self, chain: Chain, *, received: bool) -> Tensor:
+        """How the draws are shared among chains: by their power, and by sequences of objects."""
+        if not len(chain.weight):
+            return chain.weight
+        power = chain.weight * self._power(chain, received=received)
+        blind = chain.weight / chain.weight.sum()
+        total = power.sum()
+        if not total > 0:
+            return blind
+        objects = self.geometry.face_object[chain.face]
+        base = len(self.geometry.coherent) ** torch.arange(objects.shape[1])
+        _, family = (objects * base).sum(1).unique(return_inverse=True)
+        sums = torch.zeros(int(family.max()) + 1, dtype=torch.float64).index_add(0, family, power)
+        seen = int((sums > 0).sum())
+        alike = power / sums.clamp_min(1e-300)[family] / seen
+        return _BLIND * blind + (1 - _BLIND) * (_ALIKE * alike + (1 - _ALIKE) * power / total)
+
+    def _power(self, chain: Chain, *, received: bool) -> Tensor:
+        """Power at the receiver or the last point, the mean of the reference frames.
+
+        What lies between points is left out: it only makes the draw less good.
+        """
+        places = [_place(self.geometry, chain, k) for k in range(chain.face.shape[1])]
+        rows = [self.geometry.face_surface[column] for column in chain.face.T]
+        points, normals = [p for p, _, _ in places], [n for _, n, _ in places]
+        legs = [end - start for start, end in pairwise(points)]
+        middle = torch.ones_like(chain.weight)
+        for leg in legs:
+            middle = middle / leg.square().sum(1)
+        ways = [leg / leg.norm(dim=1, keepdim=True) for leg in legs]
+        for k in range(1, len(points) - 1):
+            middle = middle * _scattered(self.geometry, rows[k], normals[k], -ways[k - 1], ways[k])
+        if legs and not received:
+            middle = middle * (normals[-1] * ways[-1]).sum(1).abs()
+        total = torch.zeros_like(middle)
+        link = self.link
+        for number in self.frames.tolist():
+            value = middle
+            tx, rx = link.tx[number].detach(), link.rx[number].detach()
+            to_tx = torch.nn.functional.normalize(tx - points[0], dim=1)
+            if legs:
+                value = value * _scattered(self.geometry, rows[0], normals[0], to_tx, ways[0])
+            else:
+                value = value * (normals[0] * to_tx).sum(1).abs()
+            ends = [(tx, points[0], link.tx_pattern)]
+            if received:
+                to_rx = torch.nn.functional.normalize(rx - points[-1], dim=1)
+                value = value * _scattered(self.geometry, rows[-1], normals[-1], -ways[-1], to_rx)
+                ends.append((rx, points[-1], link.rx_pattern))
+            for antenna, point, pattern in ends:
+                offset = point - antenna
+                distance = offset.norm(dim=1)
+                gain = pattern.gain(offset / distance[:, None] @ link.rotations[number].detach())
+                value = value * gain / distance**2
+                lit = value > 0
+                share, _ = passed(
+                    self.geometry, self.shot, antenna.expand(int(lit.sum()), 3), point[lit]
+                )
+                value = value.masked_scatter(lit, value[lit] * share)
+            total = total + value
+        return total / len(self.frames)
