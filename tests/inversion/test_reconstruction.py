@@ -308,7 +308,9 @@ def test_an_unknown_object_is_the_users_mistake_not_divergence(case):
 
 @pytest.mark.parametrize("options", [{"kind": "lbfgs"}, {"rate": 0.0}])
 def test_bad_optimizers_are_named(options, unchecked):
-    with pytest.raises(InputError, match="expected kind 'adam' or 'sgd' and rate > 0"):
+    with pytest.raises(
+        InputError, match="expected kind 'adam', 'sgd' or 'gauss_newton' and rate > 0"
+    ):
         Optimizer(**options)
 
 
@@ -363,3 +365,35 @@ def test_the_exact_chain_as_the_model(case):
             nuisances=[RangeBias()],
             **(settings | {"boundary": False}),
         )
+
+
+def test_gauss_newton_finds_the_plate_in_few_steps(case, tmp_path):
+    settings = case.settings(steps=8, optimizer=Optimizer("gauss_newton", rate=0.05))
+    file = tmp_path / "fit.pt"
+    found = reconstruct(
+        case.scene,
+        case.radar,
+        case.capture,
+        [Translation("plate", axes="xz")],
+        checkpoint=file,
+        **settings,
+    )
+    assert float(case.error(found.scene).norm()) < 0.025
+    assert float(case.error(case.scene).norm()) > 0.1
+    again = reconstruct(
+        case.scene,
+        case.radar,
+        case.capture,
+        [Translation("plate", axes="xz")],
+        checkpoint=file,
+        resume=True,
+        **settings,
+    )
+    assert torch.equal(again.scene["plate"].vertices, found.scene["plate"].vertices)
+
+
+def test_gauss_newton_needs_a_loss_whose_curvature_it_knows(case):
+    settings = case.settings(steps=1, optimizer=Optimizer("gauss_newton"))
+    settings["loss"] = lambda a, b: (a - b).square().mean()
+    with pytest.raises(InputError, match="SpectrumLoss for Gauss–Newton, got function"):
+        reconstruct(case.scene, case.radar, case.capture, case.parameters(), **settings)

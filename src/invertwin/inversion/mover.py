@@ -411,7 +411,8 @@ def fit_mover(
     Raises:
         InputError: A loss that is not finite: the body has left what the radar sees.
     """
-    stepper = optimizer.build(body)
+    stepper = optimizer.build(nn.ModuleList([body]))
+    assert isinstance(stepper, torch.optim.Optimizer)  # Gauss–Newton is refused without its loss
     losses: list[float] = []
     for step in range(steps):
         optimizer.apply(stepper, step / steps)

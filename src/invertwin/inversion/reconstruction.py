@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +19,9 @@ from invertwin.channel.chains import RoughChains, rough_chains
 from invertwin.channel.paths import Grid
 from invertwin.channel.tracer import RoughPoints, rough_points
 from invertwin.errors import InputError
+from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
@@ -31,58 +34,6 @@ _CHAINS = 200_000  # of each length, where the exact chain is fitted
 _DIVERGED = 1e3  # times the first loss
 _WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
 _WINDOW = 20  # steps over which convergence is judged
-
-
-@dataclass(frozen=True)
-class Optimizer:
-    """How a gradient becomes a step.
-
-    Attributes:
-        kind: ``adam``, or ``sgd`` with momentum.
-        rate: Learning rate at the first step; parameters are in metres and radians.
-        rotation_rate: The same for parameters named ``rotation``; None = ``rate``.
-        final_rate: At the last step (cosine in between), of ``rate``; None = ``rate`` / 20.
-            The rates of all parameters fall alike.
-        momentum: Of SGD.
-        module_rates: Rates of the modules that are fitted, in their order; None, and modules
-            beyond the last = ``rate``, and ``rotation_rate`` for rotations.
-    """
-
-    kind: Literal["adam", "sgd"] = "adam"
-    rate: float = 0.03
-    rotation_rate: float | None = None
-    final_rate: float | None = None
-    momentum: float = 0.9
-    module_rates: tuple[float | None, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.kind not in ("adam", "sgd") or not self.rate > 0:
-            raise InputError(
-                f"expected kind 'adam' or 'sgd' and rate > 0, got {self.kind!r} and {self.rate}; "
-                "Adam at 0.03 suits metres and radians"
-            )
-
-    def build(self, modules: nn.Module) -> torch.optim.Optimizer:
-        """The torch optimiser over the modules' parameters."""
-        groups: dict[float, list[nn.Parameter]] = {}
-        for i, module in enumerate(modules.children()):
-            own = self.module_rates[i] if i < len(self.module_rates) else None
-            for name, parameter in module.named_parameters():
-                if parameter.requires_grad:
-                    turns = name.endswith("rotation") and self.rotation_rate is not None
-                    rate = own or (self.rotation_rate if turns else self.rate)
-                    groups.setdefault(rate / self.rate, []).append(parameter)  # type: ignore[operator]
-        listed = [{"params": group, "ratio": ratio} for ratio, group in groups.items()]
-        if self.kind == "adam":
-            return torch.optim.Adam(listed, lr=self.rate)
-        return torch.optim.SGD(listed, lr=self.rate, momentum=self.momentum)
-
-    def apply(self, optimizer: torch.optim.Optimizer, progress: float) -> None:
-        """Set the learning rates after this share of the steps."""
-        last = self.rate / 20 if self.final_rate is None else self.final_rate
-        rate = last + 0.5 * (self.rate - last) * (1 + math.cos(math.pi * progress))
-        for group in optimizer.param_groups:
-            group["lr"] = rate * group["ratio"]
 
 
 @dataclass(frozen=True)
@@ -182,7 +133,7 @@ def reconstruct(
         progress: Called with every row of the history.
 
     Source: §4.2 of the paper.
-    Differs from the source: Adam beside SGD; annealed widths.
+    Differs from the source: Adam and Gauss–Newton beside SGD; annealed widths.
 
     Raises:
         InputError: Nothing to fit, a map of zeros, a checkpoint of another fit; a range bias
@@ -224,7 +175,11 @@ def reconstruct(
             "give modules such as Pose('object')"
         )
     rates = optimizer or Optimizer()
-    state = _State(rates.build(fit.modules), fit.parameters())
+    if smooth is None and rates.kind == "gauss_newton":
+        raise InputError(
+            "expected a surrogate with kind 'gauss_newton', got the exact chain; use 'adam'"
+        )
+    state = _State(rates.build(fit.modules, fit.loss), fit.parameters())
     path = Path(checkpoint) if checkpoint is not None else None
     if resume and path is not None and path.exists():
         state.load(path, fit)
@@ -247,20 +202,20 @@ def reconstruct(
 class _State:
     """What a checkpoint holds besides the parameters."""
 
-    optimizer: torch.optim.Optimizer
+    optimizer: torch.optim.Optimizer | GaussNewton
     first: dict[str, Tensor]
     step: int = 0
     history: list[dict[str, Any]] = field(default_factory=list)
     best: tuple[int, float, dict[str, Tensor]] | None = None
     ended: Status | None = None
 
-    def keep_if_better(self, loss: float, fit: "_Fit") -> None:
-        """Remember the state of the lowest loss; without extra widths beats with."""
+    def keep_if_better(self, loss: float, fit: "_Fit", parameters: dict[str, Tensor]) -> None:
+        """Remember the parameters of the lowest loss; without extra widths beats with."""
         if self.best is not None:
             first = fit.annealed(self.step) and not fit.annealed(self.best[0])
             if not first and loss >= self.best[1]:
                 return
-        self.best = (self.step, loss, fit.parameters())
+        self.best = (self.step, loss, parameters)
 
     def save(self, path: Path, fit: "_Fit") -> None:
         """Write atomically: a kill leaves the last whole file."""
@@ -375,8 +330,8 @@ class _Fit:
         """Whether the extra widths are zero from this step on."""
         return self.surrogate is None or step >= self.widths_end
 
-    def evaluate(self, step: int) -> Tensor:
-        """The loss of a step."""
+    def maps(self, step: int) -> tuple[Tensor, Tensor]:
+        """Simulated and measured map of a step, blurred alike."""
         scene, radar, offset = self.applied()
         measured, kernels = self.measured, self.widths(step)
         if self.frames_per_step is not None and self.frames_per_step < radar.frame_count:
@@ -384,24 +339,32 @@ class _Fit:
             chosen = np.sort(rng.choice(radar.frame_count, self.frames_per_step, replace=False))
             radar, measured = radar.frames(chosen.tolist()), measured[torch.from_numpy(chosen)]
         if kernels is None:
-            value = self.loss(self._exact(scene, radar, offset), measured)
-        else:
-            simulated = surrogate_spectrum(
-                scene,
-                radar,
-                self.grid,
-                kernels,
-                samples=self.samples,
-                boundary_samples=self.boundary_samples,
-                seed=self.seed * 1_000_003 + step,
-                depth=self.depth,
-                boundary=self.boundary,
-                range_offset=offset,
-            )
-            value = self.loss(simulated, kernels.blur(measured, radar, self.grid))
+            return self._exact(scene, radar, offset), measured
+        simulated = surrogate_spectrum(
+            scene,
+            radar,
+            self.grid,
+            kernels,
+            samples=self.samples,
+            boundary_samples=self.boundary_samples,
+            seed=self.seed * 1_000_003 + step,
+            depth=self.depth,
+            boundary=self.boundary,
+            range_offset=offset,
+        )
+        return simulated, kernels.blur(measured, radar, self.grid)
+
+    def penalty(self) -> Tensor:
+        """What the regularisers add to the loss."""
+        scene, total = self.applied()[0], torch.zeros((), dtype=torch.float64)
         for term in self.regularizers:
-            value = value + term(scene)
-        return value
+            total = total + term(scene)
+        return total
+
+    def evaluate(self, step: int) -> Tensor:
+        """The loss of a step."""
+        value = self.loss(*self.maps(step))
+        return value + self.penalty() if self.regularizers else value
 
     def _exact(self, scene: Scene, radar: Radar, offset: Tensor | None) -> Tensor:
         """The exact chain's map; the same samples and phases every step."""
@@ -435,14 +398,13 @@ def _descend(
 ) -> Status:
     while state.step < fit.steps:
         rates.apply(state.optimizer, state.step / fit.steps)
-        state.optimizer.zero_grad()
+        before = fit.parameters()
         try:
-            value = fit.evaluate(state.step)
+            number = _stepped(fit, state)
         except InputError:
             if state.best is None:  # not lost on the way, but wrong from the start
                 raise
-            value = torch.tensor(math.nan)
-        number = float(value.detach())
+            number = math.nan
         if _lost(number, state.history):
             if state.best is None:
                 raise InputError(
@@ -451,9 +413,7 @@ def _descend(
                 )
             fit.modules.load_state_dict(state.best[2])
             return "diverged"
-        state.keep_if_better(number, fit)
-        value.backward()
-        state.optimizer.step()
+        state.keep_if_better(number, fit, before)
         row = {"step": state.step, "loss": number, "values": _values(fit.modules)}
         state.step += 1
         state.history.append(row | fit.watched(state.step))
@@ -464,6 +424,20 @@ def _descend(
         if tolerance > 0 and _settled(fit, state, tolerance):
             return "converged"
     return "converged" if _settled(fit, state, max(tolerance, 1e-3)) else "budget"
+
+
+def _stepped(fit: _Fit, state: _State) -> float:
+    """The loss of the present parameters, which then take a step down."""
+    if isinstance(state.optimizer, GaussNewton):
+        maps = partial(fit.maps, state.step)
+        return state.optimizer.step(maps, fit.penalty if fit.regularizers else None)
+    state.optimizer.zero_grad()
+    value = fit.evaluate(state.step)
+    number = float(value.detach())
+    if not _lost(number, state.history):
+        value.backward()
+        state.optimizer.step()
+    return number
 
 
 def _judged(fit: _Fit, state: _State, status: Status) -> Status:

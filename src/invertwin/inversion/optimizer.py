@@ -1,0 +1,83 @@
+"""How a gradient becomes a step: kind and rates."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.inversion.gauss_newton import GaussNewton
+from invertwin.inversion.loss import SpectrumLoss
+
+
+@dataclass(frozen=True)
+class Optimizer:
+    """How a gradient becomes a step.
+
+    Attributes:
+        kind: ``adam``, ``sgd`` with momentum, or ``gauss_newton`` for few parameters.
+        rate: Learning rate at the first step; parameters are in metres and radians. Of
+            Gauss–Newton the longest change of a parameter in a step, which does not fall; the
+            other rates are not for it.
+        rotation_rate: The same for parameters named ``rotation``; None = ``rate``.
+        final_rate: At the last step (cosine in between), of ``rate``; None = ``rate`` / 20.
+            The rates of all parameters fall alike.
+        momentum: Of SGD.
+        module_rates: Rates of the modules that are fitted, in their order; None, and modules
+            beyond the last = ``rate``, and ``rotation_rate`` for rotations.
+    """
+
+    kind: Literal["adam", "sgd", "gauss_newton"] = "adam"
+    rate: float = 0.03
+    rotation_rate: float | None = None
+    final_rate: float | None = None
+    momentum: float = 0.9
+    module_rates: tuple[float | None, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("adam", "sgd", "gauss_newton") or not self.rate > 0:
+            raise InputError(
+                "expected kind 'adam', 'sgd' or 'gauss_newton' and rate > 0, "
+                f"got {self.kind!r} and {self.rate}; "
+                "Adam at 0.03 suits metres and radians"
+            )
+
+    def build(
+        self, modules: nn.Module, loss: Callable[[Tensor, Tensor], Tensor] | None = None
+    ) -> torch.optim.Optimizer | GaussNewton:
+        """The optimiser over the modules' parameters.
+
+        Raises:
+            InputError: Gauss–Newton without a ``SpectrumLoss``, or for many parameters.
+        """
+        if self.kind == "gauss_newton":
+            if not isinstance(loss, SpectrumLoss):
+                raise InputError(
+                    f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
+                    "give one, or another kind of optimiser"
+                )
+            return GaussNewton(modules, loss, reach=self.rate)
+        groups: dict[float, list[nn.Parameter]] = {}
+        for i, module in enumerate(modules.children()):
+            own = self.module_rates[i] if i < len(self.module_rates) else None
+            for name, parameter in module.named_parameters():
+                if parameter.requires_grad:
+                    turns = name.endswith("rotation") and self.rotation_rate is not None
+                    rate = own or (self.rotation_rate if turns else self.rate)
+                    groups.setdefault(rate / self.rate, []).append(parameter)  # type: ignore[operator]
+        listed = [{"params": group, "ratio": ratio} for ratio, group in groups.items()]
+        if self.kind == "adam":
+            return torch.optim.Adam(listed, lr=self.rate)
+        return torch.optim.SGD(listed, lr=self.rate, momentum=self.momentum)
+
+    def apply(self, optimizer: torch.optim.Optimizer | GaussNewton, progress: float) -> None:
+        """Set the learning rates after this share of the steps."""
+        if isinstance(optimizer, GaussNewton):
+            return
+        last = self.rate / 20 if self.final_rate is None else self.final_rate
+        rate = last + 0.5 * (self.rate - last) * (1 + math.cos(math.pi * progress))
+        for group in optimizer.param_groups:
+            group["lr"] = rate * group["ratio"]
