@@ -167,10 +167,10 @@ def small_prior(size: float = 0.13) -> ShapePrior:
     return ShapePrior(decoder, lattice)
 
 
-def prior_distance() -> tuple[Scene, Direction]:
+def prior_latent() -> tuple[Scene, Direction]:
     prior = small_prior()
     module = PriorShape(
-        "object", prior, 0.5 * noise(torch.Size([prior.latent_size]), 5), (41, 17, 16)
+        "object", prior, 0.5 * noise(torch.Size([prior.latent_size]), 5), (56, 21, 20)
     )
     # Seen from its side and a little from its front.
     start = before_a_wall(box(0.1))
@@ -214,7 +214,7 @@ def smooth_vertices() -> tuple[Scene, Direction]:
 
 
 CASES = [
-    distance_grid, neural_distance, prior_distance, latent, joint_angle, skinning, lattice,
+    distance_grid, neural_distance, prior_latent, latent, joint_angle, skinning, lattice,
     smooth_vertices,
 ]  # fmt: skip
 
