@@ -15,6 +15,7 @@ from invertwin.radar import (
     Radar,
     cell_averaging_cfar,
     ordered_statistics_cfar,
+    peaks,
     point_cloud,
     range_doppler,
     range_doppler_angle,
@@ -203,3 +204,38 @@ def test_points_refuse_gradients_and_other_shapes(radar, unchecked):
     for wrong in ((power[:1], cells), (power, cells[:, :2]), (power[..., :1], cells)):
         with pytest.raises(InputError, match="power of shape"):
             point_cloud(*wrong, replace(radar), grid, CHIRPS)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_peaks_of_a_map_are_placed_in_the_world():
+    """Two bumps at one range that differ in direction alone, and one beside the detected cells."""
+    turn = rotation_from_vector(torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64))
+    radar = Radar(
+        linear_array(1, 0.01),
+        planar_array(8, 8, 0.0019, 0.0019),
+        FMCW(77e9, 1e9, 50e-6, 64),
+        torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64),
+        turn[None],
+    )
+    grid = Grid(2.0, 0.1, 30, u_start=-0.5, u_step=0.05, u_count=21, v_start=-0.5, v_step=0.05,
+                v_count=21)  # fmt: skip
+    true = torch.tensor([[3.03, -0.21, 0.12], [3.03, 0.28, -0.09], [4.5, 0.0, 0.0]]).double()
+    axes = torch.meshgrid(grid.ranges, grid.u, grid.v, indexing="ij")
+    bumps = [
+        torch.exp(-(((axes[0] - r) / 0.15) ** 2 + ((axes[1] - u) ** 2 + (axes[2] - v) ** 2) / 0.01))
+        for r, u, v in true
+    ]
+    power = torch.stack(bumps).sum(0)[None]
+    detections = (power.amax(3) > 0.1) & (grid.ranges < 4)[None, :, None]
+    found = peaks(power, detections, radar, grid)
+    assert len(found) == 2
+    order = found.u.argsort()
+    places = torch.stack([found.range, found.u, found.v], dim=1)[order]
+    torch.testing.assert_close(places, true[:2], atol=2e-3, rtol=0.0)
+    assert not found.velocity.any()
+    local = torch.stack([found.u, found.v, (1 - found.u**2 - found.v**2).sqrt()], dim=1)
+    expected = radar.positions + (found.range[:, None] * local) @ turn.T
+    offset = radar.transmitters.positions.mean(0) + radar.receivers.positions.mean(0)
+    torch.testing.assert_close(found.position, expected + 0.5 * (turn @ offset))
+    with pytest.raises(InputError, match="shape"):
+        peaks(power, detections[:, :-1], radar, grid)

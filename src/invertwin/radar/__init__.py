@@ -6,6 +6,7 @@ from invertwin.radar.detection import (
     PointCloud,
     cell_averaging_cfar,
     ordered_statistics_cfar,
+    peaks,
     point_cloud,
 )
 from invertwin.radar.direction import capon, music, source_count
@@ -92,6 +93,7 @@ __all__ = [
     "noisy_oscillator_beat",
     "normalized_gaussian",
     "ordered_statistics_cfar",
+    "peaks",
     "point_cloud",
     "quantize",
     "random_phase_spectrum",

@@ -1,0 +1,53 @@
+"""`[initial]`: a start that nobody gave, and what the fit adds to it."""
+
+import pytest
+
+from cli.small import call, read_metrics
+
+
+def smaller(repository, **changes: str) -> str:
+    text = (repository / "experiments" / "initial_guess.toml").read_text(encoding="utf-8")
+    small = {
+        "count = 24 }": "count = 12 }",
+        "density = 800.0": "density = 500.0",
+        "steps = 100": "steps = 50",
+        "frames_per_step = 12": "frames_per_step = 6",
+    }
+    for whole, part in (small | changes).items():
+        assert whole in text
+        text = text.replace(whole, part)
+    return text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["points", "image"])
+def test_the_fit_adds_to_a_conventional_guess(method, repository, tmp_path, monkeypatch):
+    text = smaller(repository, **{"[initial]": f'[initial]\nmethod = "{method}"'})
+    file = tmp_path / "small.toml"
+    file.write_text(text, encoding="utf-8")
+    assert call(monkeypatch, "reconstruct", file, "--out", tmp_path / "found") == 0
+    metrics = read_metrics(tmp_path / "found")
+    assert metrics["initial_points"] > 20
+    # The scene's own pose is 8 m off.
+    assert metrics["start_distance_m"] < 0.5
+    assert metrics["start_angle_deg"] < 12
+    assert metrics["position_error_m"] < 0.3 * metrics["start_distance_m"]
+    assert metrics["rotation_error_deg"] < 1
+    report = (tmp_path / "found" / "report.html").read_text(encoding="utf-8")
+    assert "What the refinement added" in report
+
+
+def test_a_fit_has_one_start(repository, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "small.toml"
+    starts = '[starts]\nobject = "truck"\ndistance = [0.1, 0.2]\n\n[[parameters]]'
+    file.write_text(smaller(repository, **{"[[parameters]]": starts}), encoding="utf-8")
+    assert call(monkeypatch, "reconstruct", file, "--out", tmp_path / "found") != 0
+    assert "expected no [starts] beside [initial]" in capsys.readouterr().err
+
+
+def test_a_box_without_echoes_is_named(repository, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "small.toml"
+    text = smaller(repository, **{"low = [-4.0, -1.0, 4.5]": "low = [4.8, -1.0, 11.8]"})
+    file.write_text(text, encoding="utf-8")
+    assert call(monkeypatch, "reconstruct", file, "--out", tmp_path / "found") != 0
+    assert "initial: expected echoes within the box" in capsys.readouterr().err
