@@ -19,7 +19,6 @@ from invertwin.channel.bridge import (
     one_torch_thread,
     to_float,
     to_torch,
-    tracer,
     use_backend,
 )
 from invertwin.channel.density import deposit_density
@@ -150,13 +149,11 @@ class _Deposit(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, settings: Settings, *tables: Tensor) -> Tensor:
-        import drjit as dr
-
         trace = Trace(settings)
-        out = dr.zeros(tracer().Float, trace.bins)
+        out = trace.bins()
         trace.deposit(out, record=any(ctx.needs_input_grad))
         ctx.trace = trace
-        return to_torch(out).reshape(settings.link.frame_count, *settings.grid.shape)
+        return out.map()
 
     @staticmethod
     @once_differentiable
@@ -196,7 +193,6 @@ class _Deposit(torch.autograd.Function):
         import drjit as dr
 
         trace: Trace = ctx.trace
-        grid = trace.settings.grid
         with use_backend(trace.settings.backend), one_torch_thread():
             given = {
                 name: tangent
@@ -206,7 +202,7 @@ class _Deposit(torch.autograd.Function):
             tables = {name: type(trace.fixed.tx)(getattr(trace.fixed, name)) for name in given}
             dr.enable_grad(list(tables.values()))
             inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
-            out = dr.zeros(tracer().Float, trace.bins)
+            out = trace.bins()
 
             def point_tangents() -> None:
                 for name, table in tables.items():
@@ -214,23 +210,14 @@ class _Deposit(torch.autograd.Function):
 
             for records in trace.records():
                 point_tangents()
-                replay.push(
-                    trace.shot,
-                    inputs,
-                    records,
-                    lambda *path: bins.scatter_derivative(out, grid, *path),
-                )
-                dr.eval(out)
+                replay.push(trace.shot, inputs, records, out.add_derivative)
+                dr.eval(out.values)
                 del records
             for chains in trace.boundary(inputs):
                 point_tangents()
-                chains.deposit(
-                    dr.forward_to(chains.speed), lambda *path: bins.scatter(out, grid, *path)
-                )
-                dr.eval(out)
-            return to_torch(out).reshape(
-                trace.settings.link.frame_count, *trace.settings.grid.shape
-            )
+                chains.deposit(dr.forward_to(chains.speed), out.add)
+                dr.eval(out.values)
+            return out.map()
 
 
 def _equal(first: Tensor | None, second: Tensor | None) -> bool:

@@ -6,7 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
-from invertwin.channel import bins, kernel, walk
+from invertwin.channel import kernel, walk
+from invertwin.channel.bins import Bins
 from invertwin.channel.boundary_walk import BoundaryChains, boundary_chains
 from invertwin.channel.bridge import Geometry, opaque, tracer
 from invertwin.channel.kernel import DIFFERENTIABLE, Inputs, Place
@@ -56,11 +57,9 @@ class Trace:
         self._walk = Walk(self.shot, self.fixed, settings.seed)
         self._kept: Records | None = None
 
-    @property
-    def bins(self) -> int:
-        """Number of bins over all frames."""
-        shape = self.settings.grid.shape
-        return self.shot.link.frame_count * shape[0] * shape[1] * shape[2]
+    def bins(self) -> Bins:
+        """An empty map."""
+        return Bins(self.settings.grid, self.shot.link.frame_count, self.sampler.size)
 
     def inputs(self, tables: dict[str, Any] | None = None, *, together: bool = True) -> Inputs:
         """The kernel's inputs, with some arrays replaced by ones that carry derivatives.
@@ -72,7 +71,7 @@ class Trace:
         made = Inputs.of(self.settings.geometry, link, self.shot, monostatic)
         return replace(made, **(tables or {}))
 
-    def deposit(self, out: Any, *, record: bool) -> None:
+    def deposit(self, out: Bins, *, record: bool) -> None:
         """Walk all chains into the bins; ``record`` keeps them if all fit in one chunk."""
         import drjit as dr
 
@@ -82,7 +81,7 @@ class Trace:
             if record:
                 self._kept = records
                 dr.schedule(*records.columns)
-            dr.eval(out)
+            dr.eval(out.values)
 
     def records(self) -> Iterator[Records]:
         """The vertices of all chains, a chunk at a time."""
@@ -92,7 +91,7 @@ class Trace:
         for index in chunks(self.sampler.size, self.settings.chunk):
             yield self._walked(index, None, record=True)
 
-    def _walked(self, index: Any, out: Any, *, record: bool) -> Records:
+    def _walked(self, index: Any, out: Bins | None, *, record: bool) -> Records:
         """Walk some chains into the bins, if given, and into records, if asked (else empty)."""
         import drjit as dr
 
@@ -109,7 +108,7 @@ class Trace:
                 self.shot, self.fixed, state, point, True, shared=shared, one_place=one_place
             )
             if out is not None:
-                bins.scatter(out, self.settings.grid, found, exists)
+                out.add(found, exists)
             if looped:
                 records.write(state, exists)
             elif record:
