@@ -8,8 +8,8 @@ from torch import Tensor
 
 from invertwin.channel import replay
 from invertwin.channel.bins import Contribution
-from invertwin.channel.bridge import backend, flatten, to_float, to_torch, tracer
-from invertwin.channel.kernel import DIFFERENTIABLE
+from invertwin.channel.bridge import backend, flatten, to_float, tracer
+from invertwin.channel.kernel import DIFFERENTIABLE, from_table
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.trace import Settings, Trace
 from invertwin.scene import Scene
@@ -55,7 +55,8 @@ def gradients(
 
         chains.run(dict(chains.state), visit)
     dr.backward(out)
-    return {name: to_torch(dr.grad(table)) for name, table in tables.items()}
+    by_name = dict(zip(DIFFERENTIABLE, settings.tables, strict=True))
+    return {name: from_table(name, dr.grad(tables[name]), by_name[name]) for name in tables}
 
 
 def _weighted(grid: Grid, weights: Tensor, found: Contribution) -> Any:

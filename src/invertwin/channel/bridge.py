@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.autograd.forward_ad as forward_ad
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from invertwin import doctor
@@ -109,6 +109,25 @@ def to_float(values: Tensor) -> Any:
 def to_index(values: Tensor) -> Any:
     """A flat Dr.Jit index array of a torch tensor of non-negative integers."""
     return tracer().UInt32(values.detach().to(torch.int32).contiguous().ravel().cpu().numpy())
+
+
+def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> Any:
+    """A flat Dr.Jit array of four numbers a point, the last one zero: each is read as a whole."""
+    return to_float(torch.nn.functional.pad(values.detach().to(torch.float32), (0, 1)))
+
+
+def points(table: Any, index: Any, active: Any = True) -> Any:
+    """Points of such an array."""
+    import drjit as dr
+
+    mi = tracer()
+    found = dr.gather(mi.Vector4f, table, index, active)
+    return mi.Point3f(found.x, found.y, found.z)
+
+
+def from_points(values: Any) -> Float32[Tensor, "n 3"]:
+    """Points, or derivatives by them, of such an array."""
+    return to_torch(values).reshape(-1, 4)[:, :3]
 
 
 def to_torch(values: Any) -> Tensor:

@@ -18,11 +18,10 @@ from invertwin.channel.bridge import (
     flatten,
     one_torch_thread,
     to_float,
-    to_torch,
     use_backend,
 )
 from invertwin.channel.density import deposit_density
-from invertwin.channel.kernel import DIFFERENTIABLE
+from invertwin.channel.kernel import DIFFERENTIABLE, from_table, to_table
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.trace import Settings, Trace
 from invertwin.errors import InputError
@@ -182,9 +181,7 @@ class _Deposit(torch.autograd.Function):
             results: list[Tensor | None] = [None]
             for name, source in zip(DIFFERENTIABLE, trace.settings.tables, strict=True):
                 results.append(
-                    to_torch(dr.grad(tables[name])).reshape(source.shape).to(source)
-                    if name in tables
-                    else None
+                    from_table(name, dr.grad(tables[name]), source) if name in tables else None
                 )
             return tuple(results)
 
@@ -206,7 +203,7 @@ class _Deposit(torch.autograd.Function):
 
             def point_tangents() -> None:
                 for name, table in tables.items():
-                    dr.set_grad(table, to_float(given[name]))
+                    dr.set_grad(table, to_table(name, given[name]))
 
             for records in trace.records():
                 point_tangents()

@@ -8,8 +8,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
-from invertwin.channel.bridge import Geometry, to_float, to_index, tracer
+from invertwin.channel.bridge import (
+    Geometry,
+    from_points,
+    points,
+    to_float,
+    to_index,
+    to_points,
+    to_torch,
+    tracer,
+)
 from invertwin.channel.paths import Link, Pattern
 from invertwin.channel.rays import Shot
 
@@ -21,6 +31,18 @@ SURFACE = (
 
 #: The differentiable inputs of the kernel, in the order in which torch passes them.
 DIFFERENTIABLE = ("vertices", "tx", "rx", "rotations", *SURFACE)
+POINTS = DIFFERENTIABLE[:3]
+
+
+def to_table(name: str, values: Tensor) -> Any:
+    """A torch table as the kernel reads it."""
+    return to_points(values) if name in POINTS else to_float(values)
+
+
+def from_table(name: str, values: Any, like: Tensor) -> Tensor:
+    """The torch form of an array that is laid out as one of the tables."""
+    flat = from_points(values) if name in POINTS else to_torch(values)
+    return flat.reshape(like.shape).to(like)
 
 
 @dataclass(frozen=True)
@@ -86,7 +108,7 @@ class Inputs:
         """Position of the receiver or the transmitter (a Python bool, or one per lane)."""
         if receiver is True or receiver is False:
             table = self.rx if receiver and not self.monostatic else self.tx
-            return _rows(table, frame, active)
+            return points(table, frame, active)
         import drjit as dr
 
         return dr.select(
@@ -143,23 +165,17 @@ class PatternTable:
         return rows_of_gain[0] + (rows_of_gain[1] - rows_of_gain[0]) * along
 
 
-def _rows(table: Any, index: Any, active: Any = True) -> Any:
-    import drjit as dr
-
-    return dr.gather(tracer().Point3f, table, index, active)
-
-
 def corners(inputs: Inputs, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
     """Corners of triangles, attached."""
     import drjit as dr
 
     index = dr.gather(tracer().Vector3u, inputs.faces, face, active)
-    return tuple(_rows(inputs.vertices, i, active) for i in index)  # type: ignore[return-value]
+    return tuple(points(inputs.vertices, i, active) for i in index)  # type: ignore[return-value]
 
 
 def edge_ends(inputs: Inputs, first: Any, second: Any) -> tuple[Any, Any]:
     """Ends of edges, attached."""
-    return _rows(inputs.vertices, first), _rows(inputs.vertices, second)
+    return points(inputs.vertices, first), points(inputs.vertices, second)
 
 
 @dataclass(frozen=True)

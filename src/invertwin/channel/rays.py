@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import bridge
-from invertwin.channel.bridge import Geometry, opaque, to_float, tracer
+from invertwin.channel.bridge import Geometry, opaque, to_float, to_points, tracer
 from invertwin.channel.paths import Link
 from invertwin.errors import InputError
 
@@ -40,9 +40,9 @@ class Shot:
         self.link = link
         self.origin = link.tx.detach().mean(dim=0)
         self.local_vertices = (geometry.vertices.detach() - self.origin).to(torch.float32)
-        self.vertices = to_float(self.local_vertices)
-        self.tx = to_float(link.tx.detach() - self.origin)
-        self.rx = to_float(link.rx.detach() - self.origin)
+        self.vertices = to_points(self.local_vertices)
+        self.tx = to_points(link.tx - self.origin)
+        self.rx = to_points(link.rx - self.origin)
         # Lanes without a hit are evaluated on a sound triangle, then masked: no NaN can leak.
         self.sound_face = opaque(_sound_face(geometry))
 
@@ -52,10 +52,8 @@ class Shot:
         return self.geometry.topology.ray_scene(self.local_vertices)
 
     def point(self, table: Any, index: Any) -> Any:
-        """Rows of a flat table of points."""
-        import drjit as dr
-
-        return dr.gather(tracer().Point3f, table, index)
+        """Rows of a table of points."""
+        return bridge.points(table, index)
 
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Corners of triangles."""
@@ -63,7 +61,7 @@ class Shot:
 
         mi = tracer()
         index = dr.gather(mi.Vector3u, self.geometry.topology.device_faces, face, active)
-        return tuple(dr.gather(mi.Point3f, self.vertices, i, active) for i in index)  # type: ignore[return-value]
+        return tuple(bridge.points(self.vertices, i, active) for i in index)  # type: ignore[return-value]
 
     def clear(self, start: Any, end: Any, active: Any = True) -> Any:
         """Whether nothing lies between two points (their own surfaces excluded)."""
