@@ -34,7 +34,7 @@ from rich.table import Table
 from torch import Tensor
 
 from invertwin.channel import boundary_walk
-from invertwin.channel.bridge import backend, flatten, one_torch_thread, tracer
+from invertwin.channel.bridge import backend, flatten, from_points, one_torch_thread, tracer
 from invertwin.channel.edges import InteriorEdgeSampler
 from invertwin.channel.kernel import Inputs
 from invertwin.channel.paths import Grid
@@ -157,7 +157,7 @@ class Estimator:
             ):
                 total = chains.weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
                 dr.backward_from(chains.speed * total)
-        gradient = np.array(dr.grad(vertices)).reshape(-1, 3)
+        gradient = from_points(dr.grad(vertices)).numpy()
         seconds = perf_counter() - start
         return gradient[self.moving.numpy()].sum(axis=0, dtype=np.float64), seconds
 
