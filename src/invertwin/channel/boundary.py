@@ -69,7 +69,7 @@ def edge_points(shot: Shot, centre: str, samples: int, seed: int) -> EdgePoints:
     import drjit as dr
 
     inputs = Inputs.of(shot.geometry, shot.link, shot, monostatic=False)
-    sampler = EdgeSampler(shot, inputs, getattr(shot, centre), samples, seed)
+    sampler = EdgeSampler(shot, inputs, (centre,), samples, seed)
     if not sampler.size:
         none, nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
         return EdgePoints(none, none, none, none, nothing, none, nothing)

@@ -15,6 +15,7 @@ from invertwin.channel.edges import (
     EdgePoints,
     EdgeSampler,
     InteriorEdgeSampler,
+    Shadow,
     TwoSided,
     shadow_speed,
 )
@@ -91,13 +92,11 @@ def boundary_chains(
     fixed, shared = inputs.detached(), shot.link.shared_visibility
     centres = ("tx",) if shared and depth == 1 else ("tx", "rx")
     families = len(centres) + (1 if depth > 1 and interior else 0)
-    for stream, centre in enumerate(centres):
-        table = getattr(shot, centre)
-        sampler = EdgeSampler(shot, fixed, table, samples // families, seed + stream)
-        for index in chunks(sampler.size):
-            points = sampler.draw(index)
-            if dr.width(points.face):
-                yield from _antenna_segment(shot, inputs, chain, points, centre, depth)
+    sampler = EdgeSampler(shot, fixed, centres, len(centres) * (samples // families), seed)
+    for index in chunks(sampler.size):
+        points = sampler.draw(index)
+        if dr.width(points.face):
+            yield from _antenna_segment(shot, inputs, chain, points, depth)
     if families > len(centres):
         sampler = InteriorEdgeSampler(shot, fixed, samples // families, seed + 2)
         for index in chunks(sampler.size):
@@ -107,40 +106,47 @@ def boundary_chains(
 
 
 def _antenna_segment(
-    shot: Shot, inputs: Inputs, chain: Walk, points: EdgePoints, centre: str, depth: int
+    shot: Shot, inputs: Inputs, chain: Walk, points: EdgePoints, depth: int
 ) -> Iterator[BoundaryChains]:
     """Family 1: the shadow that an edge casts from an antenna, then the chain to the other one."""
     import drjit as dr
 
-    at_receiver = centre == "rx"
+    at_receiver = points.receiver
     fixed, frame = inputs.detached(), points.frame
-    shadow = shadow_speed(fixed, points, fixed.antenna(frame, at_receiver))
+    shared = shot.link.shared_visibility
+
+    def shadow_points() -> Shadow:
+        return shadow_speed(inputs, points, inputs.antenna(frame, at_receiver))
+
+    shadow = shadow_points()
     point = kernel.place(fixed, points.face, shadow.b1, shadow.b2)
     back, distance = kernel.leg(point.position, fixed.antenna(frame, at_receiver))
     seen = kernel.to_radar(fixed, frame, -back)
     throughput = fixed.scale * fixed.gain(frame, at_receiver, seen) / dr.square(distance)
-    shared = shot.link.shared_visibility
 
     def run(state: State, visit: Callable[[State, Contribution, Any], None]) -> State:
         def connected(state: State, point: Place) -> None:
+            to_receiver = state.get("to_receiver", True)
+            # What both antennas see of a single vertex is due to the transmitter's shadows alone.
+            least = dr.select(to_receiver, 1, 2) if shared and to_receiver is not True else 1
             path, exists = walk.connect(
-                shot, fixed, state, point, not at_receiver,
-                shared=shared and not at_receiver, least=2 if shared and at_receiver else 1,
-            )  # fmt: skip
+                shot, fixed, state, point, to_receiver, least=least, shared=shared
+            )
             visit(state, path, exists)
 
         return chain.run(state, depth, connected)
 
-    for sign, share, excess in points.sides(fixed):
+    for number, (sign, share, excess) in enumerate(points.sides(fixed)):
         state = walk.start(
             points.index, frame, points.face, shadow.b1, shadow.b2, back,
             throughput=throughput * share * sign,
             length=distance + excess,
             passed=Passage(share, excess) if fixed.sheets else None,
         )  # fmt: skip
-        state["u"], state["v"] = seen.x, seen.y
+        if at_receiver is not False:
+            state |= {"u": seen.x, "v": seen.y, "to_receiver": ~at_receiver}
         # Anew for each side: a derivative taken uses the speed up.
-        speed = shadow_speed(inputs, points, inputs.antenna(frame, at_receiver)).speed
+        speed = shadow.speed if number == 0 else shadow_points().speed
         yield BoundaryChains(speed, state, run)
 
 
@@ -157,7 +163,12 @@ def _interior_segment(
     mi = tracer()
     fixed, points = inputs.detached(), found.edge
     behind = kernel.place(fixed, found.face, found.b1, found.b2)
-    shadow = shadow_speed(fixed, points, behind.position)
+
+    def shadow_points() -> Shadow:
+        moving = kernel.place(inputs, found.face, found.b1, found.b2)
+        return shadow_speed(inputs, points, moving.position)
+
+    shadow = shadow_points()
     ahead = kernel.place(fixed, points.face, shadow.b1, shadow.b2)
     to_behind, distance = kernel.leg(ahead.position, behind.position)
     inside = kernel.medium(fixed, ahead, behind, to_behind, mi.Bool(True))
@@ -193,15 +204,14 @@ def _interior_segment(
 
         return chain.run(state, choices + 1 - count, connected)
 
-    for sign, share, excess in points.sides(fixed):
+    for number, (sign, share, excess) in enumerate(points.sides(fixed)):
         state = walk.start(
             points.index + _OTHER_SIDE, points.frame, points.face, shadow.b1, shadow.b2, to_behind,
             throughput=done["amount"] * share * sign,
             length=done["so_far"] + distance + excess,
         )  # fmt: skip
         state |= {"u": done["u"], "v": done["v"], "to_receiver": ~ends_at_receiver}
-        moving = kernel.place(inputs, found.face, found.b1, found.b2)
-        speed = shadow_speed(inputs, points, moving.position).speed
+        speed = shadow.speed if number == 0 else shadow_points().speed
         yield BoundaryChains(speed, state, run)
 
 

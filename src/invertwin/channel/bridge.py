@@ -349,9 +349,12 @@ class Topology:
         self._scene: Any = None
 
     def ray_scene(self, vertices: Tensor) -> Any:
-        """The Mitsuba scene with these vertices (float32, world or shifted coordinates)."""
+        """The Mitsuba scene with these vertices (float32, never changed in place hereafter)."""
         mi = tracer()
+        if self._uploaded is vertices:
+            return self._scene
         if self._uploaded is not None and torch.equal(self._uploaded, vertices):
+            self._uploaded = vertices
             return self._scene
         if self._scene is None:
             self._parameters["vertex_positions"] = to_float(vertices)
@@ -362,7 +365,7 @@ class Topology:
             key = next(k for k, _ in self._parameters.items() if k.endswith("vertex_positions"))
             self._parameters[key] = to_float(vertices)
             self._parameters.update()
-        self._uploaded = vertices.clone()
+        self._uploaded = vertices
         return self._scene
 
     def _shapes(self) -> dict[str, Any]:

@@ -280,14 +280,13 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, grid: Grid, frames: int, frame: Tensor, *columns: Tensor) -> Tensor:
-        import drjit as dr
-
         places = [to_float(column) for column in columns]
         ctx.found = bins.Contribution(tracer().Int32(to_index(frame)), *places)
         ctx.grid, ctx.frames, ctx.backend = grid, frames, bridge.backend()
-        out = dr.zeros(tracer().Float, frames * math.prod(grid.shape))
-        bins.scatter(out, grid, ctx.found, True)
-        return to_torch(out).reshape(frames, *grid.shape)
+        ctx.paths = len(frame)
+        out = bins.Bins(grid, frames, len(frame))
+        out.add(ctx.found, True)
+        return out.map()
 
     @staticmethod
     @once_differentiable
@@ -298,13 +297,11 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
-        import drjit as dr
-
         with use_backend(ctx.backend):
             dots = tuple(
                 tracer().Float(0.0) if tangent is None else to_float(tangent)
                 for tangent in tangents[3:]
             )
-            out = dr.zeros(tracer().Float, ctx.frames * math.prod(ctx.grid.shape))
-            bins.scatter_derivative(out, ctx.grid, ctx.found, dots, True)
-            return to_torch(out).reshape(ctx.frames, *ctx.grid.shape)
+            out = bins.Bins(ctx.grid, ctx.frames, ctx.paths)
+            out.add_derivative(ctx.found, dots, True)
+            return out.map()

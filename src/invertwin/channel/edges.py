@@ -5,6 +5,7 @@ ways along a direction that is tangential there, so that no silhouette is ever s
 (derivations §3). Places are detached, ``shadow_speed`` is attached.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,7 @@ _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 class EdgePoints:
     """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
 
+    ``receiver`` says of silhouettes of two antennas whether it is the receiver's (else False).
     ``weight`` is one over (samples × density along the edge parameter). ``share`` and ``excess``
     are those of the sheets on the way, the edge's own triangles left out; what these let through
     on the side of ``opposite`` is ``covered``, on the other side ``open`` (1 where there is
@@ -33,6 +35,7 @@ class EdgePoints:
     """
 
     index: Any
+    receiver: Any
     frame: Any
     first: Any
     second: Any
@@ -86,13 +89,15 @@ def _compressed(valid: Any, *groups: Any) -> list[Any]:
     dr.eval(valid, *groups)
     kept: Any = dr.compress(valid)
     return [
-        type(group)(*(dr.gather(type(c), c, kept) for c in vars(group).values()))
+        type(group)(
+            *(c if c is False else dr.gather(type(c), c, kept) for c in vars(group).values())
+        )
         for group in groups
     ]
 
 
 class EdgeSampler:
-    """Points on the silhouettes seen from one antenna, and where their shadows fall.
+    """Points on the silhouettes seen from one antenna or both, and where their shadows fall.
 
     An edge is a silhouette if all its triangles lie, as seen from the antenna, on one side of
     it: one triangle for an open edge, two for a fold, any number for a non-manifold edge. The
@@ -100,16 +105,16 @@ class EdgeSampler:
     more on one side than on the other.
     """
 
-    def __init__(self, shot: Shot, inputs: Inputs, centre: Any, samples: int, seed: int) -> None:
+    def __init__(
+        self, shot: Shot, inputs: Inputs, centres: Sequence[str], samples: int, seed: int
+    ) -> None:
         import drjit as dr
 
         mi = tracer()
         topology = shot.geometry.topology
-        count = len(topology.edges)
-        self.shot, self.inputs, self.centre = shot, inputs, centre
-        index = dr.arange(mi.UInt32, shot.link.frame_count * count)
-        frame, edge = index // count, index % count
-        origin = shot.point(centre, frame)
+        self.shot, self.inputs, self.centres = shot, inputs, centres
+        entries = len(centres) * shot.link.frame_count * len(topology.edges)
+        edge, _, receiver, origin = self._seen(dr.arange(mi.UInt32, entries))
         y0, y1 = (
             shot.point(shot.vertices, dr.gather(mi.UInt32, ends, edge))
             for ends in topology.device_edges
@@ -118,10 +123,27 @@ class EdgeSampler:
         self.index: Any = dr.compress(sides.unlike)
         self.size = samples if dr.width(self.index) else 0
         if self.size:
+            # Both antennas get the same number of samples.
             length = dr.norm(y1 - y0) / dr.norm(0.5 * (y0 + y1) - origin)
-            weight = dr.gather(mi.Float, length, self.index)
-            self.distribution = mi.DiscreteDistribution(weight / dr.max(weight))
+            of, totals = dr.select(receiver, mi.UInt32(1), 0), dr.zeros(mi.Float, 2)
+            dr.scatter_add(totals, length, of, sides.unlike)
+            weight = length / dr.gather(mi.Float, totals, of)
+            self.distribution = mi.DiscreteDistribution(dr.gather(mi.Float, weight, self.index))
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
+
+    def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
+        """Edge, frame, whether the antenna is the receiver of two, and its place."""
+        import drjit as dr
+
+        shot, edges = self.shot, len(self.shot.geometry.topology.edges)
+        frame, edge = entry // edges, entry % edges
+        if len(self.centres) == 1:
+            origin = shot.point(getattr(shot, self.centres[0]), frame)
+            return edge, frame, False, origin
+        receiver = frame >= shot.link.frame_count
+        frame = dr.select(receiver, frame - shot.link.frame_count, frame)
+        origin = dr.select(receiver, shot.point(shot.rx, frame), shot.point(shot.tx, frame))
+        return edge, frame, receiver, origin
 
     def draw(self, index: Any) -> EdgePoints:
         """The samples of the given indices below ``size``; those without a shadow are left out."""
@@ -130,13 +152,11 @@ class EdgeSampler:
         mi = tracer()
         shot, topology = self.shot, self.shot.geometry.topology
         place, along, pmf = _along(self.distribution, index, self.size, self.seed, self.index)
-        entry = dr.gather(mi.UInt32, self.index, place)
-        frame, edge = entry // len(topology.edges), entry % len(topology.edges)
+        edge, frame, receiver, origin = self._seen(dr.gather(mi.UInt32, self.index, place))
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0 = shot.point(shot.vertices, first)
         y1 = shot.point(shot.vertices, second)
         y = y0 + (y1 - y0) * along
-        origin = shot.point(self.centre, frame)
         away = y - origin
         sides = _sides(shot, self.inputs, edge, y0, y1, away)
         beside = y + sides.outwards * (_BESIDE * dr.norm(y))
@@ -146,7 +166,7 @@ class EdgeSampler:
         hit = land(shot, self.inputs, ray, valid, (index, self.dice), coherent=True)
         valid &= hit.valid & _not_grazing(shot, hit.face, away, hit.valid)
         found = EdgePoints(
-            index, frame, first, second, sides.opposite, along, hit.face,
+            index, receiver, frame, first, second, sides.opposite, along, hit.face,
             weight=1 / (pmf * self.size * hit.chance),
             share=before.share * hit.share,
             excess=before.excess + hit.excess,
@@ -282,7 +302,7 @@ class InteriorEdgeSampler:
         measure = dr.squared_norm(point - y) / cosine
         chance = behind.chance * ahead.chance
         points = EdgePoints(
-            index, frame, first, second, sides.opposite, along, ahead.face,
+            index, False, frame, first, second, sides.opposite, along, ahead.face,
             weight=measure / (pmf * density * self.per_frame * chance),
             share=behind.share * ahead.share,
             excess=behind.excess + ahead.excess,

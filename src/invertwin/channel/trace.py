@@ -53,7 +53,8 @@ class Trace:
         self.shot = Shot(settings.geometry, settings.link)
         sampler = RaySampler if settings.sampling == "rays" else AreaSampler
         self.sampler = sampler(self.shot, settings.samples, settings.seed, settings.reference)
-        self.fixed = self.inputs()
+        one_place = bool((settings.link.tx == settings.link.rx).all())
+        self.fixed = Inputs.of(settings.geometry, settings.link, self.shot, one_place)
         self._walk = Walk(self.shot, self.fixed, settings.seed)
         self._kept: Records | None = None
 
@@ -66,10 +67,7 @@ class Trace:
 
         ``together`` says that antennas at one place also move as one.
         """
-        link = self.settings.link
-        monostatic = together and bool((link.tx == link.rx).all())
-        made = Inputs.of(self.settings.geometry, link, self.shot, monostatic)
-        return replace(made, **(tables or {}))
+        return replace(self.fixed, monostatic=together and self.fixed.monostatic, **(tables or {}))
 
     def deposit(self, out: Bins, *, record: bool) -> None:
         """Walk all chains into the bins; ``record`` keeps them if all fit in one chunk."""
