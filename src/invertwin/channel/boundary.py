@@ -1,9 +1,10 @@
 """Boundary paths in torch: how fast a shadow's edge moves over the surface it falls on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.bridge import Geometry, differentiated, to_torch, tracer
@@ -25,6 +26,10 @@ class EdgePoints:
     along: Float64[Tensor, " n"]
     face: Int64[Tensor, " n"]
     weight: Float64[Tensor, " n"]
+
+    def keep(self, mask: Bool[Tensor, " n"]) -> "EdgePoints":
+        """Some of the points."""
+        return EdgePoints(*(column[mask] for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -64,21 +69,26 @@ def require_edges(geometry: Geometry, link: Link, samples: int) -> None:
         )
 
 
-def edge_points(shot: Shot, centre: str, samples: int, seed: int) -> EdgePoints:
-    """Sample the silhouettes seen from ``tx`` or ``rx``; no rows where there are none."""
+def edge_points(
+    shot: Shot, centres: Sequence[str], samples: int, seed: int
+) -> list[tuple[str, EdgePoints]]:
+    """Sample the silhouettes seen from ``tx``, or from ``tx`` and ``rx``, apart."""
     import drjit as dr
 
     inputs = Inputs.of(shot.geometry, shot.link, shot, monostatic=False)
-    sampler = EdgeSampler(shot, inputs, (centre,), samples, seed)
+    sampler = EdgeSampler(shot, inputs, centres, samples, seed)
     if not sampler.size:
         none, nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
-        return EdgePoints(none, none, none, none, nothing, none, nothing)
+        return [("tx", EdgePoints(none, none, none, none, nothing, none, nothing))]
     drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size))
-    names = [field.name for field in fields(EdgePoints)]
-    columns = {name: to_torch(getattr(drawn, name)) for name in names}
-    return EdgePoints(
+    columns = {f.name: to_torch(getattr(drawn, f.name)) for f in fields(EdgePoints)}
+    points = EdgePoints(
         **{n: c.double() if n in ("along", "weight") else c.long() for n, c in columns.items()}
     )
+    if drawn.receiver is False:
+        return [("tx", points)]
+    receiver = to_torch(drawn.receiver).bool()
+    return [("tx", points.keep(~receiver)), ("rx", points.keep(receiver))]
 
 
 def shadow_speed(

@@ -506,8 +506,7 @@ def _boundary_paths(
     """Boundary rows of all antenna segments; ``value`` turns an edge point into a path."""
     centres = ("tx",) if link.shared_visibility else ("tx", "rx")
     parts = []
-    for stream, centre in enumerate(centres):
-        found = edge_points(shot, centre, samples // len(centres), seed + stream)
+    for centre, found in edge_points(shot, centres, samples // len(centres) * len(centres), seed):
         edge = shadow_speed(geometry, link, shot, found, centre)
         seen = view(geometry, link, edge.frame, edge.face, edge.shadow, edge.normal)
         seen = View(seen.power.detach(), seen.mirror.detach(), seen.length.detach())
