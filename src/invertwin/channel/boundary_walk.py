@@ -4,6 +4,7 @@ Their value is zero; their derivative is the speed of the shadow's edge (attache
 path would carry (detached). Delay and direction do not move with θ.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -76,6 +77,8 @@ def boundary_chains(
     """All boundary paths: antenna segments first, then interior ones.
 
     Where both antennas share one visibility, a path of one vertex has one segment, not two.
+    The first edge points are drawn now, the rest as the paths are asked for: paths from points at
+    hand are prepared while another kernel runs.
 
     Args:
         shot: Rays and antennas.
@@ -92,17 +95,27 @@ def boundary_chains(
     fixed, shared = inputs.detached(), shot.link.shared_visibility
     centres = ("tx",) if shared and depth == 1 else ("tx", "rx")
     families = len(centres) + (1 if depth > 1 and interior else 0)
-    sampler = EdgeSampler(shot, fixed, centres, len(centres) * (samples // families), seed)
-    for index in chunks(sampler.size):
-        points = sampler.draw(index)
-        if dr.width(points.face):
-            yield from _antenna_segment(shot, inputs, chain, points, depth)
+    antennas = EdgeSampler(shot, fixed, centres, len(centres) * (samples // families), seed)
+    parts = [_ahead(map(antennas.draw, chunks(antennas.size)))]
     if families > len(centres):
-        sampler = InteriorEdgeSampler(shot, fixed, samples // families, seed + 2)
-        for index in chunks(sampler.size):
-            found = sampler.draw(index)
-            if dr.width(found.edge.face):
-                yield from _interior_segment(shot, inputs, chain, found, depth)
+        interiors = InteriorEdgeSampler(shot, fixed, samples // families, seed + 2)
+        parts.append(_ahead(map(interiors.draw, chunks(interiors.size))))
+
+    def segments() -> Iterator[BoundaryChains]:
+        for points in parts[0]:
+            if dr.width(points.face):
+                yield from _antenna_segment(shot, inputs, chain, points, depth)
+        for part in parts[1:]:
+            for found in part:
+                if dr.width(found.edge.face):
+                    yield from _interior_segment(shot, inputs, chain, found, depth)
+
+    return segments()
+
+
+def _ahead(items: Iterator[Any]) -> Iterator[Any]:
+    """The same items, of which the first one is made now."""
+    return itertools.chain(list(itertools.islice(items, 1)), items)
 
 
 def _antenna_segment(

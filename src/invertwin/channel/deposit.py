@@ -167,13 +167,14 @@ class _Deposit(torch.autograd.Function):
             dr.enable_grad(list(tables.values()))
             inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
             seed = to_float(grad)
+            boundary = trace.boundary(inputs)
             for records in trace.records():
                 replay.pull(
                     trace.shot, inputs, records, lambda *path: bins.gather(seed, grid, *path)
                 )
                 dr.eval([dr.grad(table) for table in tables.values()])
                 del records  # before the next ones are made
-            for chains in trace.boundary(inputs):
+            for chains in boundary:
                 total = chains.weighted(lambda *path: bins.gather(seed, grid, *path)[0])
                 if dr.grad_enabled(chains.speed):
                     dr.backward_from(chains.speed * total)
@@ -205,12 +206,13 @@ class _Deposit(torch.autograd.Function):
                 for name, table in tables.items():
                     dr.set_grad(table, to_table(name, given[name]))
 
+            boundary = trace.boundary(inputs)
             for records in trace.records():
                 point_tangents()
                 replay.push(trace.shot, inputs, records, out.add_derivative)
                 dr.eval(out.values)
                 del records
-            for chains in trace.boundary(inputs):
+            for chains in boundary:
                 point_tangents()
                 chains.deposit(dr.forward_to(chains.speed), out.add)
                 dr.eval(out.values)

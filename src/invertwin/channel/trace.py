@@ -135,17 +135,18 @@ class Trace:
     def boundary(self, inputs: Inputs) -> Iterator[BoundaryChains]:
         """Boundary paths of all segments, a chunk at a time."""
         settings = self.settings
-        if settings.boundary_samples:
-            yield from boundary_chains(
-                self.shot,
-                inputs,
-                self._walk,
-                samples=settings.boundary_samples,
-                depth=settings.depth,
-                seed=settings.seed,
-                interior=settings.interior_edges,
-                chunks=lambda size: chunks(size, settings.chunk),
-            )
+        if not settings.boundary_samples:
+            return iter(())
+        return boundary_chains(
+            self.shot,
+            inputs,
+            self._walk,
+            samples=settings.boundary_samples,
+            depth=settings.depth,
+            seed=settings.seed,
+            interior=settings.interior_edges,
+            chunks=lambda size: chunks(size, settings.chunk),
+        )
 
 
 def chunks(size: int, chunk: int) -> Iterator[Any]:

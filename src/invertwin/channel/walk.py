@@ -173,7 +173,7 @@ def connect(
     point: Place,
     receiver: Any,
     *,
-    least: int = 1,
+    least: Any = 1,
     shared: bool = False,
     one_place: bool = False,
 ) -> tuple[Contribution, Any]:
@@ -186,7 +186,7 @@ def connect(
         point: Its latest vertex.
         receiver: Whether the path ends at the receiver (a bool, or one per lane). Where it ends at
             the transmitter, the state knows the receiver's direction ``u``, ``v``.
-        least: Fewest vertices of a path.
+        least: Fewest vertices of a path (a number, or one per lane).
         shared: What the antenna at the start sees, the one at the end sees too.
         one_place: Both are one.
     """
