@@ -55,7 +55,9 @@ def guessed(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]
     console.print(f"looking for {table.object} with a conventional detector")
     begin = time.perf_counter()
     with about("initial"):
-        scene, found = _placed(problem, table)
+        scene, found = problem.scene, {}
+        if table.low is not None and table.high is not None:
+            scene, found = _placed(problem, table, table.low, table.high)
         scene = _clouded(problem, table, scene)
     found["initial_seconds"] = time.perf_counter() - begin
     return replace(problem, scene=scene), found
@@ -63,7 +65,7 @@ def guessed(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]
 
 def added(metrics: dict[str, Any]) -> list[Table]:
     """What the fit has made better: the conventional guess beside the twin."""
-    if "initial_points" not in metrics:
+    if "initial_seconds" not in metrics:
         return []
     shapes = [(shape_label(key), f"start_{key}", key) for key in metrics if is_shape_key(key)]
     rows = [
@@ -71,22 +73,24 @@ def added(metrics: dict[str, Any]) -> list[Table]:
         for label, before, after in (*_LABELS, *shapes)
         if metrics.get(before) is not None and metrics.get(after) is not None
     ]
-    legend = (
-        f"The fit started where a conventional detector and a rectangle around its "
-        f"{metrics['initial_points']} echoes put the object."
-    )
+    legend = "The fit started from the backprojected echoes."
+    if "initial_points" in metrics:
+        legend = (
+            f"The fit started where a conventional detector and a rectangle around its "
+            f"{metrics['initial_points']} echoes put the object."
+        )
     columns = ["quantity", "conventional guess", "refined twin"]
     return [Table("What the refinement added", columns, rows, legend)]
 
 
-def _placed(problem: Problem, table: Initial) -> tuple[Scene, dict[str, Any]]:
+def _placed(
+    problem: Problem, table: Initial, low: list[float], high: list[float]
+) -> tuple[Scene, dict[str, Any]]:
     capture, grid, radar = problem.capture, problem.grid, problem.radar
     if table.method == "points":
-        points = detected_points(
-            capture, grid, table.low, table.high, false_alarm=table.false_alarm
-        )
+        points = detected_points(capture, grid, low, high, false_alarm=table.false_alarm)
     else:
-        points = image_points(capture, grid, table.low, table.high, step=table.step)
+        points = image_points(capture, grid, low, high, step=table.step)
     points = largest_group(points, table.gap)
     found: dict[str, Any] = {"initial_points": len(points)}
     plane, scene, name = Ground(table.up), problem.scene, table.object

@@ -2,9 +2,9 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from invertwin.cli.schema.section import Positive, Section, Vector
+from invertwin.cli.schema.section import Positive, Section, Vector, check_presence
 
 
 class Initial(Section):
@@ -13,14 +13,15 @@ class Initial(Section):
 
     object: str
     """name in the scene"""
-    low: Vector
-    """m, corner of the box of the world that is searched"""
-    high: Vector
+    low: Vector | None = None
+    """m, corner of the box of the world that is searched; needed unless the pose is known"""
+    high: Vector | None = None
     """m, its opposite corner"""
     method: Literal["points", "image"] = "points"
     """points = of a CFAR detector; image = backprojected power"""
-    pose: Literal["rectangle", "axes", "position"] = "rectangle"
-    """how it stands: the near sides of a rectangle, principal axes, or no turn"""
+    pose: Literal["rectangle", "axes", "position", "known"] = "rectangle"
+    """how it stands: the near sides of a rectangle, principal axes, no turn, or as the scene says:
+    then its density alone is guessed"""
     scale: bool = False
     """size from the rectangle, too"""
     up: Literal["y", "z"] = "y"
@@ -31,3 +32,9 @@ class Initial(Section):
     """m, of the image"""
     gap: Positive = 1.0
     """m; echoes with wider gaps between them are not of one object"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> "Initial":
+        needed = self.pose != "known"
+        check_presence(self, {"low": needed, "high": needed}, f'with pose = "{self.pose}"')
+        return self
