@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
-from invertwin.inversion import SpectrumLoss
+from invertwin.inversion import Optimizer, SpectrumLoss, reconstruct
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.radar import surrogate_spectrum
 from invertwin.scene.parameters import Pose, Translation
@@ -183,8 +183,43 @@ def test_a_turned_pose_has_free_quaternion_numbers_only(case):
         )  # fmt: skip
         return simulated, measured
 
+    names = [name for name, _ in module.named_parameters()]
     GaussNewton(module, SpectrumLoss("likelihood")).step(maps)
+    assert [name for name, _ in module.named_parameters()] == names
     state = module.state_dict()
     assert torch.equal(state["translation"][:2], torch.zeros(2, dtype=torch.float64))
     assert torch.equal(state["rotation"][[1, 3]], torch.zeros(2, dtype=torch.float64))
     assert float(state["translation"][2].abs()) > 0
+
+
+class InterruptError(Exception):
+    """Stands for whatever ends a run."""
+
+
+def test_reconstruct_takes_its_steps_and_resumes(case, tmp_path):
+    def fit(**changes: Any) -> Any:
+        settings = case.settings(steps=4, optimizer=Optimizer("gauss_newton", rate=0.1))
+        module = Translation("plate", axes="xz")
+        return reconstruct(case.scene, case.radar, case.capture, module, **(settings | changes))
+
+    whole = fit()
+    assert float(case.error(whole.scene)[[0, 2]].norm()) < 0.05
+    assert [row["step"] for row in whole.history] == [0, 1, 2, 3]
+
+    def stop(row: dict[str, Any]) -> None:
+        if row["step"] == 2:
+            raise InterruptError
+
+    kept = {"checkpoint": tmp_path / "fit.pt", "checkpoint_every": 1}
+    with pytest.raises(InterruptError):
+        fit(progress=stop, **kept)
+    resumed = fit(resume=True, **kept)
+    places = [
+        torch.tensor(found.history[-1]["values"]["plate.translation"]) for found in (whole, resumed)
+    ]
+    assert torch.allclose(*places, atol=2e-3)
+    fit(optimizer=Optimizer(), **kept)
+    with pytest.raises(InputError, match="got that of another optimiser"):
+        fit(resume=True, **kept)
+    with pytest.raises(InputError, match="expected a surrogate with kind 'gauss_newton'"):
+        fit(surrogate="exact")

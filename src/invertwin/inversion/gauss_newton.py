@@ -187,14 +187,17 @@ class GaussNewton:
         value = parameter.detach()
         tangent = torch.zeros_like(value)
         tangent.view(-1)[index - sum(sizes[:slot])] = 1.0
+        own = list(module.named_parameters(recurse=False))
         delattr(module, name)
         setattr(module, name, forward_ad.make_dual(value, tangent))
         try:
             with torch.no_grad():
                 yield
         finally:
-            delattr(module, name)
-            setattr(module, name, parameter)
+            # All of them, in their order, which is that of checkpoints.
+            for key, held in own:
+                delattr(module, key)
+                setattr(module, key, held)
 
 
 def _flat(values: tuple[Tensor | None, ...], like: list[nn.Parameter]) -> Float64[Tensor, " q"]:
