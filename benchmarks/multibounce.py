@@ -18,8 +18,15 @@ time over ours (> 1: we are faster).
 
 Further, on a scene with shadows (a ball before a wall and above a floor, depth 3):
 
-- `step.tracing_share`: time of a step of 10³ samples over that of one of 10⁵, in turns. At 10³ the
-  kernels take no time; what is left is Python, Dr.Jit's tracing, uploads and the tree.
+- `step.tracing_share`: share of a step of 10⁵ samples in which nothing is executed: its time less
+  the execution times of all that Dr.Jit launched in it (its kernel history: kernels, sums, copies,
+  the tree), over its time. What is left is tracing (Python, assembling and finding kernels), and
+  with it conversions between torch and Dr.Jit, torch's own part, and waiting for threads to start:
+  more than tracing costs, never less, but for what is traced while a kernel runs, which costs no
+  time. On a busy machine the waiting dominates. `step.assembly_share` is the part of it that the
+  history itself names: code generation, and compilation or a look-up in the cache.
+- `step.short_share`: time of a step of 10³ samples over that of one of 10⁵, in turns: tracing and
+  all that a step costs however few its samples, the tree too.
 - `step.new_kernels`: kernels of further steps, with other vertices, seeds and depths 2, 3, 5, that
   were not among those of the first two: what would be compiled then. A kernel from Dr.Jit's cache
   on disk counts too.
@@ -195,26 +202,43 @@ def repeated(steps: int) -> dict[str, Any]:
     def timed(number: int, samples: int) -> float:
         return sum(step(task, number, samples, 3))
 
+    def idle(number: int) -> tuple[float, float]:
+        seconds: list[float] = []
+        launched = history(lambda: seconds.append(timed(number, MANY)))
+        executed = sum(entry["execution_time"] for entry in launched) / 1e3
+        assembled = sum(e.get("codegen_time", 0) + e.get("backend_time", 0) for e in launched) / 1e3
+        return 1 - executed / seconds[0], assembled / seconds[0]
+
     known, later = set[str](), set[str]()
     for number in range(2):
         known |= kernels(lambda number=number: step(task, number, MANY, 3))
     for number, depth in enumerate((3, 2, 5, 3), start=2):
         later |= kernels(lambda number=number, depth=depth: step(task, number, MANY, depth))
     pairs = [(timed(number, FEW), timed(number, MANY)) for number in range(WARM_UP + 3 * steps)]
-    shares = [few / many for few, many in pairs[WARM_UP:]]
-    return {"tracing_share": statistics.median(shares), "new_kernels": len(later - known)}
+    tracing, assembly = zip(*(idle(number) for number in range(3 * steps)), strict=True)
+    return {
+        "tracing_share": statistics.median(tracing),
+        "assembly_share": statistics.median(assembly),
+        "short_share": statistics.median(few / many for few, many in pairs[WARM_UP:]),
+        "new_kernels": len(later - known),
+    }
 
 
 def kernels(act: Callable[[], Any]) -> set[str]:
     """Which kernels run during an action, whether compiled then or found in a cache."""
+    return {str(entry["hash"]) for entry in history(act) if entry.get("hash") is not None}
+
+
+def history(act: Callable[[], Any]) -> list[dict[str, Any]]:
+    """All that Dr.Jit launches during an action; times in milliseconds."""
     import drjit as dr
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         act()
-        history = dr.kernel_history([dr.KernelType.JIT])
+        found = dr.kernel_history()
         dr.kernel_history_clear()
-    return {str(kernel["hash"]) for kernel in history}
+    return found
 
 
 def peak_memory(samples: int, depth: int) -> float:
@@ -301,7 +325,9 @@ def table(metrics: dict[str, Any]) -> Table:
                 )
             row(part, f"forward_ratio_sionna{suffix}", ".2f", text)
             row(part, f"step_ratio_sionna{suffix}", ".2f")
-    row("step", "tracing_share", ".2f", f"step of {FEW} samples over step of {MANY}, depth 3")
+    row("step", "tracing_share", ".2f", f"of a step of {MANY} samples, depth 3: nothing executed")
+    row("step", "assembly_share", ".3f", "kernels assembled and looked up")
+    row("step", "short_share", ".2f", f"step of {FEW} samples over step of {MANY}")
     row("step", "new_kernels", "d", "in further steps: new vertices, seeds, depths 2, 3, 5")
     return grid
 

@@ -26,7 +26,8 @@ def test_every_metric_is_there_without_sionna(multibounce, monkeypatch):
         assert metrics[depth]["step_ratio_sionna"] is None
         assert metrics[depth]["samples_per_second"] > 0
         assert 0.1 < metrics[depth]["peak_memory_gb"] < 5
-    assert 0 < metrics["step"]["tracing_share"] < 2
+    assert 0 < metrics["step"]["assembly_share"] < metrics["step"]["tracing_share"] < 1
+    assert 0 < metrics["step"]["short_share"] < 2
     assert metrics["step"]["new_kernels"] == 0
     json.dumps(metrics)
     console = Console(width=200, record=True)
