@@ -55,7 +55,7 @@ def gradients(
 
         chains.run(dict(chains.state), visit)
     dr.backward(out)
-    by_name = dict(zip(DIFFERENTIABLE, settings.tables, strict=True))
+    by_name: dict[str, Tensor] = dict(zip(DIFFERENTIABLE, settings.tables, strict=True))
     return {name: from_table(name, dr.grad(tables[name]), by_name[name]) for name in tables}
 
 

@@ -70,7 +70,7 @@ class _Taps:
         )
         return _Taps(tracer().Int32(found.frame), axes, g.shape)
 
-    def __iter__(self) -> Iterator[tuple[Any, Any, tuple[int, int, int]]]:
+    def __iter__(self) -> Iterator[tuple[Any, Any, tuple[int, ...]]]:
         """Bin index, whether it is on the grid, and the tap along each axis."""
         (r0, rw, _), (u0, uw, _), (v0, vw, _) = self.axes
         nr, nu, nv = self.counts
@@ -90,7 +90,7 @@ class _Taps:
             row, ok = row * room + place, ok & (place >= 0) & (place < room)
         return row, ok
 
-    def weights(self, power: Any) -> dict[tuple[int, int, int], Any]:
+    def weights(self, power: Any) -> dict[tuple[int, ...], Any]:
         """What of the power falls on every tap."""
         (_, rw, _), (_, uw, _), (_, vw, _) = self.axes
         return {
@@ -98,7 +98,7 @@ class _Taps:
             for i, j, k in product(*(range(len(w)) for w in (rw, uw, vw)))
         }
 
-    def derivatives(self, power: Any, dots: tuple) -> dict[tuple[int, int, int], Any]:
+    def derivatives(self, power: Any, dots: tuple) -> dict[tuple[int, ...], Any]:
         """The derivative of that, given those of power, range, u and v."""
         (_, rw, rs), (_, uw, us), (_, vw, vs) = self.axes
         dot_a, dot_r, dot_u, dot_v = dots
@@ -143,7 +143,7 @@ class Bins:
         taps = _Taps.of(self.grid, found)
         self._add(taps, taps.derivatives(dr.detach(found.power), dots), active)
 
-    def _add(self, taps: _Taps, weights: dict[tuple[int, int, int], Any], active: Any) -> None:
+    def _add(self, taps: _Taps, weights: dict[tuple[int, ...], Any], active: Any) -> None:
         import drjit as dr
 
         mi = tracer()
@@ -158,7 +158,7 @@ class Bins:
         vector = mi.Vector4f(*side) if self.width == 4 else mi.Matrix4f(*side)
         dr.scatter_add(self.values, vector, mi.UInt32(row), ok & active)
 
-    def _slots(self) -> Iterator[tuple[tuple[int, int, int], int]]:
+    def _slots(self) -> Iterator[tuple[tuple[int, ...], int]]:
         """Every tap of a path, and its place in a row: two bits for each resolved axis."""
         for tap in product(*(range(3 if count > 1 else 1) for count in self.grid.shape)):
             slot = 0
