@@ -2,16 +2,14 @@
 
 import copy
 import math
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
-from torch.autograd import forward_ad
+from torch import Tensor
 
 from invertwin.inversion.gradcheck import gradcheck
-from invertwin.radar import Radar, Surrogate
+from invertwin.inversion.shape_directions import ShapeDirection, along, along_field
+from invertwin.radar import Surrogate
 from invertwin.scene import Mesh, Scene, box, plate, rigid, rotation_from_vector, sphere
 from invertwin.scene.geometry import (
     BodyTemplate,
@@ -30,7 +28,6 @@ from invertwin.scene.geometry import (
 )
 from scenes import float64, radar, thing
 
-Direction = Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]
 LOW, HIGH = [-0.45, -0.4, -0.35], [0.45, 0.4, 0.35]
 
 
@@ -46,63 +43,6 @@ def before_a_wall(mesh: Mesh) -> Scene:
 
 def noise(shape: torch.Size, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def along(module: nn.Module, **changes: Tensor) -> Direction:
-    """The module's parameters, moved by θ times these changes."""
-    start = {name: value.detach() for name, value in module.named_parameters()}
-
-    def direction(scene: Scene, seen: Radar, theta: Tensor) -> tuple[Scene, Radar]:
-        moved = {name: start[name] + theta * change for name, change in changes.items()}
-        return torch.func.functional_call(module, moved, (scene,)), seen
-
-    return direction
-
-
-def meshed(module: Any, scene: Scene, **changes: Tensor) -> Direction:
-    """The same for a field. Differences follow the first mesh's points along their normals.
-
-    Differences with common random numbers need triangles that stay the same ones, so the ends do
-    not mesh anew; where the changed field is zero on those normals is found here, by itself.
-    """
-    inner = along(module, **changes)
-    mesh = module(scene)["object"].mesh
-    points = mesh.vertices.detach()
-    start = {name: value.detach() for name, value in module.named_parameters()}
-
-    class Distance(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.shape = module
-
-        def forward(self, places: Tensor) -> Tensor:
-            return module.distance(places)
-
-    def value(theta: Tensor, places: Tensor) -> Tensor:
-        moved = {f"shape.{name}": start[name] + theta * c for name, c in changes.items()}
-        return torch.func.functional_call(Distance(), moved, (places,))
-
-    def slopes(theta: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-        at = places.detach().requires_grad_()
-        with torch.enable_grad():
-            found = value(theta, at)
-            (slope,) = torch.autograd.grad(found.sum(), at)
-        return found.detach(), slope
-
-    _, slope = slopes(torch.zeros((), dtype=torch.float64), points)
-    normals = slope / slope.norm(dim=1, keepdim=True)
-
-    def direction(scene: Scene, seen: Radar, theta: Tensor) -> tuple[Scene, Radar]:
-        if forward_ad.unpack_dual(theta).tangent is not None:
-            return inner(scene, seen, theta)
-        places = points
-        for _ in range(8):
-            found, slope = slopes(theta, places)
-            places = places - normals * (found / (slope * normals).sum(1))[:, None]
-        assert float(slopes(theta, places)[0].abs().max()) < 1e-9
-        return scene.replace("object", mesh=Mesh(places, mesh.faces)), seen
-
-    return direction
 
 
 def arm() -> BodyTemplate:
@@ -134,7 +74,7 @@ def space() -> ShapeSpace:
     )
 
 
-def distance_grid() -> tuple[Scene, Direction]:
+def distance_grid() -> tuple[Scene, ShapeDirection]:
     def ellipsoid(points: Tensor) -> Tensor:
         return 0.2 * ((points / float64([0.3, 0.2, 0.2])).norm(dim=1) - 1)
 
@@ -142,10 +82,10 @@ def distance_grid() -> tuple[Scene, Direction]:
     scene = before_a_wall(sphere(0.2, 1))
     # Values on one side fall: the surface moves outwards there.
     change = -(module.lattice.nodes[..., 0] > 0.1).double()
-    return module(scene), meshed(module, scene, value=change)
+    return module(scene), along_field(module, scene, value=change)
 
 
-def neural_distance() -> tuple[Scene, Direction]:
+def neural_distance() -> tuple[Scene, ShapeDirection]:
     module = NeuralDistance(
         "object", LOW, HIGH, (13, 12, 11), radius=0.22, width=8, frequency=3.0, seed=1
     )
@@ -154,7 +94,7 @@ def neural_distance() -> tuple[Scene, Direction]:
     weights[name].data = 0.03 * noise(weights[name].shape)
     scene = before_a_wall(sphere(0.2, 1))
     change = noise(weights[name].shape, 4)
-    return module(scene), meshed(module, scene, **{name: change})
+    return module(scene), along_field(module, scene, **{name: change})
 
 
 def small_prior(size: float = 0.13) -> ShapePrior:
@@ -167,7 +107,7 @@ def small_prior(size: float = 0.13) -> ShapePrior:
     return ShapePrior(decoder, lattice)
 
 
-def prior_latent() -> tuple[Scene, Direction]:
+def prior_latent() -> tuple[Scene, ShapeDirection]:
     prior = small_prior()
     module = PriorShape(
         "object", prior, 0.5 * noise(torch.Size([prior.latent_size]), 5), (56, 21, 20)
@@ -181,33 +121,33 @@ def prior_latent() -> tuple[Scene, Direction]:
     )
     scene = start.replace("object", pose=turned)
     change = 8.0 * noise(torch.Size([prior.latent_size]), 6)
-    return module(scene), meshed(module, scene, latent=change)
+    return module(scene), along_field(module, scene, latent=change)
 
 
-def latent() -> tuple[Scene, Direction]:
+def latent() -> tuple[Scene, ShapeDirection]:
     module = LinearShape("object", space(), [0.1, 0.2])
     return module(before_a_wall(box(0.1))), along(module, latent=float64([5.0, -10.0]))
 
 
-def joint_angle() -> tuple[Scene, Direction]:
+def joint_angle() -> tuple[Scene, ShapeDirection]:
     module = SkinnedBody("object", arm(), [[0, 0, 0.1], [0.0, 0.2, 0.5]])
     turn = float64([[0, 0, 0], [0, 0.5, 3.0]])
     return module(before_a_wall(box(0.1))), along(module, rotation=turn)
 
 
-def skinning() -> tuple[Scene, Direction]:
+def skinning() -> tuple[Scene, ShapeDirection]:
     module = SkinnedBody("object", skin(), [[0, 0, 0.1], [0.0, 0.2, 0.5]])
     turn = float64([[0, 0, 2.0], [0, 1.0, 4.0]])
     return module(before_a_wall(box(0.1))), along(module, rotation=turn)
 
 
-def lattice() -> tuple[Scene, Direction]:
+def lattice() -> tuple[Scene, ShapeDirection]:
     scene = before_a_wall(sphere(0.2, 3))
     module = LatticeDeformation("object", LOW, HIGH, (3, 3, 3))
     return scene, along(module, offsets=noise(module.offsets.shape, 2))
 
 
-def smooth_vertices() -> tuple[Scene, Direction]:
+def smooth_vertices() -> tuple[Scene, ShapeDirection]:
     ball = sphere(0.2, 3)
     module = SmoothVertices("object", ball, 10.0)
     return before_a_wall(ball), along(module, latent=6.0 * noise(module.latent.shape, 3))

@@ -214,10 +214,10 @@ def test_reconstruct_takes_its_steps_and_resumes(case, tmp_path):
     with pytest.raises(InterruptError):
         fit(progress=stop, **kept)
     resumed = fit(resume=True, **kept)
-    places = [
+    first, second = (
         torch.tensor(found.history[-1]["values"]["plate.translation"]) for found in (whole, resumed)
-    ]
-    assert torch.allclose(*places, atol=2e-3)
+    )
+    assert torch.allclose(first, second, atol=2e-3)
     fit(optimizer=Optimizer(), **kept)
     with pytest.raises(InputError, match="got that of another optimiser"):
         fit(resume=True, **kept)

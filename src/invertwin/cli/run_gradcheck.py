@@ -11,8 +11,9 @@ import numpy as np
 
 from invertwin.channel.paths import Grid
 from invertwin.cli import build, pictures
+from invertwin.cli.gradient_shapes import SHAPES, shape_direction
 from invertwin.cli.report import Again, Picture, Table, report_html
-from invertwin.cli.run_file import about_file, need, to_toml
+from invertwin.cli.run_file import about, about_file, need, to_toml
 from invertwin.cli.run_methods import compare, methods_table
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import Gradcheck, RunFile
@@ -129,7 +130,15 @@ def _check(
     scene = build.scene(run)
     radar = build.radar(need(run, "radar", "gradcheck"))
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
-    direction = _direction(settings)
+    if settings.parameter.kind in SHAPES:
+        if run.methods is not None:
+            raise InputError(
+                "methods: expected a parameter that moves something, got one of a shape; remove it"
+            )
+        with about("gradcheck.parameter"):
+            scene, direction = shape_direction(settings.parameter, run, scene)
+    else:
+        direction = _direction(settings)
     step = math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0
     report = gradcheck(
         scene,
@@ -151,11 +160,11 @@ def _check(
     )
     table = settings.parameter
     outer = report.no_interior_edges
-    unit = _UNITS.get(table.kind, f"per unit of {table.value}")
+    unit = (_UNITS | SHAPES).get(table.kind, f"per unit of {table.value}")
     folder.write_bytes(f"{name}.png", _maps(report, grid, unit))
     folder.write_bytes(f"{name}_scene.png", _picture(scene, radar, settings.parameter.object))
     others = {}
-    if run.methods is not None:
+    if isinstance(direction, Direction) and run.methods is not None:
         compared = compare(run, scene, radar, grid, direction, step, report, say)
         folder.write_bytes(f"{name}_methods.png", compared.picture)
         others["methods"] = compared.found
@@ -219,5 +228,5 @@ def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
 
 def _note(run: RunFile, found: Mapping[str, Any]) -> str:
     parameter = need(run, "gradcheck", "gradcheck").parameter
-    what = f"{parameter.kind} of {parameter.object or 'the radar'}"
+    what = f"{parameter.joint or ''} {parameter.kind} of {parameter.object or 'the radar'}".strip()
     return f"Derivative with respect to the {what}; {found['seconds']:.0f} s. {run.note}"

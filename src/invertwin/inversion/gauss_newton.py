@@ -17,24 +17,25 @@ Maps = Callable[[], tuple[Tensor, Tensor]]
 _MOST = 64  # parameters; each costs a derivative of the map per step
 _TRIES = 4  # dampings of one step
 _EASE, _STRAIN = 0.3, 4.0  # of the damping after a step that helped, and after one that did not
-_LEAST, _LARGEST = 1e-4, 1e6  # of the damping
-_FLAT = 1e-9  # of the largest curvature: below it a parameter does nothing
+_LEAST, _LARGEST = 1e-3, 1e3  # of the damping
+_SLACK = 1e-3  # of the loss: the noise of two evaluations on the same samples
 
 
 class GaussNewton:
     """Levenberg–Marquardt steps on the loss of power maps.
 
-    The step d solves ``(H + μ diag H) d = −g``: g the gradient of the loss with all its terms, in
-    reverse mode; H the loss's Gauss–Newton matrix from derivatives of the map by every single
-    parameter, in forward mode, silhouettes included. A step that does not lower the loss, on the
-    same samples, is taken back and tried again with more damping μ.
+    The step d solves ``(H + μ D) d = −g`` with no number beyond ``reach``: g the gradient of the
+    loss with all its terms, in reverse mode; H the loss's Gauss–Newton matrix from derivatives of
+    the map by every single parameter, in forward mode, silhouettes included; D the diagonal of H,
+    at least its mean. A step that raises the loss, on the same samples, is taken back and tried
+    again with more damping μ.
 
     Attributes:
         damping: present μ.
 
     Source: the Levenberg–Marquardt method.
-    Differs from the source: g and H are estimates from samples; no parameter
-    changes by more than ``reach`` in a step.
+    Differs from the source: g and H are estimates from samples, and D keeps what the data hardly
+    tell from drifting with their noise.
     """
 
     def __init__(
@@ -110,16 +111,19 @@ class GaussNewton:
         if penalty is not None:
             curvature = curvature + _penalty_curvature(penalty, parameters, free)
         start = [parameter.detach().clone() for parameter in parameters]
+        given = self.damping
         for _ in range(_TRIES):
             self._move(start, self._solved(curvature, slope[free]), free)
             with torch.no_grad():
                 after = float(self.loss(*maps()))
                 if penalty is not None:
                     after += float(penalty())
-            if after < before:
+            if after < before + _SLACK * abs(before):
                 self.damping = max(self.damping * _EASE, _LEAST)
                 return before
-            self.damping = min(self.damping * _STRAIN, _LARGEST)
+            self.damping *= _STRAIN
+        # Samples are others in the next step: what failed on these may be right on those.
+        self.damping = min(given * _STRAIN, _LARGEST)
         self._move(start, torch.zeros(int(free.sum()), dtype=torch.float64), free)
         return before
 
@@ -145,7 +149,10 @@ class GaussNewton:
 
     def _solved(self, curvature: Tensor, slope: Tensor) -> Float64[Tensor, " p"]:
         """The least of the damped quadratic model within the reach of every parameter."""
-        scale = curvature.diagonal().clamp_min(_FLAT * float(curvature.diagonal().max()))
+        own = curvature.diagonal()
+        # What the data hardly tell is damped as much as what they tell on average: noise would
+        # carry it away otherwise.
+        scale = own.clamp_min(float(own.mean()))
         model = curvature + torch.diag(self.damping * scale)
         change, free = torch.zeros_like(slope), torch.ones_like(slope, dtype=torch.bool)
         while bool(free.any()):

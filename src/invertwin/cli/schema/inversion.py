@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, Tag, model_validator
 
 from invertwin.cli.schema.mover import OpenRadarData
-from invertwin.cli.schema.parameters import MaterialValue
+from invertwin.cli.schema.parameters import Counts, MaterialValue
 from invertwin.cli.schema.recording import ArraysData, Dca1000Data
 from invertwin.cli.schema.section import (
     TAG_MARK,
@@ -177,10 +177,10 @@ class Loss(Section):
 
 
 class Optimizer(Section):
-    kind: Literal["adam", "sgd"] = "adam"
-    """how a gradient becomes a step"""
+    kind: Literal["adam", "sgd", "gauss_newton"] = "adam"
+    """how a gradient becomes a step; gauss_newton for at most 64 parameters"""
     rate: Positive = 0.03
-    """m, and rad without rotation_rate"""
+    """m, and rad without rotation_rate; of gauss_newton the longest change in a step"""
     rotation_rate: Positive | None = None
     """rad"""
     final_rate: NonNegative | None = None
@@ -260,21 +260,54 @@ class GradientParameter(Section):
     """The scalar θ of a gradient check; θ = 0 is the scene as written."""
 
     kind: Literal[
-        "translation", "rotation", "scale", "material", "radar_translation", "radar_rotation"
+        "translation",
+        "rotation",
+        "scale",
+        "material",
+        "radar_translation",
+        "radar_rotation",
+        "joint",
+        "latent",
+        "distance",
+        "density",
     ]
+    """joint = turns one of a body; latent = a coordinate of a vehicle or prior; distance = moves \
+the surface of a signed distance outwards, density = thickens a cloud in the object's place, both \
+in a round bump"""
     object: str | None = None
     """name in the scene; none for the radar's"""
     axis: Vector | None = None
     """direction, or axis of the turn"""
     value: MaterialValue | None = None
     """for kind material"""
+    joint: str | None = None
+    """name, for kind joint"""
+    index: Annotated[int, Field(ge=0)] | None = None
+    """from 0, for kind latent"""
+    center: Vector | None = None
+    """of the bump, in the object's frame [m]"""
+    width: Positive | None = None
+    """standard deviation of the bump [m]"""
+    low: Vector | None = None
+    """corner of the nodes of distance or density, in the object's frame [m]"""
+    high: Vector | None = None
+    """the opposite corner [m]"""
+    counts: Counts | None = None
+    """nodes along x, y and z"""
+    extinction: Positive | None = None
+    """of the cloud [1/m], for kind density"""
 
     @model_validator(mode="after")
     def _complete(self) -> "GradientParameter":
+        grid = self.kind in ("distance", "density")
         wanted = {
             "object": not self.kind.startswith("radar"),
-            "axis": self.kind.endswith(("translation", "rotation")),
+            "axis": self.kind.endswith(("translation", "rotation")) or self.kind == "joint",
             "value": self.kind == "material",
+            "joint": self.kind == "joint",
+            "index": self.kind == "latent",
+            **dict.fromkeys(("center", "width", "low", "high", "counts"), grid),
+            "extinction": self.kind == "density",
         }
         check_presence(self, wanted, f"with kind = {self.kind}")
         return self
@@ -286,9 +319,9 @@ class Gradcheck(Section):
     parameter: GradientParameter
     """the scalar θ"""
     step: Positive | None = None
-    """of the differences: m, or relative for scale"""
+    """of the differences: m, relative for scale and density, standard deviations for latent"""
     step_deg: Positive | None = None
-    """the same for rotations"""
+    """the same for rotations and joints"""
     noise: Positive = 0.007
     """‖standard error‖₁/‖g_FD‖₁ at which repeating stops"""
     max_pairs: Count = 64
@@ -308,7 +341,7 @@ class Gradcheck(Section):
 
     @model_validator(mode="after")
     def _complete(self) -> "Gradcheck":
-        turns = self.parameter.kind.endswith("rotation")
+        turns = self.parameter.kind.endswith("rotation") or self.parameter.kind == "joint"
         wanted = {"step_deg": turns, "step": not turns}
         check_presence(self, wanted, f"with kind = {self.parameter.kind}")
         return self

@@ -17,7 +17,7 @@ from invertwin.cli.schema.section import (
     tag_by,
 )
 
-_Counts = Annotated[list[Annotated[int, Field(ge=2)]], Field(min_length=3, max_length=3)]
+Counts = Annotated[list[Annotated[int, Field(ge=2)]], Field(min_length=3, max_length=3)]
 
 
 class Named(Section):
@@ -71,7 +71,7 @@ class _BoxParameter(ObjectParameter):
     """corner of the box, in the object's frame [m]"""
     high: Vector
     """the opposite corner [m]"""
-    counts: _Counts
+    counts: Counts
     """nodes along x, y and z"""
 
 
@@ -156,7 +156,7 @@ class PriorParameter(ObjectParameter):
     """of ½ Σ z²"""
     file: InputPath | None = None
     """that `invertwin train-prior` wrote; without it the prior of the package"""
-    counts: _Counts | None = None
+    counts: Counts | None = None
     """nodes along x, y and z at which it is meshed; without it every 0.1 m or so"""
 
 
