@@ -166,7 +166,7 @@ class Scene:
             changes: new values of `mesh`, `material`, `pose`, `velocity` or `cloud`.
 
         Raises:
-            InputError: no such object or field.
+            InputError: no such object or field; the mesh or material of a cloud, which do nothing.
         """
         unknown = sorted(set(changes) - set(Object.__dataclass_fields__))
         if unknown:
@@ -174,7 +174,14 @@ class Scene:
                 f"expected changes of {', '.join(Object.__dataclass_fields__)}, "
                 f"got {', '.join(unknown)}; use one of these fields"
             )
-        return Scene({**self.objects, name: replace(self[name], **changes)})
+        changed = replace(self[name], **changes)
+        shaped = [field for field in ("mesh", "material") if field in changes]
+        if shaped and changed.cloud is not None:
+            raise InputError(
+                f"expected changes of pose or density of the cloud {name!r}, got its {shaped[0]}, "
+                "which rays do not see; seek its density alone, or take the cloud away"
+            )
+        return Scene({**self.objects, name: changed})
 
     def at(self, time: float) -> "Scene":
         """The scene after all objects moved with their velocities for `time` [s]."""

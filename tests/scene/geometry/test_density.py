@@ -8,6 +8,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.measures import volume_iou
 from invertwin.scene import DensityGrid, Object, RoughDielectric, Scene, plate, sphere
 from invertwin.scene.geometry import without_clouds
+from invertwin.scene.parameters import Scale, Translation
 
 BOX = [-0.5] * 3, [0.5] * 3
 
@@ -84,3 +85,23 @@ def test_bad_densities_are_refused(density: Tensor, message: str) -> None:
 def test_a_level_beyond_the_densities_is_refused() -> None:
     with pytest.raises(InputError, match="level"):
         DensityGrid("item", *BOX, ball()).mesh(level=30.0)
+
+
+@pytest.mark.parametrize("order", [("size", "cloud"), ("cloud", "size")])
+def test_what_a_cloud_does_not_show_cannot_be_sought(order):
+    scene = Scene({"ball": Object(sphere(0.1, 1), RoughDielectric(4.0))})
+    made = {
+        "size": Scale("ball"),
+        "cloud": DensityGrid.even("ball", [-0.2] * 3, [0.2] * 3, (3, 3, 3)),
+    }
+    with pytest.raises(
+        InputError, match="shape of 'ball' beside|of the cloud 'ball', got its mesh"
+    ):
+        for name in order:
+            scene = made[name](scene)
+
+
+def test_a_cloud_can_be_moved():
+    scene = Scene({"ball": Object(sphere(0.1, 1), RoughDielectric(4.0))})
+    scene = DensityGrid.even("ball", [-0.2] * 3, [0.2] * 3, (3, 3, 3))(scene)
+    assert Translation("ball", [0.1, 0, 0])(scene)["ball"].cloud is not None

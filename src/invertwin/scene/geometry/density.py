@@ -112,7 +112,16 @@ class DensityGrid(nn.Module):
         return Cloud(self.lattice.low, self.lattice.high, self.density, self.albedo)
 
     def forward(self, scene: Scene) -> Scene:
-        """The scene with the object seen as the present cloud."""
+        """The scene with the object seen as the present cloud.
+
+        Raises:
+            InputError: the mesh, which is seen no more, has derivatives to carry.
+        """
+        if scene[self.object].mesh.vertices.requires_grad:
+            raise InputError(
+                f"expected no other parameters of the shape of {self.object!r} beside its density, "
+                "got some, which would change nothing; remove them"
+            )
         return scene.replace(self.object, cloud=self.cloud)
 
     def mesh(self, level: float | None = None) -> Mesh:
