@@ -213,10 +213,12 @@ def _power_chains(geometry: Geometry, link: Link, samples: int, depth: int, seed
 
 
 def _joined(parts: list[Paths]) -> Paths:
-    joined = parts[0]
-    for part in parts[1:]:
-        joined = joined + part
-    return joined
+    """All in order; in pairs, so that no row is copied once for every part."""
+    while len(parts) > 1:
+        pairs = zip(parts[::2], parts[1::2], strict=False)
+        odd = parts[-1:] if len(parts) % 2 else []
+        parts = [first + second for first, second in pairs] + odd
+    return parts[0]
 
 
 @dataclass(frozen=True)
