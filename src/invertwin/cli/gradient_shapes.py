@@ -57,7 +57,9 @@ def shape_direction(
             module = DistanceGrid.sampled(name, low, high, counts, field)
             # The surface moves outwards where the distance falls.
             change = -_bump(table, module.lattice)
-            return module(scene), along_field(module, scene, value=change)
+            with torch.no_grad():
+                begun = module(scene)
+            return begun, along_field(module, scene, value=change)
     low, high, counts = _box(table)
     lattice = Lattice.between(low, high, counts)
     inside = -signed_distance(scene[name].mesh, lattice.nodes.reshape(-1, 3))

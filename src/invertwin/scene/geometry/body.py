@@ -18,6 +18,7 @@ from invertwin.scene.scene import Scene
 
 _DO = "give arrays of one template"
 _ALONE = 0.95  # share of a vertex that a joint moves nearly alone
+_EXACT = 1e-12  # m, where they may end
 _REFINED = 4  # Newton steps of least squares
 
 
@@ -161,6 +162,8 @@ class BodyTemplate:
         with torch.no_grad():
             for _ in range(_REFINED):
                 miss = given.flatten() - skin(turns.flatten())
+                if float(miss.abs().max()) < _EXACT:
+                    break
                 slopes = torch.func.jacfwd(skin)(turns.flatten())
                 change = torch.linalg.lstsq(slopes, miss[:, None], driver="gelsd").solution
                 turns = turns + change.reshape(-1, 3)

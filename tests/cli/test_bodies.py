@@ -1,0 +1,146 @@
+"""Bodies in run files: their angles, their starts, their scores; gradient checks of shapes."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from invertwin.cli import build
+from invertwin.cli.bodies import sought_bodies
+from invertwin.cli.gradient_shapes import shape_direction
+from invertwin.cli.run_file import validate
+from invertwin.cli.schema import RunFile
+from invertwin.errors import InputError
+from invertwin.scene import Scene
+from scenes import radar
+
+STUFF = {"kind": "rough_dielectric", "permittivity": 4.0}
+LEFT = {"left_elbow": ["y"], "left_hip": ["x", "y", "z"]}
+
+
+def run_file(joints: Any = LEFT, scale: float = 1.0, **tables: Any) -> RunFile:
+    person = {
+        "shape": "body",
+        "material": STUFF,
+        "position": [0.0, 0.0, 2.0],
+        "scale": scale,
+        "angles_deg": {"left_elbow": [0.0, -50.0, 0.0], "left_knee": [-30.0, 0.0, 0.0]},
+    }
+    run = {
+        "task": "reconstruct",
+        "scene": {"person": person, "box": {"shape": "box", "size": [1.0] * 3, "material": STUFF}},
+        "parameters": [{"kind": "body", "object": "person", "joints": joints}],
+        "starts": {"object": "person", "count": 2, "distance": [0.0, 0.0], "joint_deg": 20.0},
+        **tables,
+    }
+    return validate(run, Path("run.toml"))
+
+
+def test_every_sought_joint_starts_that_far_off_and_only_these():
+    run = run_file(scale=1.2)
+    assert run.starts is not None
+    scene, bodies = build.scene(run), sought_bodies(run)
+    starts = build.starts(run.starts, scene, scene, 1, bodies)
+    again = build.starts(run.starts, scene, scene, 1, bodies)
+    body = bodies["person"]
+    truth = scene["person"].mesh
+    true = body.template.rotations_of(truth.vertices)
+    for start, same in zip(starts, again, strict=True):
+        mesh = start.scene["person"].mesh
+        assert torch.equal(mesh.vertices, same.scene["person"].mesh.vertices)
+        angles = body.errors(mesh, truth, truth)
+        assert angles["joint_error_before_deg"] == pytest.approx(20.0, abs=1e-4)
+        assert angles["joint_error_after_deg"] == pytest.approx(0.0, abs=1e-4)
+        found = body.template.rotations_of(mesh.vertices)
+        hinge = body.template.joint("left_elbow")
+        assert torch.allclose(found[hinge, [0, 2]], torch.zeros(2).double(), atol=1e-6)
+        moved = (found - true).abs().amax(1) > 1e-6
+        assert {body.template.names[int(k)] for k in moved.nonzero()[:, 0]} == set(LEFT)
+        (module,) = build.parameters(run.parameters, start.scene, bodies)
+        assert torch.allclose(module(start.scene)["person"].mesh.vertices, mesh.vertices, atol=1e-9)
+    first, second = (start.scene["person"].mesh.vertices for start in starts)
+    assert not torch.allclose(first, second, atol=1e-3)
+
+
+def test_a_truth_may_have_other_angles():
+    run = run_file(truth={"person": {"angles_deg": {"neck": [10.0, 0.0, 0.0]}}})
+    scene, truth = build.scene(run), build.true_scene(run)
+    angles = sought_bodies(run)["person"].errors(
+        scene["person"].mesh, scene["person"].mesh, truth["person"].mesh
+    )
+    assert angles["joint_error_left_elbow_deg"] == pytest.approx(50.0, abs=1e-4)
+    assert angles["joint_error_left_hip_deg"] == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"joints": {"tail": ["x"]}}, r"parameters\[0\].*expected a joint among pelvis"),
+        ({"parameters": [{"kind": "body", "object": "box", "joints": LEFT}]}, 'shape = "body"'),
+    ],
+)
+def test_bad_bodies(changes, message):
+    with pytest.raises(InputError, match=message):
+        sought_bodies(run_file(**changes))
+
+
+def checked(parameter: dict[str, Any], name: str = "person") -> tuple[Scene, Scene]:
+    """The scene at θ = 0 and at 0.01."""
+    given = {"object": name, **parameter}
+    key = "step_deg" if given["kind"] == "joint" else "step"
+    run = run_file(gradcheck={"parameter": given, key: 0.1})
+    assert run.gradcheck is not None
+    scene, direction = shape_direction(run.gradcheck.parameter, run, build.scene(run))
+    theta = torch.tensor(0.01, dtype=torch.float64)
+    return scene, direction(scene, radar(), theta)[0]
+
+
+BUMP = {
+    "center": [0.5, 0.0, 0.0],
+    "width": 0.1,
+    "low": [-0.8] * 3,
+    "high": [0.8] * 3,
+    "counts": [17] * 3,
+}
+
+
+def test_theta_turns_a_joint():
+    start, moved = checked({"kind": "joint", "joint": "left_elbow", "axis": [0.0, 2.0, 0.0]})
+    body = sought_bodies(run_file())["person"].template
+    before, after = (body.rotations_of(s["person"].mesh.vertices) for s in (start, moved))
+    assert float((after - before)[body.joint("left_elbow"), 1]) == pytest.approx(0.01, abs=1e-9)
+    assert float((after - before).abs().sum()) == pytest.approx(0.01, abs=1e-7)
+
+
+def test_theta_moves_a_surface_outwards_in_a_bump():
+    start, moved = checked({"kind": "distance", **BUMP}, "box")
+    way = (moved["box"].mesh.vertices - start["box"].mesh.vertices)[:, 0]
+    assert float(way.max()) == pytest.approx(0.01, rel=0.15)
+    far = start["box"].mesh.vertices[:, 0] < 0
+    assert float(way[far].abs().max()) < 1e-4
+
+
+def test_theta_thickens_a_cloud():
+    start, moved = checked({"kind": "density", "extinction": 5.0, **BUMP}, "box")
+    clouds = start["box"].cloud, moved["box"].cloud
+    assert clouds[0] is not None
+    assert clouds[1] is not None
+    assert float(clouds[0].density.max()) == pytest.approx(5.0, rel=1e-3)
+    ratio = clouds[1].density / clouds[0].density
+    assert float(ratio.max()) == pytest.approx(1.01, abs=1e-4)
+    assert float(ratio.min()) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "message"),
+    [
+        ({"kind": "joint", "axis": [0.0, 1.0, 0.0]}, "expected `joint` with kind = joint"),
+        ({"kind": "distance", "center": [0.0] * 3}, "expected `width` with kind = distance"),
+        ({"kind": "latent", "index": 0}, 'shape = "vehicle" without max_edge, or "prior"'),
+        ({"kind": "joint", "joint": "wing", "axis": [0.0, 1.0, 0.0]}, "got 'wing'; choose one"),
+    ],
+)
+def test_bad_directions(parameter, message):
+    with pytest.raises(InputError, match=message):
+        checked(parameter)
