@@ -39,3 +39,10 @@ def multibounce(repository, monkeypatch) -> ModuleType:
     """`benchmarks/multibounce.py`."""
     monkeypatch.syspath_prepend(repository / "benchmarks")
     return importlib.import_module("multibounce")
+
+
+@pytest.fixture
+def shapes(repository, monkeypatch) -> ModuleType:
+    """`benchmarks/shapes.py`."""
+    monkeypatch.syspath_prepend(repository / "benchmarks")
+    return importlib.import_module("shapes")

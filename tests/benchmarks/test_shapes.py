@@ -1,0 +1,130 @@
+"""The shapes benchmark: its cars, what it makes of their fits, and that it goes on where it was."""
+
+import json
+import math
+
+import pytest
+
+
+def curve(*values):
+    return [[10 * (k + 1), value] for k, value in enumerate(values)]
+
+
+def car(pose, free, prior, falling):
+    def row(chamfer, iou, shown=()):
+        return {
+            "chamfer_m": chamfer,
+            "iou": iou,
+            "chamfer_seen_m": chamfer,
+            "iou_seen": iou,
+            "start_chamfer_m": 0.16,
+            "start_iou": 0.5,
+            "steps": 30,
+            "seconds": 1.0,
+            "curve": curve(*shown) or curve(chamfer, chamfer, chamfer),
+        }
+
+    return {
+        "pose_only": row(pose, 0.7),
+        "free": row(free, 0.8),
+        "prior": row(prior, 0.9, falling),
+    }
+
+
+GOOD = car(0.10, 0.07, 0.04, (0.09, 0.06, 0.04))
+BAD = car(0.10, 0.03, 0.09, (0.12, 0.11, 0.09))
+
+
+def test_what_a_car_tells(shapes):
+    row = shapes.compared(GOOD)
+    assert row["chamfer_ratio"] == pytest.approx(0.4)
+    assert row["iou_gain"] == pytest.approx(0.2)
+    assert row["iteration_ratio"] == pytest.approx(20 / 30)
+    assert shapes.compared(BAD)["iteration_ratio"] == math.inf
+
+
+def test_medians_and_the_worst_car(shapes):
+    metrics = shapes.summary({1: GOOD, 2: BAD, 3: GOOD})
+    assert metrics["chamfer_ratio"] == pytest.approx(0.4)
+    assert metrics["worst"]["car"] == 2
+    assert metrics["chamfer_m"] == {"pose_only": 0.10, "free": 0.07, "prior": 0.04}
+    lines = shapes.verdicts(metrics)
+    assert [line.endswith(": holds") for line in lines] == [True, True, False]
+
+
+def test_cars_differ_in_shape_and_start_only(shapes):
+    run = shapes.load_run(shapes.RUN)
+    first, again, second = (shapes.run_of(k, run) for k in (1, 1, 2))
+    assert first == again
+    for own in (first, second):
+        place = own.scene["car"].position
+        assert math.hypot(*place) == pytest.approx(shapes.DISTANCE)
+        assert place[1] == 0.0
+        (part,) = own.truth["car"].parts
+        assert len(part.coefficients) == shapes.MODES_OF_SPACE
+        assert max(map(abs, part.coefficients)) <= shapes.CUT
+    assert first.truth != second.truth
+    assert first.scene != second.scene
+    same = {"seed": run.seed, "scene": run.scene, "truth": run.truth}
+    assert first.model_copy(update=same) == run
+
+
+def test_the_start_is_turned_by_ten_degrees(shapes):
+    run = shapes.load_run(shapes.RUN)
+    turns = []
+    for own in (shapes.run_of(k, run) for k in (1, 2, 3)):
+        start, truth = (
+            shapes.Rotation.from_rotvec(vector, degrees=True)
+            for vector in (own.scene["car"].rotation_deg, own.truth["car"].rotation_deg)
+        )
+        turns.append((start * truth.inv()).as_rotvec(degrees=True))
+    for turn in turns:
+        assert abs(turn[1]) == pytest.approx(shapes.ANGLE_DEG)
+        assert abs(turn[[0, 2]]).max() < 1e-9
+
+
+def test_finished_cars_are_read_unless_the_run_file_has_changed(shapes, tmp_path, monkeypatch):
+    run, fits = shapes.load_run(shapes.RUN), []
+
+    def fitted(own):
+        fits.append(own.seed)
+        return GOOD
+
+    monkeypatch.setattr(shapes, "fitted", fitted)
+    shapes.measure(tmp_path, 2, run)
+    found = shapes.measure(tmp_path, 3, run)
+    assert fits == [1, 2, 3]
+    assert found["count"] == 3
+    assert (tmp_path / "shapes.png").stat().st_size > 0
+    other = run.model_copy(update={"note": "another"})
+    shapes.measure(tmp_path, 1, other)
+    assert fits == [1, 2, 3, 1]
+
+
+def test_infinite_numbers_are_null_in_the_file(shapes, tmp_path, monkeypatch):
+    monkeypatch.setattr(shapes, "fitted", lambda own: BAD)
+    metrics = shapes.measure(tmp_path, 1)
+    assert metrics["iteration_ratio"] == math.inf
+    assert json.loads((tmp_path / "metrics.json").read_text())["iteration_ratio"] is None
+
+
+def test_every_method_is_a_fit_of_the_run_file(shapes):
+    run = shapes.load_run(shapes.RUN)
+    assert set(shapes.MODES.values()) == {shapes.FULL, *run.variants}
+    assert run.reconstruct.steps % run.measures.every == 0
+
+
+@pytest.mark.slow
+def test_a_car_is_fitted(shapes, data_folder, monkeypatch):
+    monkeypatch.setenv("INVERTWIN_DATA", str(data_folder))
+    run = shapes.run_of(1, shapes.load_run(shapes.RUN))
+    short = run.reconstruct.model_copy(update={"steps": 3, "samples": 20_000})
+    few = run.data.model_copy(update={"density": 50.0})
+    every = run.measures.model_copy(update={"every": 1})
+    monkeypatch.setattr(shapes, "MODES", {"prior": shapes.FULL})
+    run = run.model_copy(update={"reconstruct": short, "data": few, "measures": every})
+    (found,) = shapes.fitted(run).values()
+    assert [step for step, _ in found["curve"]] == [1, 2, 3]
+    assert found["curve"][-1][1] == pytest.approx(found["chamfer_m"], rel=1e-6)
+    assert 0.1 < found["start_chamfer_m"] < 0.3
+    assert 0.4 < found["start_iou"] < 0.8
