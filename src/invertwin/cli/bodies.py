@@ -32,7 +32,10 @@ def posed(table: schema.BodyShape) -> Mesh:
         InputError: No such joint, or as for the template.
     """
     body = template(table)
-    angles = {name: torch.tensor(turn).deg2rad() for name, turn in table.angles_deg.items()}
+    angles = {
+        name: torch.tensor(turn, dtype=torch.float64).deg2rad()
+        for name, turn in table.angles_deg.items()
+    }
     turns = torch.stack([rotation_from_vector(turn) for turn in body.rotations(angles)])
     return Mesh(body.posed(turns)[0], body.faces)
 

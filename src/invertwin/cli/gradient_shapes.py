@@ -85,7 +85,10 @@ def _joint(
     if not isinstance(item, schema.BodyShape):
         raise InputError(f'expected an object with shape = "body", got {table.object}; choose one')
     body = template(item).scaled(item.scale)
-    angles = {name: torch.tensor(turn).deg2rad() for name, turn in item.angles_deg.items()}
+    angles = {
+        name: torch.tensor(turn, dtype=torch.float64).deg2rad()
+        for name, turn in item.angles_deg.items()
+    }
     change = torch.zeros(len(body.parents), 3, dtype=torch.float64)
     axis = torch.tensor(table.axis, dtype=torch.float64)
     change[body.joint(table.joint or "")] = axis / axis.norm()

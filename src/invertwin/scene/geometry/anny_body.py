@@ -71,7 +71,7 @@ def load_anny(
 
 def _rest(model: Any, values: Mapping[str, float]) -> tuple[Tensor, Tensor]:
     """Skin and joints of the rest pose, in our axes."""
-    given = {name: torch.tensor([value]).double() for name, value in values.items()}
+    given = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
     with torch.no_grad():
         found = model(pose_parameters=None, phenotype_kwargs=given)
     rest, places = (found[name][0].double() for name in ("rest_vertices", "rest_bone_heads"))
