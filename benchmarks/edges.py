@@ -51,6 +51,7 @@ DEPTH = 2
 FAMILIES = 3  # among which samples are shared: shadows from both antennas, and interior ones
 REQUIRED = 1.0
 WAYS = {"weighted": True, "uniform": False}
+NOTHING = SimpleNamespace(size=0, draw=None)  # a sampler that finds no edges
 WAVEFORM = FMCW(start_frequency=76e9, bandwidth=2e9, duration=50e-6, samples=512)
 
 
@@ -138,7 +139,7 @@ class Estimator:
         start = perf_counter()
         # The samplers of the first family find nothing, so that all samples are of the second.
         with (
-            patch.object(boundary_walk, "EdgeSampler", lambda *_: SimpleNamespace(size=0)),
+            patch.object(boundary_walk, "EdgeSampler", lambda *_: NOTHING),
             patch.object(
                 boundary_walk,
                 "InteriorEdgeSampler",

@@ -283,8 +283,7 @@ class _Splat(torch.autograd.Function):
         places = [to_float(column) for column in columns]
         ctx.found = bins.Contribution(tracer().Int32(to_index(frame)), *places)
         ctx.grid, ctx.frames, ctx.backend = grid, frames, bridge.backend()
-        ctx.paths = len(frame)
-        out = bins.Bins(grid, frames, len(frame))
+        out = bins.Bins(grid, frames)
         out.add(ctx.found, True)
         return out.map()
 
@@ -302,6 +301,6 @@ class _Splat(torch.autograd.Function):
                 tracer().Float(0.0) if tangent is None else to_float(tangent)
                 for tangent in tangents[3:]
             )
-            out = bins.Bins(ctx.grid, ctx.frames, ctx.paths)
+            out = bins.Bins(ctx.grid, ctx.frames)
             out.add_derivative(ctx.found, dots, True)
             return out.map()

@@ -60,7 +60,7 @@ class Trace:
 
     def bins(self) -> Bins:
         """An empty map."""
-        return Bins(self.settings.grid, self.shot.link.frame_count, self.sampler.size)
+        return Bins(self.settings.grid, self.shot.link.frame_count)
 
     def inputs(self, tables: dict[str, Any] | None = None, *, together: bool = True) -> Inputs:
         """The kernel's inputs, with some arrays replaced by ones that carry derivatives.

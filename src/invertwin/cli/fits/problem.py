@@ -69,7 +69,6 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     need(run, "parameters", "reconstruct")
     table = need(run, "grid", "reconstruct")
     scene, truth = build.scene(run), build.true_scene(run)
-    build.parameters(run.parameters, scene, sought_bodies(run))  # their errors come before any work
     data = need(run, "data", "reconstruct")
     for i, parameter in enumerate(run.parameters):
         if isinstance(parameter, MoverParameter):
@@ -77,6 +76,7 @@ def problem_of(run: RunFile, console: Console) -> Problem:
                 f'parameters[{i}].kind: expected "mover" with data.kind = "openradar" only, got '
                 f'"{data.kind}"; use "translation", "pose" or another kind'
             )
+    build.parameters(run.parameters, scene, sought_bodies(run))  # their errors come before any work
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
         grid = build.grid(table, radar)
