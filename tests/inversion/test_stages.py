@@ -115,6 +115,18 @@ def test_wrong_stages(case, stages, message):
         fit(case, stages)
 
 
+def test_a_shape_that_another_replaces_is_no_parameter(case):
+    class Replaced(torch.nn.Module):
+        applies_to = "scene"
+
+        def forward(self, _):
+            return case.scene
+
+    builders = {"shape": BUILDERS["size"], "other": lambda _: Replaced()}
+    with pytest.raises(InputError, match="a later one replaces what they shape"):
+        fit(case, [Stage(1, ("shape",))], builders)
+
+
 def test_the_mesh_of_a_stage_is_plain(case):
     """Nothing of a stage's graph is kept by the next."""
     found = fit(case, [Stage(1, ("size",)), Stage(1, ("size",), rebuild=True)])

@@ -15,6 +15,8 @@ from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.inversion.prior import LatentNorm, Trained, Training, train_prior
 from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
+from invertwin.inversion.remeshing import remeshed, signed_distance
+from invertwin.inversion.stages import Stage, reconstruct_in_stages
 
 __all__ = [
     "Agreement",
@@ -32,12 +34,16 @@ __all__ = [
     "Reconstruction",
     "Regularizer",
     "SpectrumLoss",
+    "Stage",
     "Trained",
     "Training",
     "compare_shapes",
     "fit_mover",
     "motion_map",
     "reconstruct",
+    "reconstruct_in_stages",
+    "remeshed",
+    "signed_distance",
     "strongest_mover",
     "train_prior",
     "volume_iou",

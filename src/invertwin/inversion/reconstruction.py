@@ -433,6 +433,11 @@ def _stepped(fit: _Fit, state: _State) -> float:
         return state.optimizer.step(maps, fit.penalty if fit.regularizers else None)
     state.optimizer.zero_grad()
     value = fit.evaluate(state.step)
+    if not value.requires_grad:
+        raise InputError(
+            "expected parameters that change the map, got none that do: a later one replaces what "
+            "they shape; give one shape of each object, or another order"
+        )
     number = float(value.detach())
     if not _lost(number, state.history):
         value.backward()

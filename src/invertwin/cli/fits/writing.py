@@ -1,7 +1,7 @@
 """What a reconstruction leaves behind: tables, pictures, the report."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, get_args
 
 import torch
@@ -86,7 +86,7 @@ def tables_of(
                 [row["start"] + 1, *(_ENDS[row[k]] if k == "status" else row[k] for k in keys)]
                 for row in fits
             ]
-            title = f"Starts, {_mode(mode)}"
+            title = f"Starts, {_mode(mode, rows)}"
             tables.append(Table(title, ["start", *(COLUMNS[key] for key in keys)], cells))
     if len(rows) > 1 and any(is_shape_key(key) for key in metrics):
         tables.append(_variants(rows))
@@ -123,11 +123,15 @@ def _variants(rows: dict[str, list[dict[str, Any]]]) -> Table:
     cells = [["start", *(first[f"start_{key}"] for key in keys)]]
     for mode, fits in rows.items():
         means = [[row[key] for row in fits if key in row] for key in keys]
-        cells.append([_mode(mode), *(sum(v) / len(v) if v else None for v in means)])
+        cells.append([_mode(mode, rows), *(sum(v) / len(v) if v else None for v in means)])
     return Table("Ways to fit", ["fit", *(short_label(key) for key in keys)], cells)
 
 
-def _mode(mode: str) -> str:
+def _mode(mode: str, modes: Iterable[str]) -> str:
+    """A way to fit in words; beside variants the run's own is just that."""
+    varied = any(other not in _MODES for other in modes)
+    if mode == FULL and varied:
+        return "as the run says"
     return _MODES.get(mode, mode.replace("_", " "))
 
 
@@ -221,7 +225,7 @@ def draw(
     titles = {"measured": data, "start": "surrogate, start", "twin": "surrogate, twin"}
     titled = {titles[name]: power.numpy() for name, power in maps.items()}
     folder.write_bytes("spectra.png", pictures.spectra_picture(titled, axes))
-    losses = {_mode(mode): [row["losses"] for row in fits] for mode, fits in rows.items()}
+    losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
     annealed = annealed_until(problem.run)
     before = metrics["start_loss_sharp"] if annealed else None
     folder.write_bytes("loss.png", pictures.loss_picture(losses, annealed, before))
@@ -242,9 +246,9 @@ def draw_shapes(
     up = pictures.frame_of(problem.radar)[:, 1]
     meshes = {name: pictures.meshes_of(scene)[table.object] for name, scene in scenes.items()}
     folder.write_bytes("turntable.gif", turntable_gif(meshes, up))
-    curves = {_mode(mode): [row["curve"] for row in fits] for mode, fits in rows.items()}
+    curves = {_mode(mode, rows): [row["curve"] for row in fits] for mode, fits in rows.items()}
     if any(curve for fits in curves.values() for curve in fits):
-        losses = {_mode(mode): [row["losses"] for row in fits] for mode, fits in rows.items()}
+        losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
         folder.write_bytes("convergence.png", convergence_picture(losses, curves))
 
 
