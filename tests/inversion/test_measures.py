@@ -184,3 +184,11 @@ def test_bad_input():
     (normal,) = surface_points(ball, 1, seed=0)[1]
     with pytest.raises(InputError, match="expected a found surface that some position sees"):
         compare_shapes(ball, ball, seen_from=-10 * normal[None], count=1)
+
+
+def test_the_volume_may_be_left_out():
+    mesh = sphere(0.2, 2)
+    with_volume, without = (compare_shapes(mesh, mesh, voxel=v, count=500) for v in (0.05, None))
+    assert with_volume.iou == 1
+    assert without.iou is None
+    assert without.chamfer == with_volume.chamfer

@@ -58,7 +58,7 @@ def test_a_rebuilt_stage_begins_on_the_twin_so_far(case):
     found = fit(case, [Stage(3, ("place",)), Stage(1, ("shape",), rebuild=True)], builders)
     assert len(found.parameters) == 1
     gap = found.scene["plate"].vertices - before.scene["plate"].vertices
-    assert 0 < float(gap.norm(dim=1).max()) <= 0.02 * 3**0.5 + 1e-9  # one step of Adam
+    assert 0 < float(gap.norm(dim=1).max()) <= 0.02 * 3**0.5 * (1 + 1e-6)  # one step of Adam
 
 
 def test_meshes_are_made_finer_between_stages(case):

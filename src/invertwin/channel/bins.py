@@ -8,7 +8,6 @@ has continuous derivatives in range and direction.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 from jaxtyping import Float32
@@ -69,7 +68,7 @@ class _Taps:
         )
         return _Taps(tracer().Int32(found.frame), axes, g.shape)
 
-    def __iter__(self) -> Iterator[tuple[Any, Any, tuple[int, ...]]]:
+    def __iter__(self) -> Iterator[tuple[Any, Any, tuple[int, int, int]]]:
         """Bin index, whether it is on the grid, and the tap along each axis."""
         (r0, rw, _), (u0, uw, _), (v0, vw, _) = self.axes
         nr, nu, nv = self.counts
@@ -80,26 +79,6 @@ class _Taps:
                 line = ((self.frame * nr + (r0 + i)) * nu + (u0 + j)) * nv + v0
                 for k in range(len(vw)):
                     yield line + k, ok_u & (v0 + k >= 0) & (v0 + k < nv), (i, j, k)
-
-    def weights(self, power: Any) -> dict[tuple[int, ...], Any]:
-        """What of the power falls on every tap."""
-        (_, rw, _), (_, uw, _), (_, vw, _) = self.axes
-        return {
-            (i, j, k): power * rw[i] * uw[j] * vw[k]
-            for i, j, k in product(*(range(len(w)) for w in (rw, uw, vw)))
-        }
-
-    def derivatives(self, power: Any, dots: tuple) -> dict[tuple[int, ...], Any]:
-        """The derivative of that, given those of power, range, u and v."""
-        (_, rw, rs), (_, uw, us), (_, vw, vs) = self.axes
-        dot_a, dot_r, dot_u, dot_v = dots
-        return {
-            (i, j, k): dot_a * rw[i] * uw[j] * vw[k]
-            + power * dot_r * rs[i] * uw[j] * vw[k]
-            + power * dot_u * rw[i] * us[j] * vw[k]
-            + power * dot_v * rw[i] * uw[j] * vs[k]
-            for i, j, k in product(*(range(len(w)) for w in (rw, uw, vw)))
-        }
 
 
 class Bins:
@@ -120,20 +99,31 @@ class Bins:
     def add(self, found: Contribution, active: Any) -> None:
         """Add paths."""
         taps = _Taps.of(self.grid, found)
-        self._add(taps, taps.weights(found.power), active)
+        (_, rw, _), (_, uw, _), (_, vw, _) = taps.axes
+        for index, ok, (i, j, k) in taps:
+            self._add(index, found.power * rw[i] * uw[j] * vw[k], ok & active)
 
     def add_derivative(self, found: Contribution, dots: tuple, active: Any) -> None:
         """Add the derivative of paths' deposit, given those of power, range, u and v."""
         import drjit as dr
 
         taps = _Taps.of(self.grid, found)
-        self._add(taps, taps.derivatives(dr.detach(found.power), dots), active)
+        (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
+        power = dr.detach(found.power)
+        dot_a, dot_r, dot_u, dot_v = dots
+        for index, ok, (i, j, k) in taps:
+            value = (
+                dot_a * rw[i] * uw[j] * vw[k]
+                + power * dot_r * rs[i] * uw[j] * vw[k]
+                + power * dot_u * rw[i] * us[j] * vw[k]
+                + power * dot_v * rw[i] * uw[j] * vs[k]
+            )
+            self._add(index, value, ok & active)
 
-    def _add(self, taps: _Taps, weights: dict[tuple[int, ...], Any], active: Any) -> None:
+    def _add(self, index: Any, value: Any, active: Any) -> None:
         import drjit as dr
 
-        for index, ok, tap in taps:
-            dr.scatter_add(self.values, weights[tap], tracer().UInt32(index), ok & active)
+        dr.scatter_add(self.values, value, tracer().UInt32(index), active)
 
     def map(self) -> Float32[Tensor, "frame range u v"]:
         """What all bins hold."""

@@ -36,7 +36,7 @@ class Likeness:
             threshold [m].
         normal_consistency: mean of both directions of |n · n′| at closest points: 1 for equal
             surfaces, 0.5 for normals that know nothing of each other.
-        iou: shared over joint volume; None where a mesh is not watertight.
+        iou: shared over joint volume; None where a mesh is not watertight, or it was left out.
     """
 
     chamfer: float
@@ -52,7 +52,7 @@ def compare_shapes(
     seen_from: ArrayLike | None = None,
     thresholds: Sequence[float] = (0.02,),
     count: int = POINTS,
-    voxel: float = VOXEL,
+    voxel: float | None = VOXEL,
     seed: int = 0,
 ) -> Likeness:
     """Compare two meshes that stand in one frame.
@@ -67,7 +67,7 @@ def compare_shapes(
         seen_from: radar positions [n, 3] in the frame of the meshes (m); None counts everything.
         thresholds: of the F-score [m].
         count: points drawn on each surface.
-        voxel: edge of the voxels for the volume [m].
+        voxel: edge of the voxels for the volume [m]; None leaves the volume out.
         seed: of the points.
 
     Raises:
@@ -98,7 +98,7 @@ def compare_shapes(
         alignments.append(float(np.abs((normals * closest).sum(1)).mean()))
     share = {float(t): [float((d <= t).mean()) for d in distances] for t in thresholds}
     iou = None
-    if is_watertight(found) and is_watertight(truth):
+    if voxel is not None and is_watertight(found) and is_watertight(truth):
         keep = None if seen_from is None else (clouds, masks)
         iou = _shared_volume(found, truth, voxel, keep)
     return Likeness(

@@ -52,9 +52,9 @@ def shape_scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     table = problem.run.measures
     if table is None or table.object not in problem.known:
         return {}
-    rows: dict[str, Any] = {}
-    for ending, seen in (("", table.seen), ("_whole", False), ("_seen", True)):
-        rows |= _rows(_likeness(problem, twin, seen), ending)
+    whole, seen = (_likeness(problem, twin, seen) for seen in (False, True))
+    rows = _rows(seen if table.seen else whole, "")
+    rows |= _rows(whole, "_whole") | _rows(seen, "_seen")
     before = _rows(_likeness(problem, start, table.seen), "")
     return rows | {f"start_{key}": value for key, value in before.items()}
 
@@ -68,7 +68,8 @@ def watch_of(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
     def watch(scene: Scene) -> dict[str, float]:
         found = _placed(without_clouds(scene), table.object)
         truth = _placed(problem.truth, table.object)
-        return {CURVE: compare_shapes(found, truth, seen_from=_eyes(problem, table.seen)).chamfer}
+        eyes = _eyes(problem, table.seen)
+        return {CURVE: compare_shapes(found, truth, seen_from=eyes, voxel=None).chamfer}
 
     return watch
 
