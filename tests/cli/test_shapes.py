@@ -7,6 +7,7 @@ from PIL import Image
 
 from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
+from invertwin.cli.fits.likeness import is_shape_key, shape_label
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
 from invertwin.scene.files import load_mesh
@@ -92,6 +93,55 @@ def test_a_shape_is_fitted_in_stages_and_compared(tmp_path, monkeypatch, capsys)
     assert "Chamfer distance from" in said
     again = validate(tomllib.loads((out / "run.toml").read_text()), tmp_path / "run.toml")
     assert again == check(shapes(), tmp_path)
+
+
+def test_parts_and_holes_are_told_where_the_surface_is_closed(tmp_path, monkeypatch, capsys):
+    letters = """
+[[truth.plate.parts]]
+shape = "text"
+text = "AB"
+size = 0.2
+depth = 0.1
+
+[[parameters]]
+kind = "distance_grid"
+object = "plate"
+low = [-0.3, -0.3, -0.3]
+high = [0.3, 0.3, 0.3]
+counts = [7, 7, 7]
+
+[reconstruct]
+steps = 1
+depth = 1
+samples = 6000
+boundary_samples = 2000
+
+[measures]
+object = "plate"
+"""
+    flat = 'shape = "plate"\nwidth = 0.4\nheight = 0.3\ndivisions = 3'
+    assert flat in HEAD
+    (tmp_path / "run.toml").write_text(
+        HEAD.replace(flat, 'shape = "sphere"\nradius = 0.2') + letters
+    )
+    out = tmp_path / "out"
+    assert call(monkeypatch, "reconstruct", tmp_path / "run.toml", "-o", out) == 0
+    metrics = read_metrics(out)
+    found = [
+        [metrics[f"{whose}{key}"] for key in ("components", "euler_number")]
+        for whose in ("", "start_", "true_")
+    ]
+    assert found == [[1, 2], [1, 2], [2, -2]]
+    said = " ".join(capsys.readouterr().out.split())
+    assert "separate parts, truth" in said
+    assert "Euler number, 2 less for every hole through a part, start" in said
+
+
+def test_labels_tell_whose_a_measure_is():
+    assert is_shape_key("true_components")
+    assert shape_label("components") == "separate parts"
+    assert shape_label("start_iou") == "shared over joint volume, start"
+    assert not is_shape_key("start_loss_sharp")
 
 
 def test_the_true_shape_stands_where_the_object_stands(tmp_path):

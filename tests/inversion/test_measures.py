@@ -8,10 +8,12 @@ import torch
 from invertwin.errors import InputError
 from invertwin.inversion.measures import (
     Likeness,
+    Topology,
     compare_shapes,
     is_watertight,
     seen_points,
     surface_points,
+    topology,
     volume_iou,
 )
 from invertwin.scene import Mesh, box, plate, rotation_from_vector, sphere, text
@@ -192,3 +194,18 @@ def test_the_volume_may_be_left_out():
     assert with_volume.iou == 1
     assert without.iou is None
     assert without.chamfer == with_volume.chamfer
+
+
+def test_parts_and_holes_are_counted():
+    assert topology(sphere(0.2, 1)) == Topology(components=1, euler_number=2)
+    assert topology(text("A", 0.6, 0.2)) == Topology(components=1, euler_number=0)
+    assert topology(text("B", 0.6, 0.2)) == Topology(components=1, euler_number=-2)
+    two = joined(sphere(0.2), shifted(text("A", 0.6, 0.2), 2, 0, 0))
+    assert topology(two) == Topology(components=2, euler_number=2)
+    # Triangles without area, and vertices that no triangle has, are no part of the surface.
+    ball = sphere(0.2, 1)
+    corners = torch.cat([float64([[9.0, 9.0, 9.0]]), ball.vertices])
+    thin = torch.tensor([[1, 1, 2], [3, 3, 3]])
+    assert topology(Mesh(corners, torch.cat([ball.faces + 1, thin]))) == topology(ball)
+    with pytest.raises(InputError, match="expected a watertight mesh"):
+        topology(plate(1.0, 1.0))

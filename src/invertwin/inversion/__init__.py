@@ -2,7 +2,13 @@
 
 from invertwin.inversion.gradcheck import Agreement, Direction, GradientReport
 from invertwin.inversion.loss import SpectrumLoss
-from invertwin.inversion.measures import Likeness, compare_shapes, volume_iou
+from invertwin.inversion.measures import (
+    Likeness,
+    Topology,
+    compare_shapes,
+    topology,
+    volume_iou,
+)
 from invertwin.inversion.mover import (
     Echo,
     MotionMap,
@@ -35,6 +41,7 @@ __all__ = [
     "Regularizer",
     "SpectrumLoss",
     "Stage",
+    "Topology",
     "Trained",
     "Training",
     "compare_shapes",
@@ -45,6 +52,7 @@ __all__ = [
     "remeshed",
     "signed_distance",
     "strongest_mover",
+    "topology",
     "train_prior",
     "volume_iou",
 ]

@@ -1,4 +1,4 @@
-"""How close a shape is to another: distances of surfaces, shared volume, directions of normals."""
+"""How close a shape is to another: distances, shared volume, normals, parts and holes."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -43,6 +45,19 @@ class Likeness:
     fscore: dict[float, float]
     normal_consistency: float
     iou: float | None
+
+
+@dataclass(frozen=True)
+class Topology:
+    """In how many parts a closed surface is, and with how many holes.
+
+    Attributes:
+        components: parts of the surface that nothing joins; a cavity's wall is one too.
+        euler_number: vertices − edges + triangles: 2 for every part, less 2 for every hole through.
+    """
+
+    components: int
+    euler_number: int
 
 
 def compare_shapes(
@@ -141,6 +156,28 @@ def is_watertight(mesh: Mesh) -> bool:
     forth = (ahead[:, 0] * count + ahead[:, 1]).sort().values
     back = (ahead[:, 1] * count + ahead[:, 0]).sort().values
     return bool(torch.equal(forth, back))
+
+
+def topology(mesh: Mesh) -> Topology:
+    """Parts and holes of a closed surface, whose triangles meet in shared vertices.
+
+    Raises:
+        InputError: a mesh that is not watertight.
+    """
+    if not is_watertight(mesh):
+        raise InputError(
+            "expected a watertight mesh, whose edges all have two triangles that run along them in "
+            "opposite directions, got an open one; close it"
+        )
+    faces = mesh.faces.numpy()
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]  # not those shrunk to an edge
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    used, ends = np.unique(sides, return_inverse=True)
+    edges = np.unique(ends.reshape(-1, 2), axis=0)
+    ones = np.ones(len(edges), dtype=np.int8)
+    graph = coo_array((ones, (edges[:, 0], edges[:, 1])), shape=(len(used), len(used)))
+    count = int(connected_components(graph, directed=False, return_labels=False))
+    return Topology(count, len(used) - len(edges) + len(faces))
 
 
 def surface_points(

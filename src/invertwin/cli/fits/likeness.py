@@ -4,23 +4,24 @@ from collections.abc import Callable
 from typing import Any
 
 from invertwin.cli.fits.problem import Problem
-from invertwin.inversion.measures import Likeness, compare_shapes
+from invertwin.inversion.measures import Likeness, compare_shapes, is_watertight, topology
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.geometry import without_clouds
 
 CURVE = "chamfer_m"
 """What the curves show."""
-_BEGINNINGS = ("chamfer", "fscore", "iou", "normal_consistency")
+_BEGINNINGS = ("chamfer", "fscore", "iou", "normal_consistency", "components", "euler_number")
+_WHOSE = {"start_": ", start", "true_": ", truth"}
 
 
 def is_shape_key(key: str) -> bool:
     """Whether a number of a fit is a measure of its shape."""
-    return key.removeprefix("start_").startswith(_BEGINNINGS)
+    return _parted(key)[0].startswith(_BEGINNINGS)
 
 
 def shape_label(key: str) -> str:
     """What a measure is, in words."""
-    name = key.removeprefix("start_")
+    name, whose = _parted(key)
     text, ending = name, ""
     for end, words in (("_whole", ", whole surface"), ("_seen", ", surface that is seen")):
         if end in name:
@@ -32,22 +33,32 @@ def shape_label(key: str) -> str:
             "chamfer_m": "Chamfer distance, mean of both directions [m]",
             "iou": "shared over joint volume",
             "normal_consistency": "normal consistency",
+            "components": "separate parts",
+            "euler_number": "Euler number, 2 less for every hole through a part",
         }
         text = words.get(text, text)
-    return text + ending + (", start" if key.startswith("start_") else "")
+    return text + ending + whose
 
 
 def short_label(key: str) -> str:
     """A measure as the head of a narrow column."""
     if key.startswith("fscore"):
         return f"F {key.removeprefix('fscore_').removesuffix('cm')} cm"
-    return {"chamfer_m": "Chamfer [m]", "iou": "IoU", "normal_consistency": "normals"}.get(key, key)
+    words = {
+        "chamfer_m": "Chamfer [m]",
+        "iou": "IoU",
+        "normal_consistency": "normals",
+        "components": "parts",
+        "euler_number": "Euler",
+    }
+    return words.get(key, key)
 
 
 def shape_scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     """Measures of the found shape, whole and as far as some radar position sees it.
 
-    Those without an ending are the ones that the run file asks for.
+    Those without an ending are the ones that the run file asks for. Parts and holes are those of
+    the whole surface, also of the truth, each where it is watertight.
     """
     table = problem.run.measures
     if table is None or table.object not in problem.known:
@@ -55,7 +66,8 @@ def shape_scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     whole, seen = (_likeness(problem, twin, seen) for seen in (False, True))
     rows = _rows(seen if table.seen else whole, "")
     rows |= _rows(whole, "_whole") | _rows(seen, "_seen")
-    before = _rows(_likeness(problem, start, table.seen), "")
+    rows |= _topology(twin, table.object, "") | _topology(problem.truth, table.object, "true_")
+    before = _rows(_likeness(problem, start, table.seen), "") | _topology(start, table.object, "")
     return rows | {f"start_{key}": value for key, value in before.items()}
 
 
@@ -93,6 +105,22 @@ def _eyes(problem: Problem, seen: bool) -> Any:
 def _placed(scene: Scene, name: str) -> Mesh:
     """The object's mesh in the world."""
     return Mesh(scene[name].vertices.detach(), scene[name].mesh.faces)
+
+
+def _topology(scene: Scene, name: str, whose: str) -> dict[str, Any]:
+    mesh = scene[name].mesh
+    if not is_watertight(mesh):
+        return {}
+    found = topology(mesh)
+    return {f"{whose}components": found.components, f"{whose}euler_number": found.euler_number}
+
+
+def _parted(key: str) -> tuple[str, str]:
+    """A measure without whose it is, and whose it is in words."""
+    for whose, words in _WHOSE.items():
+        if key.startswith(whose):
+            return key.removeprefix(whose), words
+    return key, ""
 
 
 def _rows(found: Likeness, ending: str) -> dict[str, Any]:
