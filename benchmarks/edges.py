@@ -146,16 +146,17 @@ class Estimator:
                 partial(InteriorEdgeSampler, weighted=weighted),
             ),
         ):
-            for chains in boundary_walk.boundary_chains(
+            points = boundary_walk.BoundaryPoints(
                 self.shot,
-                attached,
-                Walk(self.shot, self.inputs, seed),
+                self.inputs,
                 samples=FAMILIES * samples,
                 depth=DEPTH,
                 seed=seed,
                 interior=True,
                 chunks=lambda size: iter([dr.arange(tracer().UInt32, size)] if size else []),
-            ):
+            )
+            walk = Walk(self.shot, self.inputs, seed)
+            for chains in boundary_walk.boundary_chains(self.shot, attached, walk, points):
                 total = chains.weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
                 dr.backward_from(chains.speed * total)
         gradient = from_points(dr.grad(vertices)).numpy()

@@ -19,12 +19,13 @@ time over ours (> 1: we are faster).
 Further, on a scene with shadows (a ball before a wall and above a floor, depth 3):
 
 - `step.tracing_share`: share of a step of 10⁵ samples in which nothing is executed: its time less
-  the execution times of all that Dr.Jit launched in it (its kernel history: kernels, sums, copies,
-  the tree), over its time. What is left is tracing (Python, assembling and finding kernels), and
-  with it conversions between torch and Dr.Jit, torch's own part, and waiting for threads to start:
-  more than tracing costs, never less, but for what is traced while a kernel runs, which costs no
-  time. On a busy machine the waiting dominates. `step.assembly_share` is the part of it that the
-  history itself names: code generation, and compilation or a look-up in the cache.
+  that of building the tree for the new vertices, less the execution times of all that Dr.Jit
+  launched besides (its kernel history: kernels, sums, copies), over its time. What is left is
+  tracing (Python, assembling and finding kernels), and with it conversions between torch and
+  Dr.Jit, torch's own part, and waiting for threads to start: more than tracing costs, never less,
+  but for what is traced while a kernel runs, which costs no time. On a busy machine the waiting
+  dominates. `step.tree_share` is the tree's; `step.assembly_share` is the part of the tracing that
+  the history itself names: code generation, and compilation or a look-up in the cache.
 - `step.short_share`: time of a step of 10³ samples over that of one of 10⁵, in turns: tracing and
   all that a step costs however few its samples, the tree too.
 - `step.new_kernels`: kernels of further steps, with other vertices, seeds and depths 2, 3, 5, that
@@ -42,12 +43,14 @@ import resource
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -57,7 +60,7 @@ from rich.markup import escape
 from rich.table import Table
 from throughput import WAVEFORM, sionna_version
 
-from invertwin.channel.bridge import backend, tracer
+from invertwin.channel.bridge import Topology, backend, tracer
 from invertwin.channel.deposit import deposit_power
 from invertwin.radar import Radar
 from invertwin.scene import Object, RoughConductor, Scene
@@ -202,12 +205,14 @@ def repeated(steps: int) -> dict[str, Any]:
     def timed(number: int, samples: int) -> float:
         return sum(step(task, number, samples, 3))
 
-    def idle(number: int) -> tuple[float, float]:
+    def shares(number: int) -> tuple[float, float, float]:
         seconds: list[float] = []
-        launched = history(lambda: seconds.append(timed(number, MANY)))
+        with tree_times() as trees:
+            launched = history(lambda: seconds.append(timed(number, MANY)))
         executed = sum(entry["execution_time"] for entry in launched) / 1e3
         assembled = sum(e.get("codegen_time", 0) + e.get("backend_time", 0) for e in launched) / 1e3
-        return 1 - executed / seconds[0], assembled / seconds[0]
+        idle = seconds[0] - sum(trees) - executed
+        return idle / seconds[0], sum(trees) / seconds[0], assembled / seconds[0]
 
     known, later = set[str](), set[str]()
     for number in range(2):
@@ -215,13 +220,32 @@ def repeated(steps: int) -> dict[str, Any]:
     for number, depth in enumerate((3, 2, 5, 3), start=2):
         later |= kernels(lambda number=number, depth=depth: step(task, number, MANY, depth))
     pairs = [(timed(number, FEW), timed(number, MANY)) for number in range(WARM_UP + 3 * steps)]
-    tracing, assembly = zip(*(idle(number) for number in range(3 * steps)), strict=True)
+    tracing, tree, assembly = zip(*(shares(number) for number in range(3 * steps)), strict=True)
     return {
         "tracing_share": statistics.median(tracing),
+        "tree_share": statistics.median(tree),
         "assembly_share": statistics.median(assembly),
         "short_share": statistics.median(few / many for few, many in pairs[WARM_UP:]),
         "new_kernels": len(later - known),
     }
+
+
+@contextmanager
+def tree_times() -> Iterator[list[float]]:
+    """Seconds of every building of a tree; what it launches leaves Dr.Jit's kernel history."""
+    import drjit as dr
+
+    build, found = Topology._build_tree, list[float]()
+
+    def timed(topology: Topology, vertices: torch.Tensor) -> None:
+        start = perf_counter()
+        build(topology, vertices)
+        dr.sync_thread()
+        found.append(perf_counter() - start)
+        dr.kernel_history_clear()
+
+    with patch.object(Topology, "_build_tree", timed):
+        yield found
 
 
 def kernels(act: Callable[[], Any]) -> set[str]:
@@ -326,6 +350,7 @@ def table(metrics: dict[str, Any]) -> Table:
             row(part, f"forward_ratio_sionna{suffix}", ".2f", text)
             row(part, f"step_ratio_sionna{suffix}", ".2f")
     row("step", "tracing_share", ".2f", f"of a step of {MANY} samples, depth 3: nothing executed")
+    row("step", "tree_share", ".3f", "the tree of the new vertices")
     row("step", "assembly_share", ".3f", "kernels assembled and looked up")
     row("step", "short_share", ".2f", f"step of {FEW} samples over step of {MANY}")
     row("step", "new_kernels", "d", "in further steps: new vertices, seeds, depths 2, 3, 5")

@@ -80,7 +80,7 @@ def edge_points(
     if not sampler.size:
         none, nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
         return [("tx", EdgePoints(none, none, none, none, nothing, none, nothing))]
-    drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size))
+    drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size)).kept()
     columns = {f.name: to_torch(getattr(drawn, f.name)) for f in fields(EdgePoints)}
     points = EdgePoints(
         **{n: c.double() if n in ("along", "weight") else c.long() for n, c in columns.items()}

@@ -63,59 +63,80 @@ class BoundaryChains:
             self.run(state, lambda _, path, exists: scatter(path, exists))
 
 
-def boundary_chains(
-    shot: Shot,
-    inputs: Inputs,
-    chain: Walk,
-    *,
-    samples: int,
-    depth: int,
-    seed: int,
-    interior: bool,
-    chunks: Callable[[int], Iterator[Any]],
-) -> Iterator[BoundaryChains]:
-    """All boundary paths: antenna segments first, then interior ones.
+class BoundaryPoints:
+    """The edge points of all boundary paths: antenna segments first, then interior ones.
 
-    Where both antennas share one visibility, a path of one vertex has one segment, not two.
-    The first edge points are drawn now, the rest as the paths are asked for: paths from points at
-    hand are prepared while another kernel runs.
-
-    Args:
-        shot: Rays and antennas.
-        inputs: Attached.
-        chain: Continues paths.
-        samples: Edge points over all families.
-        depth: Most vertices of a path.
-        seed: Of the edge points.
-        interior: Whether to sample interior segments.
-        chunks: Splits a number of samples into index arrays.
+    The first of each family are drawn at once, without waiting for them: this is prepared while
+    another kernel runs. The rest are drawn as they are asked for.
     """
-    import drjit as dr
 
-    fixed, shared = inputs.detached(), shot.link.shared_visibility
-    centres = ("tx",) if shared and depth == 1 else ("tx", "rx")
-    families = len(centres) + (1 if depth > 1 and interior else 0)
-    antennas = EdgeSampler(shot, fixed, centres, len(centres) * (samples // families), seed)
-    parts = [_ahead(map(antennas.draw, chunks(antennas.size)))]
-    if families > len(centres):
-        interiors = InteriorEdgeSampler(shot, fixed, samples // families, seed + 2)
-        parts.append(_ahead(map(interiors.draw, chunks(interiors.size))))
+    def __init__(
+        self,
+        shot: Shot,
+        inputs: Inputs,
+        *,
+        samples: int,
+        depth: int,
+        seed: int,
+        interior: bool,
+        chunks: Callable[[int], Iterator[Any]],
+    ) -> None:
+        """Where both antennas share one visibility, a path of one vertex has one segment, not two.
+
+        Args:
+            shot: Rays and antennas.
+            inputs: Detached.
+            samples: Edge points over all families.
+            depth: Most vertices of a path.
+            seed: Of the edge points.
+            interior: Whether to sample interior segments.
+            chunks: Splits a number of samples into index arrays.
+        """
+        self.depth = depth
+        centres = ("tx",) if shot.link.shared_visibility and depth == 1 else ("tx", "rx")
+        families = len(centres) + (1 if depth > 1 and interior else 0)
+        antennas = EdgeSampler(shot, inputs, centres, len(centres) * (samples // families), seed)
+        samplers: list[EdgeSampler | InteriorEdgeSampler] = [antennas]
+        if families > len(centres):
+            samplers.append(InteriorEdgeSampler(shot, inputs, samples // families, seed + 2))
+        later = [map(sampler.draw, chunks(sampler.size)) for sampler in samplers]
+        self._first = [list(itertools.islice(drawn, 1)) for drawn in later]
+        for family in self._first:
+            for drawn in family:
+                drawn.launch()
+        self._later = later
+
+    def families(self) -> list[Iterator[Any]]:
+        """``EdgePoints``, and ``TwoSided`` if there are interior segments; to be asked for once."""
+        first = [[drawn.kept() for drawn in family] for family in self._first]
+        self._first = []
+        return [
+            itertools.chain(now, (drawn.kept() for drawn in later))
+            for now, later in zip(first, self._later, strict=True)
+        ]
+
+
+def boundary_chains(
+    shot: Shot, inputs: Inputs, chain: Walk, points: BoundaryPoints
+) -> Iterator[BoundaryChains]:
+    """The boundary paths through edge points; ``inputs`` are attached, ``chain`` continues paths.
+
+    The first points are counted now, so that their paths are prepared while another kernel runs.
+    """
+    families = points.families()
 
     def segments() -> Iterator[BoundaryChains]:
-        for points in parts[0]:
-            if dr.width(points.face):
-                yield from _antenna_segment(shot, inputs, chain, points, depth)
-        for part in parts[1:]:
-            for found in part:
+        import drjit as dr
+
+        for edges in families[0]:
+            if dr.width(edges.face):
+                yield from _antenna_segment(shot, inputs, chain, edges, points.depth)
+        for family in families[1:]:
+            for found in family:
                 if dr.width(found.edge.face):
-                    yield from _interior_segment(shot, inputs, chain, found, depth)
+                    yield from _interior_segment(shot, inputs, chain, found, points.depth)
 
     return segments()
-
-
-def _ahead(items: Iterator[Any]) -> Iterator[Any]:
-    """The same items, of which the first one is made now."""
-    return itertools.chain(list(itertools.islice(items, 1)), items)
 
 
 def _antenna_segment(
@@ -175,10 +196,11 @@ def _interior_segment(
 
     mi = tracer()
     fixed, points = inputs.detached(), found.edge
-    behind = kernel.place(fixed, found.face, found.b1, found.b2)
+    source = found.behind
+    behind = kernel.place(fixed, source.face, source.b1, source.b2)
 
     def shadow_points() -> Shadow:
-        moving = kernel.place(inputs, found.face, found.b1, found.b2)
+        moving = kernel.place(inputs, source.face, source.b1, source.b2)
         return shadow_speed(inputs, points, moving.position)
 
     shadow = shadow_points()
@@ -194,7 +216,7 @@ def _interior_segment(
     lanes = dr.width(points.face)
     zero = dr.zeros(mi.Float, lanes)
     first = walk.start(
-        points.index, points.frame, found.face, found.b1, found.b2, -to_behind,
+        points.index, points.frame, source.face, source.b1, source.b2, -to_behind,
         throughput, zero,
     )  # fmt: skip
     first |= {"u": zero, "v": zero, "amount": zero, "so_far": zero, "here": ends_at_receiver}

@@ -150,7 +150,10 @@ class _Deposit(torch.autograd.Function):
     def forward(ctx: Any, settings: Settings, *tables: Tensor) -> Tensor:
         trace = Trace(settings)
         out = trace.bins()
-        trace.deposit(out, record=any(ctx.needs_input_grad))
+        derivative = any(ctx.needs_input_grad)
+        trace.deposit(out, record=derivative)
+        if derivative:
+            trace.draw_boundary()  # prepared while the paths are walked
         ctx.trace = trace
         return out.map()
 

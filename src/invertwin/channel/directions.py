@@ -20,10 +20,10 @@ class Directions:
 
     def __init__(self, shot: Shot) -> None:
         geometry = shot.geometry
-        centres, radii = _spheres(geometry)
+        centres, radii = shot.spheres
         self.objects = len(radii)
         self.centres = to_float(centres - shot.origin)
-        self.radii = to_float(radii)
+        self.radii = to_float(1.001 * radii)
         self.lobed = geometry.lobed
         shares = _shares(geometry)
         self.shares = to_float(shares)
@@ -178,18 +178,6 @@ def _in_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
     sine = dr.sqrt(dr.maximum(depth * (2 - depth), 0.0))
     s, c = dr.sincos(2 * dr.pi * numbers[1])
     return dr.normalize(mi.Frame3f(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
-
-
-def _spheres(geometry: Geometry) -> tuple[torch.Tensor, torch.Tensor]:
-    """Centre and radius of a sphere around each object [m]."""
-    centres, radii = [], []
-    positions = geometry.vertices.detach()
-    for used in geometry.topology.object_vertices:
-        corners = positions[used]
-        centre = 0.5 * (corners.min(dim=0).values + corners.max(dim=0).values)
-        centres.append(centre)
-        radii.append(1.001 * (corners - centre).norm(dim=1).max())
-    return torch.stack(centres), torch.stack(radii)
 
 
 def _shares(geometry: Geometry) -> torch.Tensor:

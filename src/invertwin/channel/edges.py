@@ -5,7 +5,7 @@ ways along a direction that is tangential there, so that no silhouette is ever s
 (derivations §3). Places are detached, ``shadow_speed`` is attached.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +16,11 @@ from invertwin.channel.passage import land, passage, through
 from invertwin.channel.rays import NEAR, Shot, scrambled, uniform_pair
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
-_FEW_EDGES = 2000  # up to here float32 can place a sample along the edge by its rest in the CDF
+_RESOLVED = 2e-4  # chance of an edge from which float32 resolves a sample's place within it
 # Boundary rays pass beside the edge, by this much of its distance from the origin (fifteen
 # roundings): a fine mesh's own triangles, nearly edge-on, would else lie in their way.
 _BESIDE = 1e-6
+_LAST_BELOW_ONE = 1 - 2.0**-24
 _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 
 
@@ -59,18 +60,24 @@ class EdgePoints:
 
 
 @dataclass(frozen=True)
-class TwoSided:
-    """Points on edges with what lies on both sides of a tangential direction.
+class Behind:
+    """A point from which a shadow is cast: triangle and barycentric coordinates."""
 
-    ``edge.face`` is where the shadow's edge runs; the point behind, from which it is cast, is
-    given by triangle and barycentric coordinates. The weight holds the change of measure from
-    directions to area there.
-    """
-
-    edge: EdgePoints
     face: Any
     b1: Any
     b2: Any
+
+
+@dataclass(frozen=True)
+class TwoSided:
+    """Points on edges with what lies on both sides of a tangential direction.
+
+    ``edge.face`` is where the shadow's edge runs, ``behind`` where it is cast from. The weight
+    holds the change of measure from directions to area there.
+    """
+
+    edge: EdgePoints
+    behind: Behind
 
 
 @dataclass(frozen=True)
@@ -82,18 +89,67 @@ class Shadow:
     speed: Any
 
 
-def _compressed(valid: Any, *groups: Any) -> list[Any]:
-    """The valid lanes of dataclasses of arrays."""
-    import drjit as dr
+@dataclass(frozen=True)
+class Drawn:
+    """Edge points of which some are void: recorded, and executed when asked for.
 
-    dr.eval(valid, *groups)
-    kept: Any = dr.compress(valid)
-    return [
-        type(group)(
-            *(c if c is False else dr.gather(type(c), c, kept) for c in vars(group).values())
+    ``groups`` are dataclasses of arrays, of which ``kind`` makes the points.
+    """
+
+    valid: Any
+    groups: tuple[Any, ...]
+    kind: Callable[..., Any]
+
+    def launch(self) -> None:
+        """Start the execution, without waiting for it."""
+        import drjit as dr
+
+        dr.eval(self.valid, *self.groups)
+
+    def kept(self) -> Any:
+        """The points that are not void."""
+        import drjit as dr
+
+        self.launch()
+        lanes: Any = dr.compress(self.valid)
+        return self.kind(
+            *(
+                type(group)(
+                    *(
+                        c if c is False else dr.gather(type(c), c, lanes)
+                        for c in vars(group).values()
+                    )
+                )
+                for group in self.groups
+            )
         )
-        for group in groups
-    ]
+
+
+class _Proportional:
+    """Draws entries in proportion to weights, without reading any back."""
+
+    def __init__(self, weights: Any) -> None:
+        import drjit as dr
+
+        self.weights, self.sums = weights, dr.cumsum(weights)
+        self.entries = dr.width(weights)
+        self.total = dr.gather(tracer().Float, self.sums, self.entries - 1)
+
+    def draw(self, spread: Any) -> tuple[Any, Any, Any]:
+        """Entry, the rest of the number within it, and probability: zero if there is no entry."""
+        import drjit as dr
+
+        mi = tracer()
+        target = spread * self.total
+
+        def below(at: Any) -> Any:
+            return dr.gather(mi.Float, self.sums, at) <= target
+
+        place: Any = dr.binary_search(0, self.entries - 1, below)
+        weight = dr.gather(mi.Float, self.weights, place)
+        last = dr.gather(mi.Float, self.sums, place) - weight
+        rest = dr.clip((target - last) / weight, 0.0, _LAST_BELOW_ONE)
+        return place, rest, dr.select(weight > 0, weight / self.total, 0.0)
 
 
 class EdgeSampler:
@@ -120,15 +176,14 @@ class EdgeSampler:
             for ends in topology.device_edges
         )
         sides = _sides(shot, inputs, edge, y0, y1, 0.5 * (y0 + y1) - origin)
-        self.index: Any = dr.compress(sides.unlike)
-        self.size = samples if dr.width(self.index) else 0
+        self.size = samples if entries else 0
         if self.size:
             # Both antennas get the same number of samples.
             length = dr.norm(y1 - y0) / dr.norm(0.5 * (y0 + y1) - origin)
             of, totals = dr.select(receiver, mi.UInt32(1), 0), dr.zeros(mi.Float, 2)
             dr.scatter_add(totals, length, of, sides.unlike)
-            weight = length / dr.gather(mi.Float, totals, of)
-            self.distribution = mi.DiscreteDistribution(dr.gather(mi.Float, weight, self.index))
+            share = length / dr.gather(mi.Float, totals, of)
+            self.choice = _Proportional(dr.select(sides.unlike, share, 0.0))
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
 
     def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
@@ -145,14 +200,14 @@ class EdgeSampler:
         origin = dr.select(receiver, shot.point(shot.rx, frame), shot.point(shot.tx, frame))
         return edge, frame, receiver, origin
 
-    def draw(self, index: Any) -> EdgePoints:
-        """The samples of the given indices below ``size``; those without a shadow are left out."""
+    def draw(self, index: Any) -> Drawn:
+        """The samples of the given indices below ``size``; void are those without a shadow."""
         import drjit as dr
 
         mi = tracer()
         shot, topology = self.shot, self.shot.geometry.topology
-        place, along, pmf = _along(self.distribution, index, self.size, self.seed, self.index)
-        edge, frame, receiver, origin = self._seen(dr.gather(mi.UInt32, self.index, place))
+        place, along, pmf = _along(self.choice, index, self.size, self.seed)
+        edge, frame, receiver, origin = self._seen(place)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0 = shot.point(shot.vertices, first)
         y1 = shot.point(shot.vertices, second)
@@ -160,8 +215,8 @@ class EdgeSampler:
         away = y - origin
         sides = _sides(shot, self.inputs, edge, y0, y1, away)
         beside = y + sides.outwards * (_BESIDE * dr.norm(y))
-        before = passage(shot, self.inputs, origin, beside, mi.Bool(True))
-        valid = (before.share > 0) & sides.unlike
+        before = passage(shot, self.inputs, origin, beside, pmf > 0)
+        valid = (pmf > 0) & (before.share > 0) & sides.unlike
         ray = mi.Ray3f(beside + away * NEAR, dr.normalize(away))
         hit = land(shot, self.inputs, ray, valid, (index, self.dice), coherent=True)
         valid &= hit.valid & _not_grazing(shot, hit.face, away, hit.valid)
@@ -173,7 +228,7 @@ class EdgeSampler:
             open=sides.open, open_excess=sides.open_excess,
             covered=sides.covered, covered_excess=sides.covered_excess,
         )  # fmt: skip
-        return _compressed(valid, found)[0]
+        return Drawn(valid, (found,), lambda points: points)
 
 
 class InteriorEdgeSampler:
@@ -210,12 +265,10 @@ class InteriorEdgeSampler:
                 legs = [dr.norm(middle - shot.point(t, at)) + length for t in (shot.tx, shot.rx)]
                 near += 1 / (legs[0] * legs[1])
             weight *= span * near
-        self.index: Any = dr.compress(weight > 0)
         self.per_frame = max(1, samples // self.frames)
-        self.size = self.per_frame * self.frames if dr.width(self.index) else 0
+        self.size = self.per_frame * self.frames if len(topology.edges) else 0
         if self.size:
-            chosen = dr.gather(mi.Float, weight, self.index)
-            self.distribution = mi.DiscreteDistribution(chosen / dr.max(chosen))
+            self.choice = _Proportional(weight)
         self.seeds = scrambled(seed, 4), scrambled(seed, 5)
         self.dice = scrambled(seed, 10), scrambled(seed, 11)
 
@@ -270,23 +323,20 @@ class InteriorEdgeSampler:
         x = dr.normalize(offset - along * dr.dot(along, offset))
         return x, dr.cross(along, x)
 
-    def draw(self, index: Any) -> TwoSided:
-        """The samples of the given indices below ``size``; those that hide nothing are left out."""
+    def draw(self, index: Any) -> Drawn:
+        """The samples of the given indices below ``size``; void are those that hide nothing."""
         import drjit as dr
 
         mi = tracer()
         shot, topology = self.shot, self.shot.geometry.topology
         frame, within = index // self.per_frame, index % self.per_frame
-        place, along, pmf = _along(
-            self.distribution, within, self.per_frame, self.seeds[0], self.index, index
-        )
-        edge = dr.gather(mi.UInt32, self.index, place)
+        edge, along, pmf = _along(self.choice, within, self.per_frame, self.seeds[0], index)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = (shot.point(shot.vertices, end) for end in (first, second))
         y = y0 + (y1 - y0) * along
         omega, density = self._direction(index, edge, y0, y1)
         sides = _sides(shot, self.inputs, edge, y0, y1, omega)
-        valid = sides.unlike
+        valid = (pmf > 0) & sides.unlike
         beside = mi.Point3f(y + sides.outwards * (_BESIDE * dr.norm(y)))
         hits = []
         for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
@@ -309,9 +359,7 @@ class InteriorEdgeSampler:
             open=sides.open, open_excess=sides.open_excess,
             covered=sides.covered, covered_excess=sides.covered_excess,
         )  # fmt: skip
-        other = _Behind(behind.face, b1, b2)
-        points, other = _compressed(valid, points, other)
-        return TwoSided(points, other.face, other.b1, other.b2)
+        return Drawn(valid, (points, Behind(behind.face, b1, b2)), TwoSided)
 
     def _direction(self, index: Any, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
         """A tangential direction and its density per solid angle."""
@@ -334,25 +382,15 @@ class InteriorEdgeSampler:
         return mi.Vector3f(dr.normalize(omega)), 1 / (4 * span)
 
 
-@dataclass(frozen=True)
-class _Behind:
-    face: Any
-    b1: Any
-    b2: Any
-
-
 def _along(
-    distribution: Any, index: Any, count: int, seed: Any, edges: Any, key: Any = None
+    choice: _Proportional, index: Any, count: int, seed: Any, key: Any = None
 ) -> tuple[Any, Any, Any]:
-    """Entry of the distribution, place along its edge and probability, stratified over count."""
+    """Entry of the choice, place along its edge and probability, stratified over count."""
     import drjit as dr
 
     jitter, along = uniform_pair(index if key is None else key, seed)
-    spread = (tracer().Float(index) + jitter) / count
-    if dr.width(edges) <= _FEW_EDGES:
-        return distribution.sample_reuse_pmf(spread)
-    place, pmf = distribution.sample_pmf(spread)
-    return place, along, pmf
+    place, rest, chance = choice.draw((tracer().Float(index) + jitter) / count)
+    return place, dr.select(chance > _RESOLVED, rest, along), chance
 
 
 @dataclass(frozen=True)

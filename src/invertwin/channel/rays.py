@@ -1,5 +1,6 @@
 """What rays need: the ray scene, antennas and corners in float32 about a local origin."""
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,11 @@ class Shot:
         """The ray scene. Asked for anew: another shot of the same objects may have moved them."""
         return self.geometry.topology.ray_scene(self.local_vertices)
 
+    @cached_property
+    def spheres(self) -> tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]]:
+        """Centre and radius of a sphere around each object [m]."""
+        return bounding_spheres(self.geometry)
+
     def point(self, table: Any, index: Any) -> Any:
         """Rows of a table of points."""
         return bridge.points(table, index)
@@ -87,6 +93,21 @@ def _sound_face(geometry: Geometry) -> int:
             return topology.sound_face
     topology.sound_face = int(face_areas(geometry).argmax())
     return topology.sound_face
+
+
+def bounding_spheres(
+    geometry: Geometry,
+) -> tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]]:
+    """Centre and radius of a sphere around each object, detached [m]."""
+    centres, radii = [], []
+    positions = geometry.vertices.detach()
+    for used in geometry.topology.object_vertices:
+        corners = positions[used]
+        low, high = torch.aminmax(corners, dim=0)
+        centre = 0.5 * (low + high)
+        centres.append(centre)
+        radii.append((corners - centre).norm(dim=1).max())
+    return torch.stack(centres), torch.stack(radii)
 
 
 def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:

@@ -18,7 +18,7 @@ from invertwin.channel.bridge import Geometry, to_float, tracer
 from invertwin.channel.kernel import Inputs
 from invertwin.channel.passage import land, passage
 from invertwin.channel.paths import Link
-from invertwin.channel.rays import Shot, face_areas, scrambled, uniform_pair
+from invertwin.channel.rays import Shot, bounding_spheres, face_areas, scrambled, uniform_pair
 from invertwin.errors import InputError
 
 
@@ -39,22 +39,17 @@ class Samples:
 
 
 def _caps(
-    geometry: Geometry, link: Link, margin: float
+    spheres: tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]],
+    link: Link,
+    margin: float,
 ) -> tuple[Float64[Tensor, "frame object 3"], Float64[Tensor, "frame object"]]:
     """Axis and height 1 − cos of the spherical cap that holds each object, seen from TX."""
-    axes, heights = [], []
-    positions, tx = geometry.vertices.detach(), link.tx.detach()
-    for index in range(len(geometry.coherent)):
-        used = positions[geometry.topology.object_vertices[index]]
-        centre = 0.5 * (used.min(dim=0).values + used.max(dim=0).values)
-        radius = margin * (used - centre).norm(dim=1).max()
-        offset = centre - tx
-        distance = offset.norm(dim=1)
-        sine = (radius / distance.clamp_min(1e-30)).clamp_max(1.0)
-        height = sine**2 / (1 + (1 - sine**2).sqrt())
-        axes.append(offset / distance.clamp_min(1e-30)[:, None])
-        heights.append(torch.where(distance > radius, height, 2.0))
-    return torch.stack(axes, dim=1), torch.stack(heights, dim=1)
+    centres, radii = spheres
+    offset = centres - link.tx.detach()[:, None]
+    distance = offset.norm(dim=2).clamp_min(1e-30)
+    sine = (margin * radii / distance).clamp_max(1.0)
+    height = sine**2 / (1 + (1 - sine**2).sqrt())
+    return offset / distance[:, :, None], torch.where(distance > margin * radii, height, 2.0)
 
 
 class RaySampler:
@@ -64,9 +59,9 @@ class RaySampler:
         self, shot: Shot, samples: int, seed: int, reference: tuple[Geometry, Link] | None = None
     ) -> None:
         if reference:
-            axes, heights = _caps(*reference, margin=1.1)
+            axes, heights = _caps(bounding_spheres(reference[0]), reference[1], margin=1.1)
         else:
-            axes, heights = _caps(shot.geometry, shot.link, margin=1.001)
+            axes, heights = _caps(shot.spheres, shot.link, margin=1.001)
         self.shot = shot
         self.objects = axes.shape[1]
         blocks = shot.link.frame_count * self.objects

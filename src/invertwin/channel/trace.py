@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invertwin.channel import kernel, walk
 from invertwin.channel.bins import Bins
-from invertwin.channel.boundary_walk import BoundaryChains, boundary_chains
+from invertwin.channel.boundary_walk import BoundaryChains, BoundaryPoints, boundary_chains
 from invertwin.channel.bridge import Geometry, opaque, tracer
 from invertwin.channel.kernel import DIFFERENTIABLE, Inputs, Place
 from invertwin.channel.passage import Passage
@@ -57,6 +57,7 @@ class Trace:
         self.fixed = Inputs.of(settings.geometry, settings.link, self.shot, one_place)
         self._walk = Walk(self.shot, self.fixed, settings.seed)
         self._kept: Records | None = None
+        self._points: BoundaryPoints | None = None
 
     def bins(self) -> Bins:
         """An empty map."""
@@ -132,21 +133,28 @@ class Trace:
             passed=Passage(drawn.share, drawn.excess) if self.fixed.sheets else None,
         )  # fmt: skip
 
+    def draw_boundary(self) -> None:
+        """Draw the first edge points, for the derivative to come, without waiting for them."""
+        settings = self.settings
+        if settings.boundary_samples:
+            self._points = BoundaryPoints(
+                self.shot,
+                self.fixed,
+                samples=settings.boundary_samples,
+                depth=settings.depth,
+                seed=settings.seed,
+                interior=settings.interior_edges,
+                chunks=lambda size: chunks(size, settings.chunk),
+            )
+
     def boundary(self, inputs: Inputs) -> Iterator[BoundaryChains]:
         """Boundary paths of all segments, a chunk at a time."""
-        settings = self.settings
-        if not settings.boundary_samples:
+        if self._points is None:
+            self.draw_boundary()
+        points, self._points = self._points, None
+        if points is None:
             return iter(())
-        return boundary_chains(
-            self.shot,
-            inputs,
-            self._walk,
-            samples=settings.boundary_samples,
-            depth=settings.depth,
-            seed=settings.seed,
-            interior=settings.interior_edges,
-            chunks=lambda size: chunks(size, settings.chunk),
-        )
+        return boundary_chains(self.shot, inputs, self._walk, points)
 
 
 def chunks(size: int, chunk: int) -> Iterator[Any]:
