@@ -17,7 +17,8 @@ def test_the_room_is_that_of_the_description(multibounce):
 
 @pytest.mark.slow
 def test_every_metric_is_there_without_sionna(multibounce, monkeypatch):
-    monkeypatch.setitem(sys.modules, "sionna", None)
+    for name in ("sionna", "sionna.rt"):
+        monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr(multibounce, "sionna_version", lambda: None)
     monkeypatch.setattr(multibounce, "MANY", 5_000)
     metrics = multibounce.measure(**SMALL)
@@ -26,6 +27,7 @@ def test_every_metric_is_there_without_sionna(multibounce, monkeypatch):
         assert metrics[depth]["step_ratio_sionna"] is None
         assert metrics[depth]["samples_per_second"] > 0
         assert 0.1 < metrics[depth]["peak_memory_gb"] < 5
+    assert 0 < metrics["step"]["tree_share"] < 1
     assert 0 < metrics["step"]["assembly_share"] < metrics["step"]["tracing_share"] < 1
     assert 0 < metrics["step"]["short_share"] < 2
     assert metrics["step"]["new_kernels"] == 0

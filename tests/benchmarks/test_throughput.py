@@ -11,7 +11,8 @@ SMALL = {"samples": 20_000, "boundary_samples": 2_000, "memory_samples": 20_000,
 
 @pytest.mark.slow
 def test_every_metric_is_there_without_sionna(throughput, monkeypatch):
-    monkeypatch.setitem(sys.modules, "sionna", None)
+    for name in ("sionna", "sionna.rt"):
+        monkeypatch.setitem(sys.modules, name, None)
     metrics = throughput.measure(**SMALL)
     assert metrics["useful_paths_ratio_sionna"] is None
     assert all(metrics[key] > 0 for key in throughput.REQUIRED if "sionna" not in key)

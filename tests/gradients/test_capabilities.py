@@ -25,6 +25,7 @@ from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum,
 from invertwin.scene import (
     AntennaArray,
     Cosine,
+    DensityGrid,
     Dielectric,
     Material,
     PerfectConductor,
@@ -123,6 +124,16 @@ def turned(axis: list[float]) -> Callable[[Tensor], Tensor]:
     return lambda theta: torch.cat([torch.ones(1, dtype=torch.float64), theta * float64(axis)])
 
 
+def soft() -> Moves:
+    """The occluder as a soft ball, whose densities change at random."""
+    reach = [0.3, 0.3, 0.3]
+    module = DensityGrid.even("occluder", [-x for x in reach], reach, (9, 9, 9))
+    ball = 15 * torch.sigmoid((0.2 - module.lattice.nodes.norm(dim=-1)) / 0.03)
+    change = torch.randn(ball.shape, generator=torch.Generator().manual_seed(2)).double()
+    value = DensityGrid("occluder", [-x for x in reach], reach, ball).value.detach()
+    return on_scene(module, lambda theta: {"value": value + theta * change})
+
+
 CORNERS = float64([[1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.3]])
 STILL = float64([0.0, 0.0, 0.0])
 MOVES: dict[str, Moves] = {
@@ -154,6 +165,7 @@ MOVES: dict[str, Moves] = {
     "thickness": material("thickness", 3e-3, BOARD),
     "roughness": material("rms_slope", 0.4, COATED),
     "scattering coefficient": material("scattering", 0.6, COATED),
+    "density": soft(),
 }
 
 
@@ -388,6 +400,7 @@ NAMES = {
     "permittivity": "expected a material with permittivity",
     "conductivity": "expected a material with conductivity",
     "diffuse fraction": "expected a material with diffuse",
+    "density": "expected objects with surfaces, got clouds for occluder",
 }
 REFUSED = [cell for cell, said in CELLS.items() if said == "refused"]
 

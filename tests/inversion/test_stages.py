@@ -26,8 +26,11 @@ def test_one_stage_is_a_reconstruction(case):
         case.scene, case.radar, case.capture, [Translation("plate")], **case.settings(steps=4)
     )
     staged = fit(case, [Stage(4)], {"place": BUILDERS["place"]})
-    assert [row["loss"] for row in staged.history] == [row["loss"] for row in alone.history]
-    assert torch.equal(staged.scene["plate"].vertices, alone.scene["plate"].vertices)
+    # But for the order of atomic additions.
+    losses = [[row["loss"] for row in found.history] for found in (staged, alone)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+    places = [found.scene["plate"].vertices for found in (staged, alone)]
+    torch.testing.assert_close(*places, rtol=0, atol=1e-4)
 
 
 def test_only_what_a_stage_names_is_free(case):
@@ -115,16 +118,22 @@ def test_wrong_stages(case, stages, message):
         fit(case, stages)
 
 
-def test_a_shape_that_another_replaces_is_no_parameter(case):
+@pytest.mark.parametrize("kind", ["adam", "gauss_newton"])
+@pytest.mark.parametrize("sought", [("shape",), ("shape", "other")])
+def test_a_shape_that_another_replaces_is_no_parameter(case, kind, sought):
     class Replaced(torch.nn.Module):
         applies_to = "scene"
 
+        def __init__(self):
+            super().__init__()
+            self.place = Translation("plate")
+
         def forward(self, _):
-            return case.scene
+            return self.place(case.scene)
 
     builders = {"shape": BUILDERS["size"], "other": lambda _: Replaced()}
-    with pytest.raises(InputError, match="a later one replaces what they shape"):
-        fit(case, [Stage(1, ("shape",))], builders)
+    with pytest.raises(InputError, match="got log_scale of Scale, which does not: a later one"):
+        fit(case, [Stage(1, sought)], builders, optimizer=Optimizer(kind))
 
 
 def test_the_mesh_of_a_stage_is_plain(case):

@@ -1,6 +1,6 @@
 """Gauss–Newton for few parameters: one derivative of the map in forward mode for each."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -86,14 +86,19 @@ class GaussNewton:
                 takes part in g, and by its own second derivatives in H.
 
         Raises:
-            InputError: a map that is not finite, or more than 64 parameters that matter.
+            InputError: a parameter without effect on the loss, or more than 64 that matter.
         """
         parameters = [parameter for _, _, parameter in self._slots]
         simulated, measured = maps()
         value = self.loss(simulated, measured)
         if penalty is not None:
             value = value + penalty()
-        found = torch.autograd.grad(value, parameters, allow_unused=True)
+        found: Sequence[Tensor | None] = [None] * len(parameters)
+        if value.requires_grad:
+            found = torch.autograd.grad(value, parameters, allow_unused=True)
+        for (module, name, _), slopes in zip(self._slots, found, strict=True):
+            if slopes is None:
+                raise without_effect(module, name)
         slope = _flat(found, parameters)
         before = float(value.detach())
         if not bool(torch.isfinite(slope).all()) or before != before:
@@ -207,7 +212,16 @@ class GaussNewton:
                 setattr(module, key, held)
 
 
-def _flat(values: tuple[Tensor | None, ...], like: list[nn.Parameter]) -> Float64[Tensor, " q"]:
+def without_effect(module: nn.Module, name: str) -> InputError:
+    """What is wrong with a parameter that the loss does not depend on."""
+    return InputError(
+        f"expected parameters that change the map, got {name} of {type(module).__name__}, which "
+        "does not: a later one replaces what it shapes; give one shape of each object, or another "
+        "order"
+    )
+
+
+def _flat(values: Sequence[Tensor | None], like: list[nn.Parameter]) -> Float64[Tensor, " q"]:
     """Gradients in one row, zeros for those that are not there."""
     return torch.cat(
         [

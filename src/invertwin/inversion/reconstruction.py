@@ -19,7 +19,7 @@ from invertwin.channel.chains import RoughChains, rough_chains
 from invertwin.channel.paths import Grid
 from invertwin.channel.tracer import RoughPoints, rough_points
 from invertwin.errors import InputError
-from invertwin.inversion.gauss_newton import GaussNewton
+from invertwin.inversion.gauss_newton import GaussNewton, without_effect
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
@@ -433,16 +433,20 @@ def _stepped(fit: _Fit, state: _State) -> float:
         return state.optimizer.step(maps, fit.penalty if fit.regularizers else None)
     state.optimizer.zero_grad()
     value = fit.evaluate(state.step)
-    if not value.requires_grad:
-        raise InputError(
-            "expected parameters that change the map, got none that do: a later one replaces what "
-            "they shape; give one shape of each object, or another order"
-        )
     number = float(value.detach())
     if not _lost(number, state.history):
-        value.backward()
+        if value.requires_grad:
+            value.backward()
+        _require_all_used(fit.modules)
         state.optimizer.step()
     return number
+
+
+def _require_all_used(modules: nn.ModuleList) -> None:
+    for module in modules:
+        for name, parameter in module.named_parameters():
+            if parameter.requires_grad and parameter.grad is None:
+                raise without_effect(module, name)
 
 
 def _judged(fit: _Fit, state: _State, status: Status) -> Status:
