@@ -93,7 +93,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     for mode in modes[1:]:
         metrics[f"starts_{mode}"] = without_history(rows[mode])
         same = rows[mode][best["start"]]
-        metrics |= {f"{key}_{mode}": same[key] for key in same if is_shape_key(key)}
+        own = [key for key in same if is_shape_key(key) and not key.startswith("true_")]
+        metrics |= {f"{key}_{mode}": same[key] for key in own}
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         console.print("computing the loss landscape")
         png, found = landscape(run, problem.truth, problem.radar, problem.grid, problem.capture)
