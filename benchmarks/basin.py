@@ -29,6 +29,7 @@ others (0.1 and 1 on two seeds); those of fixed width may do better at rates of 
 
 import argparse
 import json
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -43,6 +44,7 @@ from typing import Any, NamedTuple
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from report import verdict
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
@@ -340,16 +342,11 @@ def verdicts(metrics: dict[str, Any]) -> list[str]:
     """What must hold, and whether it does."""
     lines = []
     for axis, least in REQUIRED.items():
-        holds = metrics[f"basin_{axis}"]["surrogate"] >= least
-        lines.append(f"basin_{axis}.surrogate >= {least:g}: {_holds(holds)}")
+        value = metrics[f"basin_{axis}"]["surrogate"]
+        lines.append(f"basin_{axis}.surrogate {verdict(value, ('>=', least))}")
     error = metrics["final_error_cells"]
-    holds = error is not None and error <= REQUIRED_ERROR
-    lines.append(f"final_error_cells <= {REQUIRED_ERROR:g}: {_holds(holds)}")
-    return lines
-
-
-def _holds(holds: bool) -> str:
-    return "holds" if holds else "DOES NOT HOLD"
+    held = verdict(math.inf if error is None else error, ("<=", REQUIRED_ERROR))
+    return [*lines, f"final_error_cells {held}"]
 
 
 def main() -> None:

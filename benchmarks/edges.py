@@ -13,11 +13,9 @@ weighted one (> 1: the weighted one is better); `edge_sampling.variance_ratio` i
 """
 
 import argparse
-import json
 import math
 import os
 import statistics
-import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +27,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from jaxtyping import Float64
-from rich.console import Console
+from report import verdict, write
 from rich.table import Table
 from torch import Tensor
 
@@ -49,7 +47,7 @@ SAMPLES, SEEDS = 100_000, 40
 WARM_UP = 3
 DEPTH = 2
 FAMILIES = 3  # among which samples are shared: shadows from both antennas, and interior ones
-REQUIRED = 1.0
+REQUIRED = (">=", 1.0)  # variance_ratio
 WAYS = {"weighted": True, "uniform": False}
 NOTHING = SimpleNamespace(size=0, draw=None)  # a sampler that finds no edges
 WAVEFORM = FMCW(start_frequency=76e9, bandwidth=2e9, duration=50e-6, samples=512)
@@ -225,9 +223,9 @@ def table(metrics: dict[str, Any]) -> Table:
             row = found[body][name]
             error, variance, seconds = row["relative_error"], row["variance"], row["seconds"]
             grid.add_row(body, name, f"{error:.2f}", f"{variance:.3g}", f"{seconds:.4f}")
-    verdict = "yes" if found["variance_ratio"] >= REQUIRED else "NO"
+    held = verdict(found["variance_ratio"], REQUIRED)
     ratios = ", ".join(f"{body} {found[body]['variance_ratio']:.2f}" for body in bodies())
-    grid.caption = f"variance × time, uniform over weighted: {ratios} (>= {REQUIRED:g} {verdict})"
+    grid.caption = f"variance × time, uniform over weighted: {ratios} ({held})"
     return grid
 
 
@@ -237,11 +235,7 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("out/edges"))
     arguments = parser.parse_args()
     metrics = measure()
-    Console(width=None if sys.stdout.isatty() else 120).print(table(metrics))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "metrics.json"
-    path.write_text(json.dumps(metrics, indent=2) + "\n")
-    print(f"wrote {path}")
+    write(metrics, table(metrics), arguments.out)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,6 @@ the extra `bench`; without it those rows stay empty.
 """
 
 import argparse
-import json
 import os
 import resource
 import statistics
@@ -55,8 +54,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from edges import Task, bodies, placed, single
-from rich.console import Console
-from rich.markup import escape
+from report import MetricTable, write
 from rich.table import Table
 from throughput import WAVEFORM, sionna_version
 
@@ -309,27 +307,15 @@ def measure(
 def table(metrics: dict[str, Any]) -> Table:
     """What was counted, and what must hold."""
     m = metrics
-    grid = Table(
-        title=f"Closed room, {m['samples']} samples; medians of {m['steps']} steps after warm-up; "
+    page = MetricTable(
+        f"Closed room, {m['samples']} samples; medians of {m['steps']} steps after warm-up; "
         f"backend {m['backend']}; {m['cpu_count']} CPU cores, load average "
         f"{m['load_average']:.1f} at the start",
-        title_justify="left",
+        REQUIRED,
     )
-    grid.add_column("metric", no_wrap=True)
-    grid.add_column("value", justify="right", no_wrap=True)
-    grid.add_column("must hold", justify="right", no_wrap=True)
-    grid.add_column("what was counted")
 
     def row(part: str, key: str, shown: str, text: str = "") -> None:
-        value = m[part].get(key)
-        verdict = ""
-        if key in REQUIRED:
-            sign, limit = REQUIRED[key]
-            held = value is not None and (value >= limit if sign == ">=" else value <= limit)
-            verdict = f"{sign} {limit:g} " + ("yes" if held else "—" if value is None else "NO")
-        grid.add_row(
-            f"{part}.{key}", "—" if value is None else format(value, shown), verdict, escape(text)
-        )
+        page.row(f"{part}.{key}", m[part].get(key), shown, text)
 
     version = m["sionna_rt_version"]
     for part in (f"depth{depth}" for depth in DEPTHS):
@@ -354,7 +340,7 @@ def table(metrics: dict[str, Any]) -> Table:
     row("step", "assembly_share", ".3f", "kernels assembled and looked up")
     row("step", "short_share", ".2f", f"step of {FEW} samples over step of {MANY}")
     row("step", "new_kernels", "d", "in further steps: new vertices, seeds, depths 2, 3, 5")
-    return grid
+    return page.grid
 
 
 def main() -> None:
@@ -373,11 +359,7 @@ def main() -> None:
         print(memory_of_steps(*arguments.memory))
         return
     metrics = measure()
-    Console(width=None if sys.stdout.isatty() else 140).print(table(metrics))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "metrics.json"
-    path.write_text(json.dumps(metrics, indent=2) + "\n")
-    print(f"wrote {path}")
+    write(metrics, table(metrics), arguments.out)
 
 
 if __name__ == "__main__":

@@ -14,11 +14,9 @@ Prints a table and writes `metrics.json` into DIR (default `out/signals`).
 """
 
 import argparse
-import json
 import math
 import os
 import statistics
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +24,7 @@ from time import perf_counter
 from typing import Any
 
 import torch
-from rich.console import Console
+from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
 
@@ -41,9 +39,12 @@ DIRECT = ((0, 0), (2, 3))  # (tx, rx) that are summed directly; all take the sam
 WAVEFORM = FMCW(start_frequency=76.5e9, bandwidth=1e9, duration=51.2e-6, samples=256)
 INTERVAL = 60e-6  # s, from ramp to ramp
 GRAVITY = 9.81  # m/s²
-REQUIRED = {
-    "iq_error": {"static": 1e-3, "accelerating": 1e-3, "rotating": 1e-3},
-    "nufft": {"error": 1e-5, "seconds": 3.0},
+REQUIRED: Required = {
+    "iq_error.static": ("<=", 1e-3),
+    "iq_error.accelerating": ("<=", 1e-3),
+    "iq_error.rotating": ("<=", 1e-3),
+    "nufft.error": ("<=", 1e-5),
+    "nufft.seconds": ("<=", 3.0),
 }
 CASES = {
     "static": "at rest, 4–34 m away",
@@ -221,21 +222,15 @@ def measure(
 
 def table(metrics: dict[str, Any]) -> Table:
     """What was compared, and what must hold."""
-    grid = Table(
-        title=f"Signals: {metrics['points']} points over {metrics['chirps']} chirps of "
+    page = MetricTable(
+        f"Signals: {metrics['points']} points over {metrics['chirps']} chirps of "
         f"{WAVEFORM.samples} samples and 12 virtual channels; {metrics['cpu_count']} CPU cores, "
         f"{metrics['threads']} threads, load average {metrics['load_average']:.1f} at the start",
-        title_justify="left",
+        REQUIRED,
     )
-    grid.add_column("metric", no_wrap=True)
-    grid.add_column("value", justify="right", no_wrap=True)
-    grid.add_column("must hold", justify="right", no_wrap=True)
-    grid.add_column("what was compared")
 
     def row(group: str, key: str, text: str) -> None:
-        value, limit = metrics[group][key], REQUIRED[group].get(key)
-        verdict = "" if limit is None else f"<= {limit:g} {'yes' if value <= limit else 'NO'}"
-        grid.add_row(f"{group}.{key}", f"{value:.3g}", verdict, text)
+        page.row(f"{group}.{key}", metrics[group][key], ".3g", text)
 
     for name, text in CASES.items():
         row("iq_error", name, text)
@@ -253,7 +248,7 @@ def table(metrics: dict[str, Any]) -> Table:
         f"the direct sum of {len(DIRECT)} channels, times channels over {len(DIRECT)}",
     )
     row("nufft", "time_ratio", "direct over fast")
-    return grid
+    return page.grid
 
 
 def main() -> None:
@@ -262,11 +257,7 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("out/signals"))
     arguments = parser.parse_args()
     metrics = measure()
-    Console(width=None if sys.stdout.isatty() else 140).print(table(metrics))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "metrics.json"
-    path.write_text(json.dumps(metrics, indent=2) + "\n")
-    print(f"wrote {path}")
+    write(metrics, table(metrics), arguments.out)
 
 
 if __name__ == "__main__":

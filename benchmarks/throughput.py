@@ -7,7 +7,6 @@ the extra `bench`; without it that row stays empty.
 """
 
 import argparse
-import json
 import os
 import resource
 import statistics
@@ -23,8 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.markup import escape
+from report import MetricTable, write
 from rich.table import Table
 from torch import Tensor
 
@@ -303,26 +301,16 @@ def table(metrics: dict[str, Any]) -> Table:
     m = metrics
     counted = m["samples"] + m["boundary_samples"]
     hidden = m["hidden_share_of_facing_triangles"]
-    grid = Table(
-        title=f"Throughput: {m['triangles']} triangles, {hidden:.0%} of those facing the radar "
+    page = MetricTable(
+        f"Throughput: {m['triangles']} triangles, {hidden:.0%} of those facing the radar "
         f"hidden; map of {' × '.join(map(str, m['map_bins']))} bins; "
         f"medians of {m['steps']} steps after warm-up; backend {m['backend']}; "
         f"{m['cpu_count']} CPU cores, load average {m['load_average']:.1f} at the start",
-        title_justify="left",
+        REQUIRED,
     )
-    grid.add_column("metric", no_wrap=True)
-    grid.add_column("value", justify="right", no_wrap=True)
-    grid.add_column("must hold", justify="right", no_wrap=True)
-    grid.add_column("what was counted")
 
     def row(key: str, shown: str, text: str) -> None:
-        value = m[key]
-        verdict = ""
-        if key in REQUIRED:
-            sign, limit = REQUIRED[key]
-            held = value is not None and (value >= limit if sign == ">=" else value <= limit)
-            verdict = f"{sign} {limit:g} " + ("yes" if held else "—" if value is None else "NO")
-        grid.add_row(key, "—" if value is None else format(value, shown), verdict, escape(text))
+        page.row(key, m[key], shown, text)
 
     row(
         "samples_per_second",
@@ -361,7 +349,7 @@ def table(metrics: dict[str, Any]) -> Table:
         text = "deposit over Sionna"
     row("useful_paths_ratio_sionna", ".0f", text)
     row("useful_listed_paths_ratio_sionna", ".0f", "list over list")
-    return grid
+    return page.grid
 
 
 def main() -> None:
@@ -374,11 +362,7 @@ def main() -> None:
         print(memory_of_steps(arguments.memory))
         return
     metrics = measure()
-    Console(width=None if sys.stdout.isatty() else 140).print(table(metrics))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "metrics.json"
-    path.write_text(json.dumps(metrics, indent=2) + "\n")
-    print(f"wrote {path}")
+    write(metrics, table(metrics), arguments.out)
 
 
 if __name__ == "__main__":

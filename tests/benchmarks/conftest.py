@@ -1,48 +1,28 @@
 """The benchmark scripts as modules."""
 
 import importlib
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 
-@pytest.fixture
-def basin(repository, monkeypatch) -> ModuleType:
-    """`benchmarks/basin.py`."""
-    monkeypatch.syspath_prepend(repository / "benchmarks")
-    return importlib.import_module("basin")
+def script(name: str) -> Any:
+    """A fixture: `benchmarks/<name>.py`."""
+
+    @pytest.fixture(name=name)
+    def loaded(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+        monkeypatch.syspath_prepend(repository / "benchmarks")
+        return importlib.import_module(name)
+
+    return loaded
 
 
-@pytest.fixture
-def throughput(repository, monkeypatch) -> ModuleType:
-    """`benchmarks/throughput.py`."""
-    monkeypatch.syspath_prepend(repository / "benchmarks")
-    return importlib.import_module("throughput")
-
-
-@pytest.fixture
-def signals(repository, monkeypatch) -> ModuleType:
-    """`benchmarks/signals.py`."""
-    monkeypatch.syspath_prepend(repository / "benchmarks")
-    return importlib.import_module("signals")
-
-
-@pytest.fixture
-def edges(repository, monkeypatch) -> ModuleType:
-    """`benchmarks/edges.py`."""
-    monkeypatch.syspath_prepend(repository / "benchmarks")
-    return importlib.import_module("edges")
-
-
-@pytest.fixture
-def multibounce(repository, monkeypatch) -> ModuleType:
-    """`benchmarks/multibounce.py`."""
-    monkeypatch.syspath_prepend(repository / "benchmarks")
-    return importlib.import_module("multibounce")
-
-
-@pytest.fixture
-def shapes(repository, monkeypatch) -> ModuleType:
-    """`benchmarks/shapes.py`."""
-    monkeypatch.syspath_prepend(repository / "benchmarks")
-    return importlib.import_module("shapes")
+basin = script("basin")
+edges = script("edges")
+multibounce = script("multibounce")
+report = script("report")
+shapes = script("shapes")
+signals = script("signals")
+throughput = script("throughput")

@@ -42,8 +42,8 @@ def test_what_must_hold_is_said(basin):
         "final_error_cells": 0.06,
     }
     lines = basin.verdicts(metrics)
-    assert [line.endswith(": holds") for line in lines] == [True, False, False]
-    assert "DOES NOT HOLD" in basin.verdicts(metrics | {"final_error_cells": None})[2]
+    assert [line.endswith(" yes") for line in lines] == [True, False, False]
+    assert basin.verdicts(metrics | {"final_error_cells": None})[2].endswith(" NO")
 
 
 def test_offsets_move_along_one_coordinate(basin):
