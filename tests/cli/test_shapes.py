@@ -8,6 +8,7 @@ from PIL import Image
 from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import is_shape_key, shape_label
+from invertwin.cli.fits.problem import FULL, run_stages, varied_run
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
 from invertwin.scene.files import load_mesh
@@ -154,6 +155,26 @@ def test_the_true_shape_stands_where_the_object_stands(tmp_path):
 def test_a_run_with_stages_survives_the_way_to_toml(tmp_path):
     run = check(shapes(), tmp_path)
     assert check(to_toml(run), tmp_path) == run
+
+
+def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
+    text = shapes(SHAPES).replace(
+        "[variants.no_boundary]\nboundary = false\n",
+        '[variants.no_boundary]\noptimizer = "sgd"\nrate = 0.5\nannealing = 0.25\nstages = []\n',
+    )
+    text = text.replace(
+        "steps = 2\nrate = 0.01\n", 'steps = 2\noptimizer = "sgd"\nannealing = 0.5\n'
+    )
+    run = check(text, tmp_path)
+    own = varied_run(run, "no_boundary")
+    assert (own.optimizer.kind, own.optimizer.rate) == ("sgd", 0.5)
+    assert own.reconstruct is not None
+    assert own.reconstruct.annealing == 0.25
+    assert varied_run(run, FULL).optimizer.kind == "adam"
+    first, second = run_stages(varied_run(run, FULL))
+    assert "optimizer" not in first.options
+    assert second.options["optimizer"].kind == "sgd"
+    assert second.options["annealing"] == 0.5
 
 
 def test_learned_shapes_are_objects_and_parameters(tmp_path):

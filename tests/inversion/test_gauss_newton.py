@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
@@ -107,6 +108,46 @@ def test_no_step_is_longer_than_its_reach_and_none_makes_it_worse():
     again = GaussNewton(wrong, SpectrumLoss())
     again.load_state_dict(solver.state_dict())
     assert again.damping == solver.damping
+
+
+def test_a_curvature_serves_several_steps():
+    """With a kept one a step still goes down, and its derivatives are asked for less often."""
+    measured = Mixture(TRUTH)().detach()
+
+    def asked(every: int) -> tuple[int, Tensor]:
+        model, count = Mixture([0.0, 0.0, 0.0]), 0
+        solver = GaussNewton(model, SpectrumLoss(gain="one"), damping=1e-4, every=every)
+
+        def maps() -> tuple[Tensor, Tensor]:
+            nonlocal count
+            count += forward_ad.unpack_dual(model.share).tangent is not None
+            return model(), measured
+
+        for _ in range(6):
+            solver.step(maps)
+        return count, model.share.detach()
+
+    each, found = asked(1)
+    third, also = asked(3)
+    assert (each, third) == (12, 4)
+    for share in (found, also):
+        assert torch.allclose(share, float64(TRUTH), atol=1e-4)
+
+
+def test_a_kept_curvature_goes_on_from_a_checkpoint():
+    measured = Mixture(TRUTH)().detach()
+
+    def steps(count: int, state: Any = None) -> tuple[Tensor, dict[str, Any]]:
+        model = Mixture([0.0, 0.0, 0.0])
+        solver = GaussNewton(model, SpectrumLoss(), reach=0.1, every=4)
+        if state is not None:
+            solver.load_state_dict(state[1])
+            model.share.data.copy_(state[0])
+        for _ in range(count):
+            solver.step(lambda: (model(), measured))
+        return model.share.detach().clone(), solver.state_dict()
+
+    assert torch.equal(steps(6)[0], steps(3, steps(3))[0])
 
 
 def test_a_penalty_takes_part_with_its_own_curvature():

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
+from invertwin.scene.checks import checked_count
 
 Maps = Callable[[], tuple[Tensor, Tensor]]
 
@@ -35,7 +36,7 @@ class GaussNewton:
 
     Source: the Levenberg–Marquardt method.
     Differs from the source: g and H are estimates from samples, and D keeps what the data hardly
-    tell from drifting with their noise.
+    tell from drifting with their noise; H may serve several steps.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class GaussNewton:
         *,
         reach: float = 0.3,
         damping: float = 0.01,
+        every: int = 1,
     ) -> None:
         """Fit the parameters of `modules` that require a gradient.
 
@@ -53,10 +55,11 @@ class GaussNewton:
             loss: how maps are compared, a `SpectrumLoss`.
             reach: the longest change of one parameter in a step, in its unit.
             damping: μ at the first step.
+            every: steps from one H to the next; those between take the last one.
 
         Raises:
-            InputError: no parameters, more than 64, another loss, or a reach or damping that is
-                not positive.
+            InputError: no parameters, more than 64, another loss, or a reach, damping or number
+                of steps that is not positive.
         """
         self._slots = [
             (module, name, parameter)
@@ -75,6 +78,9 @@ class GaussNewton:
                 f"{reach} and {damping}; a reach of 0.3 suits metres and radians"
             )
         self.loss, self.reach, self.damping = loss, reach, damping
+        self.every = checked_count(every, "steps from one curvature to the next", 1)
+        self._known: tuple[Tensor, Tensor] | None = None  # H, and of which parameters
+        self._age = 0  # steps that H has served
 
     def step(self, maps: Maps, penalty: Callable[[], Tensor] | None = None) -> float:
         """One step, and the loss before it.
@@ -112,7 +118,11 @@ class GaussNewton:
             )
         if not bool(free.any()):
             return before
-        curvature = self._curvature(maps, simulated.detach(), measured, free)
+        if self._known is None or self._age >= self.every or not torch.equal(free, self._known[1]):
+            self._known = self._curvature(maps, simulated.detach(), measured, free), free
+            self._age = 0
+        self._age += 1
+        curvature = self._known[0]
         if penalty is not None:
             curvature = curvature + _penalty_curvature(penalty, parameters, free)
         start = [parameter.detach().clone() for parameter in parameters]
@@ -127,14 +137,19 @@ class GaussNewton:
                 self.damping = max(self.damping * _EASE, _LEAST)
                 return before
             self.damping *= _STRAIN
-        # Samples are others in the next step: what failed on these may be right on those.
+        # Samples are others in the next step: what failed on these may be right on those, with a
+        # curvature of theirs.
+        self._known = None
         self.damping = min(given * _STRAIN, _LARGEST)
         self._move(start, torch.zeros(int(free.sum()), dtype=torch.float64), free)
         return before
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint needs besides the parameters."""
-        return {"damping": self.damping}
+        kept: dict[str, Any] = {"damping": self.damping, "age": self._age}
+        if self._known is not None:
+            kept["curvature"], kept["free"] = self._known
+        return kept
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` gave.
@@ -148,6 +163,8 @@ class GaussNewton:
                 "optimiser; start without resume"
             )
         self.damping = float(state["damping"])
+        self._age = int(state.get("age", 0))
+        self._known = (state["curvature"], state["free"]) if "curvature" in state else None
 
     def zero_grad(self) -> None:
         """Nothing: gradients are not kept in the parameters."""

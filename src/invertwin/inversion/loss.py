@@ -108,38 +108,43 @@ class SpectrumLoss:
         """
         pairs = self._pyramid(simulated.detach(), measured)
         # A map's own derivative by the logarithm of the gain is the map.
-        directions = torch.cat([tangents, simulated.detach()[None].to(tangents)])
-        moved = [self._pyramid(direction, measured, like=simulated) for direction in directions]
+        rows = torch.cat([tangents, simulated.detach()[None].to(tangents)])
+        rows = rows / self._units(simulated, measured)[0]
         if self.kind == "mse":
             pairs = [(self._cleared(a), self._cleared(b)) for a, b in pairs]
-            moved = [[(self._cleared(a), b) for a, b in levels] for levels in moved]
         gain = self._gain(pairs)
-        total = tangents.new_zeros(len(directions), len(directions), dtype=torch.float64)
+        total = rows.new_zeros(len(rows), len(rows), dtype=torch.float64)
         for level, (a, b) in enumerate(pairs):
-            rows = torch.stack([levels[level][0] for levels in moved]).flatten(1).double()
+            if level > 0:
+                rows = _pooled(rows.flatten(0, 1)).unflatten(0, (len(rows), -1))
             if self.kind == "mse":
                 weight = 2 * gain**2 / b.square().mean().clamp_min(1e-30)
+                weighed = torch.stack([self._cleared(row) for row in rows]).flatten(1)
             else:
-                inside = (a > 0).flatten()
-                rows = rows * inside * gain / (gain * a.clamp_min(0.0) + self.floor).flatten()
                 weight = 1.0
-            total = total + weight * (rows @ rows.T) / (rows.shape[1] * len(pairs))
+                weighed = (
+                    rows * ((a > 0) * gain / (gain * a.clamp_min(0.0) + self.floor))
+                ).flatten(1)
+            product = (weighed @ weighed.T).double()
+            total = total + weight * product / (weighed.shape[1] * len(pairs))
         own, mixed = total[:-1, :-1], total[:-1, -1:]
         if self.gain == "fitted" and float(total[-1, -1]) > 0:
             own = own - mixed @ mixed.T / total[-1, -1]
         return own
 
-    def _pyramid(
-        self, simulated: Tensor, measured: Tensor, like: Tensor | None = None
-    ) -> list[tuple[Tensor, Tensor]]:
-        """Both maps at all resolutions, in units near one; ``like`` gives the simulated one's."""
-        scale = measured.detach().abs().mean()
-        unit = (simulated if like is None else like).detach().abs().mean()
-        unit = torch.where(unit > 0, unit, 1.0) if self.gain == "fitted" else scale
+    def _pyramid(self, simulated: Tensor, measured: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Both maps at all resolutions, in units near one."""
+        unit, scale = self._units(simulated, measured)
         pairs = [(simulated / unit, measured.to(simulated) / scale)]
         for _ in range(1, self.levels):
             pairs.append((_pooled(pairs[-1][0]), _pooled(pairs[-1][1])))
         return pairs
+
+    def _units(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+        """What the simulated and the measured map are divided by."""
+        scale = measured.detach().abs().mean()
+        unit = simulated.detach().abs().mean()
+        return torch.where(unit > 0, unit, 1.0) if self.gain == "fitted" else scale, scale
 
     def _gain(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         """The gain that minimises the loss."""

@@ -26,6 +26,8 @@ class Optimizer:
         final_rate: At the last step (cosine in between), of ``rate``; None = ``rate`` / 20.
             The rates of all parameters fall alike.
         momentum: Of SGD.
+        curvature_every: Of Gauss–Newton, steps from one curvature to the next: the map's
+            derivatives by every parameter cost the most of a step.
         module_rates: Rates of the modules that are fitted, in their order; None, and modules
             beyond the last = ``rate``, and ``rotation_rate`` for rotations.
     """
@@ -35,6 +37,7 @@ class Optimizer:
     rotation_rate: float | None = None
     final_rate: float | None = None
     momentum: float = 0.9
+    curvature_every: int = 1
     module_rates: tuple[float | None, ...] = ()
 
     def __post_init__(self) -> None:
@@ -59,7 +62,7 @@ class Optimizer:
                     f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
                     "give one, or another kind of optimiser"
                 )
-            return GaussNewton(modules, loss, reach=self.rate)
+            return GaussNewton(modules, loss, reach=self.rate, every=self.curvature_every)
         groups: dict[float, list[nn.Parameter]] = {}
         for i, module in enumerate(modules.children()):
             own = self.module_rates[i] if i < len(self.module_rates) else None

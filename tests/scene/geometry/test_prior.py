@@ -8,6 +8,7 @@ from importlib import resources
 import numpy as np
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 import trimesh
 from torch import Tensor
 
@@ -186,3 +187,26 @@ def test_a_decoder_of_other_nodes_is_refused():
     decoder = Decoder(2, 4, 3, 5)
     with pytest.raises(InputError, match="half the nodes"):
         ShapePrior(decoder, Lattice.between([-1, -1, -1], [1, 1, 1], (5, 5, 5)))
+
+
+def test_derivatives_are_the_same_on_a_surface_that_is_known():
+    """A mesh of the same latent is kept; both ways of differentiation see their own latent."""
+    prior = load_prior()
+    latent = 0.3 * torch.ones(prior.latent_size, dtype=torch.float64)
+    tangent = torch.linspace(-1, 1, prior.latent_size, dtype=torch.float64)
+    first, other = prior.mesh(latent), prior.mesh(-latent)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(latent, tangent)
+        found = forward_ad.unpack_dual(prior.mesh(dual).vertices)
+    again = latent.clone().requires_grad_()
+    mesh = prior.mesh(again)
+    assert torch.equal(mesh.vertices.detach(), first.vertices)
+    assert torch.equal(found.primal, first.vertices)
+    assert not torch.equal(other.vertices[:9], first.vertices[:9])
+    weight = torch.sin(torch.arange(mesh.vertices.numel())).reshape(mesh.vertices.shape).double()
+    (slope,) = torch.autograd.grad((mesh.vertices * weight).sum(), again)
+    assert found.tangent is not None
+    forward = float((found.tangent * weight).sum())
+    assert forward == pytest.approx(float(slope @ tangent), rel=1e-9)
+    coarse = prior.mesh(latent, (20, 12, 12))
+    assert len(coarse.vertices) < len(first.vertices) / 2

@@ -18,6 +18,7 @@ from invertwin.cli.schema import (
     MoverParameter,
     RadarParameter,
     RunFile,
+    Settings,
     SimulatedData,
     Variant,
     VerticesParameter,
@@ -109,11 +110,15 @@ def varied(problem: Problem, mode: str) -> Problem:
 
     Its run file holds the parameters of this fit only.
     """
-    run = problem.run
+    return replace(problem, run=varied_run(problem.run, mode))
+
+
+def varied_run(run: RunFile, mode: str) -> RunFile:
+    """The run file of a mode, with the parameters of this fit only."""
     wanted = Variant() if mode == FULL else Variant(boundary=False)
     if mode not in (FULL, INTERIOR):
         wanted = run.variants[mode]
-    given = wanted.model_dump(exclude_none=True)
+    given = _given(wanted)
     changes: dict[str, Any] = {}
     stages = run.stages if wanted.stages is None else wanted.stages
     names = wanted.parameters or need(run, "reconstruct", "reconstruct").parameters
@@ -139,12 +144,24 @@ def varied(problem: Problem, mode: str) -> Problem:
         keys = set(type(table).model_fields) - {"parameters"}
         update = {key: value for key, value in given.items() if key in keys}
         changes[section] = table.model_copy(update=update)
-    return replace(problem, run=run.model_copy(update=changes))
+    return run.model_copy(update=changes)
+
+
+def _given(table: Settings) -> dict[str, Any]:
+    """What a table says, by the names of the sections that it varies."""
+    found = table.model_dump(exclude_none=True)
+    if "optimizer" in found:
+        found["kind"] = found.pop("optimizer")
+    return found
 
 
 def stages_of(problem: Problem) -> list[Stage]:
     """The stages of a fit, as the library takes them."""
-    run = problem.run
+    return run_stages(problem.run)
+
+
+def run_stages(run: RunFile) -> list[Stage]:
+    """The same of a run file."""
     settings = need(run, "reconstruct", "reconstruct")
     if not run.stages:
         return [Stage(settings.steps)]
@@ -152,13 +169,13 @@ def stages_of(problem: Problem) -> list[Stage]:
 
 
 def _stage(run: RunFile, table: StageTable) -> Stage:
-    given = table.model_dump(exclude_none=True)
+    given = _given(table)
     options = {
         key: given[key]
-        for key in ("samples", "boundary_samples", "frames_per_step")
+        for key in ("samples", "boundary_samples", "frames_per_step", "annealing")
         if key in given
     }
-    rates = {key: given[key] for key in ("rate", "final_rate") if key in given}
+    rates = {key: given[key] for key in ("kind", "rate", "final_rate") if key in given}
     widths = {key: given[key] for key in ("range_width", "angle_width") if key in given}
     if rates:
         options["optimizer"] = build.optimizer(run.optimizer.model_copy(update=rates))

@@ -187,6 +187,8 @@ class Optimizer(Section):
     """on the last step; without it rate / 20"""
     momentum: Annotated[float, Field(ge=0, lt=1)] = 0.9
     """of sgd"""
+    curvature_every: Count = 1
+    """steps from one curvature of gauss_newton to the next"""
 
 
 class Reconstruct(Section):

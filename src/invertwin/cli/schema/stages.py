@@ -1,6 +1,6 @@
 """The tables of fits in stages, of their variants, and of how shapes are scored."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -12,6 +12,8 @@ class Settings(Section):
 
     steps: Count | None = None
     """budget"""
+    optimizer: Literal["adam", "sgd", "gauss_newton"] | None = None
+    """how a gradient becomes a step: its `kind`"""
     rate: Positive | None = None
     """of the optimizer"""
     final_rate: NonNegative | None = None
@@ -26,6 +28,8 @@ class Settings(Section):
     """of the surrogate at the first step, in range cells"""
     angle_width: NonNegative | None = None
     """of the surrogate at the first step, in beamwidths"""
+    annealing: Annotated[float, Field(gt=0, le=1)] | None = None
+    """share of these steps with extra width"""
 
 
 class Stage(Settings):

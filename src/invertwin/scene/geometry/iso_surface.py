@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -44,6 +44,23 @@ def iso_surface(
         with torch.no_grad():
             parts = [field(part).detach() for part in nodes.split(_CHUNK)]
         values = torch.cat(parts).reshape(lattice.counts)
+    points, faces = surface_of(field, lattice, values)
+    return Mesh(follow(field, points), faces)
+
+
+def surface_of(
+    field: Field, lattice: Lattice, values: Float64[Tensor, "x y z"]
+) -> tuple[Float64[Tensor, "p 3"], Int64[Tensor, "t 3"]]:
+    """Places of vertices, without derivatives, and triangles.
+
+    Args:
+        field: as above.
+        lattice: nodes on which the field is known.
+        values: there.
+
+    Raises:
+        InputError: as above.
+    """
     if not bool(torch.isfinite(values).all()):
         raise InputError("expected a finite field, got NaN or infinity; lower the learning rate")
     if not bool(values.min() < 0 < values.max()):
@@ -56,14 +73,26 @@ def iso_surface(
         values.detach().numpy(), 0.0, gradient_direction="descent", allow_degenerate=False
     )
     start = lattice.low + torch.from_numpy(corners).double() * lattice.spacing
-    vertices = follow(field, _polished(field, start, lattice))
-    return Mesh(vertices, torch.from_numpy(faces.astype("int64")))
+    return _polished(field, start, lattice), torch.from_numpy(faces.astype("int64"))
 
 
-def follow(field: Field, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p 3"]:
-    """Points of the surface as they are, with the derivative dV = −n df/|∇f|."""
+def slope_of(field: Field, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p 3"]:
+    """The field's gradient in space at points, without derivatives."""
+    return _value_and_slope(field, points)[1]
+
+
+def follow(
+    field: Field, points: Float64[Tensor, "p 3"], slope: Float64[Tensor, "p 3"] | None = None
+) -> Float64[Tensor, "p 3"]:
+    """Points of the surface as they are, with the derivative dV = −n df/|∇f|.
+
+    Args:
+        field: whose zero the points are on.
+        points: of the surface [m].
+        slope: the field's gradient there, where it is known already; None asks the field.
+    """
     fixed = points.detach()
-    _, slope = _value_and_slope(field, fixed)
+    slope = slope_of(field, fixed) if slope is None else slope
     direction = slope / slope.square().sum(1, keepdim=True).clamp_min(_FLAT**2)
     value = field(fixed)
     return fixed - direction * (value - value.detach())[:, None]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_tensor
-from invertwin.scene.geometry.iso_surface import iso_surface
+from invertwin.scene.geometry.iso_surface import follow, slope_of, surface_of
 from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
@@ -74,6 +74,7 @@ class ShapePrior:
             )
         self.decoder = decoder.double().requires_grad_(False)
         self.lattice = lattice
+        self._last: tuple[tuple[int, ...], Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
     @property
     def latent_size(self) -> int:
@@ -151,9 +152,8 @@ class ShapePrior:
         """
         wanted = Lattice.between(self.low, self.high, self.counts if counts is None else counts)
         values = self.values(latent)
-        with torch.no_grad():
-            known = torch.stack(list(cubic_slices(values, self.lattice, wanted)))
-        return iso_surface(lambda points: cubic(values, self.lattice, points), wanted, known)
+        points, faces, slope = self._surface(values.detach(), wanted)
+        return Mesh(follow(lambda at: cubic(values, self.lattice, at), points, slope), faces)
 
     def mean_mesh(self, counts: Sequence[int] | None = None) -> Mesh:
         """The surface of z = 0."""
@@ -168,6 +168,19 @@ class ShapePrior:
         np.savez_compressed(
             file, format=_FORMAT, counts=np.array(self.lattice.counts), **box, **weights
         )
+
+    def _surface(self, values: Tensor, wanted: Lattice) -> tuple[Tensor, Tensor, Tensor]:
+        """Vertices, triangles and the field's slope there; kept for derivatives that follow."""
+        last = self._last
+        if last is None or last[0] != wanted.counts or not torch.equal(last[1], values):
+
+            def field(at: Tensor) -> Tensor:
+                return cubic(values, self.lattice, at)
+
+            known = torch.stack(list(cubic_slices(values, self.lattice, wanted)))
+            points, faces = surface_of(field, wanted, known)
+            last = self._last = wanted.counts, values, (points, faces, slope_of(field, points))
+        return last[2]
 
     def _checked(self, latent: Tensor) -> Tensor:
         """The latent, if it is one that decodes.
