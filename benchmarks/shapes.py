@@ -8,13 +8,14 @@ an interrupted run has finished are not fitted again.
 Radar, data, fits and measures are those of `experiments/shape_car_prior.toml`; every car has a
 shape, start, speckle and noise of its own. The cars are drawn from the public learned space of
 vehicles (coordinates of a normal distribution, cut at two standard deviations), which the prior of
-the package has never seen: it was trained on procedural cars. A start is the prior's mean car,
-0.3 m off in some direction on the road and turned by 10° to some side. From the same data and start
-are fitted:
+the package has never seen: it was trained on procedural cars. Settings were chosen on other cars of
+that space than these. A start is the prior's mean car, 0.3 m off in some direction on the road and
+turned by 10° to some side. From the same data and start are fitted:
 
-- `pose_only`: place and heading of the mean car.
-- `free`: these, and its vertices, which move in smooth steps.
-- `prior`: these, and the coordinates of the prior.
+- `pose_only`: place and heading of the mean car, by Adam.
+- `free`: these, and its vertices, which move in smooth steps, by Adam: too many for Gauss–Newton.
+- `prior`: these, and the coordinates of the prior, 27 numbers, by Gauss–Newton, whose steps cost
+  more: `seconds_ratio` compares times.
 
 Distances and volumes are those of the whole car, the side that no position sees included; `_seen`
 are restricted to the surface that some position sees. Medians over the cars:
@@ -23,6 +24,7 @@ are restricted to the surface that some position sees. Medians over the cars:
 - `iou_gain`: volume IoU of `prior` minus that of `pose_only`.
 - `iteration_ratio`: the iteration at which `prior` is first as near as `free` ends, over the
   iterations of `free`; infinite where it never is.
+- `seconds_ratio`: the same in time, without a limit.
 """
 
 import argparse
@@ -62,6 +64,8 @@ REQUIRED = {
     "iou_gain": (">=", 0.08),
     "iteration_ratio": ("<=", 1 / 3),
 }
+
+SHOWN = (*REQUIRED, "seconds_ratio")
 
 Car = dict[str, Any]
 
@@ -131,13 +135,14 @@ def _line(car: Car) -> str:
 
 
 def compared(car: Car) -> dict[str, float]:
-    """The numbers of one car whose medians must hold."""
+    """The numbers of one car whose medians count."""
     prior, pose, free = car["prior"], car["pose_only"], car["free"]
     reached = next((step for step, value in prior["curve"] if value <= free["chamfer_m"]), math.inf)
     return {
         "chamfer_ratio": prior["chamfer_m"] / pose["chamfer_m"],
         "iou_gain": prior["iou"] - pose["iou"],
         "iteration_ratio": reached / free["steps"],
+        "seconds_ratio": reached / prior["steps"] * prior["seconds"] / free["seconds"],
     }
 
 
@@ -145,7 +150,7 @@ def summary(cars: dict[int, Car]) -> dict[str, Any]:
     """Medians over the cars, and the worst one, the highest ratio of distances."""
     rows = {number: compared(car) for number, car in cars.items()}
     metrics: dict[str, Any] = {
-        key: statistics.median(row[key] for row in rows.values()) for key in REQUIRED
+        key: statistics.median(row[key] for row in rows.values()) for key in SHOWN
     }
     worst = max(rows, key=lambda number: rows[number]["chamfer_ratio"])
     metrics["worst"] = {"car": worst, **rows[worst]}
@@ -242,7 +247,7 @@ def main() -> None:
     parser.add_argument("--cars", type=int, default=CARS)
     given = parser.parse_args()
     metrics = measure(given.out, given.cars)
-    for key in REQUIRED:
+    for key in SHOWN:
         print(f"{key} = {metrics[key]:.3g} (worst car {metrics['worst'][key]:.3g})")
     for line in verdicts(metrics):
         print(f"must hold: {line}")

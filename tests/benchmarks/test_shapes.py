@@ -5,13 +5,16 @@ import math
 
 import pytest
 
+from invertwin.cli import build
+from invertwin.cli.fits.problem import varied_run
+
 
 def curve(*values):
     return [[10 * (k + 1), value] for k, value in enumerate(values)]
 
 
 def car(pose, free, prior, falling):
-    def row(chamfer, iou, shown=()):
+    def row(chamfer, iou, shown=(), seconds=1.0):
         return {
             "chamfer_m": chamfer,
             "iou": iou,
@@ -20,17 +23,18 @@ def car(pose, free, prior, falling):
             "start_chamfer_m": 0.16,
             "start_iou": 0.5,
             "steps": 30,
-            "seconds": 1.0,
+            "seconds": seconds,
             "curve": curve(*shown) or curve(chamfer, chamfer, chamfer),
         }
 
     return {
         "pose_only": row(pose, 0.7),
         "free": row(free, 0.8),
-        "prior": row(prior, 0.9, falling),
+        "prior": row(prior, 0.9, falling, seconds=3.0),
     }
 
 
+MAIN = ("prior", "free")
 GOOD = car(0.10, 0.07, 0.04, (0.09, 0.06, 0.04))
 BAD = car(0.10, 0.03, 0.09, (0.12, 0.11, 0.09))
 
@@ -40,7 +44,9 @@ def test_what_a_car_tells(shapes):
     assert row["chamfer_ratio"] == pytest.approx(0.4)
     assert row["iou_gain"] == pytest.approx(0.2)
     assert row["iteration_ratio"] == pytest.approx(20 / 30)
+    assert row["seconds_ratio"] == pytest.approx(20 / 30 * 3)
     assert shapes.compared(BAD)["iteration_ratio"] == math.inf
+    assert shapes.compared(BAD)["seconds_ratio"] == math.inf
 
 
 def test_medians_and_the_worst_car(shapes):
@@ -67,6 +73,18 @@ def test_cars_differ_in_shape_and_start_only(shapes):
     assert first.scene != second.scene
     same = {"seed": run.seed, "scene": run.scene, "truth": run.truth}
     assert first.model_copy(update=same) == run
+
+
+def test_the_start_is_as_far_from_the_truth_as_it_says(shapes):
+    """The scenes that are built tell: a truth stands where the start does unless it says where."""
+    own = shapes.run_of(3, shapes.load_run(shapes.RUN))
+    truth = {"car": own.truth["car"].model_copy(update={"parts": None})}
+    bare = own.model_copy(update={"truth": truth})
+    start, true = (make(bare)["car"].pose for make in (build.scene, build.true_scene))
+    away = (start - true)[:3, 3]
+    assert float(away.norm()) == pytest.approx(shapes.DISTANCE)
+    assert float(away[1]) == 0.0
+    assert float(true[:3, 3].norm()) == 0.0
 
 
 def test_the_start_is_turned_by_ten_degrees(shapes):
@@ -111,7 +129,28 @@ def test_infinite_numbers_are_null_in_the_file(shapes, tmp_path, monkeypatch):
 def test_every_method_is_a_fit_of_the_run_file(shapes):
     run = shapes.load_run(shapes.RUN)
     assert set(shapes.MODES.values()) == {shapes.FULL, *run.variants}
-    assert run.reconstruct.steps % run.measures.every == 0
+    for mode in shapes.MODES.values():
+        assert varied_run(run, mode).reconstruct.steps % run.measures.every == 0
+
+
+def test_both_run_files_are_one_experiment(shapes):
+    """What one has as its main fit is a variant of the other."""
+    one, other = (shapes.load_run(shapes.RUN.with_name(f"shape_car_{n}.toml")) for n in MAIN)
+    same = {name: getattr(one, name) for name in ("title", "reconstruct", "optimizer", "variants")}
+    assert other.model_copy(update=same) == one
+    for mine, theirs in ((shapes.FULL, "prior"), ("free", shapes.FULL), ("pose_only",) * 2):
+        fits = varied_run(one, mine), varied_run(other, theirs)
+        first, second = (
+            found.model_copy(
+                update={
+                    "variants": {},
+                    "title": "",
+                    "reconstruct": found.reconstruct.model_copy(update={"parameters": []}),
+                }
+            )
+            for found in fits
+        )
+        assert first == second
 
 
 @pytest.mark.slow
