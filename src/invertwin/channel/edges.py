@@ -16,7 +16,7 @@ from invertwin.channel.passage import land, passage, through
 from invertwin.channel.rays import NEAR, Shot, scrambled, uniform_pair
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
-_RESOLVED = 2e-4  # chance of an edge from which float32 resolves a sample's place within it
+_RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's place within it
 # Boundary rays pass beside the edge, by this much of its distance from the origin (fifteen
 # roundings): a fine mesh's own triangles, nearly edge-on, would else lie in their way.
 _BESIDE = 1e-6
