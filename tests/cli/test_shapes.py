@@ -192,6 +192,16 @@ def test_learned_shapes_are_objects_and_parameters(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "name",
+    ["full", "interior_only", "whole", "seen", "count", "m", '"a/b"', "a-b", "2nd", '"a\\n"'],
+)
+def test_variants_have_names_of_their_own(name, tmp_path):
+    text = shapes().replace("[variants.rough]", f"[variants.{name}]")
+    with pytest.raises(InputError, match=r"variants: expected names of letters.*; choose another$"):
+        check(text, tmp_path)
+
+
+@pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ('parameters = ["vertices"]\nremesh', 'parameters = ["vertex"]\nremesh', 'got "vertex"'),

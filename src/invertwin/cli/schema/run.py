@@ -1,5 +1,7 @@
 """A whole run file."""
 
+import json
+import re
 from typing import Literal
 
 from pydantic import model_validator
@@ -24,6 +26,9 @@ from invertwin.cli.schema.section import Section, Seed, fail
 from invertwin.cli.schema.sensor import Grid, Radar
 from invertwin.cli.schema.stages import Measures, Stage, Variant
 from invertwin.cli.schema.studies import LossScan, Methods
+
+# How a run calls its own fits, and how names of its metrics end.
+_TAKEN = ("full", "interior_only", "whole", "seen", "count", "m", "number", "consistency")
 
 
 class RunFile(Section):
@@ -97,6 +102,17 @@ class RunFile(Section):
                     raise PydanticCustomError(
                         "unknown_object", "unknown object", {"path": path, "name": name}
                     )
+        return self
+
+    @model_validator(mode="after")
+    def _variants_are_named(self) -> "RunFile":
+        for name in self.variants:
+            if name in _TAKEN or not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", name):
+                fail(
+                    "expected names of letters, digits and _ that begin with a letter, other than "
+                    f"{', '.join(_TAKEN)}, got {json.dumps(name)}; choose another",
+                    "variants",
+                )
         return self
 
     @model_validator(mode="after")
