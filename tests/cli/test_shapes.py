@@ -207,6 +207,16 @@ def test_variants_have_names_of_their_own(name, tmp_path):
         ('parameters = ["vertices"]\nremesh', 'parameters = ["vertex"]\nremesh', 'got "vertex"'),
         ('name = "field"', 'name = "vertices"', 'different names, got "vertices" twice'),
         ("remesh = 0.06", "remesh = -1.0", r"stages\[1\].remesh"),
+        (
+            'parameters = ["vertices"]\nremesh',
+            'parameters = ["field"]\nremesh',
+            r'stages\[1\].remesh: expected a parameter with kind = "vertices"',
+        ),
+        (
+            'stages = [{ parameters = ["vertices"], steps = 2 }]',
+            'parameters = ["field"]\nstages = [{ remesh = 0.1 }]',
+            r"variants.rough.stages\[0\].remesh: .*got none",
+        ),
         ('object = "plate"\nseen', 'object = "plane"\nseen', "measures.object"),
         ("[variants.rough]\n", "[variants.rough]\nlaplacian = 1.0\n", "variants.rough.laplacian"),
     ],

@@ -132,6 +132,28 @@ class RunFile(Section):
             fail(f'expected parameters of different names, got "{doubled}" twice; add `name`')
         return self
 
+    @model_validator(mode="after")
+    def _stages_remesh_what_they_seek(self) -> "RunFile":
+        names = self.parameter_names
+        free = {n for n, p in zip(names, self.parameters, strict=True) if p.kind == "vertices"}
+        own = set(self.reconstruct.parameters if self.reconstruct else []) or set(names)
+        staged = [("stages", self.stages, set(own))]
+        for name, variant in self.variants.items():
+            sought = set(variant.parameters or own)
+            if variant.stages is None:
+                staged[0][2].update(sought)
+            else:
+                staged.append((f"variants.{name}.stages", variant.stages, sought))
+        for path, stages, sought in staged:
+            for i, stage in enumerate(stages):
+                if stage.remesh is not None and not free & sought & set(stage.parameters or names):
+                    fail(
+                        'expected a parameter with kind = "vertices" among those of the stage, got '
+                        "none; add one, or remove `remesh`",
+                        f"{path}[{i}].remesh",
+                    )
+        return self
+
     @property
     def parameter_names(self) -> list[str]:
         """What stages and variants call the parameters."""
