@@ -71,6 +71,17 @@ def test_curvature_is_the_second_derivative_at_the_truth(kind, background):
     assert torch.allclose(found, truth, rtol=1e-5, atol=1e-9)
 
 
+def test_reaches_of_parameters_are_their_own():
+    model, measured = Mixture([0.0, 0.0, 0.0]), Mixture(TRUTH)().detach()
+    solver = GaussNewton(model, SpectrumLoss(gain="one"), reaches={model.share: 0.1})
+    solver.step(lambda: (model(), measured))
+    assert float(model.share.detach().abs().max()) == pytest.approx(0.1)
+    rates = Optimizer("gauss_newton", rate=0.3, module_rates=(0.2, None))
+    built = rates.build(nn.ModuleList([Translation("a"), Pose("b")]), SpectrumLoss())
+    assert isinstance(built, GaussNewton)
+    assert built.reach.tolist() == [0.2] * 3 + [0.3] * (len(built.reach) - 3)
+
+
 def test_what_a_gain_explains_tells_nothing():
     measured = random_map(4) + 1
     tangents = torch.stack([measured, random_map(5)])
@@ -260,7 +271,7 @@ def test_reconstruct_takes_its_steps_and_resumes(case, tmp_path):
     )
     assert torch.allclose(first, second, atol=2e-3)
     fit(optimizer=Optimizer(), **kept)
-    with pytest.raises(InputError, match="got that of another optimiser"):
+    with pytest.raises(InputError, match="one of another"):
         fit(resume=True, **kept)
     with pytest.raises(InputError, match="expected a surrogate with kind 'gauss_newton'"):
         fit(surrogate="exact")

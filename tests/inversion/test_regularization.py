@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, cotangent_edges
 from invertwin.scene import Mesh, RoughDielectric, Scene, plate, sphere
 from invertwin.scene.parameters import Translation, Vertices
@@ -24,6 +25,12 @@ def test_the_first_shape_and_a_shift_cost_nothing():
     assert float(term(SCENE)) == 0
     assert float(term(offset(shift.clone())).detach()) < 1e-20
     assert float(term(Translation("ball", [0.1, 0.2, 0.3])(SCENE)).detach()) == 0
+
+
+def test_another_shape_is_refused():
+    term = Laplacian(SCENE, "ball", 2.0)
+    with pytest.raises(InputError, match="expected the 42 vertices of the first shape of ball"):
+        term(SCENE.replace("ball", mesh=sphere(0.2, subdivisions=2)))
 
 
 def test_energy_is_that_of_the_matrix_and_scales_with_its_weight():

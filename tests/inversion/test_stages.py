@@ -7,9 +7,10 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, reconstruct
+from invertwin.inversion.regularization import Laplacian
 from invertwin.inversion.remeshing import remeshed
 from invertwin.inversion.stages import Stage, reconstruct_in_stages, stage_checkpoint
-from invertwin.scene import Mesh, SmoothVertices
+from invertwin.scene import Mesh, SmoothVertices, plate
 from invertwin.scene.parameters import Scale, Translation, Vertices
 
 BUILDERS = {"place": lambda _: Translation("plate"), "size": lambda _: Scale("plate")}
@@ -114,8 +115,31 @@ def test_what_is_watched_joins_the_history(case):
     ],
 )
 def test_wrong_stages(case, stages, message):
+    steps = []
     with pytest.raises(InputError, match=message):
-        fit(case, stages)
+        fit(case, stages, progress=steps.append)
+    assert not steps
+
+
+def test_terms_are_of_the_scene_that_a_module_was_built_for(case):
+    """A shape that another puts in place before: its own triangles are kept smooth."""
+
+    class Finer(torch.nn.Module):
+        applies_to = "scene"
+
+        def forward(self, scene):
+            return scene.replace("plate", mesh=plate(0.3, 0.3, divisions=3))
+
+    builders = {
+        "finer": lambda _: Finer(),
+        "shape": lambda scene: Vertices("plate", len(scene["plate"].mesh.vertices)),
+    }
+
+    def terms(_, scenes):
+        return [Laplacian(scenes["shape"], "plate", 1.0)]
+
+    found = fit(case, [Stage(1), Stage(1)], builders, regularize=terms)
+    assert len(found.scene["plate"].mesh.vertices) == 16
 
 
 @pytest.mark.parametrize("kind", ["adam", "gauss_newton"])

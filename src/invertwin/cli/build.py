@@ -222,18 +222,20 @@ def _module(table: schema.Parameter, path: str, start: Start, scene: Scene) -> n
 
 
 def regularizers(
-    tables: Mapping[str, schema.Parameter], modules: Mapping[str, nn.Module], scene: Scene
+    tables: Mapping[str, schema.Parameter],
+    modules: Mapping[str, nn.Module],
+    scenes: Mapping[str, Scene],
 ) -> list[Regularizer]:
     """The terms that shapes add to the loss.
 
     Args:
         tables: All parameters, by name.
         modules: Those of a fit, by name.
-        scene: Where it starts.
+        scenes: By name, where they start.
     """
     terms: list[Regularizer] = []
     for name, module in modules.items():
-        terms += shape_terms(tables[name], module, scene)
+        terms += shape_terms(tables[name], module, scenes[name])
     return terms
 
 

@@ -63,7 +63,9 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
             fit(problem, start, i, mode, folder, console, CHECKPOINT if single else None)
             for i, start in enumerate(starts)
         ]
-    best = min(rows[modes[0]], key=lambda row: _finite(row["loss"]))
+    best = min(
+        rows[modes[0]], key=lambda row: (row["status"] == "diverged", _finite(row["loss"]))
+    )
     begun = starts[best["start"]]
     found = outcome(problem, begun, best, modes[0], folder)
     start, twin, radar, offset = begun.scene, found.twin, found.radar, found.offset

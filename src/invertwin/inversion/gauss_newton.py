@@ -1,6 +1,7 @@
 """Gauss–Newton for few parameters: one derivative of the map in forward mode for each."""
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -45,6 +46,7 @@ class GaussNewton:
         loss: Callable[[Tensor, Tensor], Tensor],
         *,
         reach: float = 0.3,
+        reaches: Mapping[nn.Parameter, float] | None = None,
         damping: float = 0.01,
         every: int = 1,
     ) -> None:
@@ -54,6 +56,7 @@ class GaussNewton:
             modules: what is fitted.
             loss: how maps are compared, a `SpectrumLoss`.
             reach: the longest change of one parameter in a step, in its unit.
+            reaches: of some parameters, in place of `reach`.
             damping: μ at the first step.
             every: steps from one H to the next; those between take the last one.
 
@@ -77,7 +80,14 @@ class GaussNewton:
                 f"expected parameters to fit, reach > 0 and damping > 0, got {len(self._slots)}, "
                 f"{reach} and {damping}; a reach of 0.3 suits metres and radians"
             )
-        self.loss, self.reach, self.damping = loss, reach, damping
+        self.loss, self.damping = loss, damping
+        own = dict(reaches or {})
+        self.reach = torch.cat(
+            [
+                torch.full((p.numel(),), own.get(p, reach), dtype=torch.float64)
+                for _, _, p in self._slots
+            ]
+        )
         self.every = checked_count(every, "steps from one curvature to the next", 1)
         self._known: tuple[Tensor, Tensor] | None = None  # H, and of which parameters
         self._age = 0  # steps that H has served
@@ -128,11 +138,8 @@ class GaussNewton:
         start = [parameter.detach().clone() for parameter in parameters]
         given = self.damping
         for _ in range(_TRIES):
-            self._move(start, self._solved(curvature, slope[free]), free)
-            with torch.no_grad():
-                after = float(self.loss(*maps()))
-                if penalty is not None:
-                    after += float(penalty())
+            self._move(start, self._solved(curvature, slope[free], self.reach[free]), free)
+            after = _value(self.loss, maps, penalty)
             if after < before + _SLACK * abs(before):
                 self.damping = max(self.damping * _EASE, _LEAST)
                 return before
@@ -152,16 +159,7 @@ class GaussNewton:
         return kept
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` gave.
-
-        Raises:
-            InputError: the state of another optimiser.
-        """
-        if "damping" not in state:
-            raise InputError(
-                "expected the state of Gauss–Newton in the checkpoint, got that of another "
-                "optimiser; start without resume"
-            )
+        """Restore what `state_dict` gave."""
         self.damping = float(state["damping"])
         self._age = int(state.get("age", 0))
         self._known = (state["curvature"], state["free"]) if "curvature" in state else None
@@ -169,7 +167,7 @@ class GaussNewton:
     def zero_grad(self) -> None:
         """Nothing: gradients are not kept in the parameters."""
 
-    def _solved(self, curvature: Tensor, slope: Tensor) -> Float64[Tensor, " p"]:
+    def _solved(self, curvature: Tensor, slope: Tensor, reach: Tensor) -> Float64[Tensor, " p"]:
         """The least of the damped quadratic model within the reach of every parameter."""
         own = curvature.diagonal()
         # What the data hardly tell is damped as much as what they tell on average: noise would
@@ -181,10 +179,10 @@ class GaussNewton:
             # What is at its limit stays there, the others make the best of it.
             rest = slope[free] + model[free][:, ~free] @ change[~free]
             change[free] = -torch.linalg.solve(model[free][:, free], rest)
-            beyond = free & (change.abs() > self.reach)
+            beyond = free & (change.abs() > reach)
             if not bool(beyond.any()):
                 break
-            change = change.clamp(-self.reach, self.reach)
+            change = change.clamp(-reach, reach)
             free = free & ~beyond
         return change
 
@@ -227,6 +225,17 @@ class GaussNewton:
             for key, held in own:
                 delattr(module, key)
                 setattr(module, key, held)
+
+
+def _value(
+    loss: Callable[[Tensor, Tensor], Tensor], maps: Maps, penalty: Callable[[], Tensor] | None
+) -> float:
+    """The loss with its term; infinite for parameters that the scene refuses."""
+    with torch.no_grad():
+        try:
+            return float(loss(*maps())) + (0.0 if penalty is None else float(penalty()))
+        except InputError:
+            return math.inf
 
 
 def without_effect(module: nn.Module, name: str) -> InputError:

@@ -20,8 +20,8 @@ class Optimizer:
     Attributes:
         kind: ``adam``, ``sgd`` with momentum, or ``gauss_newton`` for few parameters.
         rate: Learning rate at the first step; parameters are in metres and radians. Of
-            Gauss–Newton the longest change of a parameter in a step, which does not fall; the
-            other rates are not for it.
+            Gauss–Newton, like all rates, the longest change of a parameter in a step; it does not
+            fall.
         rotation_rate: The same for parameters named ``rotation``; None = ``rate``.
         final_rate: At the last step (cosine in between), of ``rate``; None = ``rate`` / 20.
             The rates of all parameters fall alike.
@@ -56,21 +56,25 @@ class Optimizer:
         Raises:
             InputError: Gauss–Newton without a ``SpectrumLoss``, or for many parameters.
         """
+        rates: dict[nn.Parameter, float] = {}
+        for i, module in enumerate(modules.children()):
+            own = self.module_rates[i] if i < len(self.module_rates) else None
+            for name, parameter in module.named_parameters():
+                if parameter.requires_grad:
+                    turns = name.endswith("rotation") and self.rotation_rate is not None
+                    rates[parameter] = own or (self.rotation_rate if turns else self.rate)  # type: ignore[assignment]
         if self.kind == "gauss_newton":
             if not isinstance(loss, SpectrumLoss):
                 raise InputError(
                     f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
                     "give one, or another kind of optimiser"
                 )
-            return GaussNewton(modules, loss, reach=self.rate, every=self.curvature_every)
+            return GaussNewton(
+                modules, loss, reach=self.rate, reaches=rates, every=self.curvature_every
+            )
         groups: dict[float, list[nn.Parameter]] = {}
-        for i, module in enumerate(modules.children()):
-            own = self.module_rates[i] if i < len(self.module_rates) else None
-            for name, parameter in module.named_parameters():
-                if parameter.requires_grad:
-                    turns = name.endswith("rotation") and self.rotation_rate is not None
-                    rate = own or (self.rotation_rate if turns else self.rate)
-                    groups.setdefault(rate / self.rate, []).append(parameter)  # type: ignore[operator]
+        for parameter, rate in rates.items():
+            groups.setdefault(rate / self.rate, []).append(parameter)
         listed = [{"params": group, "ratio": ratio} for ratio, group in groups.items()]
         if self.kind == "adam":
             return torch.optim.Adam(listed, lr=self.rate)

@@ -48,7 +48,8 @@ class Reconstruction:
         status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
             ``diverged`` (not finite, or worse than the start; then the best state is kept).
         steps: Steps done.
-        loss: Of the state returned, at the widths of its step.
+        loss: Of the state returned, at the widths of the last step; of the best state of a fit
+            that has diverged, without extra widths.
     """
 
     scene: Scene
@@ -145,6 +146,7 @@ def reconstruct(
     chains = None
     if smooth is None and depth > 1:
         chains = rough_chains(scene, radar.link(), count=_CHAINS, depth=depth, seed=seed)
+    rates = optimizer or Optimizer()
     listed = [parameters] if isinstance(parameters, nn.Module) else list(parameters)
     fit = _Fit(
         scene=scene,
@@ -153,6 +155,7 @@ def reconstruct(
         measured=capture.spectrum(grid).to(torch.float32),
         grid=grid,
         loss=loss or SpectrumLoss(),
+        optimizer=rates,
         surrogate=smooth,
         points=points,
         chains=chains,
@@ -174,7 +177,6 @@ def reconstruct(
             f"expected parameters to fit and steps >= 1, got {len(sought)} and {steps}; "
             "give modules such as Pose('object')"
         )
-    rates = optimizer or Optimizer()
     if smooth is None and rates.kind == "gauss_newton":
         raise InputError(
             "expected a surrogate with kind 'gauss_newton', got the exact chain; use 'adam'"
@@ -242,10 +244,11 @@ class _State:
                 f"expected a checkpoint in {path}, got a file that cannot be read "
                 f"({type(error).__name__}); delete it or start without resume"
             ) from None
-        if content.get("key") != fit.key():
+        if not isinstance(content, dict) or not _same(content.get("key"), fit.key()):
             raise InputError(
                 f"expected a checkpoint of this fit in {path}, got one of another (steps, seed, "
-                "grid, loss, surrogate or parameters differ); start without resume"
+                "grid, loss, optimizer, surrogate, parameters, start or data differ); start "
+                "without resume"
             )
         fit.modules.load_state_dict(content["modules"])
         self.optimizer.load_state_dict(content["optimizer"])
@@ -264,6 +267,7 @@ class _Fit:
     measured: Float[Tensor, "frame range u v"]
     grid: Grid
     loss: Callable[[Tensor, Tensor], Tensor]
+    optimizer: Optimizer
     surrogate: Surrogate | None
     points: RoughPoints | None
     chains: RoughChains | None
@@ -283,8 +287,18 @@ class _Fit:
         """What must be equal for a checkpoint to be of this fit."""
         shapes = [[n, list(p.shape)] for n, p in self.modules.named_parameters()]
         settings = [self.annealing, self.samples, self.boundary_samples, self.frames_per_step]
-        settings += [self.depth, str(self.loss), str(self.surrogate)]
-        return [self.steps, self.seed, list(self.grid.shape), self.boundary, settings, shapes]
+        settings += [self.depth, str(self.loss), str(self.surrogate), str(self.optimizer)]
+        sizes = [float(self.measured.double().norm())]
+        sizes += [float(item.vertices.detach().norm()) for item in self.scene.objects.values()]
+        return [
+            self.steps,
+            self.seed,
+            list(self.grid.shape),
+            self.boundary,
+            settings,
+            shapes,
+            sizes,
+        ]
 
     def applied(self) -> tuple[Scene, Radar, Tensor | None]:
         """Scene, radar and range offset under the present parameters."""
@@ -303,8 +317,11 @@ class _Fit:
         """What is watched of the twin after so many steps."""
         if self.watch is None or step % self.watch_every:
             return {}
-        with torch.no_grad():
-            return self.watch(self.applied()[0])
+        try:
+            with torch.no_grad():
+                return self.watch(self.applied()[0])
+        except InputError:  # parameters out of bounds, as the next step will find
+            return {}
 
     def parameters(self) -> dict[str, Tensor]:
         """A copy of the present parameters."""
@@ -451,21 +468,37 @@ def _require_all_used(modules: nn.ModuleList) -> None:
 
 def _judged(fit: _Fit, state: _State, status: Status) -> Status:
     """The status, or ``diverged`` for a fit that ends worse than it started; the best is kept."""
-    if status == "diverged" or state.best is None:
+    if state.best is None:
         return status
-    ends = {"last": fit.parameters(), "first": state.first, "best": state.best[2]}
+    ends = {"first": state.first, "best": state.best[2]}
+    if status != "diverged":
+        ends["last"] = fit.parameters()
     losses = {}
     with torch.no_grad():
         for name, parameters in ends.items():
             fit.modules.load_state_dict(parameters)
-            losses[name] = float(fit.evaluate(fit.steps))
-    if losses["last"] <= _WORSE * losses["first"]:
+            try:
+                losses[name] = float(fit.evaluate(fit.steps))
+            except InputError:  # out of bounds
+                losses[name] = math.inf
+    last = losses.get("last", math.inf)
+    if math.isfinite(last) and last <= _WORSE * losses["first"]:
         fit.modules.load_state_dict(ends["last"])
         return status
     kept = min(("first", "best"), key=lambda name: losses[name])
     fit.modules.load_state_dict(ends[kept])
     state.best = (state.step, losses[kept], ends[kept])
     return "diverged"
+
+
+def _same(kept: Any, own: list[Any]) -> bool:
+    """Whether two keys of fits are one, but for the rounding of the sizes."""
+    return (
+        isinstance(kept, list)
+        and kept[:-1] == own[:-1]
+        and len(kept[-1]) == len(own[-1])
+        and all(math.isclose(a, b, rel_tol=1e-3) for a, b in zip(kept[-1], own[-1], strict=True))
+    )
 
 
 def _lost(loss: float, history: list[dict[str, Any]]) -> bool:

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
 
@@ -30,7 +31,17 @@ class Laplacian:
         self.edges, self.weights, self.unit = cotangent_edges(mesh)
 
     def __call__(self, scene: Scene) -> Float64[Tensor, ""]:
-        """The energy of the scene's present shape."""
+        """The energy of the scene's present shape.
+
+        Raises:
+            InputError: A shape of other vertices.
+        """
+        found = len(scene[self.object].mesh.vertices)
+        if found != len(self.start):
+            raise InputError(
+                f"expected the {len(self.start)} vertices of the first shape of {self.object} for "
+                f"its Laplacian, got {found}; give one shape of each object"
+            )
         moved = (scene[self.object].mesh.vertices - self.start) / self.unit
         jump = moved[self.edges[:, 0]] - moved[self.edges[:, 1]]
         return 0.5 * self.weight * (self.weights * jump.square().sum(1)).sum()

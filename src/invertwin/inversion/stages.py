@@ -19,6 +19,7 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
 
 Build = Callable[[Scene], nn.Module]
+Regularize = Callable[[Mapping[str, nn.Module], Mapping[str, Scene]], Sequence[Regularizer]]
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def reconstruct_in_stages(
     stages: Sequence[Stage],
     *,
     rates: Mapping[str, float] | None = None,
-    regularize: Callable[[Mapping[str, nn.Module], Scene], Sequence[Regularizer]] | None = None,
+    regularize: Regularize | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     seed: int = 0,
@@ -68,7 +69,8 @@ def reconstruct_in_stages(
             this order.
         stages: One after another.
         rates: Learning rates of parameters by name, in place of the optimizer's.
-        regularize: Terms of the loss, for the modules of a stage and the scene they start from.
+        regularize: Terms of the loss, for the modules of a stage and, by the same names, the
+            scenes that they were built for.
         checkpoint: File of the last stage's state; those before have its name and their number.
         resume: Go on from the checkpoints that are there.
         seed: Of the first stage; each later one has the next.
@@ -84,14 +86,9 @@ def reconstruct_in_stages(
     """
     if not stages:
         raise InputError("expected at least one stage, got none; give Stage(steps)")
-    for k, stage in enumerate(stages):
-        for name in stage.sought:
-            if name not in builders:
-                raise InputError(
-                    f"expected names of parameters in stage {k + 1} ({', '.join(builders)}), got "
-                    f"{name!r}; correct it"
-                )
+    _require_kept(builders, stages)
     modules: dict[str, nn.Module] = {}
+    seen: dict[str, Scene] = {}
     history: list[dict[str, Any]] = []
     found: Reconstruction | None = None
     free: dict[nn.Parameter, bool] = {}
@@ -104,25 +101,19 @@ def reconstruct_in_stages(
             for name, change in stage.remesh.items():
                 scene = scene.replace(name, mesh=change(scene[name].mesh))
             # Modules are built in order, each for the scene as those before it leave it.
-            modules, before = {}, scene
+            modules, seen, before = {}, {}, scene
             for name in builders:
                 if found is None or not stage.sought or name in stage.sought:
-                    modules[name] = builders[name](before)
+                    modules[name], seen[name] = builders[name](before), before
                     if getattr(modules[name], "applies_to", "scene") == "scene":
                         with torch.no_grad():
                             before = modules[name](before)
             free = {p: p.requires_grad for m in modules.values() for p in m.parameters()}
         sought = stage.sought or tuple(modules)
-        gone = [name for name in sought if name not in modules]
-        if gone:
-            raise InputError(
-                f"expected parameters that a stage before has kept, got {gone[0]!r} in stage "
-                f"{k + 1}; rebuild it there"
-            )
         for name, module in modules.items():
             for parameter in module.parameters():
                 parameter.requires_grad_(free[parameter] and name in sought)
-        terms = regularize(modules, scene) if regularize else ()
+        terms = regularize(modules, seen) if regularize else ()
         file = (
             checkpoint if k == last or checkpoint is None else stage_checkpoint(str(checkpoint), k)
         )
@@ -149,6 +140,26 @@ def reconstruct_in_stages(
         history += [counted(row) for row in found.history]
     assert found is not None
     return replace(found, history=history, steps=len(history))
+
+
+def _require_kept(builders: Mapping[str, Build], stages: Sequence[Stage]) -> None:
+    """Refuse stages that seek what is not there, before any step is taken."""
+    kept = set(builders)
+    for k, stage in enumerate(stages):
+        for name in stage.sought:
+            if name not in builders:
+                raise InputError(
+                    f"expected names of parameters in stage {k + 1} ({', '.join(builders)}), got "
+                    f"{name!r}; correct it"
+                )
+        if k == 0 or stage.rebuild or stage.remesh:
+            kept = set(stage.sought or builders) if k else set(builders)
+        gone = [name for name in stage.sought if name not in kept]
+        if gone:
+            raise InputError(
+                f"expected parameters that a stage before has kept, got {gone[0]!r} in stage "
+                f"{k + 1}; rebuild it there"
+            )
 
 
 def _counted(before: int, stage: int, row: dict[str, Any]) -> dict[str, Any]:
