@@ -54,6 +54,7 @@ def test_truth_replaces_only_what_it_names():
         truth={"box": {"position": [0.1, 0, 2]}},
     )
     found = build.residual(build.scene(run)["box"], build.true_scene(run)["box"])
+    assert found is not None
     torch.testing.assert_close(found.offset, torch.tensor([-0.1, 0, 0], dtype=torch.float64))
     assert found.angle < 1e-7
 
@@ -139,6 +140,7 @@ def test_starts_are_as_far_off_as_asked_and_repeat():
     again = build.starts(run.starts, scene, truth, 0)
     for start, same in zip([s.scene for s in found], [s.scene for s in again], strict=True):
         rest = build.residual(start["box"], truth["box"])
+        assert rest is not None
         assert 0.3 <= rest.distance <= 0.4
         assert math.radians(15) <= rest.angle <= math.radians(25)
         assert math.isclose(rest.scale, 1.0, rel_tol=1e-9)
@@ -184,11 +186,19 @@ def test_residual_of_a_known_similarity(shape):
     offset = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     moved = build.displaced(truth, "x", offset, vector)
     found = build.residual(moved["x"], truth["x"])
+    assert found is not None
     torch.testing.assert_close(found.offset, offset)
     expected = float(rotation_angle(rotation_from_vector(vector)))
     assert math.isclose(found.angle, expected, rel_tol=1e-9)
     half = build.scene(read(scene={"x": shape | {"material": ROUGH, "scale": 0.5}}))
-    assert math.isclose(build.residual(half["x"], truth["x"]).scale, 0.5)
+    smaller = build.residual(half["x"], truth["x"])
+    assert smaller is not None
+    assert math.isclose(smaller.scale, 0.5)
+
+
+def test_objects_of_other_triangles_have_no_residual():
+    one, other = (build.scene(read(scene={"x": make_box(divisions=n)})) for n in (1, 2))
+    assert build.residual(one["x"], other["x"]) is None
 
 
 def test_parameters_start_as_the_identity():
@@ -257,8 +267,11 @@ def test_truth_of_a_scene_file_places_from_where_the_file_does(tmp_path):
     run = read_room(tmp_path, truth={"floor": {"position": [0.5, 0, 0]}, "ball": {"scale": 2.0}})
     scene, truth = build.scene(run), build.true_scene(run)
     found = build.residual(scene["floor"], truth["floor"])
+    assert found is not None
     torch.testing.assert_close(found.offset, torch.tensor([-0.5, 0, 0], dtype=torch.float64))
-    assert math.isclose(build.residual(scene["ball"], truth["ball"]).scale, 0.5)
+    larger = build.residual(scene["ball"], truth["ball"])
+    assert larger is not None
+    assert math.isclose(larger.scale, 0.5)
 
 
 @pytest.mark.parametrize(

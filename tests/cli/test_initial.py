@@ -1,8 +1,14 @@
 """`[initial]`: a start that nobody gave, and what the fit adds to it."""
 
+import tomllib
+
 import pytest
+from rich.console import Console
 
 from cli.small import call, read_metrics
+from invertwin.cli.fits.initial import guessed
+from invertwin.cli.fits.problem import problem_of
+from invertwin.cli.run_file import validate
 
 
 def smaller(repository, **changes: str) -> str:
@@ -51,3 +57,14 @@ def test_a_box_without_echoes_is_named(repository, tmp_path, monkeypatch, capsys
     file.write_text(text, encoding="utf-8")
     assert call(monkeypatch, "reconstruct", file, "--out", tmp_path / "found") != 0
     assert "initial: expected echoes within the box" in capsys.readouterr().err
+
+
+def test_a_size_is_guessed_also_of_an_object_whose_true_shape_is_another(repository, tmp_path):
+    text = smaller(repository, **{"[initial]": "[initial]\nscale = true"})
+    parts = '\n\n[[truth.truck.parts]]\nshape = "box"\nsize = [4.4, 1.0, 1.6]\n\n[radar]'
+    text = text.replace("\n\n[radar]", parts)
+    run = validate(tomllib.loads(text), tmp_path / "run.toml")
+    console = Console(quiet=True)
+    _, found = guessed(problem_of(run, console), console)
+    assert found["initial_points"] > 20
+    assert "initial_scale_error" not in found

@@ -316,12 +316,15 @@ class Residual:
         return float(self.offset.norm())
 
 
-def residual(found: Object, truth: Object) -> Residual:
+def residual(found: Object, truth: Object) -> Residual | None:
     """The similarity transform that remains between two copies of an object.
 
     Least squares over the vertices (Umeyama), so it does not depend on how the pose is
-    parameterised.
+    parameterised. None for other triangles: no vertex is another one's copy.
     """
+    same = found.vertices.shape == truth.vertices.shape
+    if not same or not torch.equal(found.mesh.faces, truth.mesh.faces):
+        return None
     a, b = found.vertices.detach(), truth.vertices.detach()
     a0, b0 = a - a.mean(0), b - b.mean(0)
     u, values, vt = torch.linalg.svd(b0.T @ a0)

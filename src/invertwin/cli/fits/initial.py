@@ -110,8 +110,8 @@ def _placed(
         mesh = Mesh(middle + (item.mesh.vertices - middle) * factor, item.mesh.faces)
         scene = scene.replace(name, mesh=mesh)
         if name in problem.known:
-            off = build.residual(scene[name], problem.truth[name]).scale
-            found["initial_scale_error"] = abs(off - 1)
+            off = build.residual(scene[name], problem.truth[name])
+            found |= {"initial_scale_error": abs(off.scale - 1)} if off else {}
     scene, losses = best_pose(
         scene,
         name,

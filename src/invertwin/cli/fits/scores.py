@@ -32,8 +32,9 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
     if name not in problem.known:
         return {"position": place}
     shapes = shape_scores(problem, without_clouds(start.scene), twin)
-    if not torch.equal(twin[name].mesh.faces, problem.truth[name].mesh.faces):
-        # Other triangles: no vertex is another one's copy, only surfaces can be compared.
+    before = build.residual(start.scene[name], problem.truth[name])
+    after = build.residual(twin[name], problem.truth[name])
+    if before is None or after is None:
         return {"position": place, **shapes}
     settings = need(problem.run, "reconstruct", "reconstruct")
     if name in start.bodies:
@@ -41,8 +42,6 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
         angles = start.bodies[name].errors(*meshes)
         good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
         return {**angles, "success": good, "position": place, **shapes}
-    before = build.residual(start.scene[name], problem.truth[name])
-    after = build.residual(twin[name], problem.truth[name])
     rows: dict[str, Any] = {
         "start_distance_m": before.distance,
         "position_error_m": after.distance,

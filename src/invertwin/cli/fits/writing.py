@@ -97,10 +97,8 @@ def tables_of(
         for i, axis in enumerate("xyz"):
             cells.append([f"{name}.{axis} [m]", *(_clean(center[i]) for center in centers)])
         if name in problem.known and "rotation_error_deg" in metrics:
-            angles = [
-                _clean(math.degrees(build.residual(scene[name], problem.truth[name]).angle))
-                for scene in scenes
-            ]
+            off = [build.residual(scene[name], problem.truth[name]) for scene in scenes]
+            angles = [_clean(math.degrees(found.angle)) if found else None for found in off]
             cells.append([f"{name}, angle to the truth [°]", *angles])
     for row in cells:
         row += [None] * (4 - len(row))
