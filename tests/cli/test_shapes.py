@@ -4,13 +4,16 @@ import tomllib
 
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
-from invertwin.cli.fits.likeness import is_shape_key, shape_label
-from invertwin.cli.fits.problem import FULL, run_stages, varied_run
+from invertwin.cli.fits.likeness import is_shape_key, shape_label, shape_scores
+from invertwin.cli.fits.problem import FULL, problem_of, run_stages, varied_run
+from invertwin.cli.fits.writing import tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
+from invertwin.scene import Mesh
 from invertwin.scene.files import load_mesh
 
 HEAD, TAIL = RUN.split("[[parameters]]")
@@ -96,8 +99,7 @@ def test_a_shape_is_fitted_in_stages_and_compared(tmp_path, monkeypatch, capsys)
     assert again == check(shapes(), tmp_path)
 
 
-def test_parts_and_holes_are_told_where_the_surface_is_closed(tmp_path, monkeypatch, capsys):
-    letters = """
+LETTERS = """
 [[truth.plate.parts]]
 shape = "text"
 text = "AB"
@@ -120,11 +122,16 @@ boundary_samples = 2000
 [measures]
 object = "plate"
 """
+
+
+def letters() -> str:
     flat = 'shape = "plate"\nwidth = 0.4\nheight = 0.3\ndivisions = 3'
     assert flat in HEAD
-    (tmp_path / "run.toml").write_text(
-        HEAD.replace(flat, 'shape = "sphere"\nradius = 0.2') + letters
-    )
+    return HEAD.replace(flat, 'shape = "sphere"\nradius = 0.2') + LETTERS
+
+
+def test_parts_and_holes_are_told_where_the_surface_is_closed(tmp_path, monkeypatch, capsys):
+    (tmp_path / "run.toml").write_text(letters())
     out = tmp_path / "out"
     assert call(monkeypatch, "reconstruct", tmp_path / "run.toml", "-o", out) == 0
     metrics = read_metrics(out)
@@ -136,6 +143,32 @@ object = "plate"
     said = " ".join(capsys.readouterr().out.split())
     assert "separate parts, truth" in said
     assert "Euler number, 2 less for every hole through a part, start" in said
+
+
+@pytest.mark.parametrize(("voxel", "said"), [(1e-5, "at most 200000000 voxels"), (9.0, "none")])
+def test_voxels_of_a_wrong_size_are_refused_before_the_fit(
+    voxel, said, tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "run.toml").write_text(f"{letters()}voxel = {voxel}\n")
+    assert call(monkeypatch, "reconstruct", tmp_path / "run.toml", "-o", tmp_path / "out") == 2
+    shown = capsys.readouterr()
+    assert "measures: expected" in shown.err
+    assert said in shown.err
+    assert shown.err.count("\n") == 1
+    assert "step 1" not in shown.out
+
+
+def test_a_twin_that_has_collapsed_has_no_measures(tmp_path):
+    problem = problem_of(check(letters(), tmp_path), Console(quiet=True))
+    start = problem.scene
+    mesh = start["plate"].mesh
+    twin = start.replace("plate", mesh=Mesh(0 * mesh.vertices, mesh.faces))
+    found = shape_scores(problem, start, twin)
+    assert found["start_chamfer_m"] > 0
+    assert not {"chamfer_m", "chamfer_seen_m", "iou"} & set(found)
+    metrics = {"steps": 1, "status": "budget", "parameters": {}, **found}
+    result = tables_of(problem, metrics, start, twin, {FULL: [found]})[0]
+    assert ["Chamfer distance, mean of both directions [m]", None] in result.rows
 
 
 def test_labels_tell_whose_a_measure_is():
@@ -188,7 +221,7 @@ def test_learned_shapes_are_objects_and_parameters(tmp_path):
     assert len(scene["plate"].mesh.faces) > 200
     tables = build.named(run.parameters)
     module = build.builders(run.parameters, build.Start(scene))["vertices"](scene)
-    assert len(build.regularizers(tables, {"vertices": module}, scene)) == 1
+    assert len(build.regularizers(tables, {"vertices": module}, {"vertices": scene})) == 1
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fits.fitting import calibrated, fit, outcome
 from invertwin.cli.fits.initial import added, guessed
-from invertwin.cli.fits.likeness import is_shape_key
+from invertwin.cli.fits.likeness import check_measures, is_shape_key
 from invertwin.cli.fits.problem import modes_of, problem_of
 from invertwin.cli.fits.scores import (
     agreement,
@@ -55,6 +55,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         starts = build.starts(
             run.starts, problem.scene, problem.truth, run.seed, sought_bodies(run)
         )
+    check_measures(problem, without_clouds(starts[0].scene))
     modes = modes_of(run)
     single = len(starts) * len(modes) == 1
     rows: dict[str, list[dict[str, Any]]] = {}
@@ -63,9 +64,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
             fit(problem, start, i, mode, folder, console, CHECKPOINT if single else None)
             for i, start in enumerate(starts)
         ]
-    best = min(
-        rows[modes[0]], key=lambda row: (row["status"] == "diverged", _finite(row["loss"]))
-    )
+    best = min(rows[modes[0]], key=lambda row: (row["status"] == "diverged", _finite(row["loss"])))
     begun = starts[best["start"]]
     found = outcome(problem, begun, best, modes[0], folder)
     start, twin, radar, offset = begun.scene, found.twin, found.radar, found.offset

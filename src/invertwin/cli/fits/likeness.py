@@ -4,7 +4,15 @@ from collections.abc import Callable
 from typing import Any
 
 from invertwin.cli.fits.problem import Problem
-from invertwin.inversion.measures import Likeness, compare_shapes, is_watertight, topology
+from invertwin.cli.run_file import about
+from invertwin.errors import InputError
+from invertwin.inversion.measures import (
+    Likeness,
+    compare_shapes,
+    is_watertight,
+    topology,
+    volume_iou,
+)
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.geometry import without_clouds
 
@@ -54,20 +62,37 @@ def short_label(key: str) -> str:
     return words.get(key, key)
 
 
+def check_measures(problem: Problem, start: Scene) -> None:
+    """Refuse settings of measures before any fit.
+
+    Raises:
+        InputError: Too many voxels or none, a start without area, or one that is not seen.
+    """
+    table = problem.run.measures
+    if table is None or table.object not in problem.known:
+        return
+    with about("measures"):
+        _likeness(problem, start, table.seen)
+        truth = _placed(problem.truth, table.object)
+        if is_watertight(truth):
+            volume_iou(truth, truth, table.voxel)
+
+
 def shape_scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     """Measures of the found shape, whole and as far as some radar position sees it.
 
     Those without an ending are the ones that the run file asks for. Parts and holes are those of
-    the whole surface, also of the truth, each where it is watertight.
+    the whole surface, also of the truth, each where it is watertight. What a shape does not have,
+    such as one that has collapsed, is left out.
     """
     table = problem.run.measures
     if table is None or table.object not in problem.known:
         return {}
-    whole, seen = (_likeness(problem, twin, seen) for seen in (False, True))
+    whole, seen = (_tried(problem, twin, seen) for seen in (False, True))
     rows = _rows(seen if table.seen else whole, "")
     rows |= _rows(whole, "_whole") | _rows(seen, "_seen")
     rows |= _topology(twin, table.object, "") | _topology(problem.truth, table.object, "true_")
-    before = _rows(_likeness(problem, start, table.seen), "") | _topology(start, table.object, "")
+    before = _rows(_tried(problem, start, table.seen), "") | _topology(start, table.object, "")
     return rows | {f"start_{key}": value for key, value in before.items()}
 
 
@@ -98,6 +123,14 @@ def _likeness(problem: Problem, scene: Scene, seen: bool) -> Likeness:
     )
 
 
+def _tried(problem: Problem, scene: Scene, seen: bool) -> Likeness | None:
+    """The same; None of a shape without area, or that is not seen."""
+    try:
+        return _likeness(problem, scene, seen)
+    except InputError:
+        return None
+
+
 def _eyes(problem: Problem, seen: bool) -> Any:
     return problem.radar.positions if seen else None
 
@@ -123,7 +156,9 @@ def _parted(key: str) -> tuple[str, str]:
     return key, ""
 
 
-def _rows(found: Likeness, ending: str) -> dict[str, Any]:
+def _rows(found: Likeness | None, ending: str) -> dict[str, Any]:
+    if found is None:
+        return {}
     rows: dict[str, Any] = {f"chamfer{ending}_m": found.chamfer}
     for threshold, value in found.fscore.items():
         rows[f"fscore_{threshold * 100:g}cm{ending}"] = value

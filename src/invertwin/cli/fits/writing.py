@@ -158,6 +158,9 @@ def _result(run: RunFile, metrics: dict[str, Any]) -> list[list[Any]]:
     for key in metrics:
         if is_shape_key(key) and not any(key.endswith(f"_{mode}") for mode in _modes(run)):
             rows.append([shape_label(key), metrics[key]])
+            found = key.removeprefix("start_")
+            if found not in metrics:
+                rows.append([shape_label(found), None])
     for key, label in _CALIBRATION_LABELS.items():
         if key in metrics.get("calibration", {}):
             value = metrics["calibration"][key]
