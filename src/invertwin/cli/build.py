@@ -170,10 +170,21 @@ class Start:
     bodies: Mapping[str, SoughtBody] = field(default_factory=dict)
 
 
-def builders(tables: Sequence[schema.Parameter], start: Start) -> dict[str, Build]:
-    """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order."""
+def builders(
+    tables: Sequence[schema.Parameter],
+    start: Start,
+    objects: Mapping[str, schema.SceneObject] | None = None,
+) -> dict[str, Build]:
+    """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order.
+
+    Args:
+        tables: What is sought.
+        start: Where the fit starts.
+        objects: The `[scene.<name>]` tables, whose coordinates learned shapes start from.
+    """
+    objects = objects or {}
     return {
-        name: partial(_module, table, f"parameters[{i}]", start)
+        name: partial(_module, table, f"parameters[{i}]", start, objects)
         for i, (name, table) in enumerate(named(tables).items())
     }
 
@@ -190,6 +201,7 @@ def parameters(
     tables: Sequence[schema.Parameter],
     scene: Scene,
     bodies: Mapping[str, SoughtBody] | None = None,
+    objects: Mapping[str, schema.SceneObject] | None = None,
 ) -> list[nn.Module]:
     """The modules of the `[[parameters]]` tables; each starts as the object is, or as it says.
 
@@ -197,10 +209,17 @@ def parameters(
         InputError: A material value that the object's material does not have, or that starts at
             the end of its range; a box that does not hold the object.
     """
-    return [make(scene) for make in builders(tables, Start(scene, bodies or {})).values()]
+    makers = builders(tables, Start(scene, bodies or {}), objects)
+    return [make(scene) for make in makers.values()]
 
 
-def _module(table: schema.Parameter, path: str, start: Start, scene: Scene) -> nn.Module:
+def _module(
+    table: schema.Parameter,
+    path: str,
+    start: Start,
+    objects: Mapping[str, schema.SceneObject],
+    scene: Scene,
+) -> nn.Module:
     match table:
         case schema.TranslationParameter():
             return Translation(table.object, axes="".join(table.axes))
@@ -218,7 +237,8 @@ def _module(table: schema.Parameter, path: str, start: Start, scene: Scene) -> n
             with about(path):
                 return density_module(table, scene[table.object])
     with about(path):
-        return shape_module(table, scene[table.object].mesh, start.bodies)
+        item = objects.get(table.object)
+        return shape_module(table, scene[table.object].mesh, start.bodies, item)
 
 
 def regularizers(

@@ -48,7 +48,10 @@ def shape_mesh(table: schema.Placement) -> Mesh:
 
 
 def shape_module(
-    table: schema.Parameter, mesh: Mesh, bodies: Mapping[str, SoughtBody]
+    table: schema.Parameter,
+    mesh: Mesh,
+    bodies: Mapping[str, SoughtBody],
+    item: schema.SceneObject | None = None,
 ) -> nn.Module:
     """The module of a shape that is sought, from the object's present mesh.
 
@@ -56,9 +59,11 @@ def shape_module(
         table: The parameter.
         mesh: Of its object.
         bodies: Bodies whose joints are sought, by object.
+        item: The table of its object, whose coordinates are where those of its own space start.
 
     Raises:
-        InputError: A box without volume, files are missing, or too many coordinates.
+        InputError: A box without volume, files are missing, too many coordinates, or fewer than
+            the object has.
     """
     match table:
         case schema.VerticesParameter():
@@ -85,12 +90,31 @@ def shape_module(
             )
         case schema.ShapeSpaceParameter():
             space = load_vehicle_space(table.folder, table.level)
-            return LinearShape(table.object, space, table.modes)
+            return LinearShape(table.object, space, _coefficients(table, item))
         case schema.BodyParameter():
             return bodies[table.object].module(table.object, mesh)
         case schema.PriorParameter():
-            return PriorShape(table.object, load_prior(table.file), counts=table.counts)
+            own = isinstance(item, schema.Learned) and item.prior == table.file
+            latent = item.latent if own else None
+            return PriorShape(table.object, load_prior(table.file), latent, table.counts)
     raise InputError(f"expected a shape, got {table.kind}; choose another kind")
+
+
+def _coefficients(table: schema.ShapeSpaceParameter, item: schema.SceneObject | None) -> Tensor:
+    """Where the coordinates start: as the object's, where it is of the same space; else 0."""
+    found = torch.zeros(table.modes, dtype=torch.float64)
+    if isinstance(item, schema.Vehicle) and (item.folder, item.level) == (
+        table.folder,
+        table.level,
+    ):
+        count = len(item.coefficients)
+        if count > table.modes:
+            raise InputError(
+                f"expected at least as many modes as {table.object} has coefficients, {count}, got "
+                f"{table.modes}; raise modes"
+            )
+        found[:count] = found.new_tensor(item.coefficients)
+    return found
 
 
 def density_module(table: schema.DensityParameter, item: Object) -> DensityGrid:

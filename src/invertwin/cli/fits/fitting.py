@@ -162,7 +162,7 @@ def _staged(
             start.scene,
             problem.radar,
             problem.capture,
-            build.builders(run.parameters, start),
+            build.builders(run.parameters, start, run.scene),
             stages,
             rates=rates,
             regularize=partial(build.regularizers, tables),

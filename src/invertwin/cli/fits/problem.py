@@ -77,7 +77,8 @@ def problem_of(run: RunFile, console: Console) -> Problem:
                 f'parameters[{i}].kind: expected "mover" with data.kind = "openradar" only, got '
                 f'"{data.kind}"; use "translation", "pose" or another kind'
             )
-    build.parameters(run.parameters, scene, sought_bodies(run))  # their errors come before any work
+    # Their errors come before any work.
+    build.parameters(run.parameters, scene, sought_bodies(run), run.scene)
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
         grid = build.grid(table, radar)

@@ -111,7 +111,7 @@ class DensityParameter(_BoxParameter):
 
 
 class ShapeSpaceParameter(ObjectParameter):
-    """Coordinates of the public space of vehicles, from the mean shape."""
+    """Coordinates of the public space of vehicles, from those of its object, else the mean."""
 
     kind: Literal["shape_space"]
     folder: InputPath = Field("vehicle_prior", validate_default=True)
@@ -149,7 +149,7 @@ MaterialValue = Literal[
 
 
 class PriorParameter(ObjectParameter):
-    """Coordinates of the learned prior of vehicles, from the mean car."""
+    """Coordinates of the learned prior of vehicles, from those of its object, else the mean car."""
 
     kind: Literal["prior"]
     weight: NonNegative = 0.0

@@ -20,7 +20,12 @@ from invertwin.cli.schema.inversion import (
     Surrogate,
 )
 from invertwin.cli.schema.objects import SceneFile, SceneObject, Truth
-from invertwin.cli.schema.parameters import Parameter, RadarParameter
+from invertwin.cli.schema.parameters import (
+    Parameter,
+    PriorParameter,
+    RadarParameter,
+    ShapeSpaceParameter,
+)
 from invertwin.cli.schema.recording import Chirps, Impairments, Raw
 from invertwin.cli.schema.section import Section, Seed, fail
 from invertwin.cli.schema.sensor import Grid, Radar
@@ -152,6 +157,19 @@ class RunFile(Section):
                         "none; add one, or remove `remesh`",
                         f"{path}[{i}].remesh",
                     )
+        return self
+
+    @model_validator(mode="after")
+    def _learned_shapes_have_their_own_size(self) -> "RunFile":
+        for parameter in self.parameters:
+            if not isinstance(parameter, ShapeSpaceParameter | PriorParameter):
+                continue
+            name, why = parameter.object, f'an object sought with kind = "{parameter.kind}"'
+            scale = self.scene[name].scale if name in self.scene else 1.0
+            if scale != 1:
+                fail(f"expected 1 of {why}, got {scale:g}; remove it", f"scene.{name}.scale")
+            if self.initial is not None and self.initial.object == name and self.initial.scale:
+                fail(f"expected false with {why}, got true; remove it", "initial.scale")
         return self
 
     @property
