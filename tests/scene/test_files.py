@@ -28,6 +28,7 @@ from invertwin.scene import (
     sphere,
     text,
 )
+from invertwin.scene.files import read_arrays
 
 
 def triangles(mesh: Mesh) -> np.ndarray:
@@ -344,3 +345,25 @@ def test_misspelled_material_is_refused(tmp_path):
 def test_missing_scene_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="expected an existing file"):
         load_scene_xml(tmp_path / "none.xml")
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "flipped", "plain array", "text"])
+def test_damaged_arrays_are_one_error(damage, tmp_path):
+    file, plain = tmp_path / "parts.npz", tmp_path / "plain.npy"
+    np.savez_compressed(file, values=np.random.default_rng(0).normal(size=1000))
+    np.save(plain, np.zeros(3))
+    assert read_arrays(file, "look", ["values", "others"]).keys() == {"values"}
+    content = file.read_bytes()
+    middle = len(content) // 2
+    spoilt = {
+        "empty": b"",
+        "cut": content[:-100],
+        "flipped": content[:middle]
+        + bytes(255 - b for b in content[middle : middle + 50])
+        + content[middle + 50 :],
+        "plain array": plain.read_bytes(),
+        "text": b"no numbers",
+    }
+    file.write_bytes(spoilt[damage])
+    with pytest.raises(InputError, match=r"expected plain arrays in parts.npz, got \w+; look$"):
+        read_arrays(file, "look")

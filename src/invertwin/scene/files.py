@@ -2,8 +2,10 @@
 
 import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+import zlib
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -91,6 +93,39 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         os.replace(temporary, file)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def read_arrays(
+    path: Path, do: str, wanted: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file by name; those that are wanted, if they are there.
+
+    Args:
+        path: the file.
+        do: what the user can do where it cannot be read, for the message.
+        wanted: names; None = all.
+
+    Raises:
+        InputError: a file that is damaged, or another one, or pickled objects.
+    """
+    try:
+        # Opened here: numpy leaves a damaged file open.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+            return {k: arrays[k] for k in arrays.files if wanted is None or k in wanted}
+    # The last one is of archives that need a password or a later version.
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        EOFError,
+        BadZipFile,
+        zlib.error,
+        RuntimeError,
+    ) as error:
+        raise InputError(
+            f"expected plain arrays in {path.name}, got {type(error).__name__}; {do}"
+        ) from None
 
 
 def load_scene_xml(

@@ -175,6 +175,11 @@ def test_bad_files(tmp_path):
     np.savez(tmp_path / "pickled.npz", **(model | pickled))
     with pytest.raises(InputError, match="save sparse matrices and pickled objects as arrays"):
         load_smpl(tmp_path / "pickled.npz")
+    np.savez(tmp_path / "more.npz", **(model | {"names": pickled["J_regressor"]}))
+    assert len(load_smpl(tmp_path / "more.npz").parents) == 4
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    with pytest.raises(InputError, match="expected plain arrays in array"):
+        load_smpl(tmp_path / "array.npy")
     (tmp_path / "text.npz").write_text("no archive")
     with pytest.raises(InputError, match="expected plain arrays in text"):
         load_smpl(tmp_path / "text.npz")

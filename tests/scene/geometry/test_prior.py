@@ -178,7 +178,8 @@ def test_what_is_no_prior_is_refused(tmp_path):
         np.savez(tmp_path / f"{name}.npz", **arrays)
     (tmp_path / "cut.npz").write_bytes(good.read_bytes()[:100_000])
     (tmp_path / "text.npz").write_text("no numbers")
-    for name in [*wrong, "cut", "text"]:
+    (tmp_path / "empty.npz").write_bytes(b"")
+    for name in [*wrong, "cut", "text", "empty"]:
         with pytest.raises(InputError, match=f"in {name}.npz"):
             load_prior(tmp_path / f"{name}.npz")
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
+from invertwin.scene.files import read_arrays
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rotation_from_vector
 from invertwin.scene.scene import Scene
@@ -342,23 +343,14 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
     if not path.is_file():
         raise InputError(f"expected a body model, got no file {path}; give the path of a .npz file")
     names = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs")
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            missing = [name for name in names if name not in content.files]
-            if missing:
-                raise InputError(
-                    f"expected {', '.join(names)} in {path.name}, got no {', '.join(missing)}; "
-                    "give a file of SMPL's layout"
-                )
-            kept = [*names, *(name for name in ("posedirs",) if name in content.files)]
-            arrays = {name: content[name] for name in kept}
-    except (OSError, ValueError, EOFError) as error:
-        if isinstance(error, InputError):
-            raise
+    do = "save sparse matrices and pickled objects as arrays with numpy.savez first"
+    arrays = read_arrays(path, do, (*names, "posedirs"))
+    missing = [name for name in names if name not in arrays]
+    if missing:
         raise InputError(
-            f"expected plain arrays in {path.name}, got {type(error).__name__}; "
-            "save sparse matrices and pickled objects as arrays with numpy.savez first"
-        ) from None
+            f"expected {', '.join(names)} in {path.name}, got no {', '.join(missing)}; "
+            "give a file of SMPL's layout"
+        )
     rest = checked_tensor(arrays["v_template"], (None, 3), "v_template", _DO)
     table = arrays["kintree_table"].astype(np.int64)
     if table.ndim != 2 or len(table) != 2:

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_tensor
+from invertwin.scene.files import read_arrays
 from invertwin.scene.geometry.iso_surface import follow, slope_of, surface_of
 from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
 from invertwin.scene.mesh import Mesh
@@ -280,10 +280,8 @@ def _read(path: Path) -> ShapePrior:
     do = "give a file of invertwin train-prior"
     if not path.is_file():
         raise InputError(f"expected a shape prior, got no file {path}; {do}")
+    found = read_arrays(path, do)
     try:
-        # Opened here: numpy leaves a damaged file open.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
-            found = {name: arrays[name] for name in arrays.files}
         if str(found.pop("format")) != _FORMAT:
             raise ValueError("another format")
         low, high, counts = (found.pop(name) for name in ("low", "high", "counts"))
@@ -292,7 +290,7 @@ def _read(path: Path) -> ShapePrior:
         nodes, features = weights["basis.weight"].shape
         decoder = Decoder(latent, width, features, nodes).double()
         decoder.load_state_dict(weights)
-    except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, OSError, BadZipFile):
+    except (KeyError, ValueError, TypeError, RuntimeError):
         raise InputError(f"expected a shape prior in {path.name}, got another file; {do}") from None
     if not all(bool(torch.isfinite(w).all()) for w in weights.values()):
         raise InputError(f"expected finite numbers in {path.name}, got NaN or infinity; {do}")

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
-from invertwin.scene.files import load_mesh
+from invertwin.scene.files import load_mesh, read_arrays
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
 
@@ -136,12 +136,12 @@ def load_vehicle_space(folder: str | Path, level: Literal["coarse", "fine"] = "f
             f"expected the vehicle space {file.name} in {folder}, got no such file; "
             f"set INVERTWIN_DATA to the folder that holds vehicle_prior/ ({_ORIGINAL})"
         )
-    with np.load(file, allow_pickle=False) as arrays:
-        wanted = [f"{name}_{part}" for part in ("mean", "pc", "sv")]
-        missing = [key for key in wanted if key not in arrays.files]
-        if missing:
-            raise InputError(f"expected {missing[0]} in {file.name}, got none; load the original")
-        mean, components, singular = (arrays[key].astype(np.float64) for key in wanted)
+    wanted = [f"{name}_{part}" for part in ("mean", "pc", "sv")]
+    arrays = read_arrays(file, f"load the original ({_ORIGINAL})", wanted)
+    missing = [key for key in wanted if key not in arrays]
+    if missing:
+        raise InputError(f"expected {missing[0]} in {file.name}, got none; load the original")
+    mean, components, singular = (arrays[key].astype(np.float64) for key in wanted)
     mesh = load_mesh(Path(folder) / mean_file)
     count = len(mesh.vertices)
     # Rows hold the body's vertices, then the wheels', then points in the plane of images.
