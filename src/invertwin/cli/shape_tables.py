@@ -94,8 +94,9 @@ def shape_module(
         case schema.BodyParameter():
             return bodies[table.object].module(table.object, mesh)
         case schema.PriorParameter():
-            own = isinstance(item, schema.Learned) and item.prior == table.file
-            latent = item.latent if own else None
+            latent = None
+            if isinstance(item, schema.Learned) and item.prior == table.file:
+                latent = item.latent
             return PriorShape(table.object, load_prior(table.file), latent, table.counts)
     raise InputError(f"expected a shape, got {table.kind}; choose another kind")
 
