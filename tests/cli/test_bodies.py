@@ -77,7 +77,10 @@ def test_a_truth_may_have_other_angles():
     ("changes", "message"),
     [
         ({"joints": {"tail": ["x"]}}, r"parameters\[0\].*expected a joint among pelvis"),
-        ({"parameters": [{"kind": "body", "object": "box", "joints": LEFT}]}, 'shape = "body"'),
+        (
+            {"parameters": [{"kind": "body", "object": "box", "joints": LEFT}], "starts": None},
+            'shape = "body"',
+        ),
     ],
 )
 def test_bad_bodies(changes, message):
@@ -144,3 +147,9 @@ def test_theta_thickens_a_cloud():
 def test_bad_directions(parameter, message):
     with pytest.raises(InputError, match=message):
         checked(parameter)
+
+
+def test_joints_that_nobody_seeks_are_not_turned():
+    pose = [{"kind": "pose", "object": "person"}]
+    with pytest.raises(InputError, match=r'starts.joint_deg: expected .* kind = "body" of person'):
+        run_file(parameters=pose)

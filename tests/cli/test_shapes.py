@@ -11,7 +11,7 @@ from rich.console import Console
 from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import is_shape_key, shape_label, shape_scores
-from invertwin.cli.fits.problem import FULL, problem_of, run_stages, varied_run
+from invertwin.cli.fits.problem import FULL, annealed_until, problem_of, run_stages, varied_run
 from invertwin.cli.fits.writing import tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
@@ -191,6 +191,16 @@ def test_the_true_shape_stands_where_the_object_stands(tmp_path):
 def test_a_run_with_stages_survives_the_way_to_toml(tmp_path):
     run = check(shapes(), tmp_path)
     assert check(to_toml(run), tmp_path) == run
+
+
+def test_extra_widths_end_where_the_only_stage_says(tmp_path):
+    settings = "steps = 2\nrange_width = 3.0\nannealing = 0.5\n"
+    one = LETTERS.replace("[measures]", f"[[stages]]\n{settings}\n[measures]")
+    assert annealed_until(check(shapes(LETTERS), tmp_path)) is None
+    assert annealed_until(check(shapes(one), tmp_path)) == 1.0
+    wide = f"{shapes(LETTERS)}\n[surrogate]\nrange_width = 2.0\n"
+    assert annealed_until(check(wide, tmp_path)) == pytest.approx(0.7)
+    assert annealed_until(check(wide + "exact = true\n", tmp_path)) is None
 
 
 def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_count
+from invertwin.scene.checks import checked_count, checked_number
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.geometry.prior import Decoder, ShapePrior
 from invertwin.scene.geometry.vehicles import car_distance, sample_car
@@ -42,7 +42,8 @@ class Training:
         seed: of cars, network and order.
 
     Raises:
-        InputError: a count below one, or fewer cars than coordinates.
+        InputError: a count below one, fewer cars than coordinates, a rate that is not positive, or
+            a negative weight or seed.
     """
 
     cars: int = 3000
@@ -60,6 +61,9 @@ class Training:
     def __post_init__(self) -> None:
         for name in ("cars", "held_out", "latent", "width", "features", "epochs", "batch"):
             checked_count(getattr(self, name), name, 1)
+        checked_number(self.rate, "rate", 0.0, open_low=True)
+        checked_number(self.regularizer, "regularizer", 0.0)
+        checked_count(self.seed, "seed", 0)
         if self.cars <= max(self.latent, self.features):
             raise InputError(
                 f"expected more cars than {max(self.latent, self.features)} coordinates and "

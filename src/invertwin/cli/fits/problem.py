@@ -213,11 +213,13 @@ def density_of(run: RunFile) -> float:
 
 def annealed_until(run: RunFile) -> float | None:
     """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
-    settings = need(run, "reconstruct", "reconstruct")
-    if len(run.stages) > 1:
+    settings, stages = need(run, "reconstruct", "reconstruct"), run_stages(run)
+    if len(stages) > 1 or run.surrogate.exact:
         return None
-    wide = run.surrogate.range_width > 0 or run.surrogate.angle_width > 0
-    return settings.annealing * settings.steps if wide else None
+    options = stages[0].options
+    widths = options.get("surrogate", run.surrogate)
+    wide = widths.range_width > 0 or widths.angle_width > 0
+    return options.get("annealing", settings.annealing) * stages[0].steps if wide else None
 
 
 def nuisances_of(problem: Problem) -> list[nn.Module]:

@@ -138,6 +138,18 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
+    def _turned_joints_are_sought(self) -> "RunFile":
+        if self.starts is not None and self.starts.joint_deg > 0:
+            name = self.starts.object
+            if not any(p.kind == "body" and p.object == name for p in self.parameters):
+                fail(
+                    f'expected a parameter with kind = "body" of {name}, whose joints it turns, '
+                    "got none; add one, or remove `joint_deg`",
+                    "starts.joint_deg",
+                )
+        return self
+
+    @model_validator(mode="after")
     def _stages_remesh_what_they_seek(self) -> "RunFile":
         names = self.parameter_names
         free = {n for n, p in zip(names, self.parameters, strict=True) if p.kind == "vertices"}

@@ -132,17 +132,6 @@ class DensityGrid(nn.Module):
         """
         return cloud_surface(self.cloud, level)
 
-    def meshed(self, scene: Scene, level: float | None = None) -> Scene:
-        """The scene with the object as a mesh again: the surface of equal density.
-
-        The material must not have values per triangle, nor the object velocities per vertex.
-
-        Raises:
-            InputError: as ``mesh``.
-        """
-        with torch.no_grad():
-            return scene.replace(self.object, mesh=self.mesh(level), cloud=None)
-
 
 def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
     """The closed surface of equal density, by marching cubes; without gradients.
