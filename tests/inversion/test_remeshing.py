@@ -82,6 +82,17 @@ def test_a_length_that_is_none(edge):
         remeshed(sphere(0.2, 1), edge)
 
 
+@pytest.mark.parametrize("face", [[0, 0, 1], [0, 1, 2]])
+def test_a_surface_without_area(face):
+    line = Mesh(float64([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]), torch.tensor([face]))
+    with pytest.raises(InputError, match="expected a surface with area"):
+        remeshed(line, 0.05)
+
+
+def test_no_points_have_no_distances():
+    assert signed_distance(sphere(0.2, 1), float64([]).reshape(0, 3)).shape == (0,)
+
+
 def some_points() -> torch.Tensor:
     generator = torch.Generator().manual_seed(0)
     return 0.8 * torch.rand(3000, 3, generator=generator, dtype=torch.float64) - 0.4

@@ -9,6 +9,7 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number
 from invertwin.scene.mesh import Mesh
 
@@ -35,9 +36,12 @@ def remeshed(mesh: Mesh, edge: float) -> Mesh:
         edge: target length [m].
 
     Raises:
-        InputError: a length that is not positive.
+        InputError: a length that is not positive, or a surface without area.
     """
     length = checked_number(edge, "edge length [m]", 0.0, open_low=True)
+    a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
+    if not bool((torch.linalg.cross(b - a, c - a) != 0).any()):
+        raise InputError("expected a surface with area, got none; check the mesh")
     surface = _Surface(mesh)
     for _ in range(_ROUNDS):
         surface.split(_LONG * length)
@@ -57,6 +61,8 @@ def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tenso
         mesh: the surface.
         points: in the mesh's frame [m].
     """
+    if not len(points):
+        return torch.zeros(0, dtype=torch.float64)
     places = points.detach().numpy()
     gap = np.linalg.norm(places - closest_points(mesh, places), axis=1)
     corners = mesh.vertices.detach().numpy()[mesh.faces.numpy()]
