@@ -7,6 +7,7 @@ import pytest
 
 from invertwin.cli import build
 from invertwin.cli.fits.problem import varied_run
+from invertwin.cli.run_file import need
 
 
 def curve(*values):
@@ -80,7 +81,7 @@ def test_the_start_is_as_far_from_the_truth_as_it_says(shapes):
     own = shapes.run_of(3, shapes.load_run(shapes.RUN))
     truth = {"car": own.truth["car"].model_copy(update={"parts": None})}
     bare = own.model_copy(update={"truth": truth})
-    start, true = (make(bare)["car"].pose for make in (build.scene, build.true_scene))
+    start, true = (make(bare)["car"].transform for make in (build.scene, build.true_scene))
     away = (start - true)[:3, 3]
     assert float(away.norm()) == pytest.approx(shapes.DISTANCE)
     assert float(away[1]) == 0.0
@@ -130,7 +131,8 @@ def test_every_method_is_a_fit_of_the_run_file(shapes):
     run = shapes.load_run(shapes.RUN)
     assert set(shapes.MODES.values()) == {shapes.FULL, *run.variants}
     for mode in shapes.MODES.values():
-        assert varied_run(run, mode).reconstruct.steps % run.measures.every == 0
+        settings = need(varied_run(run, mode), "reconstruct", "reconstruct")
+        assert settings.steps % need(run, "measures", "reconstruct").every == 0
 
 
 def test_both_run_files_are_one_experiment(shapes):
@@ -145,7 +147,9 @@ def test_both_run_files_are_one_experiment(shapes):
                 update={
                     "variants": {},
                     "title": "",
-                    "reconstruct": found.reconstruct.model_copy(update={"parameters": []}),
+                    "reconstruct": need(found, "reconstruct", "reconstruct").model_copy(
+                        update={"parameters": []}
+                    ),
                 }
             )
             for found in fits

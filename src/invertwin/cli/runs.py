@@ -154,7 +154,7 @@ def open_run(
     if found and not overwrite:
         raise InputError(
             f"expected a folder without results, got {path} with {found[0]} in it; "
-            "add --overwrite or --resume, or choose another -o"
+            "add --overwrite or choose another -o (interrupted fits go on with --resume)"
         )
     created = sum(not folder.exists() for folder in (path, *path.parents))
     try:

@@ -73,7 +73,8 @@ def convergence_picture(
             right.plot(steps, distances, color=color, marker=".", label="_" if k else name)
     left.set(xlabel="step", ylabel="loss")
     right.set(xlabel="step", ylabel="Chamfer distance [m]")
-    right.set_ylim(bottom=0)
+    highest = max(value for fits in curves.values() for curve in fits for _, value in curve)
+    right.set_ylim(0, 1.05 * highest)
     for axes in (left, right):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)

@@ -7,7 +7,7 @@ from typing import Any, get_args
 import torch
 
 from invertwin.cli import build, pictures
-from invertwin.cli.fits.likeness import is_shape_key, shape_label, short_label
+from invertwin.cli.fits.likeness import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, annealed_until, sought_objects
 from invertwin.cli.report import Again, Picture, Table, report_html, shown
 from invertwin.cli.run_file import need, to_toml
@@ -247,10 +247,17 @@ def draw_shapes(
     up = pictures.frame_of(problem.radar)[:, 1]
     meshes = {name: pictures.meshes_of(scene)[table.object] for name, scene in scenes.items()}
     folder.write_bytes("turntable.gif", turntable_gif(meshes, up))
-    curves = {_mode(mode, rows): [row["curve"] for row in fits] for mode, fits in rows.items()}
+    curves = {_mode(mode, rows): [_curve(row) for row in fits] for mode, fits in rows.items()}
     if any(curve for fits in curves.values() for curve in fits):
         losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
         folder.write_bytes("convergence.png", convergence_picture(losses, curves))
+
+
+def _curve(row: dict[str, Any]) -> list[list[float]]:
+    """How the measure went, from the start on where that is scored."""
+    begun = row.get(f"start_{CURVE}")
+    first = [] if begun is None or not row["curve"] else [[0, begun]]
+    return [*first, *row["curve"]]
 
 
 def write_report(
