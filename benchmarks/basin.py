@@ -50,8 +50,7 @@ from rich.table import Table
 from torch import Tensor, nn
 
 from invertwin.capture import Capture
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import RoughPoints, rough_points
+from invertwin.channel import Grid, RoughPoints, rough_points
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer, reconstruct
 from invertwin.radar import FMCW, Radar, Surrogate

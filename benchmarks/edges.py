@@ -31,11 +31,10 @@ from report import verdict, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel import boundary_walk
+from invertwin.channel import Grid, boundary_walk
 from invertwin.channel.bridge import backend, flatten, from_points, one_torch_thread, tracer
 from invertwin.channel.edges import InteriorEdgeSampler
 from invertwin.channel.kernel import Inputs
-from invertwin.channel.paths import Grid
 from invertwin.channel.rays import Shot
 from invertwin.channel.walk import Walk
 from invertwin.radar import FMCW, Radar

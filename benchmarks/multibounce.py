@@ -58,8 +58,8 @@ from report import MetricTable, write
 from rich.table import Table
 from throughput import WAVEFORM, sionna_version
 
+from invertwin.channel import deposit_power
 from invertwin.channel.bridge import Topology, backend, tracer
-from invertwin.channel.deposit import deposit_power
 from invertwin.radar import Radar
 from invertwin.scene import Object, RoughConductor, Scene
 from invertwin.scene.antenna import linear_array

@@ -28,7 +28,7 @@ from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel.paths import Paths
+from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar import FMCW, Chirps, Radar, beat_signal, moving_beat
 from invertwin.scene.antenna import linear_array

@@ -26,11 +26,9 @@ from report import MetricTable, write
 from rich.table import Table
 from torch import Tensor
 
+from invertwin.channel import Grid, deposit_power, trace_power
 from invertwin.channel.bridge import backend, flatten, tracer
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid
 from invertwin.channel.rays import Shot, visible
-from invertwin.channel.tracer import trace_power
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array

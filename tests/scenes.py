@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from invertwin.channel.paths import Grid, Link
+from invertwin.channel import Grid, Link
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import (
     AntennaArray,

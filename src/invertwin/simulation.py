@@ -7,10 +7,15 @@ import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor
 
-from invertwin.channel.bridge import use_backend
-from invertwin.channel.chains import RoughChains
-from invertwin.channel.paths import Grid, Paths
-from invertwin.channel.tracer import RoughPoints, rough_points, trace_field
+from invertwin.channel import (
+    Grid,
+    Paths,
+    RoughChains,
+    RoughPoints,
+    rough_points,
+    trace_field,
+    use_backend,
+)
 from invertwin.errors import InputError
 from invertwin.radar.impairments import Impairments
 from invertwin.radar.motion import (

@@ -5,7 +5,7 @@ import torch
 import xarray as xr
 
 from invertwin.capture import READERS, Capture, Track, read
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import exact_spectrum

@@ -15,8 +15,7 @@ from torch.func import functional_call
 
 from invertwin.capture import Capture
 from invertwin.capture.track import Track
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.tracer import trace_field
+from invertwin.channel import deposit_power, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import gradcheck

@@ -20,7 +20,7 @@ from gradients.test_capabilities import (
     pushed,
     selected,
 )
-from invertwin.channel.deposit import deposit_power
+from invertwin.channel import deposit_power
 from invertwin.radar import Surrogate
 from invertwin.scene import Scene, plate
 from scenes import relative, thing

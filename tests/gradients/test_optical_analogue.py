@@ -14,9 +14,8 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
+from invertwin.channel import Grid, Link, deposit_power
 from invertwin.channel.bridge import tracer
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid, Link
 from invertwin.scene import (
     Cosine,
     Isotropic,

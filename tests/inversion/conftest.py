@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from invertwin.capture import Capture
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.inversion import Optimizer
 from invertwin.radar import Radar, Surrogate
 from invertwin.scene import Scene, plate

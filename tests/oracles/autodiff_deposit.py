@@ -6,11 +6,10 @@ from typing import Any
 import drjit as dr
 from torch import Tensor
 
-from invertwin.channel import replay
+from invertwin.channel import Grid, Link, replay
 from invertwin.channel.bins import Contribution
 from invertwin.channel.bridge import backend, flatten, to_float, tracer
 from invertwin.channel.kernel import DIFFERENTIABLE, from_table
-from invertwin.channel.paths import Grid, Link
 from invertwin.channel.trace import Settings, Trace
 from invertwin.scene import Scene
 

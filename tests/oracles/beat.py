@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from invertwin.channel.paths import Paths
+from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar import FMCW, OFDM, Radar, SteppedFrequency
 

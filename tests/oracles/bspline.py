@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 
 
 def weights(position: Tensor, start: float, step: float, count: int) -> Tensor:

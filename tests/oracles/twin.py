@@ -5,8 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from invertwin.channel.paths import Grid, Link, Paths
-from invertwin.channel.tracer import trace_power
+from invertwin.channel import Grid, Link, Paths, trace_power
 from invertwin.scene import Scene
 from oracles.bspline import deposit
 

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.tracer import rough_points, trace_power
+from invertwin.channel import deposit_power, rough_points, trace_power
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Direction, gradcheck
 from invertwin.peers.binning import binned

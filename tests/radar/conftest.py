@@ -7,7 +7,7 @@ import torch
 from jaxtyping import config
 from torch import Tensor
 
-from invertwin.channel.paths import Paths
+from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar import FMCW, Radar
 from invertwin.scene.antenna import linear_array, planar_array

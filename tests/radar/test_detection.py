@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar import (
     FMCW,

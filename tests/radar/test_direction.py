@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar import (
     Chirps,

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invertwin.channel.tracer import rough_points, trace_field
+from invertwin.channel import rough_points, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar import (

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invertwin.channel.paths import Paths
+from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.boards import board

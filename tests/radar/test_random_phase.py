@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from invertwin.channel.paths import Paths
+from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar import Surrogate, random_phase_spectrum, surrogate_spectrum
 from invertwin.scene import Translation

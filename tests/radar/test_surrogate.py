@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import trace_field
+from invertwin.channel import Grid, trace_field
 from invertwin.errors import InputError
 from invertwin.radar import (
     FMCW,

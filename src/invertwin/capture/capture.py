@@ -20,7 +20,7 @@ from invertwin.capture.radar_fields import (
 )
 from invertwin.capture.range_interpolation import RangeInterpolator
 from invertwin.capture.track import Track
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import exact_spectrum

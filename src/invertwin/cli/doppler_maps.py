@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.cli.pictures import DYNAMIC_RANGE_DB, U_LABEL, V_LABEL, png_bytes
 from invertwin.radar import (
     Chirps,

@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from invertwin.capture import Capture
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import rough_points, trace_field
+from invertwin.channel import Grid, deposit_power, rough_points, trace_field
 from invertwin.cli import build, pictures
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData

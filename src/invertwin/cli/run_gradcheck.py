@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.cli import build, pictures
 from invertwin.cli.gradient_shapes import SHAPES, shape_direction
 from invertwin.cli.report import Again, Picture, Table, report_html

@@ -18,7 +18,7 @@ from invertwin.capture import (
     ti,
 )
 from invertwin.capture.elements import elements
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.cli.doppler_maps import (
     DOPPLER_NOTE,
     Panel,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from invertwin.capture import Capture
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.cli import build, pictures
 from invertwin.cli.figures import deep_minima, scan_picture
 from invertwin.cli.landscape import exact_losses, line_name, moved, smooth_losses

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import rough_points
+from invertwin.channel import Grid, rough_points
 from invertwin.cli import build
 from invertwin.cli.figures import Panel, derivatives_picture
 from invertwin.cli.pictures import Axes

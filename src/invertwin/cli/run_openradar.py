@@ -12,7 +12,7 @@ from rich.console import Console
 from torch import Tensor
 
 from invertwin.capture import ChirpData, openradar
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.cli import build, pictures
 from invertwin.cli.doppler_maps import Panel, doppler_maps, panels, panels_picture
 from invertwin.cli.fits.fitting import Bar

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from invertwin.capture import Capture, described_arrays
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.cli import build, pictures, sensors
 from invertwin.cli.doppler_maps import DOPPLER_NOTE, doppler_maps, panels, panels_picture
 from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.cli import schema
 from invertwin.cli.run_file import about
 from invertwin.errors import InputError

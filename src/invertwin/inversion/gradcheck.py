@@ -10,8 +10,7 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid, deposit_power
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate

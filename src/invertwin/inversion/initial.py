@@ -16,7 +16,7 @@ from torch import Tensor
 
 from invertwin.capture.backprojection import backproject
 from invertwin.capture.capture import Capture
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.detection import ordered_statistics_cfar, peaks
 from invertwin.radar.radar import Radar

@@ -12,8 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from invertwin.channel import Link
 from invertwin.channel.bridge import flatten
-from invertwin.channel.paths import Link
 from invertwin.channel.rays import Shot, visible
 from invertwin.errors import InputError
 from invertwin.scene.antenna import Isotropic

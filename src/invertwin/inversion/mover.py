@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Complex, Float, Float64
 from torch import Tensor, nn
 
-from invertwin.channel.paths import Grid, Paths
-from invertwin.channel.tracer import trace_power
+from invertwin.channel import Grid, Paths, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.reconstruction import Optimizer

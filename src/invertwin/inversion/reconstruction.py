@@ -14,10 +14,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from invertwin.capture.capture import Capture
-from invertwin.channel.bridge import use_backend
-from invertwin.channel.chains import RoughChains, rough_chains
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import RoughPoints, rough_points
+from invertwin.channel import (
+    Grid,
+    RoughChains,
+    RoughPoints,
+    rough_chains,
+    rough_points,
+    use_backend,
+)
 from invertwin.errors import InputError
 from invertwin.inversion.gauss_newton import GaussNewton, without_effect
 from invertwin.inversion.loss import SpectrumLoss

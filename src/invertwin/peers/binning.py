@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 
 
 def binned(

@@ -16,8 +16,8 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from invertwin.channel import Grid, Link
 from invertwin.channel.bridge import Geometry, differentiated, flatten, to_float, to_torch, tracer
-from invertwin.channel.paths import Grid, Link
 from invertwin.channel.rays import Shot, visible
 from invertwin.channel.tracer import view
 from invertwin.errors import InputError

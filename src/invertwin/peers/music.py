@@ -12,8 +12,7 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import RoughPoints, trace_field
+from invertwin.channel import Grid, RoughPoints, trace_field
 from invertwin.radar.direction import music
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import beat_signal, range_profile

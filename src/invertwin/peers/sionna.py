@@ -16,8 +16,8 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.channel import Grid
 from invertwin.channel.bridge import to_float, to_index, to_torch, tracer
-from invertwin.channel.paths import Grid
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.peers.binning import binned
 from invertwin.radar.radar import Radar

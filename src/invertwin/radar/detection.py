@@ -13,8 +13,8 @@ from scipy.special import gammaincc, gammaincinv
 from scipy.stats import beta, f
 from torch import Tensor
 
+from invertwin.channel import Grid
 from invertwin.channel.bridge import differentiated
-from invertwin.channel.paths import Grid
 from invertwin.errors import InputError
 from invertwin.radar.doppler import velocity_axis, velocity_span
 from invertwin.radar.motion import Chirps

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.paths import Paths
+from invertwin.channel import Paths
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar, sampled

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.paths import Grid, Paths
+from invertwin.channel import Grid, Paths
 from invertwin.errors import InputError
 from invertwin.radar.doppler import velocity_span
 from invertwin.radar.motion import Chirps

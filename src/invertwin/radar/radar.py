@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.paths import Grid, Link
+from invertwin.channel import Grid, Link
 from invertwin.errors import InputError
 from invertwin.radar.waveform import (
     WINDOWS,

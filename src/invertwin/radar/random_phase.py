@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.channel.paths import Grid, Paths
+from invertwin.channel import Grid, Paths
 from invertwin.radar.point_spread import airy_field, airy_radii, normalized_gaussian
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SIGMA_PER_FWHM

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.paths import Grid, Paths
+from invertwin.channel import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.nonuniform import beat_of_delays, sums_on_gpu

@@ -9,9 +9,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import trace_power
+from invertwin.channel import Grid, deposit_power, trace_power
 from invertwin.errors import InputError
 from invertwin.radar.point_spread import (
     airy,

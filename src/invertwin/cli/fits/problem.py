@@ -8,7 +8,7 @@ from rich.console import Console
 from torch import nn
 
 from invertwin.capture import Capture
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.recordings import measured
