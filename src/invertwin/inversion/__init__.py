@@ -2,8 +2,8 @@
 
 from invertwin.inversion.gradcheck import Agreement, Direction, GradientReport
 from invertwin.inversion.loss import SpectrumLoss
-from invertwin.inversion.measures import (
-    Likeness,
+from invertwin.inversion.metrics import (
+    ShapeMetrics,
     Topology,
     compare_shapes,
     topology,
@@ -32,13 +32,13 @@ __all__ = [
     "GradientReport",
     "Laplacian",
     "LatentNorm",
-    "Likeness",
     "MotionMap",
     "MovingBody",
     "Optimizer",
     "RangeBias",
     "Reconstruction",
     "Regularizer",
+    "ShapeMetrics",
     "SpectrumLoss",
     "Stage",
     "Topology",

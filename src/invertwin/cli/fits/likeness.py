@@ -6,8 +6,8 @@ from typing import Any
 from invertwin.cli.fits.problem import Problem
 from invertwin.cli.run_file import about
 from invertwin.errors import InputError
-from invertwin.inversion.measures import (
-    Likeness,
+from invertwin.inversion.metrics import (
+    ShapeMetrics,
     compare_shapes,
     is_watertight,
     topology,
@@ -111,7 +111,7 @@ def watch_of(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
     return watch
 
 
-def _likeness(problem: Problem, scene: Scene, seen: bool) -> Likeness:
+def _likeness(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics:
     table = problem.run.measures
     assert table is not None
     return compare_shapes(
@@ -123,7 +123,7 @@ def _likeness(problem: Problem, scene: Scene, seen: bool) -> Likeness:
     )
 
 
-def _tried(problem: Problem, scene: Scene, seen: bool) -> Likeness | None:
+def _tried(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics | None:
     """The same; None of a shape without area, or that is not seen."""
     try:
         return _likeness(problem, scene, seen)
@@ -156,7 +156,7 @@ def _parted(key: str) -> tuple[str, str]:
     return key, ""
 
 
-def _rows(found: Likeness | None, ending: str) -> dict[str, Any]:
+def _rows(found: ShapeMetrics | None, ending: str) -> dict[str, Any]:
     if found is None:
         return {}
     rows: dict[str, Any] = {f"chamfer{ending}_m": found.chamfer}
