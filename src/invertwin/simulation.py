@@ -10,9 +10,11 @@ from torch import Tensor
 from invertwin.channel import (
     Grid,
     Paths,
-    RoughChains,
+    RoughPaths,
     RoughPoints,
-    rough_points,
+    Sampling,
+    Speckle,
+    draw_speckle,
     trace_field,
     use_backend,
 )
@@ -63,7 +65,7 @@ def simulate(
     boundary: bool = True,
     density: float = 20_000.0,
     points: RoughPoints | None = None,
-    chains: RoughChains | None = None,
+    chains: RoughPaths | None = None,
     chain_count: int = 200_000,
     snr_db: float | None = None,
     noise_figure_db: float | None = None,
@@ -96,6 +98,14 @@ def simulate(
         InputError: An object in motion: a frame is one instant. Noise on a mean spectrum.
     """
     smooth = chosen_surrogate(surrogate)
+    sampling = Sampling(
+        depth=depth,
+        samples=samples,
+        boundary_samples=boundary_samples,
+        boundary=boundary,
+        points_per_m2=density,
+        rough_paths=chain_count,
+    )
     with use_backend(backend):
         if smooth is not None:
             if snr_db is not None or noise_figure_db is not None:
@@ -109,11 +119,8 @@ def simulate(
                     radar,
                     grid,
                     smooth,
-                    depth=depth,
-                    samples=samples,
-                    boundary_samples=boundary_samples,
+                    sampling=sampling,
                     seed=seed,
-                    boundary=boundary,
                 )
             )
         moving = [name for name, item in scene.objects.items() if item.velocity is not None]
@@ -125,15 +132,9 @@ def simulate(
         paths = trace_field(
             scene,
             radar.link(),
-            samples=samples,
-            density=density,
-            points=points,
-            depth=depth,
-            chains=chains,
-            chain_count=chain_count,
-            boundary_samples=boundary_samples,
+            sampling=sampling,
             seed=seed,
-            boundary=boundary,
+            speckle=Speckle(points, chains),
         )
     beat = beat_signal(paths, radar)
     if snr_db is not None or noise_figure_db is not None:
@@ -242,12 +243,14 @@ def simulate_chirps(
     if again and impairments is not None:
         impairments.check_applicable()
     motion = scene.at if isinstance(scene, Scene) else scene
-    fixed = points or rough_points(motion(0.0), density, seed)
+    sampling = Sampling(
+        depth=1, samples=samples, boundary_samples=0, points_per_m2=density, backend=backend
+    )
+    start = motion(0.0)
+    fixed = Speckle(points) if points else draw_speckle(start, radar.link(), sampling, seed)
 
     def traced(instant: Scene) -> Paths:
-        return trace_field(
-            instant, radar.link(), samples=samples, points=fixed, seed=seed, backend=backend
-        )
+        return trace_field(instant, radar.link(), sampling=sampling, seed=seed, speckle=fixed)
 
     if isinstance(scene, Scene) and not again:
         front = impairments or Impairments()

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid, deposit_power, rough_points, trace_field
+from invertwin.channel import Grid, Sampling, deposit_power, draw_speckle, trace_field
 from invertwin.cli import build, pictures
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData
@@ -106,7 +106,8 @@ def exact_losses(
     data = need(run, "data", "the loss landscape")
     assert isinstance(data, SimulatedData)
     seed = run.seed if data.seed is None else data.seed
-    points = rough_points(truth, data.density, seed)
+    drawn = Sampling(depth=1, samples=data.samples, boundary=False, points_per_m2=data.density)
+    speckle = draw_speckle(truth, radar.link(), drawn, seed)
     link, channels = radar.link(), seen or radar
     centers = link.tx[0], link.rx[0]
     own = channels.link()
@@ -116,10 +117,9 @@ def exact_losses(
         paths = trace_field(
             scene,
             link,
-            samples=data.samples,
-            points=points,
+            sampling=drawn,
             seed=seed,
-            boundary=False,
+            speckle=speckle,
         )
         # What the whole array's centre sees, at the delay to the centre of the channels.
         legs = [
@@ -172,11 +172,9 @@ def smooth_losses(
             scene,
             link,
             grid,
-            samples=samples,
-            boundary_samples=0,
+            sampling=Sampling(depth=depth, samples=samples, boundary_samples=0),
             seed=run.seed,
-            depth=depth,
-            sampling="area",
+            scheme="area",
             reference=(scenes[len(scenes) // 2], link),
         )
         return float(loss(kernel.shape(power, radar, grid), measured))

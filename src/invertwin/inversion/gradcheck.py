@@ -10,7 +10,7 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, deposit_power
+from invertwin.channel import Grid, Link, Sampling, deposit_power
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
@@ -171,17 +171,21 @@ def gradcheck(
         InputError: The map does not depend on θ (all differences are zero).
     """
 
-    def map_at(theta: Tensor, count: int, edges: int, key: int, **options: object) -> Tensor:
+    def map_at(
+        theta: Tensor,
+        drawn: Sampling,
+        key: int,
+        reference: tuple[Scene, Link] | None = None,
+    ) -> Tensor:
         moved, seen = direction(scene, radar, theta)
         deposit = deposit_power(
             moved,
             seen.link(),
             grid,
-            samples=count,
-            boundary_samples=edges,
+            sampling=drawn,
             seed=key,
-            depth=depth,
-            **options,  # type: ignore[arg-type]
+            scheme="rays" if reference is None else sampling,
+            reference=reference,
         )
         return surrogate.shape(deposit.double(), seen, grid)
 
@@ -192,11 +196,14 @@ def gradcheck(
                 theta = forward_ad.make_dual(
                     torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
                 )
-                edges = boundary_samples if boundary else 0
-                out = map_at(
-                    theta, samples, edges, seed + k,
-                    boundary=boundary, interior_edges=interior_edges,
-                )  # fmt: skip
+                drawn = Sampling(
+                    depth=depth,
+                    samples=samples,
+                    boundary_samples=boundary_samples if boundary else 0,
+                    boundary=boundary,
+                    interior_edges=interior_edges,
+                )
+                out = map_at(theta, drawn, seed + k)
                 primal, tangent = forward_ad.unpack_dual(out)
                 primals.append(primal)
                 tangents.append(torch.zeros_like(primal) if tangent is None else tangent)
@@ -206,10 +213,8 @@ def gradcheck(
         ends = [
             map_at(
                 torch.tensor(sign * epsilon, dtype=torch.float64),
-                difference_samples,
-                0,
+                Sampling(depth=depth, samples=difference_samples, boundary_samples=0),
                 key,
-                sampling=sampling,
                 reference=(scene, radar.link()),
             )
             for sign in (1.0, -1.0)

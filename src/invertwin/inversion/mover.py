@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Complex, Float, Float64
 from torch import Tensor, nn
 
-from invertwin.channel import Grid, Paths, trace_power
+from invertwin.channel import Grid, Paths, Sampling, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.reconstruction import Optimizer
@@ -377,7 +377,12 @@ def body_power(
         time: After the middle of the frame that the body was fitted to [s].
     """
     alone = Scene({body.object: body(scene, time)[body.object]})
-    paths = trace_power(alone, found.radar.link(), samples=samples, seed=seed, boundary=False)
+    paths = trace_power(
+        alone,
+        found.radar.link(),
+        sampling=Sampling(depth=1, samples=samples, boundary=False),
+        seed=seed,
+    )
     return found.expected(paths, body.velocity_at(paths.first, scene, time))
 
 

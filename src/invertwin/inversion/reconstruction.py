@@ -16,10 +16,10 @@ from torch import Tensor, nn
 from invertwin.capture.capture import Capture
 from invertwin.channel import (
     Grid,
-    RoughChains,
+    RoughPaths,
     RoughPoints,
-    rough_chains,
-    rough_points,
+    Sampling,
+    draw_speckle,
     use_backend,
 )
 from invertwin.errors import InputError
@@ -145,11 +145,11 @@ def reconstruct(
             with the exact chain.
     """
     smooth = chosen_surrogate(surrogate)
-    if smooth is None and points is None:
-        points = rough_points(scene, density, seed)
     chains = None
-    if smooth is None and depth > 1:
-        chains = rough_chains(scene, radar.link(), count=_CHAINS, depth=depth, seed=seed)
+    if smooth is None:
+        drawn = Sampling(depth=depth, points_per_m2=density, rough_paths=_CHAINS)
+        speckle = draw_speckle(scene, radar.link(), drawn, seed)
+        points, chains = points or speckle.points, speckle.paths
     rates = optimizer or Optimizer()
     listed = [parameters] if isinstance(parameters, nn.Module) else list(parameters)
     fit = _Fit(
@@ -274,7 +274,7 @@ class _Fit:
     optimizer: Optimizer
     surrogate: Surrogate | None
     points: RoughPoints | None
-    chains: RoughChains | None
+    chains: RoughPaths | None
     annealing: float
     seed: int
     depth: int
@@ -361,17 +361,20 @@ class _Fit:
             radar, measured = radar.frames(chosen.tolist()), measured[torch.from_numpy(chosen)]
         if kernels is None:
             return self._exact(scene, radar, offset), measured
+        if offset is not None:
+            radar = replace(radar, range_bias=offset)
         simulated = surrogate_spectrum(
             scene,
             radar,
             self.grid,
             kernels,
-            samples=self.samples,
-            boundary_samples=self.boundary_samples,
+            sampling=Sampling(
+                depth=self.depth,
+                samples=self.samples,
+                boundary_samples=self.boundary_samples,
+                boundary=self.boundary,
+            ),
             seed=self.seed * 1_000_003 + step,
-            depth=self.depth,
-            boundary=self.boundary,
-            range_offset=offset,
         )
         return simulated, kernels.blur(measured, radar, self.grid)
 

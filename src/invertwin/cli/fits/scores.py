@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from invertwin.capture import calibrate, locate
+from invertwin.channel import Sampling
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import shape_scores
 from invertwin.cli.fits.problem import Problem, density_of
@@ -117,14 +118,13 @@ def sharp_spectrum(
     with torch.no_grad():
         return surrogate_spectrum(
             scene,
-            radar,
+            radar if offset is None else replace(radar, range_bias=offset),
             problem.grid,
             sharp_surrogate(problem),
-            samples=4 * settings.samples,
-            boundary_samples=0,
+            sampling=Sampling(
+                depth=settings.depth, samples=4 * settings.samples, boundary_samples=0
+            ),
             seed=problem.run.seed,
-            depth=settings.depth,
-            range_offset=offset,
         )
 
 
