@@ -125,8 +125,6 @@ def test_terms_are_of_the_scene_that_a_module_was_built_for(case):
     """A shape that another puts in place before: its own triangles are kept smooth."""
 
     class Finer(torch.nn.Module):
-        applies_to = "scene"
-
         def forward(self, scene):
             return scene.replace("plate", mesh=plate(0.3, 0.3, divisions=3))
 
@@ -146,8 +144,6 @@ def test_terms_are_of_the_scene_that_a_module_was_built_for(case):
 @pytest.mark.parametrize("sought", [("shape",), ("shape", "other")])
 def test_a_shape_that_another_replaces_is_no_parameter(case, kind, sought):
     class Replaced(torch.nn.Module):
-        applies_to = "scene"
-
         def __init__(self):
             super().__init__()
             self.place = Translation("plate")

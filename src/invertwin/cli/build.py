@@ -21,6 +21,7 @@ from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.stages import Build
+from invertwin.radar.parameters import RadarPose
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import (
     Mesh,
@@ -34,7 +35,6 @@ from invertwin.scene import (
 from invertwin.scene.files import CONCRETE, load_mesh, load_scene_xml
 from invertwin.scene.parameters import (
     Pose,
-    RadarPose,
     Scale,
     Translation,
 )

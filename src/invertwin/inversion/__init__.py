@@ -17,7 +17,6 @@ from invertwin.inversion.mover import (
     motion_map,
     strongest_mover,
 )
-from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.inversion.prior import LatentNorm, Trained, Training, train_prior
 from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
@@ -26,7 +25,6 @@ from invertwin.inversion.stages import Stage, reconstruct_in_stages
 
 __all__ = [
     "Agreement",
-    "ClockOffset",
     "Direction",
     "Echo",
     "GradientReport",
@@ -35,7 +33,6 @@ __all__ = [
     "MotionMap",
     "MovingBody",
     "Optimizer",
-    "RangeBias",
     "Reconstruction",
     "Regularizer",
     "ShapeMetrics",

@@ -252,8 +252,6 @@ class MovingBody(nn.Module):
         diffuse: parameter [], logit of the diffuse share of the reflected power.
     """
 
-    applies_to = "scene"
-
     def __init__(self, object: str, scene: Scene, radar: Radar, echo: Echo) -> None:
         """Start at an echo with the object's own size.
 

@@ -27,6 +27,7 @@ from invertwin.inversion.gauss_newton import GaussNewton, without_effect
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
+from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
 from invertwin.scene.scene import Scene
@@ -35,6 +36,7 @@ from invertwin.simulation import simulate
 Status = Literal["converged", "budget", "diverged"]
 
 _CHAINS = 200_000  # of each length, where the exact chain is fitted
+OF_RADARS = (ClockOffset, RadarPose, RangeBias)  # modules Radar → Radar; others map scenes
 _DIVERGED = 1e3  # times the first loss
 _WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
 _WINDOW = 20  # steps over which convergence is judged
@@ -197,7 +199,7 @@ def reconstruct(
             state.save(path, fit)
     status = state.ended
     with torch.no_grad():
-        moved, seen, _ = fit.applied()
+        moved, seen = fit.applied()
     loss_then = state.history[-1]["loss"]
     if status == "diverged" and state.best is not None:
         loss_then = state.best[1]
@@ -304,18 +306,15 @@ class _Fit:
             sizes,
         ]
 
-    def applied(self) -> tuple[Scene, Radar, Tensor | None]:
-        """Scene, radar and range offset under the present parameters."""
-        scene, radar, offset = self.scene, self.radar, None
+    def applied(self) -> tuple[Scene, Radar]:
+        """Scene and radar under the present parameters."""
+        scene, radar = self.scene, self.radar
         for module in self.modules:
-            kind = getattr(module, "applies_to", "scene")
-            if kind in ("scene", "both"):
-                scene = module(scene)
-            if kind in ("radar", "both"):
+            if isinstance(module, OF_RADARS):
                 radar = module(radar)
-            if kind == "range":
-                offset = module()
-        return scene, radar, offset
+            else:
+                scene = module(scene)
+        return scene, radar
 
     def watched(self, step: int) -> dict[str, float]:
         """What is watched of the twin after so many steps."""
@@ -353,16 +352,14 @@ class _Fit:
 
     def maps(self, step: int) -> tuple[Tensor, Tensor]:
         """Simulated and measured map of a step, blurred alike."""
-        scene, radar, offset = self.applied()
+        scene, radar = self.applied()
         measured, kernels = self.measured, self.widths(step)
         if self.frames_per_step is not None and self.frames_per_step < radar.frame_count:
             rng = np.random.default_rng([self.seed, step])
             chosen = np.sort(rng.choice(radar.frame_count, self.frames_per_step, replace=False))
             radar, measured = radar.frames(chosen.tolist()), measured[torch.from_numpy(chosen)]
         if kernels is None:
-            return self._exact(scene, radar, offset), measured
-        if offset is not None:
-            radar = replace(radar, range_bias=offset)
+            return self._exact(scene, radar), measured
         simulated = surrogate_spectrum(
             scene,
             radar,
@@ -390,12 +387,8 @@ class _Fit:
         value = self.loss(*self.maps(step))
         return value + self.penalty() if self.regularizers else value
 
-    def _exact(self, scene: Scene, radar: Radar, offset: Tensor | None) -> Tensor:
+    def _exact(self, scene: Scene, radar: Radar) -> Tensor:
         """The exact chain's map; the same samples and phases every step."""
-        if offset is not None:
-            raise InputError(
-                "expected no range bias with the exact chain, got one; fit it with a surrogate"
-            )
         found = simulate(
             scene,
             radar,

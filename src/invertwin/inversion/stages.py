@@ -11,7 +11,7 @@ from torch import nn
 
 from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
-from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
+from invertwin.inversion.reconstruction import OF_RADARS, Optimizer, Reconstruction, reconstruct
 from invertwin.inversion.regularization import Regularizer
 from invertwin.radar.radar import Radar
 from invertwin.scene.geometry.density import without_clouds
@@ -97,7 +97,9 @@ def reconstruct_in_stages(
         if found is None or stage.rebuild or stage.remesh:
             if found is not None:
                 # What was a cloud goes on as a mesh.
-                scene, radar = without_clouds(found.scene), found.radar
+                scene = without_clouds(found.scene)
+                # Modules of the sensor that stay add the bias again.
+                radar = replace(found.radar, range_bias=radar.range_bias)
             for name, change in stage.remesh.items():
                 scene = scene.replace(name, mesh=change(scene[name].mesh))
             # Modules are built in order, each for the scene as those before it leave it.
@@ -105,7 +107,7 @@ def reconstruct_in_stages(
             for name in builders:
                 if found is None or not stage.sought or name in stage.sought:
                     modules[name], seen[name] = builders[name](before), before
-                    if getattr(modules[name], "applies_to", "scene") == "scene":
+                    if not isinstance(modules[name], OF_RADARS):
                         with torch.no_grad():
                             before = modules[name](before)
             free = {p: p.requires_grad for m in modules.values() for p in m.parameters()}

@@ -32,6 +32,7 @@ from invertwin.radar.impairments import (
     residual_phase,
 )
 from invertwin.radar.motion import Chirps, moving_beat, range_rate
+from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.radar.point_spread import airy, dirichlet, normalized_gaussian
 from invertwin.radar.radar import Radar
 from invertwin.radar.random_phase import random_phase_spectrum
@@ -61,6 +62,7 @@ __all__ = [
     "SURROGATES",
     "Board",
     "Chirps",
+    "ClockOffset",
     "Impairments",
     "Impulse",
     "Leakage",
@@ -68,6 +70,8 @@ __all__ = [
     "PhysicsWarning",
     "PointCloud",
     "Radar",
+    "RadarPose",
+    "RangeBias",
     "SampledWaveform",
     "Spectrogram",
     "SteppedFrequency",

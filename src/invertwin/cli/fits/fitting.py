@@ -31,10 +31,9 @@ from invertwin.cli.fits.problem import (
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.run_file import need
 from invertwin.cli.runs import PARTS, RunFolder
-from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.stages import reconstruct_in_stages, stage_checkpoint
-from invertwin.radar.radar import Radar
+from invertwin.radar import ClockOffset, Radar, RangeBias
 from invertwin.scene import Scene
 
 
@@ -50,7 +49,7 @@ def calibrated(
         capture, row = calibrate(problem.capture, center), {}
     else:
         alone = Scene({table.object: problem.truth[table.object]})
-        nuisances = [RangeBias(), ClockOffset(problem.capture)]
+        nuisances = [RangeBias(), ClockOffset(problem.capture.positions)]
         checkpoint = f"{PARTS}/calibration.pt"
         rate = table.rate or problem.run.optimizer.rate
         steps = table.steps or steps_of(problem)
@@ -136,9 +135,8 @@ def outcome(
     problem = varied(problem, mode)
     nuisances = nuisances_of(problem)
     found = _staged(problem, start, row["start"], nuisances, None, folder, row["checkpoint"])
-    offsets = [module() for module in nuisances if getattr(module, "applies_to", "") == "range"]
-    offset = offsets[-1].detach() if offsets else None
-    return Outcome(found.scene, found.radar, offset)
+    offset = torch.as_tensor(found.radar.range_bias) if found.radar.biased else None
+    return Outcome(found.scene, replace(found.radar, range_bias=0.0), offset)
 
 
 def _staged(

@@ -25,10 +25,9 @@ from invertwin.cli.schema import (
 )
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.errors import InputError
-from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.inversion.remeshing import remeshed
 from invertwin.inversion.stages import Stage
-from invertwin.radar.radar import Radar
+from invertwin.radar import ClockOffset, Radar, RangeBias
 from invertwin.scene import Scene
 
 FULL, INTERIOR = "full", "interior_only"
@@ -224,6 +223,6 @@ def annealed_until(run: RunFile) -> float | None:
 
 def nuisances_of(problem: Problem) -> list[nn.Module]:
     """New modules of what is fitted along."""
-    made = {"range_bias": RangeBias, "clock_offset": lambda: ClockOffset(problem.capture)}
+    made = {"range_bias": RangeBias, "clock_offset": lambda: ClockOffset(problem.capture.positions)}
     names = need(problem.run, "reconstruct", "reconstruct").nuisances
     return [made[name]() for name in names]
