@@ -8,14 +8,14 @@ serves ``reconstruct`` and ``gradcheck``; deriving from :class:`ForwardModel` su
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.capture.chirps import ChirpCapture
+from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_power
 from invertwin.errors import InputError
 from invertwin.radar.doppler import range_doppler_angle, velocity_axis
@@ -64,7 +64,9 @@ class ForwardModel(ABC):
         """
         return self
 
-    def for_differences(self, scene: Scene, sensor: Any, samples: int, scheme: str) -> Self:
+    def for_differences(
+        self, scene: Scene, sensor: Any, samples: int, scheme: Literal["rays", "area"]
+    ) -> Self:
         """The model with common random numbers for scenes that differ a little.
 
         Args:
@@ -114,7 +116,7 @@ class SurrogateMap(ForwardModel):
     grid: Grid
     surrogate: Surrogate | str = "response"
     sampling: Sampling = Sampling()
-    _reference: tuple[Scene, Radar, str] | None = field(default=None, repr=False)
+    _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         chosen = chosen_surrogate(self.surrogate)
@@ -134,7 +136,8 @@ class SurrogateMap(ForwardModel):
         self, scene: Scene, sensor: Radar, seed: int
     ) -> Float[Tensor, "frame range u v"]:
         """The expected power spectrum. See ``ForwardModel.predict``."""
-        reference, scheme = None, "rays"
+        scheme: Literal["rays", "area"] = "rays"
+        reference = None
         if self._reference is not None:
             fixed, device, scheme = self._reference
             reference = (fixed, device.link())
@@ -154,7 +157,7 @@ class SurrogateMap(ForwardModel):
         return recording.spectrum(self.grid).to(torch.float32)
 
     def for_differences(
-        self, scene: Scene, sensor: Radar, samples: int, scheme: str
+        self, scene: Scene, sensor: Radar, samples: int, scheme: Literal["rays", "area"]
     ) -> "SurrogateMap":
         """Samples come from a density that belongs to this scene."""
         sampling = replace(self.sampling, samples=samples, boundary_samples=0)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from invertwin.channel import deposit_power, rough_points, trace_power
+from invertwin.channel import Sampling, deposit_power, draw_speckle, trace_power
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Direction, gradcheck
 from invertwin.peers.binning import binned
@@ -47,11 +47,20 @@ def grid(radar):
 
 def test_paths_in_bins_are_what_the_kernel_deposits(radar, grid):
     link = radar.link()
-    paths = trace_power(scene(0.2), link, samples=20_000, seed=3, boundary=False)
+    paths = trace_power(
+        scene(0.2),
+        link,
+        sampling=Sampling(depth=1, samples=20_000, boundary_samples=0, boundary=False),
+        seed=3,
+    )
     ray = torch.nn.functional.normalize(paths.first - link.tx[paths.frame], dim=1)
     found = binned(paths.frame, paths.power, paths.range, ray[:, 0], ray[:, 1], grid)
     expected = deposit_power(
-        scene(0.2), link, grid, samples=20_000, boundary_samples=0, seed=3, boundary=False
+        scene(0.2),
+        link,
+        grid,
+        sampling=Sampling(depth=1, samples=20_000, boundary_samples=0, boundary=False),
+        seed=3,
     )
     torch.testing.assert_close(
         found.float(), expected, rtol=1e-3, atol=1e-3 * float(expected.max())
@@ -96,7 +105,9 @@ def test_edge_sampling_refuses_what_it_cannot_do(radar, grid):
 
 def test_music_is_differentiated_through_the_whole_chain(radar, grid):
     given = scene(0.35)
-    music = MusicMap(radar, grid, rough_points(given, 500.0, 1), 3, (4, 3), 1)
+    drawn = Sampling(depth=1, points_per_m2=500.0)
+    speckle = draw_speckle(given, radar.link(), drawn, 1)
+    music = MusicMap(radar, grid, speckle, 3, (4, 3), 1)
     found = music.derivative(given, SLIDE)
     # Steps far below a wavelength and so small that no point appears.
     assert distance(found, music.difference(given, SLIDE, 1e-7)) < 1e-3

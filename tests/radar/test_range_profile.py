@@ -425,3 +425,11 @@ def test_wrong_input(point_paths, linear):
         beat_signal(paths, replace(linear, waveform=Impulse(77e9, 1e9)))
     with pytest.raises(InputError, match="beat signal of shape"):
         range_profile(torch.zeros(1, 1, 16, 65, dtype=torch.complex128), linear, Grid(1, 0.1, 9))
+
+
+def test_a_range_bias_is_refused(linear, point_paths):
+    paths = point_paths(linear, *cloud(3))
+    zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    for bias in (0.1, zero):
+        with pytest.raises(InputError, match="expected range_bias 0 for exact signals"):
+            beat_signal(paths, replace(linear, range_bias=bias))

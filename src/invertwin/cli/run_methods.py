@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from invertwin.channel import Grid, rough_points
+from invertwin.channel import Grid, Sampling, draw_speckle
 from invertwin.cli import build
 from invertwin.cli.figures import Panel, derivatives_picture
 from invertwin.cli.pictures import Axes
@@ -85,7 +85,9 @@ def compare(
     music = MusicMap(
         radar,
         grid,
-        rough_points(scene, settings.density, run.seed),
+        draw_speckle(
+            scene, radar.link(), Sampling(depth=1, points_per_m2=settings.density), run.seed
+        ),
         settings.sources,
         tuple(settings.smoothing),
         run.seed,

@@ -188,6 +188,11 @@ def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
             "expected field paths, got power paths, which have no phase; use trace_field, or "
             "the surrogate for power"
         )
+    if radar.biased:
+        raise InputError(
+            f"expected range_bias 0 for exact signals, got {radar.range_bias}; fit a range bias "
+            "with a surrogate"
+        )
     if len(paths) == 0:
         return
     if not 0 <= int(paths.frame.min()) <= int(paths.frame.max()) < radar.frame_count:
