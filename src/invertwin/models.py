@@ -116,7 +116,9 @@ class SurrogateMap(ForwardModel):
     grid: Grid
     surrogate: Surrogate | str = "response"
     sampling: Sampling = Sampling()
-    _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(default=None, repr=False)
+    _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(
+        default=None, repr=False
+    )
 
     def __post_init__(self) -> None:
         chosen = chosen_surrogate(self.surrogate)
@@ -132,9 +134,7 @@ class SurrogateMap(ForwardModel):
         assert isinstance(self.surrogate, Surrogate)
         return self.surrogate
 
-    def predict(
-        self, scene: Scene, sensor: Radar, seed: int
-    ) -> Float[Tensor, "frame range u v"]:
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
         """The expected power spectrum. See ``ForwardModel.predict``."""
         scheme: Literal["rays", "area"] = "rays"
         reference = None
@@ -206,9 +206,7 @@ class ExactMap(ForwardModel):
     redraws: ClassVar[bool] = False
     smooth: ClassVar[bool] = False
 
-    def predict(
-        self, scene: Scene, sensor: Radar, seed: int
-    ) -> Float[Tensor, "frame range u v"]:
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
         """The spectrum of the exact beat signals. See ``ForwardModel.predict``."""
         found = simulate(
             scene, sensor, self.grid, seed=seed, sampling=self.sampling, speckle=self.speckle

@@ -1,7 +1,7 @@
 """Exact signals on one page: scene → paths → beat signals → spectrum, as a real radar does it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Complex128, Float

@@ -111,9 +111,7 @@ def exact_losses(
     data = need(run, "data", "the loss landscape")
     assert isinstance(data, SimulatedData)
     seed = run.seed if data.seed is None else data.seed
-    sampling = Sampling(
-        depth=1, samples=data.samples, points_per_m2=data.density, boundary=False
-    )
+    sampling = Sampling(depth=1, samples=data.samples, points_per_m2=data.density, boundary=False)
     link, channels = radar.link(), seen or radar
     speckle = draw_speckle(truth, link, sampling, seed)
     centers = link.tx[0], link.rx[0]

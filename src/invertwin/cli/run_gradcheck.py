@@ -54,6 +54,7 @@ _METHODS = (
     "Red: grows with θ; blue: falls. One colour scale for all that have a unit of power."
 )
 
+
 def run_gradcheck(
     runs: Mapping[str, RunFile],
     files: Mapping[str, Path],

@@ -13,6 +13,7 @@ from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fits.fitting import calibrated, fit
 from invertwin.cli.fits.initial import added, guessed
 from invertwin.cli.fits.likeness import check_measures, is_shape_key
+from invertwin.cli.fits.mover import run_mover
 from invertwin.cli.fits.problem import modes_of, problem_of
 from invertwin.cli.fits.scores import (
     agreement,
@@ -33,7 +34,6 @@ from invertwin.cli.fits.writing import (
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table
 from invertwin.cli.run_file import need
-from invertwin.cli.fits.mover import run_mover
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
 from invertwin.cli.schema import MoverParameter, RunFile, SimulatedData
 from invertwin.inversion import Reconstruction

@@ -115,6 +115,8 @@ class Fingerprint:
         numbers = torch.nan_to_num(numbers.double())
         norm = float(numbers.norm())
         place = torch.arange(len(numbers), dtype=torch.float64)
-        waves = [float((numbers * torch.cos((0.7 + k) * place + k)).sum()) for k in range(_PROJECTIONS)]
+        waves = [
+            float((numbers * torch.cos((0.7 + k) * place + k)).sum()) for k in range(_PROJECTIONS)
+        ]
         # In units of the norm, so that one tolerance serves all of them.
         self._numbers += [math.log(norm) if norm > 0 else -1e9, *(w / (norm or 1.0) for w in waves)]

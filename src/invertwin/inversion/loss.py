@@ -279,9 +279,7 @@ class Objective:
                 parameters.
         """
         total = torch.zeros((), dtype=torch.float64)
-        for loss, weight, pair, rows in zip(
-            self.losses, self.weights, maps, tangents, strict=True
-        ):
+        for loss, weight, pair, rows in zip(self.losses, self.weights, maps, tangents, strict=True):
             assert isinstance(loss, SpectrumLoss)
             total = total + weight * loss.curvature(*pair, rows)
         return total / sum(self.weights)

@@ -101,7 +101,9 @@ def reconstruct(
             begun = without_clouds(fit.twin())
             for name, change in stage.remesh.items():
                 begun = begun.replace(name, mesh=change(begun[name].mesh))
-            sought = {n: u for n, u in unknowns.items() if not stage.unknowns or n in stage.unknowns}
+            sought = {
+                n: u for n, u in unknowns.items() if not stage.unknowns or n in stage.unknowns
+            }
             fixed = [n for n, u in sought.items() if isinstance(u.module, nn.Module)]
             if fixed:
                 raise InputError(

@@ -75,7 +75,7 @@ def calibrated(
         stage = replace(stages_of(problem.run)[0], steps=table.steps or steps_of(problem.run))
         checkpoint = folder.file(f"{PARTS}/calibration.pt")
         every = need(problem.run, "reconstruct", "reconstruct").checkpoint_every
-        with _watched(Bar(console, "calibration", stage.steps)) as advance:
+        with watched(Bar(console, "calibration", stage.steps)) as advance:
             found = reconstruct(
                 Scene({table.object: target}),
                 Observation(
@@ -167,7 +167,7 @@ def _staged(
         folder.file(str(stage_file(Path(checkpoint), k)))
     watch = watch_of(problem)
     every = run.measures.every if run.measures else 1
-    with _watched(bar) as advance:
+    with watched(bar) as advance:
         return reconstruct(
             start.scene,
             observations_of(problem),
@@ -199,7 +199,7 @@ def _values(modules: nn.ModuleList) -> dict[str, Any]:
 
 
 @contextmanager
-def _watched(bar: "Bar | None") -> Iterator[list[Report]]:
+def watched(bar: "Bar | None") -> Iterator[list[Report]]:
     """Progress that is shown; Ctrl-C waits for the end of the step."""
     if bar is None:
         yield []

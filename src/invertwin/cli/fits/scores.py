@@ -14,7 +14,7 @@ from invertwin.cli.fits.likeness import shape_scores
 from invertwin.cli.fits.problem import Problem, Sight, points_per_m2, sampling_of
 from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import need
-from invertwin.cli.schema import MaterialParameter, Parameter, RunFile, SimulatedData
+from invertwin.cli.schema import MaterialParameter, Parameter, SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
 from invertwin.models import SurrogateMap, surrogate_correlation

@@ -281,7 +281,11 @@ def write_report(
     }
     spectra = ["spectra", *(f"spectra_{name}" for name in run.observations)]
     shown = [
-        Picture(name.capitalize().replace("_", ", "), (folder.path / f"{name}.png").read_bytes(), notes.get(name.split("_")[0], ""))
+        Picture(
+            name.capitalize().replace("_", ", "),
+            (folder.path / f"{name}.png").read_bytes(),
+            notes.get(name.split("_")[0], ""),
+        )
         for name in ("scene", *spectra, "loss", "convergence", "landscape")
         if f"{name}.png" in folder.names
     ]
