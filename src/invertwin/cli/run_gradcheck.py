@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.cli import build, pictures
-from invertwin.cli.gradient_shapes import SHAPES, shape_direction
+from invertwin.cli.gradients import UNITS, theta_of
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, about_file, need, to_toml
 from invertwin.cli.run_methods import compare, methods_table
 from invertwin.cli.runs import PARTS, RunFolder
-from invertwin.cli.schema import Gradcheck, RunFile
+from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Direction, GradientReport, gradcheck
+from invertwin.inversion.gradcheck import Check, GradientReport, gradcheck
+from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
@@ -52,13 +53,6 @@ _METHODS = (
     "Derivatives summed over elevation (range × azimuth) and over range (elevation × azimuth). "
     "Red: grows with θ; blue: falls. One colour scale for all that have a unit of power."
 )
-_UNITS = {
-    "translation": "1/m",
-    "rotation": "1/rad",
-    "scale": "per relative size",
-    "radar_translation": "1/m",
-    "radar_rotation": "1/rad",
-}
 
 
 def run_gradcheck(
@@ -122,6 +116,7 @@ def _check(
 ) -> dict[str, Any]:
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
+    table = settings.parameter
     if run.surrogate.exact:
         raise InputError(
             "surrogate.exact: expected a smooth map to differentiate, got the exact chain; remove "
@@ -130,42 +125,43 @@ def _check(
     scene = build.scene(run)
     radar = build.radar(need(run, "radar", "gradcheck"))
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
-    if settings.parameter.kind in SHAPES:
-        if run.methods is not None:
-            raise InputError(
-                "methods: expected a parameter that moves something, got one of a shape; remove it"
-            )
-        with about("gradcheck.parameter"):
-            scene, direction = shape_direction(settings.parameter, run, scene)
-    else:
-        direction = _direction(settings)
-    step = math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0
-    report = gradcheck(
-        scene,
-        radar,
-        grid,
-        direction,
-        surrogate=build.surrogate(run.surrogate),
+    with about("gradcheck.parameter"):
+        theta = theta_of(table, run, scene)
+    if theta.shape and run.methods is not None:
+        raise InputError(
+            "methods: expected a parameter that moves something, got one of a shape; remove it"
+        )
+    sampling = Sampling(
         depth=settings.depth,
         samples=settings.samples,
         boundary_samples=settings.boundary_samples,
+    )
+    check = Check(
         repeats=settings.repeats,
-        step=step,
+        step=math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0,
         difference_samples=settings.difference_samples,
         noise=settings.noise,
         max_pairs=settings.max_pairs,
-        sampling=settings.sampling,
+        scheme=settings.sampling,
+    )
+    report = gradcheck(
+        SurrogateMap(grid, build.surrogate(run.surrogate), sampling),
+        theta.module,
+        theta.tangent,
+        scene=scene,
+        sensor=radar,
+        of="sensor" if theta.of_radar else "scene",
+        check=check,
         seed=run.seed,
         progress=say,
     )
-    table = settings.parameter
     outer = report.no_interior_edges
-    unit = (_UNITS | SHAPES).get(table.kind, f"per unit of {table.value}")
+    unit = UNITS.get(table.kind, f"per unit of {table.value}")
     folder.write_bytes(f"{name}.png", _maps(report, grid, unit))
     folder.write_bytes(f"{name}_scene.png", _picture(scene, radar, settings.parameter.object))
     others = {}
-    if isinstance(direction, Direction) and run.methods is not None:
-        compared = compare(run, scene, radar, grid, direction, step, report, say)
+    if run.methods is not None:
+        compared = compare(run, scene, radar, grid, theta, check.step, report, say)
         folder.write_bytes(f"{name}_methods.png", compared.picture)
         others["methods"] = compared.found
     return {
@@ -178,14 +174,6 @@ def _check(
         "seconds": time.perf_counter() - begin,
         **others,
     }
-
-
-def _direction(settings: Gradcheck) -> Direction:
-    table = settings.parameter
-    values = table.model_dump(exclude_none=True)
-    if table.axis is not None:
-        values["axis"] = tuple(table.axis)
-    return Direction(**values)
 
 
 def _maps(report: GradientReport, grid: Grid, unit: str) -> bytes:

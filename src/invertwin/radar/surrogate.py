@@ -4,12 +4,13 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, Sampling, deposit_power, trace_power
+from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
 from invertwin.errors import InputError
 from invertwin.radar.point_spread import (
     airy,
@@ -202,6 +203,8 @@ def surrogate_spectrum(
     *,
     sampling: Sampling,
     seed: int,
+    scheme: Literal["rays", "area"] = "rays",
+    reference: tuple[Scene, Link] | None = None,
 ) -> Float[Tensor, "frame range u v"]:
     """Power spectrum of a scene, differentiable in it: deposit, then shape.
 
@@ -214,6 +217,8 @@ def surrogate_spectrum(
         surrogate: Kernels and their extra widths.
         sampling: How many paths are drawn.
         seed: Same seed, same spectrum.
+        scheme: See ``deposit_power``.
+        reference: See ``deposit_power``.
 
     Raises:
         InputError: See ``deposit_power``; random phases on paths of several bounces.
@@ -233,7 +238,15 @@ def surrogate_spectrum(
             range_width=surrogate.range_width,
             aperture_radius=surrogate.aperture_radius,
         )
-    deposit = deposit_power(scene, radar.link(), grid, sampling=sampling, seed=seed)
+    deposit = deposit_power(
+        scene,
+        radar.link(),
+        grid,
+        sampling=sampling,
+        seed=seed,
+        scheme=scheme,
+        reference=reference,
+    )
     return surrogate.shape(deposit, radar, grid)
 
 

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+import torch
+
 from invertwin.cli.fits.problem import Problem
 from invertwin.cli.run_file import about
 from invertwin.errors import InputError
@@ -124,7 +126,7 @@ def _likeness(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics:
 
 
 def _tried(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics | None:
-    """The same; None of a shape without area, or that is not seen."""
+    """Like ``_likeness``; None if the shape is empty or invisible."""
     try:
         return _likeness(problem, scene, seen)
     except InputError:
@@ -132,7 +134,9 @@ def _tried(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics | None:
 
 
 def _eyes(problem: Problem, seen: bool) -> Any:
-    return problem.radar.positions if seen else None
+    if not seen:
+        return None
+    return torch.cat([sight.radar.positions.detach() for sight in problem.sights.values()])
 
 
 def _placed(scene: Scene, name: str) -> Mesh:

@@ -14,7 +14,6 @@ from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import MaterialValue, RunFile, SimulatedData
 from invertwin.cli.shape_pictures import convergence_picture, turntable_gif
-from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
 _ENDS = {
@@ -199,12 +198,21 @@ def draw(
     metrics: dict[str, Any],
     start: Scene,
     twin: Scene,
-    radar: Radar,
-    maps: dict[str, torch.Tensor],
+    maps: dict[str, list[torch.Tensor]],
 ) -> None:
-    """Writes the pictures of the best fit."""
+    """Write the pictures of the best fit.
+
+    Args:
+        problem: What was fitted.
+        folder: Where to write.
+        rows: Of every fit, by mode.
+        metrics: Of the run.
+        start: Scene at the start.
+        twin: Scene that was found.
+        maps: By what they show, one for every sensor.
+    """
     sought = sought_objects(problem.run)
-    places = radar.positions.detach().numpy()
+    places = torch.cat([s.radar.positions.detach() for s in problem.sights.values()]).numpy()
     truth = pictures.meshes_of(problem.truth)
     outline = {k: v for k, v in truth.items() if k in problem.known and k in sought}
     scenes = {"truth": problem.truth} if outline else {}
@@ -216,16 +224,18 @@ def draw(
                 name: pictures.Drawing(pictures.meshes_of(scene), sought, outline, places)
                 for name, scene in scenes.items()
             },
-            pictures.frame_of(radar),
+            pictures.frame_of(problem.first.radar),
         ),
     )
-    grid = problem.grid
-    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
     simulated = isinstance(problem.run.data, SimulatedData)
     data = "data (exact simulation)" if simulated else "data (measured)"
     titles = {"measured": data, "start": "surrogate, start", "twin": "surrogate, twin"}
-    titled = {titles[name]: power.numpy() for name, power in maps.items()}
-    folder.write_bytes("spectra.png", pictures.spectra_picture(titled, axes))
+    for number, (name, sight) in enumerate(problem.sights.items()):
+        grid = sight.grid
+        axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
+        titled = {titles[key]: maps[key][number].numpy() for key in maps}
+        file = f"spectra_{name}.png" if name else "spectra.png"
+        folder.write_bytes(file, pictures.spectra_picture(titled, axes))
     losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
     annealed = annealed_until(problem.run)
     before = metrics["start_loss_sharp"] if annealed else None
@@ -244,7 +254,7 @@ def draw_shapes(
     assert table is not None
     scenes = {"truth": problem.truth} if table.object in problem.known else {}
     scenes |= {"start": start, "twin": twin}
-    up = pictures.frame_of(problem.radar)[:, 1]
+    up = pictures.frame_of(problem.first.radar)[:, 1]
     meshes = {name: pictures.meshes_of(scene)[table.object] for name, scene in scenes.items()}
     folder.write_bytes("turntable.gif", turntable_gif(meshes, up))
     curves = {_mode(mode, rows): [_curve(row) for row in fits] for mode, fits in rows.items()}
@@ -269,9 +279,14 @@ def write_report(
         "loss": _loss_note(run, metrics),
         "landscape": _landscape_note(run, metrics),
     }
+    spectra = ["spectra", *(f"spectra_{name}" for name in run.observations)]
     shown = [
-        Picture(name.capitalize(), (folder.path / f"{name}.png").read_bytes(), notes.get(name, ""))
-        for name in ("scene", "spectra", "loss", "convergence", "landscape")
+        Picture(
+            name.capitalize().replace("_", ", "),
+            (folder.path / f"{name}.png").read_bytes(),
+            notes.get(name.split("_")[0], ""),
+        )
+        for name in ("scene", *spectra, "loss", "convergence", "landscape")
         if f"{name}.png" in folder.names
     ]
     title = run.title or "Reconstruction"

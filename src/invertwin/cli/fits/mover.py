@@ -1,44 +1,42 @@
-"""`invertwin reconstruct` of a recording of movers: the strongest one becomes a moving twin."""
+"""`invertwin reconstruct` of a mover: the strongest echo that moves becomes a moving twin."""
 
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from rich.console import Console
 from torch import Tensor
 
-from invertwin.capture import ChirpData, openradar
-from invertwin.channel import Grid
+from invertwin.capture import ChirpCapture
+from invertwin.channel import Grid, Sampling
 from invertwin.cli import build, pictures
 from invertwin.cli.doppler_maps import Panel, doppler_maps, panels, panels_picture
-from invertwin.cli.fits.fitting import Bar
+from invertwin.cli.fits.fitting import Bar, watched
 from invertwin.cli.pictures import U_LABEL
+from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import MoverParameter, OpenRadarData, RunFile
-from invertwin.cli.sensors import board_elements
+from invertwin.cli.schema import MoverParameter, RunFile
 from invertwin.errors import InputError
-from invertwin.inversion.mover import (
+from invertwin.inversion import (
+    CorrelationLoss,
     Echo,
-    MotionMap,
     MovingBody,
-    body_power,
-    fit_mover,
-    motion_map,
-    pattern_correlation,
+    Observation,
+    Reconstruction,
+    Schedule,
+    of_point,
+    reconstruct,
     strongest_mover,
 )
-from invertwin.radar.motion import Chirps
-from invertwin.radar.radar import Radar
+from invertwin.models import MotionMap
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 
-_ORIGINAL = "github.com/PreSenseRadar/OpenRadar"
 _CELLS = 4  # about the mover, that twin and point are scored on
 _DRAWN_CELLS = 8
 _RAYS = 10_000  # of a map that is scored or drawn
@@ -56,6 +54,8 @@ _LABELS = {
     "bare_psf_correlation": "a point target at the peak instead",
     "heldout_twin_correlation": "second half of the frame, predicted by a twin of the first half",
     "heldout_bare_psf_correlation": "the same with a point target of the first half",
+    "position_error_m": "distance to the truth [m]",
+    "velocity_error_m_s": "velocity off the truth [m/s]",
     "fit_seconds": "time of the fits [s]",
     "wall_seconds": "time of all, pictures included [s]",
 }
@@ -69,60 +69,76 @@ _TWIN_LABELS = {
 
 
 @dataclass(frozen=True)
-class _Frame:
-    """Chirps in a row.
+class _Found:
+    """A fitted body.
 
     Attributes:
-        beat: [chirp, tx, rx, sample].
-        found: Their map.
+        recording: What it was fitted to.
+        model: The map of the whole recording.
         echo: The strongest mover in it.
+        body: With the values that were found.
+        fit: The fit.
+        seconds: Time of the fit.
     """
 
-    beat: Tensor
-    found: MotionMap
+    recording: ChirpCapture
+    model: MotionMap
     echo: Echo
-
-
-@dataclass(frozen=True)
-class _Twin:
-    """A fitted body, and the seconds that it took."""
-
     body: MovingBody
-    losses: list[float]
+    fit: Reconstruction
     seconds: float
 
+    def predicted(self, scene: Scene, model: MotionMap, seed: int, time: float = 0.0) -> Tensor:
+        """What the body looks like in a map, a time after the middle of its recording [s]."""
+        with torch.no_grad():
+            return model.sampled_by(samples=_RAYS).predict(
+                self.body(scene, time), self.recording.radar(), seed
+            )[0]
 
-def run_openradar(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
-    """Finds the strongest mover, fits a twin to it, writes the folder.
+    def near(self, cells: int, model: MotionMap | None = None, time: float = 0.0) -> MotionMap:
+        """The cells of a map about the echo, which moves along its line of sight for a time."""
+        place = self.echo.range + self.echo.rate * time
+        return (model or self.model).around(place, self.echo.rate, cells, self.recording.radar())
+
+
+def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
+    """Find the strongest mover, fit a twin to it, write the folder.
+
+    Args:
+        run: The run file.
+        folder: Where to write.
+        console: Where progress is shown.
 
     Returns:
         The tables to print and the outcome.
 
     Raises:
-        InputError: A run file that asks for something else, or no recording.
+        InputError: A run file that asks for something else, or data without chirps.
     """
     begin = time.perf_counter()
-    data, radar, grid = _recorded(run)
-    scene, table = build.scene(run), _mover(run)
-    chirps = data.settings.chirps
-    whole = _frame(run, data.beat[0], radar, grid, chirps)
-    twin = _fitted(run, table, scene, whole, "twin", console)
-    seen = whole.found.around(whole.echo, _CELLS)
-    with torch.no_grad():
-        shown = body_power(twin.body, scene, seen, samples=_RAYS, seed=run.seed)
+    table, recording = _mover(run), _recorded(run)
+    grid = build.grid(need(run, "grid", "reconstruct"), recording.radar())
+    scene = build.scene(run)
+    whole = _fitted(run, table, scene, recording, grid, "twin", console)
+    seen = whole.near(_CELLS)
+    observed = seen.observe(recording)[0]
     metrics: dict[str, Any] = {
         "task": run.task,
         **_echo_metrics(whole.echo),
-        **_scores("", shown, seen.of_point(whole.echo), seen),
+        **_scores("", whole, scene, seen, observed, run.seed),
     }
-    halves, half_twin = _heldout(run, table, scene, data, radar, grid, console)
+    halves, half = _heldout(run, table, scene, recording, grid, console)
     metrics |= halves
-    metrics["twin"] = twin.body.values(scene)
-    metrics["loss"] = twin.losses[-1]
-    metrics["steps"] = len(twin.losses)
-    metrics["fit_seconds"] = twin.seconds + half_twin.seconds
-    moving = twin.body.moving(scene)
-    drawn = _pictures(run, data, whole, twin, half_twin, scene, moving)
+    values = whole.body.values()
+    metrics["twin"] = {name: value.tolist() for name, value in values.items()}
+    metrics |= _errors(run, table.object, values)
+    metrics["loss"] = whole.fit.history[-1]["loss"]
+    metrics["steps"] = whole.fit.steps
+    metrics["status"] = whole.fit.status
+    metrics["fit_seconds"] = whole.seconds + half.seconds
+    with torch.no_grad():
+        moving = whole.body(scene)
+    drawn = _pictures(run, whole, half, scene, moving)
     for name, picture in drawn.items():
         folder.write_bytes(f"{name}.png", picture.png)
     save_mesh(folder.file("twin.ply"), moving)
@@ -137,92 +153,95 @@ def run_openradar(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
     return tables, outcome
 
 
-def _recorded(run: RunFile) -> tuple[ChirpData, Radar, Grid]:
-    data = need(run, "data", "reconstruct")
-    assert isinstance(data, OpenRadarData)
-    for name in ("radar", "starts", "calibration", "landscape", "truth"):
+def _recorded(run: RunFile) -> ChirpCapture:
+    for name in ("starts", "calibration", "landscape", "initial"):
         if getattr(run, name):
             raise InputError(
-                f"{name}: expected no such section with data.kind = openradar, got one; remove it: "
-                "the recording brings its radar along, and nothing in it was surveyed"
+                f"{name}: expected no such section with a mover, got one; remove it: the fit "
+                "starts at the strongest echo that moves"
             )
-    path = Path(data.folder)
-    with about("data.folder"):
-        if not (path / openradar.FILE).is_file():
-            raise InputError(
-                f"expected {openradar.FILE} in {path}, got no such file; it is made from the "
-                f"public recording of {_ORIGINAL}: set INVERTWIN_DATA to the folder that holds "
-                f"{path.name}/"
-            )
-        chirps = openradar.read_chirps(path)
-    with about("data.board"):
-        radar = chirps.radar(*board_elements(data.board))
-    return chirps, radar, build.grid(need(run, "grid", "reconstruct"), radar)
+    recording = chirp_capture(run)
+    if recording.device.frame_count > 1:
+        raise InputError(
+            f"data: expected one frame with a mover, got {recording.device.frame_count}; "
+            "choose one with `frame`"
+        )
+    return recording
 
 
 def _mover(run: RunFile) -> MoverParameter:
     table = need(run, "parameters", "reconstruct")[0]
     if len(run.parameters) > 1 or not isinstance(table, MoverParameter):
         kinds = ", ".join(parameter.kind for parameter in run.parameters)
-        raise InputError(
-            f"parameters: expected one of kind mover with data.kind = openradar, got {kinds}; "
-            "leave only that"
-        )
+        raise InputError(f"parameters: expected a mover alone, got {kinds}; leave only the mover")
     return table
 
 
-def _frame(run: RunFile, beat: Tensor, radar: Radar, grid: Grid, chirps: Chirps) -> _Frame:
-    oversample = math.ceil(need(run, "grid", "reconstruct").oversample)
-    found = motion_map(beat, radar, grid, chirps, oversample)
-    return _Frame(beat, found, strongest_mover(beat, found))
-
-
 def _fitted(
-    run: RunFile, table: MoverParameter, scene: Scene, frame: _Frame, name: str, console: Console
-) -> _Twin:
+    run: RunFile,
+    table: MoverParameter,
+    scene: Scene,
+    recording: ChirpCapture,
+    grid: Grid,
+    name: str,
+    console: Console,
+) -> _Found:
     settings = need(run, "reconstruct", "reconstruct")
+    radar = recording.radar()
+    oversample = math.ceil(need(run, "grid", "reconstruct").oversample)
+    sampling = Sampling(depth=1, samples=settings.samples, boundary=False)
+    model = MotionMap.of(radar, grid, recording.chirps, oversample, sampling)
+    echo = strongest_mover(recording, model)
     begin = time.perf_counter()
     with about(f"scene.{table.object}"):
-        body = MovingBody(table.object, scene, frame.found.radar, frame.echo)
-    bar = Bar(console, name, settings.steps)
-    with bar:
-        losses = fit_mover(
-            body,
+        body = MovingBody(table.object, scene, radar, echo)
+    near = model.around(echo.range, echo.rate, table.cells, radar)
+    with watched(Bar(console, name, settings.steps)) as callbacks:
+        fit = reconstruct(
             scene,
-            frame.found.around(frame.echo, table.cells),
-            steps=settings.steps,
-            samples=settings.samples,
-            seed=run.seed,
+            Observation(near, radar, recording),
+            body,
+            loss=CorrelationLoss(),
             optimizer=build.optimizer(run.optimizer),
-            progress=bar.advance,
+            schedule=Schedule(settings.steps),
+            callbacks=callbacks,
+            seed=run.seed,
         )
-    return _Twin(body, losses, time.perf_counter() - begin)
+    return _Found(recording, model, echo, body, fit, time.perf_counter() - begin)
 
 
 def _heldout(
     run: RunFile,
     table: MoverParameter,
     scene: Scene,
-    data: ChirpData,
-    radar: Radar,
+    recording: ChirpCapture,
     grid: Grid,
     console: Console,
-) -> tuple[dict[str, Any], _Twin]:
+) -> tuple[dict[str, Any], _Found]:
     """Fits the first half of the chirps and predicts the second, with a twin and with a point.
 
     Both move on with the velocities of the first half; nothing is taken from the second.
     """
-    chirps, count = data.settings.chirps, data.settings.loops // 2
-    half = replace(chirps, count=count)
-    first = _frame(run, data.beat[0, :count], radar, grid, half)
-    twin = _fitted(run, table, scene, first, "twin of the first half", console)
-    later = float(chirps.times(len(radar.transmitters.positions))[count, 0])
-    second = motion_map(
-        data.beat[0, count : 2 * count], radar, grid, half, len(first.found.rates) // count
-    ).around(first.echo, _CELLS, later)
-    with torch.no_grad():
-        shown = body_power(twin.body, scene, second, samples=_RAYS, seed=run.seed, time=later)
-    return _scores("heldout_", shown, second.of_point(first.echo, later), second), twin
+    count = recording.chirps.count // 2
+    half = _fitted(
+        run, table, scene, recording.loops(0, count), grid, "twin of the first half", console
+    )
+    later = float(recording.chirps.times(len(recording.device.transmitters.positions))[count, 0])
+    second = recording.loops(count, count)
+    seen = half.near(_CELLS, time=later)
+    return _scores("heldout_", half, scene, seen, seen.observe(second)[0], run.seed, later), half
+
+
+def _errors(run: RunFile, name: str, found: Mapping[str, Tensor]) -> dict[str, float]:
+    """How far position and velocity are from the truth, where the run file knows it."""
+    if run.data.kind != "simulated" and name not in run.truth:
+        return {}
+    truth = build.true_scene(run)[name]
+    errors = {"position_error_m": float((found["position_m"] - truth.center).norm())}
+    if truth.velocity is not None:
+        off = found["velocity_m_s"] - truth.velocity.reshape(-1, 3).mean(0)
+        errors["velocity_error_m_s"] = float(off.norm())
+    return errors
 
 
 def _echo_metrics(echo: Echo) -> dict[str, Any]:
@@ -234,45 +253,57 @@ def _echo_metrics(echo: Echo) -> dict[str, Any]:
     }
 
 
-def _scores(prefix: str, twin: Tensor, point: Tensor, seen: MotionMap) -> dict[str, Any]:
+def _scores(
+    prefix: str,
+    found: _Found,
+    scene: Scene,
+    seen: MotionMap,
+    observed: Tensor,
+    seed: int,
+    time: float = 0.0,
+) -> dict[str, Any]:
     """Correlations of twin and point with the recording, on the same cells and scales."""
-    found = {
+    maps = {
+        "twin": found.predicted(scene, seen, seed, time),
+        "bare_psf": of_point(seen, found.recording.radar(), found.echo, time)[0],
+    }
+    rows = {
         scale: {
-            name: float(pattern_correlation(power, seen.power, scale))
-            for name, power in (("twin", twin), ("bare_psf", point))
+            name: 1 - float(CorrelationLoss(scale)(power, observed)) for name, power in maps.items()
         }
         for scale in _SCALES
     }
-    headline = {f"{prefix}{name}_correlation": v for name, v in found["magnitude"].items()}
-    return {**headline, f"{prefix}correlations": found}
+    headline = {f"{prefix}{name}_correlation": v for name, v in rows["magnitude"].items()}
+    return {**headline, f"{prefix}correlations": rows}
 
 
 def _pictures(
-    run: RunFile,
-    data: ChirpData,
-    whole: _Frame,
-    twin: _Twin,
-    half: _Twin,
-    scene: Scene,
-    moving: Scene,
+    run: RunFile, whole: _Found, half: _Found, scene: Scene, moving: Scene
 ) -> dict[str, Picture]:
-    radar, grid, chirps = whole.found.radar, whole.found.grid, whole.found.chirps
-    wide = whole.found.around(whole.echo, _DRAWN_CELLS)
+    recording = whole.recording
+    radar, grid, chirps = recording.radar(), whole.model.grid, recording.chirps
+    wide = whole.near(_DRAWN_CELLS)
+    maps = {
+        "recorded": wide.observe(recording)[0],
+        "twin": whole.predicted(scene, wide, run.seed),
+        "point target": of_point(wide, radar, whole.echo)[0],
+    }
     with torch.no_grad():
-        shown = body_power(twin.body, scene, wide, samples=_RAYS, seed=run.seed)
-    maps = {"recorded": wide.power, "twin": shown, "point target": wide.of_point(whole.echo)}
-    start = MovingBody(twin.body.object, scene, radar, whole.echo).moving(scene)
+        start = MovingBody(whole.body.object, scene, radar, whole.echo)(scene)
     drawings = {
         name: pictures.Drawing(
-            pictures.meshes_of(drawn), [twin.body.object], {}, radar.positions.numpy()
+            pictures.meshes_of(drawn), [whole.body.object], {}, radar.positions.numpy()
         )
         for name, drawn in (("start", start), ("twin", moving))
     }
-    losses = {"twin": [twin.losses], "twin of the first half": [half.losses]}
+    losses = {
+        name: [[row["loss"] for row in found.fit.history]]
+        for name, found in (("twin", whole), ("twin of the first half", half))
+    }
     return {
         "recording": Picture(
             "The recording",
-            panels_picture(panels(doppler_maps(data.beat, radar, grid, chirps))),
+            panels_picture(panels(doppler_maps(recording.beat, radar, grid, chirps))),
             "Range rates are modulo the unambiguous span; phases that transmitters in turn add to "
             "movers are taken out.",
         ),
@@ -311,7 +342,7 @@ def _over_directions(maps: Mapping[str, Tensor], wide: MotionMap) -> dict[str, P
 
 
 def _tables(metrics: Mapping[str, Any]) -> list[Table]:
-    rows = [[label, metrics[key]] for key, label in _LABELS.items()]
+    rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
     scales: list[Sequence[Any]] = [
         [
             label,
