@@ -91,8 +91,7 @@ def simulate(
     else:
         beat = beat_signal(paths, radar)
         if noisy:
-            levels = {"snr_db": snr_db, "noise_figure_db": noise_figure_db}
-            beat = add_noise(beat, radar, **levels, seed=seed)
+            beat = add_noise(beat, radar, snr_db=snr_db, noise_figure_db=noise_figure_db, seed=seed)
     return Simulation(exact_spectrum(beat, radar, grid), paths, beat)
 
 

@@ -1,6 +1,6 @@
 """The scalar θ of a gradient check, from the tables of a run file: a module and a tangent."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -112,7 +112,7 @@ def _material(table: schema.GradientParameter, scene: Scene) -> Theta:
     module = MaterialValues(table.object or "", **{value: getattr(material, value)})
     key = f"raw.{value}"
     raw = module.get_parameter(key).detach()
-    found, slope = torch.func.jvp(
+    found, slope = torch.func.jvp(  # type: ignore[misc]
         lambda parameter: _value(module, key, parameter, scene, value),
         (raw,),
         (torch.ones_like(raw),),

@@ -16,10 +16,13 @@ from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import Chirps, Impairments, RunFile, SimulatedData
+from invertwin.cli.schema import Chirps as ChirpsTable
+from invertwin.cli.schema import Impairments as ImpairmentsTable
+from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, velocity_span
+from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
@@ -55,7 +58,6 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
     data = _simulated(run)
     seed = run.seed if data.seed is None else data.seed
     front = None if run.impairments is None else sensors.impairments(run.impairments, data)
-    noise = {} if front else {"snr_db": data.snr_db, "noise_figure_db": data.noise_figure_db}
     with torch.no_grad():
         return simulate(
             scene,
@@ -63,8 +65,9 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
             grid,
             seed=seed,
             sampling=_sampling(data, data.depth),
+            snr_db=None if front else data.snr_db,
+            noise_figure_db=None if front else data.noise_figure_db,
             impairments=front,
-            **noise,
         )
 
 
@@ -135,23 +138,36 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
     return _finish(run, folder, scene, radar, metrics, shown, status)
 
 
-def _chirp_train(
-    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: Chirps
-) -> list[Table]:
-    """Simulate several ramps a frame, between which objects move."""
-    data, chirps = _simulated(run), sensors.chirps(table)
-    seed = run.seed if data.seed is None else data.seed
-    begin = time.perf_counter()
+def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> torch.Tensor:
+    """Exact beat signals of every chirp with the settings of `[data]` and `[chirps]`.
+
+    Args:
+        run: The run file.
+        scene: With moving objects.
+        radar: What records.
+        chirps: Timing.
+    """
+    data = _simulated(run)
+    front = sensors.impairments(run.impairments or ImpairmentsTable(), data)
     with about("chirps"), torch.no_grad():
-        beat = simulate_chirps(
+        return simulate_chirps(
             scene,
             radar,
             chirps,
-            seed=seed,
+            seed=run.seed if data.seed is None else data.seed,
             sampling=_sampling(data, 1),
-            retrace=table.retrace,
-            impairments=sensors.impairments(run.impairments or Impairments(), data),
+            retrace=need(run, "chirps", "several ramps a frame").retrace,
+            impairments=front,
         )
+
+
+def _chirp_train(
+    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: ChirpsTable
+) -> list[Table]:
+    """Simulate several ramps a frame, between which objects move."""
+    begin = time.perf_counter()
+    chirps = sensors.chirps(table)
+    beat = chirp_train(run, scene, radar, chirps)
     seconds = time.perf_counter() - begin
     maps = doppler_maps(beat, radar, grid, chirps)
     if table.tdm and isinstance(radar.waveform, FMCW):

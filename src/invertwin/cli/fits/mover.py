@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from rich.console import Console
@@ -12,15 +12,16 @@ from torch import Tensor
 
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Grid, Sampling
-from invertwin.cli import build, pictures
+from invertwin.cli import build, pictures, sensors
 from invertwin.cli.doppler_maps import Panel, doppler_maps, panels, panels_picture
 from invertwin.cli.fits.fitting import Bar, watched
 from invertwin.cli.pictures import U_LABEL
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
+from invertwin.cli.run_simulate import chirp_train
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import MoverParameter, RunFile
+from invertwin.cli.schema import MoverParameter, RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion import (
     CorrelationLoss,
@@ -37,10 +38,11 @@ from invertwin.models import MotionMap
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 
+Scale = Literal["magnitude", "power", "level"]
 _CELLS = 4  # about the mover, that twin and point are scored on
 _DRAWN_CELLS = 8
 _RAYS = 10_000  # of a map that is scored or drawn
-_SCALES = {
+_SCALES: dict[Scale, str] = {
     "magnitude": "magnitude (√power)",
     "power": "power",
     "level": "level (dB, down to −40 dB)",
@@ -131,7 +133,7 @@ def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
     metrics |= halves
     values = whole.body.values()
     metrics["twin"] = {name: value.tolist() for name, value in values.items()}
-    metrics |= _errors(run, table.object, values)
+    metrics |= _errors(run, table.object, recording, values)
     metrics["loss"] = whole.fit.history[-1]["loss"]
     metrics["steps"] = whole.fit.steps
     metrics["status"] = whole.fit.status
@@ -160,7 +162,14 @@ def _recorded(run: RunFile) -> ChirpCapture:
                 f"{name}: expected no such section with a mover, got one; remove it: the fit "
                 "starts at the strongest echo that moves"
             )
-    recording = chirp_capture(run)
+    data = need(run, "data", "a mover")
+    if isinstance(data, SimulatedData):
+        radar = build.radar(need(run, "radar", "simulated data"))
+        chirps = sensors.chirps(need(run, "chirps", "a mover in simulated data"))
+        beat = chirp_train(run, build.true_scene(run), radar, chirps)
+        recording = ChirpCapture(beat, radar, chirps)
+    else:
+        recording = chirp_capture(data)
     if recording.device.frame_count > 1:
         raise InputError(
             f"data: expected one frame with a mover, got {recording.device.frame_count}; "
@@ -232,16 +241,24 @@ def _heldout(
     return _scores("heldout_", half, scene, seen, seen.observe(second)[0], run.seed, later), half
 
 
-def _errors(run: RunFile, name: str, found: Mapping[str, Tensor]) -> dict[str, float]:
-    """How far position and velocity are from the truth, where the run file knows it."""
-    if run.data.kind != "simulated" and name not in run.truth:
+def _errors(
+    run: RunFile, name: str, recording: ChirpCapture, found: Mapping[str, Tensor]
+) -> dict[str, float]:
+    """How far position and velocity are from the truth, where the run file knows it.
+
+    The truth is that of the frame's start, the twin that of the middle of its chirps.
+    """
+    if not isinstance(run.data, SimulatedData) and name not in run.truth:
         return {}
     truth = build.true_scene(run)[name]
-    errors = {"position_error_m": float((found["position_m"] - truth.center).norm())}
-    if truth.velocity is not None:
-        off = found["velocity_m_s"] - truth.velocity.reshape(-1, 3).mean(0)
-        errors["velocity_error_m_s"] = float(off.norm())
-    return errors
+    still = torch.zeros(1, 3, dtype=torch.float64)
+    velocity = (still if truth.velocity is None else truth.velocity).reshape(-1, 3).mean(0)
+    times = recording.chirps.times(len(recording.device.transmitters.positions))
+    place = truth.center + velocity * times.mean()
+    return {
+        "position_error_m": float((found["position_m"] - place).norm()),
+        "velocity_error_m_s": float((found["velocity_m_s"] - velocity).norm()),
+    }
 
 
 def _echo_metrics(echo: Echo) -> dict[str, Any]:
