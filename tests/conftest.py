@@ -12,6 +12,13 @@ from jaxtyping import config, install_import_hook
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
+# Workers of pytest-xdist share the cores out among themselves, before Dr.Jit starts a thread for
+# every core that it may use. What a worker starts inherits its share.
+if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):
+    cores, workers = sorted(os.sched_getaffinity(0)), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    number = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
+    os.sched_setaffinity(0, cores[number % len(cores) :: workers])
+
 # Shape annotations are executed in tests only; users pay nothing for them. The numeric tower of
 # PEP 484: an int is welcome where a float is asked for.
 install_import_hook(
