@@ -15,7 +15,7 @@ from typing import Any
 
 from invertwin import doctor
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _ROOMS = ("capture", "channel", "inversion", "radar", "scene")
 

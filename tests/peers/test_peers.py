@@ -71,6 +71,7 @@ def distance(found, truth):
     return float((found - truth).abs().sum() / truth.abs().sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("turn", "least", "most"), [(0.0, 0.0, 0.02), (0.35, 0.2, 2.0)])
 def test_edge_sampling_lacks_the_delay_and_nothing_else(radar, grid, turn, least, most):
     """A plate that slides in its own plane keeps the delay of every ray; a tilted one does not."""
