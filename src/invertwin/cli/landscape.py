@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
+from invertwin import plotting
 from invertwin.capture import Capture
 from invertwin.channel import Grid, deposit_power, rough_points, trace_field
-from invertwin.cli import build, pictures
+from invertwin.cli import build
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.constants import SPEED_OF_LIGHT
@@ -22,13 +24,13 @@ from invertwin.scene import AntennaArray, Scene
 
 def landscape(
     run: RunFile, truth: Scene, radar: Radar, grid: Grid, capture: Capture
-) -> tuple[bytes, dict[str, Any]]:
-    """The picture and the numbers of the `[landscape]` table.
+) -> tuple[Figure, dict[str, Any]]:
+    """The figure and the numbers of the `[landscape]` table.
 
     For the exact signal one channel of one frame is enough to show the shape.
 
     Returns:
-        PNG bytes; and the number of local minima of every curve.
+        The figure; and the number of local minima of every curve.
     """
     table = need(run, "landscape", "the loss landscape")
     settings = need(run, "reconstruct", "the loss landscape")
@@ -55,10 +57,10 @@ def landscape(
             name: (x, smooth_losses(run, radar, grid, capture, scenes, kernel, samples, depth))
             for name, kernel in kernels.items()
         }
-    counts = {name: pictures.count_minima(losses) for name, (_, losses) in smooth.items()}
-    minima = {"exact": pictures.count_minima(exact[1]), **counts}
+    counts = {name: plotting.count_minima(losses) for name, (_, losses) in smooth.items()}
+    minima = {"exact": plotting.count_minima(exact[1]), **counts}
     along = line_name(table.object, table.axis)
-    return pictures.landscape_picture(exact, smooth, along), {"local_minima": minima}
+    return plotting.landscape(exact, smooth, along), {"local_minima": minima}
 
 
 def moved(truth: Scene, name: str, axis: Sequence[float], offsets: Iterable[float]) -> list[Scene]:

@@ -18,7 +18,7 @@ from invertwin.inversion.mover import (
     strongest_mover,
 )
 from invertwin.inversion.nuisances import ClockOffset, RangeBias
-from invertwin.inversion.prior import LatentNorm, Trained, Training, train_prior
+from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
@@ -42,8 +42,6 @@ __all__ = [
     "SpectrumLoss",
     "Stage",
     "Topology",
-    "Trained",
-    "Training",
     "compare_shapes",
     "fit_mover",
     "motion_map",
@@ -53,6 +51,5 @@ __all__ = [
     "signed_distance",
     "strongest_mover",
     "topology",
-    "train_prior",
     "volume_iou",
 ]
