@@ -21,7 +21,7 @@ from invertwin.cli.options import (
     SeedOption,
     console,
 )
-from invertwin.cli.plugins import registry
+from invertwin.cli.registry import load_plugins
 from invertwin.cli.run_file import about_file
 from invertwin.cli.running import (
     default_folder,
@@ -229,8 +229,8 @@ def doctor(backend: BackendOption = None) -> None:
         raise typer.Exit(1)
 
 
-for _added in registry().commands:
-    app.command()(_added)
+for _name, _function in load_plugins().commands.items():
+    app.command(_name)(_function)
 
 
 def main() -> None:

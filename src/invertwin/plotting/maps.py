@@ -59,7 +59,7 @@ def spectrum(
     columns = {title: _views(power, grid) for title, power in _titled(spectra).items()}
     rows = len(next(iter(columns.values())))
     figure = Figure(figsize=(1.2 + 3.4 * len(columns), 3.3 * rows), layout="constrained")
-    cells = figure.subplots(rows, len(columns), squeeze=False)
+    cells = figure.subplots(rows, len(columns), squeeze=False, sharey=True)
     drawn = [
         (cells[row, column], title if row == 0 else "", view)
         for column, (title, views) in enumerate(columns.items())
@@ -146,8 +146,8 @@ def gradient(
     shared = {title: first(values) for title, values in _titled(derivatives).items()}
     others = {title: first(values) for title, values in (own_scale or {}).items()}
     count = len(shared) + len(others) + (power is not None)
-    figure = Figure(figsize=(1.2 + 3.4 * count, 3.3), layout="constrained")
-    cells = list(figure.subplots(1, count, squeeze=False)[0])
+    figure = Figure(figsize=(1.2 + 2.9 * count, 3.3), layout="constrained")
+    cells = list(figure.subplots(1, count, squeeze=False, sharey=True)[0])
     cells[0].set_ylabel("range [m]", fontsize=8)
     if power is not None:
         _draw_decibels(figure, [(cells.pop(0), "power", first(power))], True, 30.0)
@@ -156,11 +156,10 @@ def gradient(
         _signed(cell, title, panel, limit)
         for cell, (title, panel) in zip(cells, shared.items(), strict=False)
     ]
-    bar = figure.colorbar(images[-1], ax=cells[: len(shared)], shrink=0.8)
-    bar.set_label(label, fontsize=8)
+    _colorbar(figure, images[-1], cells[: len(shared)], label)
     for cell, (title, panel) in zip(cells[len(shared) :], others.items(), strict=True):
         image = _signed(cell, title, panel, _limit(panel))
-        figure.colorbar(image, ax=cell, shrink=0.8).set_label("own scale, same unit", fontsize=8)
+        _colorbar(figure, image, [cell], "own scale, same unit")
     return figure
 
 
@@ -200,7 +199,7 @@ def _draw_decibels(
         image = _image(cell, title, panel, level, vmin=top - dynamic_range, vmax=top)
     assert image is not None
     label = "power [dB below peak]" if relative else "received over transmitted power [dB]"
-    figure.colorbar(image, ax=[cell for cell, *_ in drawn], label=label, shrink=0.85)
+    _colorbar(figure, image, [cell for cell, *_ in drawn], label)
 
 
 def _signed(cell: Any, title: str, panel: Panel, limit: float) -> Any:
@@ -224,6 +223,12 @@ def _image(cell: Any, title: str, panel: Panel, values: NDArray, **style: Any) -
     cell.set_xlabel(panel.label, fontsize=8)
     cell.tick_params(labelsize=7)
     return image
+
+
+def _colorbar(figure: Figure, image: Any, cells: list[Any], label: str) -> None:
+    bar = figure.colorbar(image, ax=cells, shrink=0.85)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
 
 
 def _edges(places: Tensor) -> tuple[float, float]:

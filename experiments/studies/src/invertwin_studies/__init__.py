@@ -17,5 +17,5 @@ def register(registry: Any) -> None:
 
     registry.section("methods", Methods)
     registry.section("loss_scan", LossScan)
-    registry.command(loss_scan)
-    registry.command(train_prior)
+    registry.command("loss-scan", loss_scan)
+    registry.command("train-prior", train_prior)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from invertwin.cli.plugins import registry
+from invertwin.cli.registry import load_plugins
 from invertwin.cli.schema.initial import Initial
 from invertwin.cli.schema.inversion import (
     Calibration,
@@ -211,7 +211,7 @@ def _with_plugins() -> type[_RunFile]:
     """The run file with the sections of installed plugins."""
     added: Any = {
         name: (model | None, Field(None, description=(model.__doc__ or "").split(".")[0]))
-        for name, model in registry().sections.items()
+        for name, model in load_plugins().sections.items()
     }
     return create_model("RunFile", __base__=_RunFile, __doc__=_RunFile.__doc__, **added)
 

@@ -16,12 +16,12 @@ class Registry:
 
     Attributes:
         sections: Tables of run files, by name.
-        commands: Functions with typer annotations.
+        commands: Functions with typer annotations, by name.
     """
 
     def __init__(self) -> None:
         self.sections: dict[str, type[BaseModel]] = {}
-        self.commands: list[Callable[..., Any]] = []
+        self.commands: dict[str, Callable[..., Any]] = {}
 
     def section(self, name: str, model: type[BaseModel]) -> None:
         """Adds the table `[name]` to run files.
@@ -32,13 +32,18 @@ class Registry:
         """
         self.sections[name] = model
 
-    def command(self, function: Callable[..., Any]) -> None:
-        """Adds a command that is called like the function, with - for _."""
-        self.commands.append(function)
+    def command(self, name: str, function: Callable[..., Any]) -> None:
+        """Adds a command.
+
+        Args:
+            name: What users type.
+            function: What it does; its arguments have typer annotations.
+        """
+        self.commands[name] = function
 
 
 @cache
-def registry() -> Registry:
+def load_plugins() -> Registry:
     """The registry, after all plugins have seen it."""
     found = Registry()
     for entry in entry_points(group="invertwin.plugins"):
