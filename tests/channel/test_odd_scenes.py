@@ -7,10 +7,14 @@ import pytest
 import torch
 
 from invertwin.capture import read
-from invertwin.channel import Sampling
-from invertwin.channel.bridge import backend, use_backend
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.tracer import trace_field, trace_power
+from invertwin.channel import (
+    Sampling,
+    backend,
+    deposit_power,
+    trace_field,
+    trace_power,
+    use_backend,
+)
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,

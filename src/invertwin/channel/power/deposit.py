@@ -1,6 +1,6 @@
 """Power paths straight into the bins of a map, with derivatives in both modes.
 
-No path is ever stored for torch: chains are walked, deposited and forgotten, or kept as records
+No path is ever stored for torch: paths are walked, deposited and forgotten, or kept as records
 while these fit the memory budget, and replayed for the derivative.
 """
 
@@ -11,20 +11,15 @@ from jaxtyping import Float32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from invertwin.channel import bins, bridge, replay
-from invertwin.channel.boundary import require_edges
-from invertwin.channel.bridge import (
-    differentiated,
-    flatten,
-    one_torch_thread,
-    to_float,
-    use_backend,
-)
-from invertwin.channel.density import deposit_density
-from invertwin.channel.kernel import DIFFERENTIABLE, from_table, to_table
 from invertwin.channel.paths import Grid, Link
+from invertwin.channel.power import bins, replay
+from invertwin.channel.power.clouds import deposit_density
+from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
+from invertwin.channel.power.trace import Trace
+from invertwin.channel.rays.arrays import to_float
+from invertwin.channel.rays.backend import backend, dr, mi, one_torch_thread, use_backend
+from invertwin.channel.rays.geometry import differentiated, flatten, require_edges
 from invertwin.channel.sampling import Sampling
-from invertwin.channel.trace import Settings, Trace
 from invertwin.errors import InputError
 from invertwin.scene.scene import Object, Scene
 
@@ -41,8 +36,8 @@ def deposit_power(
 ) -> Float32[Tensor, "frame range u v"]:
     """Expected received over transmitted power in every bin of a map, per frame.
 
-    ``∫ f dA₁ … dAₙ`` over all chains of up to ``depth`` surface points that see each other in
-    turn, with ``f`` the radar equation of the chain: 1/R² for every leg, the scattering
+    ``∫ f dA₁ … dAₙ`` over all paths of up to ``depth`` surface points that see each other in
+    turn, with ``f`` the radar equation of the path: 1/R² for every segment, the scattering
     distribution of the material and both cosines for every point.
     Differentiable in both modes with respect to vertices, material values and radar poses;
     moving silhouettes included unless ``boundary`` is off. Objects that are clouds add the power
@@ -75,19 +70,9 @@ def deposit_power(
         return torch.stack(soft).sum(0)
     with use_backend(sampling.backend), one_torch_thread():
         geometry = flatten(surfaces, link.wavelength)
-        fixed = None if reference is None else _sorted(reference[0])[0]
-        settings = Settings(
-            geometry=geometry,
-            link=link,
-            grid=grid,
-            sampling=sampling,
-            seed=seed,
-            scheme=scheme,
-            reference=(flatten(fixed, link.wavelength), reference[1])
-            if reference and fixed
-            else None,
-            backend=bridge.backend(),
-        )
+        fixed = None
+        if reference is not None and (hard := _sorted(reference[0])[0]) is not None:
+            fixed = flatten(hard, link.wavelength), reference[1]
         if sampling.boundary:
             require_edges(geometry, link, sampling.boundary_samples)
         if any(differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
@@ -95,8 +80,9 @@ def deposit_power(
                 "expected an antenna pattern without derivatives, got one that carries them; "
                 "power paths do not differentiate patterns: detach its values"
             )
-        hard = _Deposit.apply(settings, *settings.tables)
-    return hard + torch.stack(soft).sum(0) if soft else hard  # type: ignore[no-any-return]
+        trace = Trace(geometry, link, sampling, seed, scheme=scheme, reference=fixed)
+        found = _Deposit.apply(trace, grid, *trace.tables)
+    return found + torch.stack(soft).sum(0) if soft else found  # type: ignore[no-any-return]
 
 
 def _sorted(scene: Scene) -> tuple[Scene | None, list[Object]]:
@@ -109,84 +95,85 @@ def _sorted(scene: Scene) -> tuple[Scene | None, list[Object]]:
 class _Deposit(torch.autograd.Function):
     """∂map/∂(vertices, poses, materials), forward and backward.
 
-    The derivative of the deposit itself is written out, and that of a chain replayed from its
+    The derivative of the deposit itself is written out, and that of a path replayed from its
     records; Dr.Jit differentiates the smooth geometry at one vertex.
     """
 
     @staticmethod
-    def forward(ctx: Any, settings: Settings, *tables: Tensor) -> Tensor:
-        trace = Trace(settings)
-        out = trace.bins()
+    def forward(ctx: Any, trace: Trace, grid: Grid, *tables: Tensor) -> Tensor:
+        out = bins.Bins(grid, trace.rays.link.frame_count)
         derivative = any(ctx.needs_input_grad)
-        trace.deposit(out, record=derivative)
+        ctx.records = trace.deposit(out, record=derivative)
         if derivative:
-            trace.draw_boundary()  # prepared while the paths are walked
-        ctx.trace = trace
+            _ = trace.boundary_points  # prepared while the paths are walked
+        ctx.trace, ctx.grid, ctx.backend = trace, grid, backend()
         return out.map()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        import drjit as dr
-
         trace: Trace = ctx.trace
-        grid = trace.settings.grid
-        with use_backend(trace.settings.backend), one_torch_thread():
-            wanted = [n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[1:], strict=True) if w]
-            tables = {name: type(trace.fixed.tx)(getattr(trace.fixed, name)) for name in wanted}
-            dr.enable_grad(list(tables.values()))
+        with use_backend(ctx.backend), one_torch_thread():
+            wanted = [n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[2:], strict=True) if w]
+            tables = _attached(trace, wanted)
             inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
             seed = to_float(grad)
+
+            def gather(*path: Any) -> tuple[Any, Any, Any, Any]:
+                return bins.gather(seed, ctx.grid, *path)
+
             boundary = trace.boundary(inputs)
-            for records in trace.records():
-                replay.pull(
-                    trace.shot, inputs, records, lambda *path: bins.gather(seed, grid, *path)
-                )
+            for records in [ctx.records] if ctx.records else trace.records():
+                replay.pull(trace.rays, inputs, records, gather)
                 dr.eval([dr.grad(table) for table in tables.values()])
                 del records  # before the next ones are made
-            for chains in boundary:
-                total = chains.weighted(lambda *path: bins.gather(seed, grid, *path)[0])
-                if dr.grad_enabled(chains.speed):
-                    dr.backward_from(chains.speed * total)
+            for paths in boundary:
+                total = paths.weighted(lambda *path: gather(*path)[0])
+                if dr.grad_enabled(paths.speed):
+                    dr.backward_from(paths.speed * total)
                 dr.eval([dr.grad(table) for table in tables.values()])
-            results: list[Tensor | None] = [None]
-            for name, source in zip(DIFFERENTIABLE, trace.settings.tables, strict=True):
+            results: list[Tensor | None] = [None, None]
+            for name, source in zip(DIFFERENTIABLE, trace.tables, strict=True):
                 results.append(
                     from_table(name, dr.grad(tables[name]), source) if name in tables else None
                 )
             return tuple(results)
 
     @staticmethod
-    def jvp(ctx: Any, _: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
-        import drjit as dr
-
+    def jvp(ctx: Any, _: None, __: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         trace: Trace = ctx.trace
-        with use_backend(trace.settings.backend), one_torch_thread():
+        with use_backend(ctx.backend), one_torch_thread():
             given = {
                 name: tangent
                 for name, tangent in zip(DIFFERENTIABLE, tangents, strict=True)
                 if tangent is not None
             }
-            tables = {name: type(trace.fixed.tx)(getattr(trace.fixed, name)) for name in given}
-            dr.enable_grad(list(tables.values()))
+            tables = _attached(trace, list(given))
             inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
-            out = trace.bins()
+            out = bins.Bins(ctx.grid, trace.rays.link.frame_count)
 
             def point_tangents() -> None:
                 for name, table in tables.items():
                     dr.set_grad(table, to_table(name, given[name]))
 
             boundary = trace.boundary(inputs)
-            for records in trace.records():
+            for records in [ctx.records] if ctx.records else trace.records():
                 point_tangents()
-                replay.push(trace.shot, inputs, records, out.add_derivative)
+                replay.push(trace.rays, inputs, records, out.add_derivative)
                 dr.eval(out.values)
                 del records
-            for chains in boundary:
+            for paths in boundary:
                 point_tangents()
-                chains.deposit(dr.forward_to(chains.speed), out.add)
+                paths.deposit(dr.forward_to(paths.speed), out.add)
                 dr.eval(out.values)
             return out.map()
+
+
+def _attached(trace: Trace, names: list[str]) -> dict[str, Any]:
+    """Copies of some of the kernel's tables that carry derivatives."""
+    tables = {name: mi.Float(trace.fixed.table(name)) for name in names}
+    dr.enable_grad(list(tables.values()))
+    return tables
 
 
 def _equal(first: Tensor | None, second: Tensor | None) -> bool:

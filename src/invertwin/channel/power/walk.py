@@ -1,7 +1,7 @@
-"""Chains of surface points, drawn vertex by vertex in one symbolic loop.
+"""Paths over surface points, drawn vertex by vertex in one symbolic loop.
 
 The loop is compiled once for any depth, and keeps no vertex unless asked to: then it writes one
-`Records` row a vertex, from which derivatives are replayed (``channel/replay.py``). Detached.
+`Records` row a vertex, from which derivatives are replayed (``channel/power/replay.py``). Detached.
 """
 
 from collections.abc import Callable
@@ -9,19 +9,20 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from invertwin.channel import kernel
-from invertwin.channel.bins import Contribution
-from invertwin.channel.bridge import opaque, tracer
-from invertwin.channel.directions import Directions
-from invertwin.channel.kernel import Inputs, Place
-from invertwin.channel.passage import Passage, land, passage
-from invertwin.channel.rays import NEAR, Shot, scrambled
+from invertwin.channel.power import integrand
+from invertwin.channel.power.bins import Contribution
+from invertwin.channel.power.directions import Directions
+from invertwin.channel.power.integrand import Inputs, Place
+from invertwin.channel.power.passage import Passage, land, passage
+from invertwin.channel.rays.arrays import opaque, scrambled
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import NEAR, RayScene
 
 _LEAST_SURVIVAL = 0.1  # of Russian roulette
 _ROULETTE_FROM = 3  # vertices after which it begins; shorter paths have less noise without
 _STREAM = 0x9E3779B9  # seeds of successive vertices
 
-#: A chain at its latest vertex, one lane a path: what the loop carries.
+#: A path at its latest vertex, one lane each: what the loop carries.
 State = dict[str, Any]
 
 
@@ -40,12 +41,9 @@ def start(
 
     ``back`` points to where the path comes from; ``throughput`` is everything up to arriving
     here, one over the density of the samples included; ``length`` is that of the path so far.
-    ``passed`` is what lies on the first leg, for antennas that share what they see. A state with
-    a ``weight`` also follows one over the density of its points per area.
+    ``passed`` is what lies on the first segment, for antennas that share what they see. A state
+    with a ``weight`` also follows one over the density of its points per area.
     """
-    import drjit as dr
-
-    mi = tracer()
     count = dr.width(index)
     return {
         "index": index,
@@ -58,31 +56,30 @@ def start(
         "back": mi.Vector3f(back),
         "throughput": throughput,
         "length": length,
-        **({} if passed is None else {"share": passed.share, "excess": passed.excess}),
+        **(
+            {} if passed is None else {"transmittance": passed.transmittance, "extra": passed.extra}
+        ),
     }
 
 
 class Walk:
-    """Continues chains, and shows every vertex to a visitor."""
+    """Continues paths, and shows every vertex to a visitor."""
 
-    def __init__(self, shot: Shot, inputs: Inputs, seed: int) -> None:
-        self.shot = shot
+    def __init__(self, rays: RayScene, inputs: Inputs, seed: int) -> None:
+        self.rays = rays
         self.inputs = inputs
         self.seed = scrambled(seed, 7)
 
     @cached_property
     def directions(self) -> Directions:
-        """How chains go on; paths of one bounce never ask."""
-        return Directions(self.shot)
+        """How paths go on; those of one bounce never ask."""
+        return Directions(self.rays, self.inputs.surfaces)
 
     def run(self, state: State, depth: Any, visit: Callable[[State, Place], None]) -> State:
         """Walk up to ``depth`` vertices (a number, or one per lane); returns the last state.
 
         ``visit`` may change what it put into the state itself.
         """
-        import drjit as dr
-
-        mi = tracer()
         if isinstance(depth, int) and depth == 1:
             visit(state, self._place(state))
             return state
@@ -112,18 +109,17 @@ class Walk:
         return state
 
     def _place(self, state: State) -> Place:
-        return kernel.place(self.inputs, state["face"], state["b1"], state["b2"], state["active"])
+        return integrand.place(
+            self.inputs, state["face"], state["b1"], state["b2"], state["active"]
+        )
 
     def _extend(self, state: State, point: Place, directions: Directions) -> None:
-        """Draw the next vertex into the state; chains that miss or are too long end."""
-        import drjit as dr
-
-        mi = tracer()
+        """Draw the next vertex into the state; paths that miss or are too long end."""
         active = state["active"] & (state["number"] < state["last"])
         back = state["back"]
         omega, density = directions.draw(point, back, self._numbers(state))
-        scattered = kernel.scattered(
-            self.inputs, point.surface, point.normal, back, mi.Vector3f(omega), active
+        scattered = self.inputs.surfaces.scattered(
+            point.surface, point.normal, back, mi.Vector3f(omega), active
         )
         ratio: Any = scattered / (density * dr.abs(dr.dot(point.normal, back)))
         survival = dr.select(
@@ -136,27 +132,26 @@ class Walk:
         origin = point.position + side * (NEAR * dr.norm(point.position))
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
         key = state["index"], self.seed + (state["number"] * 4 + 3) * _STREAM
-        hit = land(self.shot, self.inputs, ray, active, key, coherent=False)
+        hit = land(self.rays, self.inputs, ray, active, key, coherent=False)
         active &= hit.valid
-        found = kernel.place(self.inputs, hit.face, hit.b1, hit.b2, active)
-        to_point, distance = kernel.leg(found.position, point.position)
+        found = integrand.place(self.inputs, hit.face, hit.b1, hit.b2, active)
+        to_point, distance = integrand.segment(found.position, point.position)
         cosine: Any = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
-        inside = kernel.medium(self.inputs, point, found, -to_point, active)
+        inside = integrand.medium(self.inputs, point, found, -to_point, active)
         odds = density * survival * cosine * hit.chance
-        weight = scattered * hit.share * dr.exp(-inside.attenuation * distance) / odds
+        weight = scattered * hit.transmittance * dr.exp(-inside.attenuation * distance) / odds
         state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
         if "weight" in state:
             state["weight"] = state["weight"] * dr.square(distance) / odds
         state["face"], state["b1"], state["b2"] = hit.face, hit.b1, hit.b2
         state["back"] = mi.Vector3f(to_point)
-        state["length"] = state["length"] + inside.index * distance + hit.excess
+        state["length"] = state["length"] + inside.index * distance + hit.extra
         state["number"] = state["number"] + 1
         state["active"] = active
 
     def _numbers(self, state: State, pairs: int = 0) -> list[Any]:
         """Uniform numbers of this vertex: four, or the two of a later stream."""
-        mi = tracer()
         streams = (pairs,) if pairs else (0, 1)
         numbers = []
         for stream in streams:
@@ -167,7 +162,7 @@ class Walk:
 
 
 def connect(
-    shot: Shot,
+    rays: RayScene,
     inputs: Inputs,
     state: State,
     point: Place,
@@ -180,9 +175,9 @@ def connect(
     """The path that ends at the latest vertex, and whether it exists.
 
     Args:
-        shot: Rays.
+        rays: Rays.
         inputs: Detached.
-        state: The chain.
+        state: The path so far.
         point: Its latest vertex.
         receiver: Whether the path ends at the receiver (a bool, or one per lane). Where it ends at
             the transmitter, the state knows the receiver's direction ``u``, ``v``.
@@ -190,9 +185,7 @@ def connect(
         shared: What the antenna at the start sees, the one at the end sees too.
         one_place: Both are one.
     """
-    import drjit as dr
-
-    found = kernel.connection(
+    found = integrand.connection(
         inputs, state["frame"], point, state["back"], receiver, state["active"], same=one_place
     )
     u, v = found.seen.x, found.seen.y
@@ -200,23 +193,25 @@ def connect(
         u, v = dr.select(receiver, u, state["u"]), dr.select(receiver, v, state["v"])
     power = state["throughput"] * found.factor
     exists = state["active"] & (power != 0) & (state["number"] >= least)
-    one, none = tracer().Float(1.0), tracer().Float(0.0)
-    share, excess = state.get("share", one), state.get("excess", none)
+    one, none = mi.Float(1.0), mi.Float(0.0)
+    transmittance, extra = state.get("transmittance", one), state.get("extra", none)
     if not (shared and "last" not in state):
-        first = exists & (state["number"] == 1) if shared else tracer().Bool(False)
+        first = exists & (state["number"] == 1) if shared else mi.Bool(False)
         antenna = inputs.antenna(state["frame"], receiver, exists)
-        passed = passage(shot, inputs, point.position, antenna, exists & ~first)
-        share = dr.select(first, share, passed.share)
-        excess = dr.select(first, excess, passed.excess)
-    length = 0.5 * (state["length"] + found.distance + excess)
-    return Contribution(state["frame"], power * share, length, u, v), exists & (share > 0)
+        passed = passage(rays, inputs, point.position, antenna, exists & ~first)
+        transmittance = dr.select(first, transmittance, passed.transmittance)
+        extra = dr.select(first, extra, passed.extra)
+    length = 0.5 * (state["length"] + found.distance + extra)
+    return Contribution(state["frame"], power * transmittance, length, u, v), exists & (
+        transmittance > 0
+    )
 
 
 @dataclass(frozen=True)
 class Records:
-    """Vertices of chains as flat arrays, vertex after vertex: ``[vertex × lane]``.
+    """Vertices of paths as flat arrays, vertex after vertex: ``[vertex × lane]``.
 
-    ``throughput`` is zero where a chain has ended; ``seen`` says that the vertex is connected to
+    ``throughput`` is zero where a path has ended; ``seen`` says that the vertex is connected to
     the receiver.
     """
 
@@ -232,19 +227,14 @@ class Records:
 
     @staticmethod
     def single(state: State, seen: Any) -> "Records":
-        """Records of chains of one vertex."""
-        import drjit as dr
-
+        """Records of paths of one vertex."""
         names = ("frame", "face", "b1", "b2", "throughput", "length")
         columns = {name: state[name] for name in names}
         return Records(lanes=dr.width(state["index"]), depth=1, **columns, seen=seen)
 
     @staticmethod
     def empty(state: State, depth: int, sound_face: Any) -> "Records":
-        """Room for chains that start in this state."""
-        import drjit as dr
-
-        mi = tracer()
+        """Room for paths that start in this state."""
         lanes = dr.width(state["index"])
         size = lanes * depth
         face = dr.zeros(mi.UInt32, size)
@@ -267,8 +257,6 @@ class Records:
 
     def write(self, state: State, seen: Any) -> None:
         """Store the latest vertex."""
-        import drjit as dr
-
         at = (state["number"] - 1) * self.lanes + state["lane"]
         values = {**state, "seen": seen}
         for name in ("face", "b1", "b2", "throughput", "length", "seen"):

@@ -1,7 +1,7 @@
 """Power that clouds of soft scatterers send back, into the bins of a map: rays that fade.
 
 Geometry and transmittance are torch in float64, so that automatic differentiation in both modes
-does their derivatives; only the deposit is a kernel. A cloud has no silhouette: its power is
+does their derivatives; only the deposit is a integrand. A cloud has no silhouette: its power is
 continuous in all that moves, so no boundary terms are due.
 """
 
@@ -15,9 +15,10 @@ from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from invertwin.channel import bins, bridge
-from invertwin.channel.bridge import to_float, to_index, to_torch, tracer, use_backend
 from invertwin.channel.paths import Grid, Link
+from invertwin.channel.power import bins
+from invertwin.channel.rays.arrays import to_float, to_index, to_torch
+from invertwin.channel.rays.backend import backend, mi, use_backend
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.cloud import Cloud
@@ -278,8 +279,8 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, grid: Grid, frames: int, frame: Tensor, *columns: Tensor) -> Tensor:
         places = [to_float(column) for column in columns]
-        ctx.found = bins.Contribution(tracer().Int32(to_index(frame)), *places)
-        ctx.grid, ctx.frames, ctx.backend = grid, frames, bridge.backend()
+        ctx.found = bins.Contribution(mi.Int32(to_index(frame)), *places)
+        ctx.grid, ctx.frames, ctx.backend = grid, frames, backend()
         out = bins.Bins(grid, frames)
         out.add(ctx.found, True)
         return out.map()
@@ -295,8 +296,7 @@ class _Splat(torch.autograd.Function):
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         with use_backend(ctx.backend):
             dots = tuple(
-                tracer().Float(0.0) if tangent is None else to_float(tangent)
-                for tangent in tangents[3:]
+                mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[3:]
             )
             out = bins.Bins(ctx.grid, ctx.frames)
             out.add_derivative(ctx.found, dots, True)

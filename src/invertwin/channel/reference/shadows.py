@@ -1,22 +1,25 @@
-"""Boundary paths in torch: how fast a shadow's edge moves over the surface it falls on."""
+"""Boundary paths of one bounce in torch: how fast a shadow's edge moves over a surface."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from invertwin.channel.bridge import Geometry, differentiated, to_torch, tracer
-from invertwin.channel.edges import EdgeSampler
-from invertwin.channel.kernel import Inputs
-from invertwin.channel.paths import Link
-from invertwin.channel.rays import Shot, visible
-from invertwin.errors import InputError
+from invertwin.channel.paths import Paths, joined
+from invertwin.channel.power.edges import EdgeSampler
+from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.rays.arrays import to_torch
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.geometry import mixed
+from invertwin.channel.rays.scene import RayScene, visible
+from invertwin.channel.reference.radar_equation import Echo, Place, radar_equation
 
 
 @dataclass(frozen=True)
-class EdgePoints:
+class SilhouettePoints:
     """Detached points on silhouettes: edge, place along it, triangle behind, weight."""
 
     frame: Int64[Tensor, " n"]
@@ -27,62 +30,49 @@ class EdgePoints:
     face: Int64[Tensor, " n"]
     weight: Float64[Tensor, " n"]
 
-    def keep(self, mask: Bool[Tensor, " n"]) -> "EdgePoints":
+    def keep(self, mask: Bool[Tensor, " n"]) -> "SilhouettePoints":
         """Some of the points."""
-        return EdgePoints(*(column[mask] for column in vars(self).values()))
+        return SilhouettePoints(*(column[mask] for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
-class Edge:
-    """Points on a shadow's edge.
+class ShadowEdge:
+    """Points on the edge of a shadow.
 
     Attributes:
         frame, face: Radar pose, and the triangle the shadow falls on.
-        shadow: Where it falls [m], detached.
-        normal: Unit normal there, detached.
+        b1, b2: Where on the triangle.
+        place: Where it falls, detached.
         speed: Area newly lit per unit of θ, divided by the sampling density: attached, and
             zero in derivative where the other antenna does not see the point.
     """
 
     frame: Int64[Tensor, " n"]
     face: Int64[Tensor, " n"]
-    shadow: Float64[Tensor, "n 3"]
-    normal: Float64[Tensor, "n 3"]
+    b1: Float64[Tensor, " n"]
+    b2: Float64[Tensor, " n"]
+    place: Place
     speed: Float64[Tensor, " n"]
 
 
-def silhouettes_move(geometry: Geometry, link: Link) -> bool:
-    """Whether a derivative flows through anything that decides what is visible."""
-    return any(differentiated(value) for value in (geometry.vertices, link.tx, link.rx))
+def silhouette_points(
+    rays: RayScene, centres: Sequence[str], samples: int, seed: int
+) -> list[tuple[str, SilhouettePoints]]:
+    """Sample the silhouettes seen from ``tx``, or from ``tx`` and ``rx``, apart.
 
-
-def require_edges(geometry: Geometry, link: Link, samples: int) -> None:
-    """Refuse a derivative that would silently leave moving silhouettes out.
-
-    Raises:
-        InputError: Silhouettes move and there are no samples of them.
+    Args:
+        rays: The scene and its antennas.
+        centres: Antennas.
+        samples: Points over all antennas and frames.
+        seed: Of the points.
     """
-    if samples < 1 and silhouettes_move(geometry, link):
-        raise InputError(
-            "expected boundary_samples >= 1 for a derivative in which silhouettes move, got "
-            f"{samples}; give some, or boundary=False for fixed visibility"
-        )
-
-
-def edge_points(
-    shot: Shot, centres: Sequence[str], samples: int, seed: int
-) -> list[tuple[str, EdgePoints]]:
-    """Sample the silhouettes seen from ``tx``, or from ``tx`` and ``rx``, apart."""
-    import drjit as dr
-
-    inputs = Inputs.of(shot.geometry, shot.link, shot, monostatic=False)
-    sampler = EdgeSampler(shot, inputs, centres, samples, seed)
+    sampler = EdgeSampler(rays, Inputs.of(rays), centres, samples, seed)
     if not sampler.size:
         none, nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
-        return [("tx", EdgePoints(none, none, none, none, nothing, none, nothing))]
-    drawn = sampler.draw(dr.arange(tracer().UInt32, sampler.size)).kept()
-    columns = {f.name: to_torch(getattr(drawn, f.name)) for f in fields(EdgePoints)}
-    points = EdgePoints(
+        return [("tx", SilhouettePoints(none, none, none, none, nothing, none, nothing))]
+    drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept()
+    columns = {f.name: to_torch(getattr(drawn, f.name)) for f in fields(SilhouettePoints)}
+    points = SilhouettePoints(
         **{n: c.double() if n in ("along", "weight") else c.long() for n, c in columns.items()}
     )
     if drawn.receiver is False:
@@ -91,15 +81,19 @@ def edge_points(
     return [("tx", points.keep(~receiver)), ("rx", points.keep(receiver))]
 
 
-def shadow_speed(
-    geometry: Geometry, link: Link, shot: Shot, points: EdgePoints, centre: str
-) -> Edge:
+def shadow_edge(rays: RayScene, points: SilhouettePoints, centre: str) -> ShadowEdge:
     """Turn edge points into shadow points with the attached speed of the shadow's edge.
 
     ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
     x_m the material point under it; T is the edge's image turned to the shadowed side.
     Source: derivations §3.
+
+    Args:
+        rays: The scene and its antennas.
+        points: On edges.
+        centre: The antenna from which the shadows are cast.
     """
+    geometry, link = rays.geometry, rays.link
     c = getattr(link, centre)[points.frame]
     y0, y1 = geometry.vertices[points.first], geometry.vertices[points.second]
     y = y0 + (y1 - y0) * points.along[:, None]
@@ -107,9 +101,9 @@ def shadow_speed(
     plane = torch.linalg.cross(p1 - p0, p2 - p0)
     moving = c + (y - c) * (_dot(plane, p0 - c) / _dot(plane, y - c))[:, None]
 
-    shadow, normal = moving.detach(), torch.nn.functional.normalize(plane.detach(), dim=1)
+    shadow, normal = moving.detach(), normalize(plane.detach(), dim=1)
     b1, b2 = barycentric(shadow, p0.detach(), p1.detach(), p2.detach())
-    material = p0 * (1 - b1 - b2)[:, None] + p1 * b1[:, None] + p2 * b2[:, None]
+    material = mixed((p0, p1, p2), b1, b2)
 
     ray, edge = (y - c).detach(), (y1 - y0).detach()
     stretch = (shadow - c.detach()).norm(dim=1) / ray.norm(dim=1)
@@ -124,9 +118,33 @@ def shadow_speed(
     weight = points.weight
     if not link.shared_visibility:
         other = (link.rx if centre == "tx" else link.tx)[points.frame]
-        weight = weight * visible(shot, shadow, other)
+        weight = weight * visible(rays, shadow, other)
     speed = _dot(tangent, moving - material) * weight
-    return Edge(points.frame, points.face, shadow, normal, speed)
+    ones = torch.ones_like(b1)
+    place = Place(shadow, normal, ones, geometry.face_surface[points.face])
+    return ShadowEdge(points.frame, points.face, b1, b2, place, speed)
+
+
+def boundary_rows(
+    rays: RayScene, samples: int, seed: int, row: Callable[[ShadowEdge, Echo], Paths]
+) -> Paths:
+    """Boundary paths of one bounce, of the segments at all antennas.
+
+    Args:
+        rays: The scene and its antennas.
+        samples: Silhouette points over all antennas and frames.
+        seed: Of the points.
+        row: Makes paths of shadow points and of the radar equation there.
+    """
+    centres = ("tx",) if rays.link.shared_visibility else ("tx", "rx")
+    count = samples // len(centres) * len(centres)
+    parts = []
+    for centre, points in silhouette_points(rays, centres, count, seed):
+        edge = shadow_edge(rays, points, centre)
+        with torch.no_grad():
+            echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.place])
+        parts.append(row(edge, echo))
+    return joined(parts)
 
 
 def barycentric(

@@ -13,8 +13,9 @@ from typing import Any
 from jaxtyping import Float32
 from torch import Tensor
 
-from invertwin.channel.bridge import to_torch, tracer
 from invertwin.channel.paths import Grid
+from invertwin.channel.rays.arrays import to_torch
+from invertwin.channel.rays.backend import dr, mi
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,6 @@ class Contribution:
 
 def _axis(position: Any, start: float, step: float, count: int) -> tuple[Any, list, list]:
     """First bin, weights and weights' derivatives of the quadratic B-spline along one axis."""
-    import drjit as dr
-
-    mi = tracer()
     if count == 1:
         return mi.Int32(0), [mi.Float(1.0)], [mi.Float(0.0)]
     t = (position - start) * (1 / step)
@@ -58,15 +56,13 @@ class _Taps:
 
     @staticmethod
     def of(grid: Grid, found: Contribution) -> "_Taps":
-        import drjit as dr
-
         g = grid
         axes = (
             _axis(dr.detach(found.range), g.range_start, g.range_step, g.range_count),
             _axis(dr.detach(found.u), g.u_start, g.u_step, g.u_count),
             _axis(dr.detach(found.v), g.v_start, g.v_step, g.v_count),
         )
-        return _Taps(tracer().Int32(found.frame), axes, g.shape)
+        return _Taps(mi.Int32(found.frame), axes, g.shape)
 
     def __iter__(self) -> Iterator[tuple[Any, Any, tuple[int, int, int]]]:
         """Bin index, whether it is on the grid, and the tap along each axis."""
@@ -90,11 +86,9 @@ class Bins:
     """
 
     def __init__(self, grid: Grid, frames: int) -> None:
-        import drjit as dr
-
         self.shape = (frames, *grid.shape)
         self.grid = grid
-        self.values = dr.zeros(tracer().Float, math.prod(self.shape))
+        self.values = dr.zeros(mi.Float, math.prod(self.shape))
 
     def add(self, found: Contribution, active: Any) -> None:
         """Add paths."""
@@ -105,8 +99,6 @@ class Bins:
 
     def add_derivative(self, found: Contribution, dots: tuple, active: Any) -> None:
         """Add the derivative of paths' deposit, given those of power, range, u and v."""
-        import drjit as dr
-
         taps = _Taps.of(self.grid, found)
         (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
         power = dr.detach(found.power)
@@ -121,9 +113,7 @@ class Bins:
             self._add(index, value, ok & active)
 
     def _add(self, index: Any, value: Any, active: Any) -> None:
-        import drjit as dr
-
-        dr.scatter_add(self.values, value, tracer().UInt32(index), active)
+        dr.scatter_add(self.values, value, mi.UInt32(index), active)
 
     def map(self) -> Float32[Tensor, "frame range u v"]:
         """What all bins hold."""
@@ -132,9 +122,6 @@ class Bins:
 
 def gather(seed: Any, grid: Grid, found: Contribution, active: Any) -> tuple[Any, Any, Any, Any]:
     """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path."""
-    import drjit as dr
-
-    mi = tracer()
     taps = _Taps.of(grid, found)
     (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
     bars = [mi.Float(0.0) for _ in range(4)]

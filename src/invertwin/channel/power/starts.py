@@ -13,12 +13,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel import kernel
-from invertwin.channel.bridge import Geometry, to_float, tracer
-from invertwin.channel.kernel import Inputs
-from invertwin.channel.passage import land, passage
 from invertwin.channel.paths import Link
-from invertwin.channel.rays import Shot, bounding_spheres, face_areas, scrambled, uniform_pair
+from invertwin.channel.power import integrand
+from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.power.passage import land, passage
+from invertwin.channel.rays.arrays import between, point_at, scrambled, to_float, uniform_pair
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.scene import RayScene, bounding_spheres, face_areas
 from invertwin.errors import InputError
 
 
@@ -26,7 +28,7 @@ from invertwin.errors import InputError
 class Samples:
     """Points on surfaces (Dr.Jit arrays). ``weight`` is one over (samples × area density).
 
-    ``share`` and ``excess`` are those of the sheets between the transmitter and the point.
+    ``transmittance`` and ``extra`` length are those of the sheets between transmitter and point.
     """
 
     frame: Any
@@ -34,8 +36,8 @@ class Samples:
     b1: Any
     b2: Any
     weight: Any
-    share: Any
-    excess: Any
+    transmittance: Any
+    extra: Any
 
 
 def _caps(
@@ -56,15 +58,19 @@ class RaySampler:
     """Rays from TX, the same number into the cap around each object, jittered on a grid."""
 
     def __init__(
-        self, shot: Shot, samples: int, seed: int, reference: tuple[Geometry, Link] | None = None
+        self,
+        rays: RayScene,
+        samples: int,
+        seed: int,
+        reference: tuple[Geometry, Link] | None = None,
     ) -> None:
         if reference:
             axes, heights = _caps(bounding_spheres(reference[0]), reference[1], margin=1.1)
         else:
-            axes, heights = _caps(shot.spheres, shot.link, margin=1.001)
-        self.shot = shot
+            axes, heights = _caps(rays.spheres, rays.link, margin=1.001)
+        self.rays = rays
         self.objects = axes.shape[1]
-        blocks = shot.link.frame_count * self.objects
+        blocks = rays.link.frame_count * self.objects
         self.rows = max(1, int(np.sqrt(samples / blocks)))
         self.columns = max(1, samples // blocks // self.rows)
         self.size = blocks * self.rows * self.columns
@@ -73,10 +79,7 @@ class RaySampler:
 
     def draw(self, index: Any, inputs: Inputs) -> Samples:
         """The samples of the given indices below ``size``."""
-        import drjit as dr
-
-        mi = tracer()
-        shot, per_block = self.shot, self.rows * self.columns
+        rays, per_block = self.rays, self.rows * self.columns
         block, place = index // per_block, index % per_block
         frame = block // self.objects
         jitter = uniform_pair(index, self.seed)
@@ -99,14 +102,14 @@ class RaySampler:
             away = direction - dr.gather(mi.Vector3f, self.axes, entry)
             inside = (dr.squared_norm(away) <= 2 * cap) | (block == entry)
             density += dr.select(inside, per_block / (2 * dr.pi * cap), 0.0)
-        centre = shot.point(shot.tx, frame)
+        centre = point_at(rays.tx, frame)
         ray = mi.Ray3f(centre, direction)
-        hit = land(shot, inputs, ray, mi.Bool(True), (index, self.dice), coherent=True)
-        point = kernel.place(inputs, hit.face, hit.b1, hit.b2)
+        hit = land(rays, inputs, ray, mi.Bool(True), (index, self.dice), coherent=True)
+        point = integrand.place(inputs, hit.face, hit.b1, hit.b2)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
         weight = dr.select(hit.valid, distance / (cosine * density * hit.chance), 0.0)
-        return Samples(frame, hit.face, hit.b1, hit.b2, weight, hit.share, hit.excess)
+        return Samples(frame, hit.face, hit.b1, hit.b2, weight, hit.transmittance, hit.extra)
 
 
 class AreaSampler:
@@ -117,36 +120,36 @@ class AreaSampler:
     """
 
     def __init__(
-        self, shot: Shot, samples: int, seed: int, reference: tuple[Geometry, Link] | None = None
+        self,
+        rays: RayScene,
+        samples: int,
+        seed: int,
+        reference: tuple[Geometry, Link] | None = None,
     ) -> None:
-        mi = tracer()
-        geometry = reference[0] if reference else shot.geometry
-        if len(geometry.faces) != len(shot.geometry.faces):
+        geometry = reference[0] if reference else rays.geometry
+        if len(geometry.faces) != len(rays.geometry.faces):
             raise InputError(
-                f"expected a reference scene of {len(shot.geometry.faces)} triangles, got "
+                f"expected a reference scene of {len(rays.geometry.faces)} triangles, got "
                 f"{len(geometry.faces)}; use the scene the differences start from"
             )
         areas = face_areas(geometry)
-        self.shot = shot
-        self.per_frame = max(1, samples // shot.link.frame_count)
-        self.size = self.per_frame * shot.link.frame_count
+        self.rays = rays
+        self.per_frame = max(1, samples // rays.link.frame_count)
+        self.size = self.per_frame * rays.link.frame_count
         self.distribution = mi.DiscreteDistribution(to_float(areas / areas.mean()))
         self.seeds = scrambled(seed, 1), scrambled(seed, 2)
 
     def draw(self, index: Any, inputs: Inputs) -> Samples:
         """The samples of the given indices below ``size``."""
-        import drjit as dr
-
-        mi = tracer()
-        shot = self.shot
+        rays = self.rays
         frame, place = index // self.per_frame, index % self.per_frame
         jitter, _ = uniform_pair(index, self.seeds[0])
         uniform = (mi.Float(place) + jitter) / self.per_frame
         face, pmf = self.distribution.sample_pmf(uniform)
         b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
-        p0, p1, p2 = shot.corners(face)
+        triangle = p0, p1, p2 = rays.corners(face)
         area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
-        position = p0 * (1 - b.x - b.y) + p1 * b.x + p2 * b.y
-        passed = passage(shot, inputs, shot.point(shot.tx, frame), position, mi.Bool(True))
-        weight = dr.select(passed.share > 0, area / (pmf * self.per_frame), 0.0)
-        return Samples(frame, face, b.x, b.y, weight, passed.share, passed.excess)
+        position = between(triangle, b.x, b.y)
+        passed = passage(rays, inputs, point_at(rays.tx, frame), position, mi.Bool(True))
+        weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
+        return Samples(frame, face, b.x, b.y, weight, passed.transmittance, passed.extra)
