@@ -8,7 +8,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors"}
+FOUNDATION = {"constants", "errors", "limits"}
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "channel"}
 RADAR = CHANNEL - {"doctor"} | {"radar"}
@@ -20,6 +20,7 @@ INVERSION = SIMULATION | CAPTURE | {"inversion"}
 ALLOWED = {
     "constants": set(),
     "errors": set(),
+    "limits": set(),
     "doctor": FOUNDATION,
     "scene": SCENE,
     "channel": CHANNEL,
@@ -28,7 +29,8 @@ ALLOWED = {
     "capture": CAPTURE,
     "inversion": INVERSION,
     "peers": SIMULATION | {"peers"},
-    "cli": INVERSION | {"doctor", "peers", "cli", "__init__"},
+    "datasets": CAPTURE | {"datasets", "cli"},
+    "cli": INVERSION | {"doctor", "peers", "datasets", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

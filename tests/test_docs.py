@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from invertwin.capture import rail_sar
+from invertwin.datasets import rail_sar
 from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
 

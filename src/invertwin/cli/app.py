@@ -1,5 +1,6 @@
 """The command line `invertwin`: from run files and recordings to folders of results."""
 
+import json
 import os
 import sys
 import time
@@ -16,11 +17,10 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from invertwin import __version__
-from invertwin.cli.keys import key_tables
+from invertwin.cli.registry import load_plugins
 from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.run_file import about_file, load_run, need
 from invertwin.cli.runs import RunFolder, open_run
-from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
 app = typer.Typer(
@@ -290,9 +290,17 @@ def keys(
         str | None,
         typer.Argument(help="Such as radar or radar.waveform; default: all.", show_default=False),
     ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json-schema", help="Print the JSON Schema, for editors.")
+    ] = False,
 ) -> None:
     """Print the keys of run files: what may be written where, units, defaults."""
-    _print(key_tables(section))
+    from invertwin.cli.keys import json_schema, key_tables
+
+    if as_json:
+        print(json.dumps(json_schema(), indent=2, ensure_ascii=False))
+    else:
+        _print(key_tables(section))
 
 
 @app.command()
@@ -309,6 +317,8 @@ def doctor(backend: BackendOption = None) -> None:
 def main() -> None:
     """Entry point: bad input is one line and exit code 2, an interruption 130."""
     warnings.showwarning = _shown_once()
+    for name, command in load_plugins().commands.items():
+        app.command(name)(command)
     try:
         app(standalone_mode=True)
     except InputError as error:
@@ -331,7 +341,7 @@ def _reconstruct(file: Path, out: Path, overwrite: bool, resume: bool, seed: int
 
 @contextmanager
 def _folder(
-    path: Path, runs: dict[str, RunFile], overwrite: bool, resume: bool
+    path: Path, runs: dict[str, Any], overwrite: bool, resume: bool
 ) -> Iterator[RunFolder]:
     """The run's folder; says where the results are, or how to resume."""
     folder = open_run(path, runs, overwrite=overwrite, resume=resume)
@@ -350,9 +360,9 @@ def _folder(
 
 def _load(
     files: list[Path], seed: int | None, command: str, sections: Sequence[str]
-) -> dict[str, RunFile]:
+) -> dict[str, Any]:
     """Run files by stem, with the sections that the command cannot do without."""
-    runs: dict[str, RunFile] = {}
+    runs: dict[str, Any] = {}
     for file in files:
         if file.stem in runs:
             raise InputError(

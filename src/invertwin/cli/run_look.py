@@ -13,8 +13,6 @@ from invertwin.capture import (
     ChirpData,
     described_arrays,
     estimate_channels,
-    openradar,
-    rail_sar,
     ti,
 )
 from invertwin.capture.elements import elements
@@ -34,6 +32,7 @@ from invertwin.cli.doppler_maps import (
 )
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.runs import RunFolder
+from invertwin.datasets import openradar, rail_sar
 from invertwin.errors import InputError
 from invertwin.radar import Radar, SampledWaveform, range_profile, velocity_span
 from invertwin.scene import AntennaArray

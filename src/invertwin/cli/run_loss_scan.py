@@ -17,8 +17,7 @@ from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.studies import LossScan
+from invertwin.cli.schema import LossScan, RunFile
 from invertwin.errors import InputError
 from invertwin.radar.direction import music
 from invertwin.radar.radar import Radar

@@ -4,14 +4,13 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
 from torch import Tensor
 
-from invertwin.capture import ChirpData, openradar
+from invertwin.capture import ChirpData
 from invertwin.channel import Grid
 from invertwin.cli import build, pictures
 from invertwin.cli.doppler_maps import Panel, doppler_maps, panels, panels_picture
@@ -20,8 +19,8 @@ from invertwin.cli.pictures import U_LABEL
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import MoverParameter, OpenRadarData, RunFile
-from invertwin.cli.sensors import board_elements
+from invertwin.cli.recordings import recorded_chirps
+from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 from invertwin.inversion.mover import (
     Echo,
@@ -38,7 +37,6 @@ from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 
-_ORIGINAL = "github.com/PreSenseRadar/OpenRadar"
 _CELLS = 4  # about the mover, that twin and point are scored on
 _DRAWN_CELLS = 8
 _RAYS = 10_000  # of a map that is scored or drawn
@@ -139,30 +137,22 @@ def run_openradar(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
 
 def _recorded(run: RunFile) -> tuple[ChirpData, Radar, Grid]:
     data = need(run, "data", "reconstruct")
-    assert isinstance(data, OpenRadarData)
     for name in ("radar", "starts", "calibration", "landscape", "truth"):
         if getattr(run, name):
             raise InputError(
                 f"{name}: expected no such section with data.kind = openradar, got one; remove it: "
                 "the recording brings its radar along, and nothing in it was surveyed"
             )
-    path = Path(data.folder)
-    with about("data.folder"):
-        if not (path / openradar.FILE).is_file():
-            raise InputError(
-                f"expected {openradar.FILE} in {path}, got no such file; it is made from the "
-                f"public recording of {_ORIGINAL}: set INVERTWIN_DATA to the folder that holds "
-                f"{path.name}/"
-            )
-        chirps = openradar.read_chirps(path)
+    found = recorded_chirps(data)
+    chirps = found.chirps
     with about("data.board"):
-        radar = chirps.radar(*board_elements(data.board))
+        radar = found.radar()
     return chirps, radar, build.grid(need(run, "grid", "reconstruct"), radar)
 
 
-def _mover(run: RunFile) -> MoverParameter:
+def _mover(run: RunFile) -> Any:
     table = need(run, "parameters", "reconstruct")[0]
-    if len(run.parameters) > 1 or not isinstance(table, MoverParameter):
+    if len(run.parameters) > 1 or table.kind != "mover":
         kinds = ", ".join(parameter.kind for parameter in run.parameters)
         raise InputError(
             f"parameters: expected one of kind mover with data.kind = openradar, got {kinds}; "
@@ -178,7 +168,7 @@ def _frame(run: RunFile, beat: Tensor, radar: Radar, grid: Grid, chirps: Chirps)
 
 
 def _fitted(
-    run: RunFile, table: MoverParameter, scene: Scene, frame: _Frame, name: str, console: Console
+    run: RunFile, table: Any, scene: Scene, frame: _Frame, name: str, console: Console
 ) -> _Twin:
     settings = need(run, "reconstruct", "reconstruct")
     begin = time.perf_counter()
@@ -201,7 +191,7 @@ def _fitted(
 
 def _heldout(
     run: RunFile,
-    table: MoverParameter,
+    table: Any,
     scene: Scene,
     data: ChirpData,
     radar: Radar,

@@ -34,7 +34,7 @@ from invertwin.cli.report import Table
 from invertwin.cli.run_file import need
 from invertwin.cli.run_openradar import run_openradar
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
-from invertwin.cli.schema import OpenRadarData, RunFile, SimulatedData
+from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry import without_clouds
 
@@ -44,7 +44,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
 
     Starts that an interrupted run has finished are not fitted again.
     """
-    if isinstance(run.data, OpenRadarData):
+    if getattr(run.data, "kind", None) == "openradar":
         return run_openradar(run, folder, console)
     begin = time.perf_counter()
     need(run, "reconstruct", "reconstruct")

@@ -15,7 +15,7 @@ from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import Chirps, Impairments, RunFile, SimulatedData
+from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, exact_spectrum, velocity_span
 from invertwin.radar.radar import Radar
@@ -146,7 +146,7 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
 
 
 def _chirp_train(
-    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: Chirps
+    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: Any
 ) -> list[Table]:
     """The same for several ramps a frame, between which objects move."""
     data, chirps = _simulated(run), sensors.chirps(table)
@@ -161,7 +161,7 @@ def _chirp_train(
             retrace=table.retrace,
             samples=data.samples,
             density=data.density,
-            impairments=sensors.impairments(run.impairments or Impairments(), data),
+            impairments=sensors.impairments(run.impairments, data),
         )
     seconds = time.perf_counter() - begin
     maps = doppler_maps(beat, radar, grid, chirps)

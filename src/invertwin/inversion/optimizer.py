@@ -3,12 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Lt
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.limits import Count, NonNegative, Positive
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.loss import SpectrumLoss
 
@@ -33,11 +35,11 @@ class Optimizer:
     """
 
     kind: Literal["adam", "sgd", "gauss_newton"] = "adam"
-    rate: float = 0.03
-    rotation_rate: float | None = None
-    final_rate: float | None = None
-    momentum: float = 0.9
-    curvature_every: int = 1
+    rate: Positive = 0.03
+    rotation_rate: Positive | None = None
+    final_rate: NonNegative | None = None
+    momentum: Annotated[float, Ge(0), Lt(1)] = 0.9
+    curvature_every: Count = 1
     module_rates: tuple[float | None, ...] = ()
 
     def __post_init__(self) -> None:

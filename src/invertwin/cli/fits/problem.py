@@ -15,13 +15,10 @@ from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.schema import (
-    MoverParameter,
-    RadarParameter,
     RunFile,
     Settings,
     SimulatedData,
     Variant,
-    VerticesParameter,
 )
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.errors import InputError
@@ -72,7 +69,7 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     scene, truth = build.scene(run), build.true_scene(run)
     data = need(run, "data", "reconstruct")
     for i, parameter in enumerate(run.parameters):
-        if isinstance(parameter, MoverParameter):
+        if parameter.kind == "mover":
             raise InputError(
                 f'parameters[{i}].kind: expected "mover" with data.kind = "openradar" only, got '
                 f'"{data.kind}"; use "translation", "pose" or another kind'
@@ -103,7 +100,7 @@ def problem_of(run: RunFile, console: Console) -> Problem:
 
 def sought_objects(run: RunFile) -> list[str]:
     """Objects that have parameters."""
-    return [p.object for p in run.parameters if not isinstance(p, RadarParameter)]
+    return [p.object for p in run.parameters if getattr(p, "object", None)]
 
 
 def varied(problem: Problem, mode: str) -> Problem:
@@ -131,7 +128,7 @@ def varied_run(run: RunFile, mode: str) -> RunFile:
     if wanted.smooth is not None:
         smooth = {"smooth": wanted.smooth}
         for name, table in kept.items():
-            if isinstance(table, VerticesParameter):
+            if table.kind == "vertices":
                 kept[name] = table.model_copy(update=smooth)
     changes["parameters"] = list(kept.values())
     # Stages seek what the fit has; one that has nothing left to seek falls out.
@@ -187,7 +184,7 @@ def _stage(run: RunFile, table: StageTable) -> Stage:
         tables = build.named(run.parameters)
         sought = [tables[name] for name in table.parameters or tables]
         change = partial(remeshed, edge=table.remesh)
-        remesh = {t.object: change for t in sought if isinstance(t, VerticesParameter)}
+        remesh = {t.object: change for t in sought if t.kind == "vertices"}
     steps = table.steps or need(run, "reconstruct", "reconstruct").steps
     return Stage(steps, tuple(table.parameters), table.rebuild, remesh, options)
 

@@ -13,7 +13,7 @@ from invertwin.cli.fits.likeness import shape_scores
 from invertwin.cli.fits.problem import Problem, density_of
 from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import need
-from invertwin.cli.schema import MaterialParameter, Parameter, RunFile, SimulatedData
+from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
@@ -60,9 +60,9 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
     return rows | shapes | value_errors(sought, twin, problem.truth, frequency)
 
 
-def _made_known(problem: Problem, parameter: Parameter) -> bool:
+def _made_known(problem: Problem, parameter: Any) -> bool:
     """Whether the run file tells what the sought object is really made of."""
-    if not isinstance(parameter, MaterialParameter):
+    if parameter.kind != "material":
         return False
     table = problem.run.truth.get(parameter.object)
     stated = table is not None and table.material is not None

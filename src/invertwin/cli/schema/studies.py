@@ -1,45 +1,112 @@
-"""The tables of the studies: other ways to a derivative, and losses along a line."""
+"""The tables of the studies: gradient checks, other ways to a derivative, losses along a line."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field
+from annotated_types import Ge, Len
+from pydantic import model_validator
 
-from invertwin.cli.schema.section import Count, Positive, Section, Vector
+from invertwin.cli.materials import MaterialValue
+from invertwin.cli.section import Counts, Depth, Section, Vector, check_presence, key
+from invertwin.limits import Count, Positive
 
-Subarray = Annotated[list[Count], Field(min_length=2, max_length=2)]
+Subarray = Annotated[list[Count], Len(2, 2)]
+
+
+class GradientParameter(Section):
+    """The scalar θ of a gradient check; θ = 0 is the scene as written."""
+
+    kind: Literal[
+        "translation",
+        "rotation",
+        "scale",
+        "material",
+        "radar_translation",
+        "radar_rotation",
+        "joint",
+        "latent",
+        "distance",
+        "density",
+    ] = key(
+        "joint = turns one of a body; latent = a coordinate of a vehicle or prior; distance = "
+        "moves the surface of a signed distance outwards, density = thickens a cloud in the "
+        "object's place, both in a round bump"
+    )
+    object: str | None = key("name in the scene; none for the radar's", None)
+    axis: Vector | None = key("direction, or axis of the turn", None)
+    value: MaterialValue | None = key("for kind material", None)
+    joint: str | None = key("name, for kind joint", None)
+    index: Annotated[int, Ge(0)] | None = key("from 0, for kind latent", None)
+    center: Vector | None = key("of the bump, in the object's frame [m]", None)
+    width: Positive | None = key("standard deviation of the bump [m]", None)
+    low: Vector | None = key(
+        "corner of the nodes of distance or density, in the object's frame [m]", None
+    )
+    high: Vector | None = key("the opposite corner [m]", None)
+    counts: Counts | None = key("nodes along x, y and z", None)
+    extinction: Positive | None = key("of the cloud [1/m], for kind density", None)
+
+    @model_validator(mode="after")
+    def _complete(self) -> "GradientParameter":
+        grid = self.kind in ("distance", "density")
+        wanted = {
+            "object": not self.kind.startswith("radar"),
+            "axis": self.kind.endswith(("translation", "rotation")) or self.kind == "joint",
+            "value": self.kind == "material",
+            "joint": self.kind == "joint",
+            "index": self.kind == "latent",
+            **dict.fromkeys(("center", "width", "low", "high", "counts"), grid),
+            "extinction": self.kind == "density",
+        }
+        check_presence(self, wanted, f"with kind = {self.kind}")
+        return self
+
+
+class Gradcheck(Section):
+    """Derivative of the map against central differences."""
+
+    parameter: GradientParameter = key("the scalar θ")
+    step: Positive | None = key(
+        "of the differences: m, relative for scale and density, standard deviations for latent",
+        None,
+    )
+    step_deg: Positive | None = key("the same for rotations and joints", None)
+    noise: Positive = key("‖standard error‖₁/‖g_FD‖₁ at which repeating stops", 0.007)
+    max_pairs: Count = key("of differences, at most", 64)
+    depth: Depth = key("most bounces of a path", 3)
+    samples: Count = key("rays of one derivative", 4_000_000)
+    boundary_samples: Count = key("silhouette samples of one derivative", 1_000_000)
+    repeats: Count = key("derivatives averaged", 4)
+    difference_samples: Count = key("samples of one end of a pair", 8_000_000)
+    sampling: Literal["rays", "area"] = key("of the differences", "rays")
+
+    @model_validator(mode="after")
+    def _complete(self) -> "Gradcheck":
+        turns = self.parameter.kind.endswith("rotation") or self.parameter.kind == "joint"
+        wanted = {"step_deg": turns, "step": not turns}
+        check_presence(self, wanted, f"with kind = {self.parameter.kind}")
+        return self
 
 
 class Methods(Section):
     """Other ways to the derivative of a gradient check, in one table with ours."""
 
-    density: Positive = 6e3
-    """rough points per m² of the exact signals that MUSIC is given"""
-    sources: Count = 6
-    """of MUSIC, in every range bin"""
-    smoothing: Subarray = [8, 6]
-    """elements along x, y of the subarrays of MUSIC"""
-    samples: Count = 400_000
-    """rays of the other ray tracers, and as many points on edges"""
+    density: Positive = key(
+        "rough points per m² of the exact signals that MUSIC is given", 6e3
+    )
+    sources: Count = key("of MUSIC, in every range bin", 6)
+    smoothing: Subarray = key("elements along x, y of the subarrays of MUSIC", [8, 6])
+    samples: Count = key("rays of the other ray tracers, and as many points on edges", 400_000)
 
 
 class LossScan(Section):
     """Losses of the raw signal, its range profile, MUSIC and the surrogate along a line."""
 
-    object: str
-    """name in the scene"""
-    axis: Vector
-    """direction of the line"""
-    span: Positive = 0.02
-    """m on either side of the truth"""
-    points: Annotated[int, Field(ge=3)] = 201
-    """on the line"""
-    wide_span: Positive = 0.4
-    """m on either side, surrogate alone"""
-    wide_points: Annotated[int, Field(ge=3)] = 41
-    """on that line"""
-    sources: Count = 6
-    """of MUSIC, in every range bin"""
-    smoothing: Subarray = [8, 6]
-    """elements along x, y of the subarrays of MUSIC"""
-    samples: Count = 200_000
-    """rays of the surrogate at each point"""
+    object: str = key("name in the scene")
+    axis: Vector = key("direction of the line")
+    span: Positive = key("m on either side of the truth", 0.02)
+    points: Annotated[int, Ge(3)] = key("on the line", 201)
+    wide_span: Positive = key("m on either side, surrogate alone", 0.4)
+    wide_points: Annotated[int, Ge(3)] = key("on that line", 41)
+    sources: Count = key("of MUSIC, in every range bin", 6)
+    smoothing: Subarray = key("elements along x, y of the subarrays of MUSIC", [8, 6])
+    samples: Count = key("rays of the surrogate at each point", 200_000)
