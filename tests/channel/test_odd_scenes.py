@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import torch
 
-from invertwin.capture import read
 from invertwin.channel.bridge import backend, use_backend
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.tracer import trace_field, trace_power
+from invertwin.datasets import rail_sar
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,

@@ -111,7 +111,10 @@ def test_run_files_with_materials_are_written_and_read_again(tmp_path):
     ("table", "parts"),
     [
         ({"kind": "dielectric"}, ["scene.wall.material: ", "`permittivity`, or `itu`"]),
-        ({"kind": "dielectric", "itu": "concret"}, ["scene.wall.material: ", "did you mean concrete?"]),
+        (
+            {"kind": "dielectric", "itu": "concret"},
+            ["scene.wall.material: ", "did you mean concrete?"],
+        ),
         (
             {"kind": "slab", "permittivity": 2.0, "thickness": -0.01},
             ["scene.wall.material.thickness: ", "greater than or equal to 0", "got -0.01"],
@@ -230,7 +233,9 @@ def test_materials_of_a_scene_file_take_no_images(tmp_path):
         "material": {"kind": "dielectric", "permittivity": {"image": "x.npy"}},
     }
     run = validate({"task": "simulate", "scene_file": table}, tmp_path / "run.toml")
-    with pytest.raises(InputError, match=r"scene_file\.material\.permittivity: expected permittivity as a number"):
+    with pytest.raises(
+        InputError, match=r"scene_file\.material\.permittivity: expected permittivity as a number"
+    ):
         build.scene(run)
 
 

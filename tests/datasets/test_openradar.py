@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-
 from invertwin.datasets.openradar import FILE, read, read_chirps
 from invertwin.errors import InputError
 from invertwin.radar.boards import board

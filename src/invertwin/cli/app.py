@@ -340,9 +340,7 @@ def _reconstruct(file: Path, out: Path, overwrite: bool, resume: bool, seed: int
 
 
 @contextmanager
-def _folder(
-    path: Path, runs: dict[str, Any], overwrite: bool, resume: bool
-) -> Iterator[RunFolder]:
+def _folder(path: Path, runs: dict[str, Any], overwrite: bool, resume: bool) -> Iterator[RunFolder]:
     """The run's folder; says where the results are, or how to resume."""
     folder = open_run(path, runs, overwrite=overwrite, resume=resume)
     try:

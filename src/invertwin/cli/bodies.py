@@ -30,7 +30,7 @@ def body(
     """A body with joints and one skin, y up, facing −z, in the frame of its model.
 
     Args:
-        model: person = made of formulas, arms held out at rest; anny = of the optional extra `anny`.
+        model: person = made of formulas, arms held out at rest; anny = of the extra `anny`.
         file: SMPL's layout (.npz), from the run file's folder; in place of a model.
         height: m, of `person`.
         spacing: m, of the corners of its triangles.

@@ -80,9 +80,7 @@ def _at_start(
     return begun, along(module, **changes)
 
 
-def _joint(
-    table: schema.GradientParameter, item: Any
-) -> tuple[SkinnedBody, dict[str, Tensor]]:
+def _joint(table: schema.GradientParameter, item: Any) -> tuple[SkinnedBody, dict[str, Tensor]]:
     if item is None or _shape(item) != "body":
         raise InputError(f'expected an object with shape = "body", got {table.object}; choose one')
     body = template(item).scaled(item.scale)

@@ -61,8 +61,9 @@ class Table(Section):
         found: dict[str, Any] = {}
         for name, (place, hint) in self.made_from.items():
             if place is None:
-                options = [given[kind] for kind in _members(hint) if kind in given]
-                found |= {name: option for option in options[:1]}
+                kind = next((kind for kind in _members(hint) if kind in given), None)
+                if kind is not None:
+                    found[name] = given[kind]
             elif getattr(self, place) is not None:
                 with about(place):
                     found[name] = registry.value(getattr(self, place), hint, name, given)
@@ -246,7 +247,7 @@ class Registry:
             members.append(Annotated[found.points, Tag(f"{TAG_MARK}points")])
         if all(kind.untagged for kind in kinds.values()):
             keys = keys[1:]
-        return Annotated[Union[tuple(members)], tag_by(keys, found.default)]
+        return Annotated[tuple(members), tag_by(keys, found.default)]
 
     @cache  # noqa: B019 - as above
     def table(self, group: str, name: str, base: type[Table] | None = None) -> Any:
@@ -319,7 +320,7 @@ class Registry:
         if default is inspect.Parameter.empty:
             return kind, key(words)
         if not isinstance(default, _PLAIN):
-            return kind | None if isinstance(kind, type) else Union[kind, None], key(words, None)
+            return Union[kind, None], key(words, None)  # noqa: UP007 - some are no types
         if isinstance(default, float) and _is_angle(hint):
             default = round(math.degrees(default), 9)
         if isinstance(default, tuple) or _letters(hint):
@@ -447,7 +448,7 @@ def number_or_list(*kinds: Any) -> Any:
     from pydantic import Discriminator
 
     members = tuple(Annotated[kind, Tag(TAG_MARK + tag(kind))] for kind in kinds)
-    return Annotated[Union[members], Discriminator(form)]
+    return Annotated[members, Discriminator(form)]
 
 
 def _members(hint: Any) -> tuple[Any, ...]:

@@ -16,10 +16,10 @@ from invertwin.cli import build, pictures
 from invertwin.cli.doppler_maps import Panel, doppler_maps, panels, panels_picture
 from invertwin.cli.fits.fitting import Bar
 from invertwin.cli.pictures import U_LABEL
+from invertwin.cli.recordings import recorded_chirps
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.recordings import recorded_chirps
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 from invertwin.inversion.mover import (

@@ -44,7 +44,7 @@ InputPath = Annotated[str, MinLen(1), AfterValidator(_beside_run_file)]
 """Path of a file or folder, from the run file's folder, then from INVERTWIN_DATA."""
 
 
-class At(InputError):
+class KeyInputError(InputError):
     """Bad input at a key of the run file."""
 
     def __init__(self, path: str, text: str) -> None:
@@ -57,10 +57,10 @@ def about(path: str) -> Iterator[None]:
     """Errors of the library with the key of the run file that they are about."""
     try:
         yield
-    except At as error:
-        raise At(f"{path}.{error.path}", error.text) from None
+    except KeyInputError as error:
+        raise KeyInputError(f"{path}.{error.path}", error.text) from None
     except InputError as error:
-        raise At(path, str(error)) from None
+        raise KeyInputError(path, str(error)) from None
 
 
 def key(description: str, default: Any = ..., **limits: Any) -> Any:

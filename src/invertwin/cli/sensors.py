@@ -113,9 +113,7 @@ class RadarTable(Section):
     window: Window = key("over the samples of a ramp", "hamming")
     array_window: Window = key("over the elements", "hamming")
     positions: Track = key("m, one frame each: a list of points or a track", [[0.0, 0.0, 0.0]])
-    orientation: Orientation = key(
-        "look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0])
-    )
+    orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
     shared_visibility: bool | None = key(
         "what the transmitter sees, the receiver sees; default: when both are within 0.1 m", None
     )

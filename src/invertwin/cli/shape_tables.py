@@ -88,9 +88,7 @@ class Mover(ParameterTable):
 
     kind: Literal["mover"]
     object: str = key("name in the scene")
-    cells: Count = key(
-        "range and Doppler cells to either side of the echo that are fitted", 6
-    )
+    cells: Count = key("range and Doppler cells to either side of the echo that are fitted", 6)
 
 
 def register(registry: Registry) -> None:
@@ -164,9 +162,7 @@ def vehicle(
     return mesh if max_edge is None else remeshed(mesh, max_edge)
 
 
-def learned(
-    latent: Sequence[float] | None = None, prior: InputPath | None = None
-) -> Mesh:
+def learned(latent: Sequence[float] | None = None, prior: InputPath | None = None) -> Mesh:
     """A car of the learned prior: x ahead, y to the left, z up, on the ground z = 0.
 
     Args:
@@ -216,9 +212,7 @@ def distance_grid(
     return DistanceGrid.sampled(object, low, high, counts, distance, smooth)
 
 
-def density(
-    object: str, low: Vector, high: Vector, counts: Counts, item: Object
-) -> DensityGrid:
+def density(object: str, low: Vector, high: Vector, counts: Counts, item: Object) -> DensityGrid:
     """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else faint and
     even. Rates of about 0.1 suit it; measures and pictures show the surface of its usual level.
 

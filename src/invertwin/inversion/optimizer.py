@@ -10,9 +10,9 @@ from annotated_types import Ge, Lt
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
-from invertwin.limits import Count, NonNegative, Positive
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.loss import SpectrumLoss
+from invertwin.limits import Count, NonNegative, Positive
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The tables of fits: starts, budget, stages, variants, scores."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import model_validator

@@ -79,9 +79,7 @@ class Raw(Section):
     adc_start_time: NonNegative = key(
         "s, from the start of the ramp to the first sample; the waveform is what is sampled", 0.0
     )
-    frame_period: Positive | None = key(
-        "s, from frame to frame, as the settings say it", None
-    )
+    frame_period: Positive | None = key("s, from frame to frame, as the settings say it", None)
 
 
 class ObservationTable(Section):
@@ -115,9 +113,7 @@ class RunFile(Section):
     observations: dict[str, ObservationTable] = key(
         "[observations.<name>]: several sensors, each with its own data", {}
     )
-    parameters: list[Annotated[Any, OneOf("parameter")]] = key(
-        "[[parameters]]: what is sought", []
-    )
+    parameters: list[Annotated[Any, OneOf("parameter")]] = key("[[parameters]]: what is sought", [])
     starts: Starts | None = key("where fits start; without it where the scene says", None)
     initial: Initial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None

@@ -90,9 +90,7 @@ class Gradcheck(Section):
 class Methods(Section):
     """Other ways to the derivative of a gradient check, in one table with ours."""
 
-    density: Positive = key(
-        "rough points per m² of the exact signals that MUSIC is given", 6e3
-    )
+    density: Positive = key("rough points per m² of the exact signals that MUSIC is given", 6e3)
     sources: Count = key("of MUSIC, in every range bin", 6)
     smoothing: Subarray = key("elements along x, y of the subarrays of MUSIC", [8, 6])
     samples: Count = key("rays of the other ray tracers, and as many points on edges", 400_000)

@@ -24,9 +24,7 @@ class LatticeDeformation(nn.Module):
 
     applies_to = "scene"
 
-    def __init__(
-        self, object: str, low: Point, high: Point, counts: Counts = (4, 4, 4)
-    ) -> None:
+    def __init__(self, object: str, low: Point, high: Point, counts: Counts = (4, 4, 4)) -> None:
         """Deform `object`, by zero at the start.
 
         Args:
