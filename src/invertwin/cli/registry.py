@@ -17,10 +17,20 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Union, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from annotated_types import Len, MinLen
-from pydantic import GetCoreSchemaHandler, Tag, create_model, model_validator
+from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, model_validator
 
 from invertwin.cli.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
 from invertwin.errors import InputError
@@ -247,7 +257,7 @@ class Registry:
             members.append(Annotated[found.points, Tag(f"{TAG_MARK}points")])
         if all(kind.untagged for kind in kinds.values()):
             keys = keys[1:]
-        return Annotated[tuple(members), tag_by(keys, found.default)]
+        return Annotated[_any_of(members), tag_by(keys, found.default)]
 
     @cache  # noqa: B019 - as above
     def table(self, group: str, name: str, base: type[Table] | None = None) -> Any:
@@ -320,7 +330,7 @@ class Registry:
         if default is inspect.Parameter.empty:
             return kind, key(words)
         if not isinstance(default, _PLAIN):
-            return Union[kind, None], key(words, None)  # noqa: UP007 - some are no types
+            return _any_of([kind, None]), key(words, None)
         if isinstance(default, float) and _is_angle(hint):
             default = round(math.degrees(default), 9)
         if isinstance(default, tuple) or _letters(hint):
@@ -341,6 +351,9 @@ class Registry:
             if letters:
                 return Annotated[list[Literal[tuple(letters)]], MinLen(1)]  # type: ignore[valid-type]
             limits = [item for item in arguments[1:] if item != RADIANS]
+            if float in members and any(_is_array(member) for member in members):
+                number = Annotated[(float, *limits)] if limits else float
+                return number_or_list(number, list[number])  # type: ignore[valid-type]
             kind = self.read_type(arguments[0], name)
             return Annotated[(kind, *limits)] if limits else kind  # type: ignore[return-value]
         if Path in members:
@@ -445,10 +458,12 @@ def number_or_list(*kinds: Any) -> Any:
             return "list"
         return "table" if isinstance(bare, type) and issubclass(bare, Section) else "number"
 
-    from pydantic import Discriminator
+    members = [Annotated[kind, Tag(TAG_MARK + tag(kind))] for kind in kinds]
+    return Annotated[_any_of(members), Discriminator(form)]
 
-    members = tuple(Annotated[kind, Tag(TAG_MARK + tag(kind))] for kind in kinds)
-    return Annotated[members, Discriminator(form)]
+
+def _any_of(kinds: Sequence[Any]) -> Any:
+    return Union.__getitem__(tuple(kinds))  # type: ignore[attr-defined]
 
 
 def _members(hint: Any) -> tuple[Any, ...]:
@@ -494,8 +509,6 @@ def _radians(value: Any) -> Any:
 
 
 def _hints(make: Any) -> dict[str, Any]:
-    from typing import get_type_hints
-
     plain = isinstance(make, type) and not is_dataclass(make)
     return get_type_hints(make.__init__ if plain else make, include_extras=True)
 
