@@ -1,7 +1,7 @@
 """From the tables of a run file to the library's values: scenes, parameters, starts."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -12,17 +12,14 @@ from torch import Tensor, nn
 from invertwin.channel import Grid
 from invertwin.cli.bodies import Bodies, SoughtBody
 from invertwin.cli.fit_tables import surrogate as surrogate
-from invertwin.cli.recordings import measured as measured
-from invertwin.cli.recordings import recorded_chirps as recorded_chirps
 from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import unknown_object
-from invertwin.cli.schema import ObjectTable, RunFile, SceneFile, Starts
+from invertwin.cli.schema import RunFile, SceneFile, Starts
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
-from invertwin.cli.shape_tables import Placement, given_for, joined, shape_terms
+from invertwin.cli.shape_tables import ObjectTable, Placement, given_for, joined, shape_terms
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Regularizer
-from invertwin.inversion.stages import Build
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Mesh, Object, Scene, rigid, rotation_angle, rotation_from_vector
 from invertwin.scene.files import CONCRETE, load_scene_xml
@@ -125,7 +122,7 @@ class Start:
 
 def builders(
     tables: Sequence[Any], start: Start, objects: Mapping[str, ObjectTable] | None = None
-) -> dict[str, Build]:
+) -> dict[str, Callable[[Scene], nn.Module]]:
     """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order.
 
     Args:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from invertwin.cli.report import Table
-from invertwin.cli.schema import run_file_model
+from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
 COLUMNS = ("key", "value", "default", "unit or meaning")
@@ -19,7 +19,7 @@ def json_schema() -> Schema:
     """The JSON Schema of run files, for editors; kinds and sections of plugins are in it."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **run_file_model().model_json_schema(),
+        **RunFile.model_json_schema(),
     }
 
 

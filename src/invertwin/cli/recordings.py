@@ -7,7 +7,14 @@ from annotated_types import Ge
 from pydantic import model_validator
 from torch import Tensor, float64, zeros
 
-from invertwin.capture import Capture, ChannelCalibration, ChirpData, described_arrays, ti
+from invertwin.capture import (
+    Capture,
+    ChannelCalibration,
+    ChirpCapture,
+    ChirpData,
+    described_arrays,
+    ti,
+)
 from invertwin.cli.registry import Group, OneOf, Registry, Table
 from invertwin.cli.section import Depth, InputPath, Section, Seed, about, fail, key
 from invertwin.cli.sensors import (
@@ -183,8 +190,8 @@ def measured(data: Any, path: str = "data") -> Capture:
     Raises:
         InputError: Files that are missing, damaged or contradict each other.
     """
+    found = _built(data, path)
     with about(path):
-        found = data.build()
         capture = found.capture(data.chirp) if isinstance(found, Recording) else found
         if data.channels is None:
             return capture
@@ -192,25 +199,30 @@ def measured(data: Any, path: str = "data") -> Capture:
             return ChannelCalibration.load(data.channels).apply(capture)
 
 
-def recorded_chirps(data: Any, path: str = "data") -> Recording:
-    """The recording of a `[data]` table with every chirp, as movers need it.
+def chirp_capture(data: Any, path: str = "data") -> ChirpCapture:
+    """The recording of a `[data]` table with every chirp of its frames.
 
     Args:
         data: The table.
         path: Of the table, for errors.
 
     Raises:
-        InputError: As for `measured`, or data without chirps.
+        InputError: Data without chirps, or files that are missing or damaged.
     """
+    found = None if data.kind == "simulated" else _built(data, path)
+    if not isinstance(found, Recording):
+        raise InputError(
+            f'{path}.kind: expected data with chirps, got "{data.kind}"; give dca1000, arrays, or '
+            "simulated with [chirps]"
+        )
     with about(path):
-        found = data.build()
-        if not isinstance(found, Recording):
-            raise InputError(
-                "expected data with every chirp, such as dca1000 or arrays, got "
-                f"{data.kind}, which has one signal per frame; give such data"
-            )
-        if data.channels is None:
-            return found
-        with about("channels"):
-            calibration = ChannelCalibration.load(data.channels)
-            return replace(found, chirps=calibration.apply_to_chirps(found.chirps))
+        radar, chirps = found.radar(), found.chirps
+        if data.channels is not None:
+            with about("channels"):
+                chirps = ChannelCalibration.load(data.channels).apply_to_chirps(chirps)
+    return ChirpCapture(chirps.beat, radar, chirps.settings.chirps)
+
+
+def _built(data: Any, path: str) -> Capture | Recording:
+    with about(path):
+        return data.build()

@@ -242,7 +242,8 @@ class Registry:
     def names(self, group: str) -> list[str]:
         """The kinds of a group, or of "task"."""
         if group == "task":
-            return ["simulate", "reconstruct", "gradcheck", "loss-scan", "demo", *self.commands]
+            own = ["simulate", "reconstruct", "gradcheck", "loss-scan", "demo"]
+            return list(dict.fromkeys([*own, *self.commands]))
         return list(self._kinds(group))
 
     @cache  # noqa: B019 - the only registry lives as long as the program

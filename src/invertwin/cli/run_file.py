@@ -21,6 +21,7 @@ from invertwin.cli.section import about as about
 from invertwin.errors import InputError
 
 _MOST_ERRORS = 4  # in one line
+_STUDIES = ("methods", "loss_scan")  # sections of the package in experiments/studies
 _WORDS = {
     r"a valid dictionary( or .*)?": "a table",
     r"a valid string": "a text in quotes",
@@ -88,9 +89,9 @@ def validate(raw: dict[str, Any], source: Path) -> Any:
         InputError: It does not fit the schema.
     """
     try:
-        from invertwin.cli.schema import run_file_model
+        from invertwin.cli.schema import RunFile
 
-        return run_file_model().model_validate(raw, context={"folder": source.parent})
+        return RunFile.model_validate(raw, context={"folder": source.parent})
     except ValidationError as error:
         errors = error.errors(include_url=False)
         lines = dict.fromkeys(_explain(item) for item in errors)
@@ -135,10 +136,11 @@ def _explain(error: ErrorDetails) -> str:
     match error["type"]:
         case "unknown_key":
             key, allowed = context["key"], context["allowed"]
+            said = f"expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
+            if not path and key in _STUDIES:
+                return f"{key}: {said}install the studies: pip install -e ./experiments/studies"
             return (
-                f"{path}.{key}".lstrip(".")
-                + f": expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
-                + _nearest(key, allowed, "remove the key")
+                f"{path}.{key}".lstrip(".") + f": {said}" + _nearest(key, allowed, "remove the key")
             )
         case "unknown_object":
             return unknown_object(context["path"], context["name"], list(error["input"]["scene"]))

@@ -17,6 +17,7 @@ from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
 from invertwin.limits import Count, NonNegative, Positive
+from invertwin.radar.parameters import RadarPose
 from invertwin.scene import Mesh, Object, Scene, rigid, rotation_from_vector, shapes
 from invertwin.scene.files import load_mesh
 from invertwin.scene.geometry import (
@@ -30,7 +31,7 @@ from invertwin.scene.geometry import (
     load_prior,
     load_vehicle_space,
 )
-from invertwin.scene.parameters import Pose, RadarPose, Scale, Translation, Vertices
+from invertwin.scene.parameters import Pose, Scale, Translation, Vertices
 
 
 class Placement(Table):

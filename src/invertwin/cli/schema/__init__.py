@@ -3,26 +3,15 @@
 from invertwin.cli.materials import MaterialValue
 from invertwin.cli.recordings import SimulatedData
 from invertwin.cli.schema.fits import Initial, Reconstruct, Settings, Stage, Starts, Variant
-from invertwin.cli.schema.run import (
-    ObservationTable,
-    Raw,
-    RunFile,
-    SceneFile,
-    Truth,
-    run_file_model,
-)
-from invertwin.cli.schema.studies import Gradcheck, GradientParameter, LossScan
-from invertwin.cli.shape_tables import ObjectTable, Placement
+from invertwin.cli.schema.gradcheck import Gradcheck, GradientParameter
+from invertwin.cli.schema.run import ObservationTable, Raw, RunFile, SceneFile, Truth
 
 __all__ = [
     "Gradcheck",
     "GradientParameter",
     "Initial",
-    "LossScan",
     "MaterialValue",
-    "ObjectTable",
     "ObservationTable",
-    "Placement",
     "Raw",
     "Reconstruct",
     "RunFile",
@@ -33,5 +22,4 @@ __all__ = [
     "Starts",
     "Truth",
     "Variant",
-    "run_file_model",
 ]

@@ -129,6 +129,7 @@ class Variant(Settings):
     """The same data and start, fitted otherwise, to compare."""
 
     parameters: Names | None = key("names of what is sought; without it all", None)
+    observations: Names | None = key("names of the sensors that are fitted; without it all", None)
     boundary: bool | None = key("with boundary terms", None)
     smooth: _Rate = key("of free vertices", None)
     stages: list[Stage] | None = key("in place of [[stages]]", None)

@@ -2,8 +2,7 @@
 
 import json
 import re
-from functools import cache
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import MinLen
 from pydantic import create_model, model_validator
@@ -21,7 +20,7 @@ from invertwin.cli.schema.fits import (
     Starts,
     Variant,
 )
-from invertwin.cli.schema.studies import Gradcheck, LossScan, Methods
+from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.section import InputPath, Section, Seed, Vector, fail, key
 from invertwin.cli.sensors import ChirpsTable, GridTable, RadarTable
 from invertwin.errors import InputError
@@ -32,7 +31,6 @@ from invertwin.radar.surrogate import Surrogate
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "interior_only", "whole", "seen", "count", "m", "number", "consistency")
-_SENSOR = ("radar", "grid", "data", "surrogate", "chirps", "model")
 
 AnyMaterial = Annotated[Any, OneOf("material")]
 AnyModel = Annotated[Any, OneOf("model")]
@@ -57,6 +55,7 @@ class Truth(Section):
     rotation_deg: Vector | None = key("rotation vector", None)
     scale: Positive | None = key("factor", None)
     material: AnyMaterial | None = key("what it is really made of", None)
+    velocity: Vector | None = key("m/s", None)
     angles_deg: dict[str, Vector] | None = key(
         "of a body, all of its joints that are not at rest", None
     )
@@ -94,7 +93,7 @@ class ObservationTable(Section):
     weight: Positive = key("of its loss beside the others'", 1.0)
 
 
-class RunFile(Section):
+class _RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
     task: Annotated[str, NameOf("task")] = key("what the file is for")
@@ -133,11 +132,9 @@ class RunFile(Section):
     calibration: Calibration | None = key("before the fit", None)
     landscape: Landscape | None = key("losses along a line", None)
     gradcheck: Gradcheck | None = key("the gradient check", None)
-    methods: Methods | None = key("other ways to its derivative, to compare", None)
-    loss_scan: LossScan | None = key("losses of signals and of the surrogate along a line", None)
 
     @model_validator(mode="after")
-    def _names_exist(self) -> "RunFile":
+    def _names_exist(self) -> "_RunFile":
         if self.scene_file is None:
             if not self.scene:
                 fail("expected at least 1 object, got none; add [scene.<name>]", "scene")
@@ -150,7 +147,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _variants_are_named(self) -> "RunFile":
+    def _variants_are_named(self) -> "_RunFile":
         for name in self.variants:
             if name in _TAKEN or not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", name):
                 fail(
@@ -161,7 +158,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _parameters_are_named(self) -> "RunFile":
+    def _parameters_are_named(self) -> "_RunFile":
         known = self.parameter_names
         doubled = next((name for name in known if known.count(name) > 1), None)
         staged = [("stages", self.stages)]
@@ -178,7 +175,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _turned_joints_are_sought(self) -> "RunFile":
+    def _turned_joints_are_sought(self) -> "_RunFile":
         if self.starts is not None and self.starts.joint_deg > 0:
             name = self.starts.object
             if not any(p.kind == "body" and p.object == name for p in self.parameters):
@@ -190,7 +187,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _stages_remesh_what_they_seek(self) -> "RunFile":
+    def _stages_remesh_what_they_seek(self) -> "_RunFile":
         names = self.parameter_names
         free = {n for n, p in zip(names, self.parameters, strict=True) if p.kind == "vertices"}
         own = set(self.reconstruct.parameters if self.reconstruct else []) or set(names)
@@ -212,7 +209,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _learned_shapes_have_their_own_size(self) -> "RunFile":
+    def _learned_shapes_have_their_own_size(self) -> "_RunFile":
         for parameter in self.parameters:
             if parameter.kind not in ("shape_space", "prior"):
                 continue
@@ -229,32 +226,16 @@ class RunFile(Section):
         """What stages and variants call the parameters."""
         return [p.name or p.kind for p in self.parameters]
 
-    @property
-    def observed(self) -> dict[str, ObservationTable]:
-        """What is compared, by name, each with all sections; without [observations] one, ""."""
-        whole = {name: getattr(self, name) for name in _SENSOR}
-        tables = self.observations or {"": ObservationTable()}
-        return {
-            name: table.model_copy(update={k: v for k, v in whole.items() if not getattr(table, k)})
-            for name, table in tables.items()
-        }
-
     def references(self) -> list[tuple[str, str]]:
         """Where the run file names an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
         for i, parameter in enumerate(self.parameters):
             if getattr(parameter, "object", None) is not None:
                 used.append((f"parameters[{i}].object", parameter.object))
-        for section in (
-            "starts",
-            "initial",
-            "landscape",
-            "calibration",
-            "loss_scan",
-            "measures",
-        ):
-            if getattr(self, section) is not None:
-                used.append((f"{section}.object", getattr(self, section).object))
+        for section in type(self).model_fields:
+            name = getattr(getattr(self, section), "object", None)
+            if name is not None:
+                used.append((f"{section}.object", name))
         if self.gradcheck is not None and self.gradcheck.parameter.object is not None:
             used.append(("gradcheck.parameter.object", self.gradcheck.parameter.object))
         return used
@@ -267,19 +248,23 @@ def _named(used: list[str], known: list[str], path: str) -> None:
             fail(got, path)
 
 
-@cache
-def run_file_model() -> type[RunFile]:
-    """The run file with the sections of plugins."""
-    load_plugins()
+def _with_plugins() -> type[_RunFile]:
+    """The run file with the sections of installed plugins."""
     tables = {
         name: registry.table_of(model, name.title().replace("_", ""), checked=None)
-        for name, model in registry.sections.items()
+        for name, model in load_plugins().sections.items()
     }
-    taken = sorted(set(tables) & set(RunFile.model_fields))
+    taken = sorted(set(tables) & set(_RunFile.model_fields))
     if taken:
         raise InputError(f"expected new names of sections, got {taken[0]}; rename that plugin's")
     fields: dict[str, Any] = {
-        name: (table | None, key(" ".join((table.__doc__ or "").split()), None))
+        name: (table | None, key((table.__doc__ or "").split(".")[0], None))
         for name, table in tables.items()
     }
-    return create_model("RunFile", __base__=RunFile, **fields) if fields else RunFile
+    return create_model("RunFile", __base__=_RunFile, __doc__=_RunFile.__doc__, **fields)
+
+
+if TYPE_CHECKING:
+    RunFile = _RunFile
+else:
+    RunFile = _with_plugins()

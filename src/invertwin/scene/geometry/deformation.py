@@ -22,8 +22,6 @@ class LatticeDeformation(nn.Module):
             lattice's nodes and of one more on every side.
     """
 
-    applies_to = "scene"
-
     def __init__(self, object: str, low: Point, high: Point, counts: Counts = (4, 4, 4)) -> None:
         """Deform `object`, by zero at the start.
 
