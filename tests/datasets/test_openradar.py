@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.capture import read
-from invertwin.capture.openradar import FILE, read_chirps
+from invertwin.datasets.openradar import FILE, read, read_chirps
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
 from invertwin.radar.doppler import compensate_tdm, range_doppler
@@ -37,12 +36,12 @@ def test_virtual_channels_are_transmitters_times_receivers(write):
 
 
 def test_a_capture_has_the_elements_of_a_board(write):
-    capture = read(write(), "openradar", chirps="mean")
+    capture = read(write(), chirps="mean")
     tx, _ = board("xWR1642").arrays()
     assert torch.equal(capture.radar().transmitters.positions, tx.positions)
     torch.testing.assert_close(capture.beat, read_chirps(write()).samples.mean(1))
     mine = board("xWR1843").arrays(elevation=1, transmitters=[1, 3])
-    other = read(write(), "openradar", chirps=3, arrays=mine)
+    other = read(write(), chirps=3, arrays=mine)
     assert torch.equal(other.radar().transmitters.positions, mine[0].positions)
 
 
@@ -83,7 +82,7 @@ def test_the_recording_has_movers_near_three_metres(data_folder):
     nearest = data.settings.waveform.range_resolution
     ranges = torch.arange(128) * nearest
     assert 2.8 < float(ranges[profile.argmax()]) < 3.2
-    capture = read(data_folder / "openradar", "openradar", chirps=0)
+    capture = read(data_folder / "openradar", chirps=0)
     assert capture.radar().waveform.center_frequency == pytest.approx(78.956e9, rel=1e-4)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.capture import Capture, calibrate, locate, read
-from invertwin.capture.rail_sar import FILE
+from invertwin.capture import Capture, calibrate, locate
+from invertwin.datasets.rail_sar import FILE, read
 from invertwin.errors import InputError
 
 META = {"align_time_offset_s": 0.5, "align_range_bias_m": 0.2, "valid_scan_time_s": [0.1, 0.9]}
@@ -46,7 +46,7 @@ def write(tmp_path):
 
 
 def test_scans_become_labelled_range_profiles(write):
-    capture = read(write(), "rail_sar")
+    capture = read(write())
     assert capture.frame_count == 41
     torch.testing.assert_close(capture.times, torch.arange(5, 46).double() * 0.02)
     torch.testing.assert_close(capture.ranges, 1.8 + 0.01 * torch.arange(200).double())
@@ -56,7 +56,7 @@ def test_scans_become_labelled_range_profiles(write):
 
 
 def test_profiles_are_analytic_and_without_what_stands_still(write):
-    capture = read(write(), "rail_sar")
+    capture = read(write())
     spectrum = torch.fft.fft(capture.range_profile, dim=1).abs()
     assert spectrum[:, 101:].max() < 1e-6 * spectrum.max()
     power = capture.range_profile.abs().square()
@@ -67,14 +67,14 @@ def test_profiles_are_analytic_and_without_what_stands_still(write):
 
 
 def test_clock_and_bias_can_be_given(write):
-    capture = read(write(), "rail_sar", clock_offset=0.7, range_bias=0.1)
+    capture = read(write(), clock_offset=0.7, range_bias=0.1)
     torch.testing.assert_close(capture.radar().positions[:, 1], -(capture.times + 0.7))
     assert capture.ranges[0].item() == pytest.approx(1.9)
     assert (capture.clock_offset, capture.range_bias) == (0.7, 0.1)
 
 
 def test_the_recording_survives_a_file_of_our_own(write, tmp_path):
-    capture = read(write(), "rail_sar")
+    capture = read(write())
     capture.save(tmp_path / "rail.nc")
     assert torch.equal(Capture.load(tmp_path / "rail.nc").range_profile, capture.range_profile)
 
@@ -94,22 +94,22 @@ def test_the_recording_survives_a_file_of_our_own(write, tmp_path):
 )
 def test_recordings_that_are_wrong_are_refused(write, changes, message):
     with pytest.raises(InputError, match=message):
-        read(write(**changes), "rail_sar")
+        read(write(**changes))
 
 
 def test_missing_and_truncated_recordings_are_refused(write, tmp_path):
     with pytest.raises(InputError, match="no such file"):
-        read(tmp_path, "rail_sar")
+        read(tmp_path)
     path = write() / FILE
     whole = path.read_bytes()
     for size in (0, 10, len(whole) // 2):
         path.write_bytes(whole[:size])
         with pytest.raises(InputError, match="damaged or truncated"):
-            read(tmp_path, "rail_sar")
+            read(tmp_path)
 
 
 def test_the_recording_calibrated_on_one_reflector(data_folder):
-    capture = read(data_folder / "rail_sar", "rail_sar")
+    capture = read(data_folder / "rail_sar")
     assert capture.frame_count == 237
     assert capture.survey is not None
     first, second = capture.survey
