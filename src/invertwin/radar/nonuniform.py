@@ -126,9 +126,9 @@ class NonUniformSum(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         coefficient, rest, turns = ctx.saved_tensors
-        grad, phasor = grads[0], _phasor(rest)
+        grad, phasor = grad_outputs[0], _phasor(rest)
         with_turns = ctx.needs_input_grad[2]
         if with_turns:
             grad = torch.cat([grad, grad * _places(ctx.samples, turns)])

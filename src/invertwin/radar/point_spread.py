@@ -126,7 +126,7 @@ class _BesselJ1(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         z, value = ctx.saved_tensors
         ratio = torch.where(z == 0, 0.5 * torch.ones_like(z), value / z)
-        return grads[0] * (torch.special.bessel_j0(z) - ratio)
+        return grad_outputs[0] * (torch.special.bessel_j0(z) - ratio)

@@ -1,5 +1,8 @@
 """Waveforms and the radar: what is transmitted, from where, and which bins it resolves."""
 
+# Fields of the base class may be properties of a waveform.
+# pyright: reportIncompatibleVariableOverride=false
+
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

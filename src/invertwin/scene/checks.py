@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 
-ArrayLike = Tensor | np.ndarray | Sequence
+ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
 
 def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: str) -> Tensor:

@@ -82,7 +82,7 @@ class Smoother:
             csc_array(eye_array(count) + amount * laplacian(faces, count))
         )
 
-    def __reduce__(self) -> tuple:
+    def __reduce__(self) -> tuple[Any, ...]:
         return type(self), self._given
 
     def solve(self, values: Tensor) -> Tensor:
