@@ -25,7 +25,7 @@ _FLAT = 0.5  # least cosine between two triangles whose edge is flipped: corners
 
 
 def remeshed(mesh: Mesh, edge: float) -> Mesh:
-    """The same surface with edges of about one length; topology and borders stay.
+    """Remesh a surface with edges of about one length; topology and borders stay.
 
     Too long edges are split, too short ones collapsed, others flipped where vertices then have
     closer to six neighbours, and vertices moved along the surface to the middle of theirs.

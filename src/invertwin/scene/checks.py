@@ -47,7 +47,14 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
 def checked_number(
     value: object, what: str, low: float, high: float = math.inf, *, open_low: bool = False
 ) -> float:
-    """The value of a finite number (or 0-d tensor) in [low, high], or (low, high] if `open_low`.
+    """`value` as a finite number in [low, high], or (low, high] if `open_low`.
+
+    Args:
+        value: a number, or a tensor of dimension 0.
+        what: its name and unit, for the error.
+        low: least value.
+        high: greatest value.
+        open_low: whether the least value itself is excluded.
 
     Raises:
         InputError: not a number, NaN, infinite or out of range.
@@ -69,7 +76,12 @@ def checked_number(
 
 
 def checked_count(value: object, what: str, low: int) -> int:
-    """An integer that is at least `low`.
+    """`value` as an integer that is at least `low`.
+
+    Args:
+        value: an integer.
+        what: its name, for the error.
+        low: least value.
 
     Raises:
         InputError: not an integer, or too small.
