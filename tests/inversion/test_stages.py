@@ -4,12 +4,12 @@ from functools import partial
 
 import pytest
 import torch
+from invertwin.inversion.stages import Stage, reconstruct_in_stages, stage_checkpoint
 
 from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, reconstruct
 from invertwin.inversion.regularization import Laplacian
 from invertwin.inversion.remeshing import remeshed
-from invertwin.inversion.stages import Stage, reconstruct_in_stages, stage_checkpoint
 from invertwin.scene import Mesh, SmoothVertices, plate
 from invertwin.scene.parameters import Scale, Translation, Vertices
 

@@ -14,7 +14,7 @@ from invertwin.inversion.metrics import (
 from invertwin.inversion.mover import Echo, MovingBody, of_point, strongest_mover
 from invertwin.inversion.observation import Observation, Unknown
 from invertwin.inversion.optimizer import Optimizer
-from invertwin.inversion.prior import LatentNorm, Trained, Training, train_prior
+from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
@@ -42,8 +42,6 @@ __all__ = [
     "SpectrumLoss",
     "Stage",
     "Topology",
-    "Trained",
-    "Training",
     "Unknown",
     "Watch",
     "compare_shapes",
@@ -53,6 +51,5 @@ __all__ = [
     "signed_distance",
     "strongest_mover",
     "topology",
-    "train_prior",
     "volume_iou",
 ]

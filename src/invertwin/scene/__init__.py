@@ -13,7 +13,6 @@ from invertwin.scene.cloud import Cloud
 from invertwin.scene.files import load_mesh, load_scene_xml, save_mesh
 from invertwin.scene.geometry import (
     BodyTemplate,
-    Car,
     DensityGrid,
     DistanceGrid,
     LatticeDeformation,
@@ -25,15 +24,12 @@ from invertwin.scene.geometry import (
     SkinnedBody,
     SmoothVertices,
     articulated_template,
-    car_distance,
-    car_mesh,
     iso_surface,
     load_anny,
     load_prior,
     load_smpl,
     load_vehicle_space,
     person,
-    sample_car,
 )
 from invertwin.scene.material import (
     ITU_MATERIALS,
@@ -87,7 +83,6 @@ __all__ = [
     "ITU_MATERIALS",
     "AntennaArray",
     "BodyTemplate",
-    "Car",
     "Cloud",
     "Compose",
     "Cosine",
@@ -128,8 +123,6 @@ __all__ = [
     "Vertices",
     "articulated_template",
     "box",
-    "car_distance",
-    "car_mesh",
     "complex_permittivity",
     "compose",
     "dihedral",
@@ -156,7 +149,6 @@ __all__ = [
     "rotation_angle",
     "rotation_from_quaternion",
     "rotation_from_vector",
-    "sample_car",
     "save_mesh",
     "slab_coefficients",
     "slope_exponent",
