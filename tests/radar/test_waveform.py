@@ -1,6 +1,7 @@
 """Waveforms, radar geometry, grids, and the errors and warnings at their edge."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -90,7 +91,7 @@ def test_wrong_units(make, message):
 
 def small(**changes) -> Radar:
     one = linear_array(1, LAMBDA / 2)
-    arguments = {
+    arguments: dict[str, Any] = {
         "transmitters": one,
         "receivers": one,
         "waveform": FMCW(77e9, 1e9, 40e-6, 64),
