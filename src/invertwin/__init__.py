@@ -15,21 +15,27 @@ from typing import Any
 
 from invertwin import doctor
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _ROOMS = ("capture", "channel", "inversion", "plotting", "radar", "scene")
 
 # Name → module.
 _MENU = {
     "Capture": "capture.capture",
+    "ExactMap": "models",
     "FMCW": "radar.waveform",
     "Grid": "channel.paths",
     "InputError": "errors",
     "Object": "scene.scene",
+    "MotionMap": "models",
+    "Observation": "inversion.observation",
     "Radar": "radar.radar",
+    "Sampling": "channel",
     "Scene": "scene.scene",
     "SpectrumLoss": "inversion.loss",
+    "Schedule": "inversion.schedule",
     "Surrogate": "radar.surrogate",
+    "SurrogateMap": "models",
     "gradcheck": "inversion.gradcheck",
     "load_mesh": "scene.files",
     "reconstruct": "inversion.reconstruction",

@@ -11,7 +11,7 @@ from rich.console import Console
 from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import is_shape_key, shape_label, shape_scores
-from invertwin.cli.fits.problem import FULL, annealed_until, problem_of, run_stages, varied_run
+from invertwin.cli.fits.problem import FULL, annealed_until, problem_of, stages_of, varied_run
 from invertwin.cli.fits.writing import tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
@@ -78,6 +78,7 @@ def check(text: str, tmp_path):
     return validate(tomllib.loads(text), tmp_path / "run.toml")
 
 
+@pytest.mark.slow
 def test_a_shape_is_fitted_in_stages_and_compared(tmp_path, monkeypatch, capsys):
     (tmp_path / "shape.toml").write_text(shapes())
     out = tmp_path / "out"
@@ -133,6 +134,7 @@ def letters() -> str:
     return HEAD.replace(flat, 'shape = "sphere"\nradius = 0.2') + LETTERS
 
 
+@pytest.mark.slow
 def test_parts_and_holes_are_told_where_the_surface_is_closed(tmp_path, monkeypatch, capsys):
     (tmp_path / "run.toml").write_text(letters())
     out = tmp_path / "out"
@@ -217,10 +219,11 @@ def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
     assert own.reconstruct is not None
     assert own.reconstruct.annealing == 0.25
     assert varied_run(run, FULL).optimizer.kind == "adam"
-    first, second = run_stages(varied_run(run, FULL))
-    assert "optimizer" not in first.options
-    assert second.options["optimizer"].kind == "sgd"
-    assert second.options["annealing"] == 0.5
+    first, second = stages_of(varied_run(run, FULL))
+    assert first.optimizer is None
+    assert second.optimizer is not None
+    assert second.optimizer.kind == "sgd"
+    assert second.annealing == 0.5
 
 
 def learned(shape: str) -> str:

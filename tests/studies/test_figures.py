@@ -37,6 +37,7 @@ SCAN = (
 )
 
 
+@pytest.mark.slow
 def test_all_methods_in_one_table(run_file, monkeypatch, capsys):
     """Without Sionna RT its row says so, and all others are there."""
     monkeypatch.setattr(all_methods, "sionna_version", lambda: None)
@@ -86,6 +87,7 @@ def test_minima_that_are_noise_do_not_count():
     assert deep_minima((1 - torch.cos(20 * torch.pi * x) + x**2).numpy()) == 19
 
 
+@pytest.mark.slow
 def test_losses_along_a_line(run_file, monkeypatch, capsys):
     run_file.write_text(SCAN)
     assert call(monkeypatch, "loss-scan", run_file) == 0

@@ -101,7 +101,7 @@ def to_toml(run: RunFile) -> str:
     """The run file as used, defaults filled in; reading it back gives an equal run file."""
     lines: list[str] = []
     for key, value in run.model_dump(exclude_none=True).items():
-        if key in ("scene", "truth", "variants"):
+        if key in ("scene", "truth", "variants", "observations"):
             for name, table in value.items():
                 lines += ["", f"[{key}.{_key(name)}]", *_lines(table)]
         elif isinstance(value, dict):

@@ -11,15 +11,16 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from invertwin import plotting
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.gradient_shapes import SHAPES, shape_direction
+from invertwin.cli.gradients import UNITS, theta_of
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, about_file, need, to_toml
 from invertwin.cli.runs import PARTS, RunFolder
-from invertwin.cli.schema import Gradcheck, RunFile
+from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Direction, GradientReport, gradcheck
+from invertwin.inversion.gradcheck import Check, GradientReport, gradcheck
+from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
@@ -49,13 +50,6 @@ _LEGEND = (
     "their step is halved, noise included. order: how the gap to the differences grows with their "
     "step; 2 for a right gradient, 0 for a wrong one. pairs: difference pairs averaged."
 )
-_UNITS = {
-    "translation": "1/m",
-    "rotation": "1/rad",
-    "scale": "per relative size",
-    "radar_translation": "1/m",
-    "radar_rotation": "1/rad",
-}
 
 
 @dataclass(frozen=True)
@@ -169,6 +163,7 @@ def _check(
 ) -> dict[str, Any]:
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
+    table = settings.parameter
     if run.surrogate.exact:
         raise InputError(
             "surrogate.exact: expected a smooth map to differentiate, got the exact chain; remove "
@@ -177,42 +172,43 @@ def _check(
     scene = build.scene(run)
     radar = build.radar(need(run, "radar", "gradcheck"))
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
-    if settings.parameter.kind in SHAPES:
-        for key in _studies(run):
-            raise InputError(
-                f"{key}: expected a parameter that moves something, got one of a shape; remove it"
-            )
-        with about("gradcheck.parameter"):
-            scene, direction = shape_direction(settings.parameter, run, scene)
-    else:
-        direction = _direction(settings)
-    step = math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0
-    report = gradcheck(
-        scene,
-        radar,
-        grid,
-        direction,
-        surrogate=build.surrogate(run.surrogate),
+    with about("gradcheck.parameter"):
+        theta = theta_of(table, run, scene)
+    for key in _studies(run) if theta.shape else ():
+        raise InputError(
+            f"{key}: expected a parameter that moves something, got one of a shape; remove it"
+        )
+    sampling = Sampling(
         depth=settings.depth,
         samples=settings.samples,
         boundary_samples=settings.boundary_samples,
+    )
+    check = Check(
         repeats=settings.repeats,
-        step=step,
+        step=math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0,
         difference_samples=settings.difference_samples,
         noise=settings.noise,
         max_pairs=settings.max_pairs,
-        sampling=settings.sampling,
+        scheme=settings.sampling,
+    )
+    report = gradcheck(
+        SurrogateMap(grid, build.surrogate(run.surrogate), sampling),
+        theta.module,
+        theta.tangent,
+        scene=scene,
+        sensor=radar,
+        of="sensor" if theta.of_radar else "scene",
+        check=check,
         seed=run.seed,
         progress=say,
     )
-    table = settings.parameter
     outer = report.no_interior_edges
-    unit = (_UNITS | SHAPES).get(table.kind, f"per unit of {table.value}")
+    unit = UNITS.get(table.kind, f"per unit of {table.value}")
     folder.write_figure(f"{name}.png", _maps(report, grid, unit))
     moved = [table.object] if table.object else []
     folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=moved))
     others = {}
-    checked = Checked(run, scene, radar, grid, direction, step, report, say)
+    checked = Checked(run, scene, radar, grid, theta.direction(), check.step, report, say)
     for key, study in _studies(run).items():
         others[key], figure = study.compare(checked)
         folder.write_figure(f"{name}_{key}.png", figure)
@@ -232,14 +228,6 @@ def _studies(run: RunFile) -> dict[str, GradcheckStudy]:
     """The sections that compare something with the gradient check."""
     values = {key: getattr(run, key) for key in type(run).model_fields}
     return {key: value for key, value in values.items() if isinstance(value, GradcheckStudy)}
-
-
-def _direction(settings: Gradcheck) -> Direction:
-    table = settings.parameter
-    values = table.model_dump(exclude_none=True)
-    if table.axis is not None:
-        values["axis"] = tuple(table.axis)
-    return Direction(**values)
 
 
 def _maps(report: GradientReport, grid: Grid, unit: str) -> Figure:

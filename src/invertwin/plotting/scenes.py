@@ -26,7 +26,7 @@ _VIEWS = {"from the radar": (0, 1, 2), "from above": (0, 2, 1), "from the side":
 
 def scene(
     scenes: Scene | Mapping[str, Scene],
-    radar: Radar | None = None,
+    radar: Radar | Sequence[Radar] | None = None,
     *,
     highlight: Sequence[str] | None = None,
     outline: Scene | None = None,
@@ -37,16 +37,17 @@ def scene(
 
     Args:
         scenes: What is drawn, by title.
-        radar: Its positions are marked, and its mean axes are those of the views. None takes the
-            world's axes: right x, up y, ahead z.
+        radar: Its positions are marked, and its mean axes are those of the views; of several
+            radars, those of the first. None takes the world's axes: right x, up y, ahead z.
         highlight: Names of the objects that are drawn in colour, the others grey; None is all.
         outline: Objects whose sharp edges are drawn on top in red, such as the truth.
     """
     titled = scenes if isinstance(scenes, Mapping) else {"scene": scenes}
     drawn = {title: _shapes(shown) for title, shown in titled.items()}
     edges = {} if outline is None else _shapes(outline)
-    places = None if radar is None else numbers(radar.positions)
-    views = _views(radar)
+    radars = [] if radar is None else [radar] if isinstance(radar, Radar) else list(radar)
+    places = np.concatenate([numbers(r.positions) for r in radars]) if radars else None
+    views = _views(radars[0] if radars else None)
     windows = [_window([*drawn.values(), edges], places, view) for view in views]
     ratios = [min(max(h / w, 0.3), 1.3) for _, _, w, h in windows]
     if len(drawn) == 1:

@@ -42,6 +42,7 @@ from invertwin.radar.impairments import (
     residual_phase,
 )
 from invertwin.radar.motion import Chirps, moving_beat, range_rate
+from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.radar.point_spread import airy, dirichlet, normalized_gaussian
 from invertwin.radar.radar import Radar
 from invertwin.radar.random_phase import random_phase_spectrum
@@ -71,6 +72,7 @@ __all__ = [
     "SURROGATES",
     "Board",
     "Chirps",
+    "ClockOffset",
     "DopplerMaps",
     "Impairments",
     "Impulse",
@@ -80,6 +82,8 @@ __all__ = [
     "PhysicsWarning",
     "PointCloud",
     "Radar",
+    "RadarPose",
+    "RangeBias",
     "SampledWaveform",
     "Spectrogram",
     "SteppedFrequency",

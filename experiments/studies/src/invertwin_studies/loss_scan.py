@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
 from invertwin.cli.landscape import exact_losses, line_name, moved, smooth_losses
 from invertwin.cli.report import Again, Picture, Table, report_html
@@ -18,6 +18,7 @@ from invertwin.cli.run_simulate import exact
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
+from invertwin.models import SurrogateMap
 from invertwin.radar.direction import music
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
@@ -58,7 +59,6 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
     if depth > 1:
         raise InputError(f"data.depth: expected 1 for loss-scan, got {depth}; set depth = 1")
     found = exact(run, truth, radar, grid)
-    assert found.beat is not None
     near, wide = _losses(run, settings, truth, radar, grid, found.beat)
     wavelengths = 2 * settings.span / radar.waveform.wavelength
     minima = {name: deep_minima(losses) for name, (_, losses) in near.items()}
@@ -100,14 +100,15 @@ def _losses(
 ) -> tuple[dict[str, Curve], Curve]:
     """The four curves near the truth, and the surrogate's farther away."""
     capture = Capture.from_beat(measured, radar)
-    kernel = build.surrogate(run.surrogate)
+    sampling = Sampling(depth=1, samples=settings.samples)
+    model = SurrogateMap(grid, build.surrogate(run.surrogate), sampling)
 
     def line(span: float, points: int) -> tuple[np.ndarray, list[Any]]:
         x = np.linspace(-span, span, points)
         return x, moved(truth, settings.object, settings.axis, x)
 
     def smooth(scenes: list[Any]) -> np.ndarray:
-        return smooth_losses(run, radar, grid, capture, scenes, kernel, settings.samples, depth=1)
+        return smooth_losses(run, radar, capture, scenes, model)
 
     with torch.no_grad():
         x, scenes = line(settings.span, settings.points)

@@ -7,7 +7,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from invertwin.channel import rough_points
+from invertwin.channel import Sampling, draw_speckle
 from invertwin.cli import build
 from invertwin.cli.report import Table
 from invertwin.cli.run_gradcheck import Checked
@@ -56,7 +56,9 @@ def compare(settings: Methods, checked: Checked) -> tuple[dict[str, Any], Figure
     music = MusicMap(
         radar,
         grid,
-        rough_points(scene, settings.density, run.seed),
+        draw_speckle(
+            scene, radar.link(), Sampling(depth=1, points_per_m2=settings.density), run.seed
+        ),
         settings.sources,
         (settings.smoothing[0], settings.smoothing[1]),
         run.seed,

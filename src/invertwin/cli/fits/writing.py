@@ -14,7 +14,6 @@ from invertwin.cli.report import Again, Picture, Table, report_html, shown
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import MaterialValue, RunFile, SimulatedData
-from invertwin.radar.radar import Radar
 from invertwin.scene import Mesh, Scene
 
 _ENDS = {
@@ -199,23 +198,35 @@ def draw(
     metrics: dict[str, Any],
     start: Scene,
     twin: Scene,
-    radar: Radar,
-    maps: dict[str, torch.Tensor],
+    maps: dict[str, list[torch.Tensor]],
 ) -> None:
-    """Writes the pictures of the best fit."""
+    """Write the pictures of the best fit.
+
+    Args:
+        problem: What was fitted.
+        folder: Where to write.
+        rows: Of every fit, by mode.
+        metrics: Of the run.
+        start: Scene at the start.
+        twin: Scene that was found.
+        maps: By what they show, one for every sensor.
+    """
     sought = sought_objects(problem.run)
     truth = problem.truth
     known = {k: truth[k] for k in truth.names if k in problem.known and k in sought}
     scenes = {"truth": truth} if known else {}
     scenes |= {"start": start, "twin": twin}
     outline = Scene(known) if known else None
-    figure = plotting.scene(scenes, radar, highlight=sought, outline=outline)
+    radars = [sight.radar for sight in problem.sights.values()]
+    figure = plotting.scene(scenes, radars, highlight=sought, outline=outline)
     folder.write_figure("scene.png", figure)
     simulated = isinstance(problem.run.data, SimulatedData)
     data = "data (exact simulation)" if simulated else "data (measured)"
     titles = {"measured": data, "start": "surrogate, start", "twin": "surrogate, twin"}
-    titled = {titles[name]: power for name, power in maps.items()}
-    folder.write_figure("spectra.png", plotting.spectrum(titled, problem.grid))
+    for number, (name, sight) in enumerate(problem.sights.items()):
+        titled = {titles[key]: found[number] for key, found in maps.items()}
+        file = f"spectra_{name}.png" if name else "spectra.png"
+        folder.write_figure(file, plotting.spectrum(titled, sight.grid))
     losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
     annealed = annealed_until(problem.run)
     before = metrics["start_loss_sharp"] if annealed else None
@@ -235,7 +246,7 @@ def draw_shapes(
     assert table is not None
     scenes = {"truth": problem.truth} if table.object in problem.known else {}
     scenes |= {"start": start, "twin": twin}
-    turns = problem.radar.rotations
+    turns = problem.first.radar.rotations
     up = (0.0, 1.0, 0.0) if turns is None else turns.detach().mean(0)[:, 1]
     found = {name: scene[table.object] for name, scene in scenes.items()}
     meshes = {name: Mesh(item.vertices, item.mesh.faces) for name, item in found.items()}
@@ -262,9 +273,14 @@ def write_report(
         "loss": _loss_note(run, metrics),
         "landscape": _landscape_note(run, metrics),
     }
+    spectra = ["spectra", *(f"spectra_{name}" for name in run.observations)]
     shown = [
-        Picture(name.capitalize(), (folder.path / f"{name}.png").read_bytes(), notes.get(name, ""))
-        for name in ("scene", "spectra", "loss", "convergence", "landscape")
+        Picture(
+            name.capitalize().replace("_", ", "),
+            (folder.path / f"{name}.png").read_bytes(),
+            notes.get(name.split("_")[0], ""),
+        )
+        for name in ("scene", *spectra, "loss", "convergence", "landscape")
         if f"{name}.png" in folder.names
     ]
     title = run.title or "Reconstruction"

@@ -28,12 +28,29 @@ from invertwin.cli.schema.parameters import (
     ShapeSpaceParameter,
 )
 from invertwin.cli.schema.recording import Chirps, Impairments, Raw
-from invertwin.cli.schema.section import Section, Seed, fail
+from invertwin.cli.schema.section import Positive, Section, Seed, fail
 from invertwin.cli.schema.sensor import Grid, Radar
 from invertwin.cli.schema.stages import Measures, Stage, Variant
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "interior_only", "whole", "seen", "count", "m", "number", "consistency")
+
+
+class Observed(Section):
+    """What one of several sensors recorded; without a key as at the top of the file."""
+
+    radar: Radar | None = None
+    """what measures"""
+    grid: Grid | None = None
+    """the map that is compared"""
+    chirps: Chirps | None = None
+    """several ramps a frame"""
+    data: Data | None = None
+    """what is fitted"""
+    surrogate: Surrogate | None = None
+    """kernels of the smooth model"""
+    weight: Positive = 1.0
+    """share in the loss"""
 
 
 class _RunFile(Section):
@@ -65,6 +82,8 @@ class _RunFile(Section):
     """raw files that simulate writes beside the capture"""
     data: Data | None = None
     """what is fitted"""
+    observations: dict[str, Observed] = {}
+    """[observations.<name>]: what each of several sensors recorded"""
     parameters: list[Parameter] = []
     """[[parameters]]: what is sought"""
     starts: Starts | None = None

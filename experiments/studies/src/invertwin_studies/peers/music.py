@@ -12,7 +12,7 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, RoughPoints, trace_field
+from invertwin.channel import Grid, Sampling, Speckle, trace_field
 from invertwin.radar.direction import music
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import beat_signal, range_profile
@@ -31,7 +31,7 @@ class MusicMap:
     Attributes:
         radar: Its radar.
         grid: Bins.
-        points: Rough points, the same wherever the scene moves.
+        speckle: Rough points, the same wherever the scene moves.
         sources: Per range bin.
         smoothing: Elements of the subarrays along x and y.
         seed: Of coherent paths.
@@ -39,7 +39,7 @@ class MusicMap:
 
     radar: Radar
     grid: Grid
-    points: RoughPoints
+    speckle: Speckle
     sources: int
     smoothing: tuple[int, int]
     seed: int
@@ -52,10 +52,9 @@ class MusicMap:
         paths = trace_field(
             scene,
             seen.link(),
-            samples=_SAMPLES,
-            points=self.points,
+            sampling=Sampling(depth=1, samples=_SAMPLES, boundary=False),
             seed=self.seed,
-            boundary=False,
+            speckle=self.speckle,
         )
         return beat_signal(paths, seen)
 
