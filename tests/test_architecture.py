@@ -8,7 +8,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors", "seeds"}
+FOUNDATION = {"constants", "errors", "limits", "seeds"}
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "channel"}
 RADAR = CHANNEL - {"doctor"} | {"radar"}
@@ -21,6 +21,7 @@ INVERSION = MODELS | {"inversion"}
 ALLOWED = {
     "constants": set(),
     "errors": set(),
+    "limits": set(),
     "seeds": set(),
     "doctor": FOUNDATION,
     "scene": SCENE,
@@ -31,7 +32,8 @@ ALLOWED = {
     "models": MODELS,
     "inversion": INVERSION,
     "plotting": INVERSION | {"plotting"},
-    "cli": INVERSION | {"doctor", "plotting", "cli", "__init__"},
+    "datasets": CAPTURE | {"datasets", "cli"},
+    "cli": INVERSION | {"doctor", "plotting", "datasets", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

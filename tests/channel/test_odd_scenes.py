@@ -6,11 +6,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invertwin.capture import read
-from invertwin.channel import Sampling
-from invertwin.channel.bridge import backend, use_backend
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.tracer import trace_field, trace_power
+from invertwin.channel import (
+    Sampling,
+    backend,
+    deposit_power,
+    trace_field,
+    trace_power,
+    use_backend,
+)
+from invertwin.datasets import rail_sar
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,
@@ -138,7 +142,7 @@ def test_small_balls_from_a_rail_have_finite_gradients(radius):
 
 def test_measured_track_has_finite_gradients(data_folder):
     """Seed 36 once gave NaN: a boundary ray in the plane of the triangle that it met."""
-    capture = read(data_folder / "rail_sar", "rail_sar", clock_offset=9.216, range_bias=0.46257)
+    capture = rail_sar.read(data_folder / "rail_sar", clock_offset=9.216, range_bias=0.46257)
     survey, radar = capture.survey, capture.radar()
     assert survey is not None
     shift = float64([-0.6, -0.04, 0.0]).requires_grad_()
