@@ -88,9 +88,7 @@ def wall_and_kernels(problem: Problem, steps: int) -> list[dict[str, float]]:
         nonlocal begun
         taken, kernels = perf_counter() - begun, dr.kernel_history()
         milliseconds = sum(kernel["execution_time"] for kernel in kernels)
-        rows.append(
-            {"step": taken, "kernels": milliseconds / 1e3, "kernel_count": len(kernels)}
-        )
+        rows.append({"step": taken, "kernels": milliseconds / 1e3, "kernel_count": len(kernels)})
         begun = perf_counter()
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -132,9 +130,7 @@ def measure(steps: int = STEPS, skipped: int = SKIPPED) -> dict[str, Any]:
     problem = problem_of(load_run(RUN), Console(quiet=True))
     first, second = wall_and_kernels(problem, steps), torch_operations(problem, steps)
     rows = [one | other for one, other in zip(first, second, strict=True)][skipped:]
-    found: dict[str, Any] = {
-        key: statistics.median(row[key] for row in rows) for key in rows[0]
-    }
+    found: dict[str, Any] = {key: statistics.median(row[key] for row in rows) for key in rows[0]}
     parts = found["kernels"] + found["convolutions"] + found["torch"]
     found["rest"] = max(0.0, found["step"] - parts)
     found["step_over_kernels"] = found["step"] / found["kernels"]

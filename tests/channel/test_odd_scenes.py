@@ -10,6 +10,7 @@ import torch
 from invertwin.capture import read
 from invertwin.channel.bridge import backend, use_backend
 from invertwin.channel.deposit import deposit_power
+from invertwin.channel.paths import Grid
 from invertwin.channel.tracer import trace_field, trace_power
 from invertwin.errors import InputError
 from invertwin.scene import (
@@ -24,7 +25,7 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
-from scenes import GRID, float64, link, occluder, thing
+from scenes import GRID, float64, link, occluder, shift_error, thing
 
 COUNTS: dict[str, Any] = {"samples": 2_000, "boundary_samples": 500, "seed": 0}
 BACK = rotation_from_vector(float64([0.0, math.pi, 0.0]))[None]
@@ -91,6 +92,7 @@ def test_small_balls_from_a_rail_have_finite_gradients(radius):
     """Most rays miss, and some shadows graze: neither may leave a NaN."""
     places = torch.zeros(60, 3, dtype=torch.float64)
     places[:, 0] = torch.linspace(-2, 2, 60)
+    grid = Grid(2.5, 0.075, 40, u_start=-0.8, u_step=0.1, u_count=17)
     scene = Scene(
         {
             "a": thing(sphere(radius, subdivisions=2), (0.0, 0.1, 3.0)),
@@ -101,10 +103,11 @@ def test_small_balls_from_a_rail_have_finite_gradients(radius):
         moved, leaves = movable(scene)
         track = places.clone().requires_grad_()
         out = deposit_power(
-            moved, link(track), GRID, samples=6_000, boundary_samples=2_000, seed=seed
+            moved, link(track), grid, samples=6_000, boundary_samples=2_000, seed=seed
         )
         gradients = torch.autograd.grad(out.sum(), [*leaves.values(), track])
-        assert all(torch.isfinite(g).all() for g in gradients), seed
+        assert out.any()
+        assert shift_error(gradients) < 1e-4, seed
 
 
 def test_measured_track_has_finite_gradients(data_folder):
@@ -158,5 +161,12 @@ def test_a_backward_pass_runs_where_its_forward_pass_ran(monkeypatch):
     with use_backend("cpu"):
         out = deposit_power(scene, link(), GRID, **COUNTS)
     monkeypatch.setenv("INVERTWIN_BACKEND", "nowhere")
-    gradients = torch.autograd.grad(out.sum(), list(leaves.values()))
-    assert all(torch.isfinite(g).all() for g in gradients)
+    found = torch.autograd.grad(out.sum(), list(leaves.values()))
+    monkeypatch.undo()
+    scene, leaves = movable(occluder())
+    with use_backend("cpu"):
+        out = deposit_power(scene, link(), GRID, **COUNTS)
+        expected = torch.autograd.grad(out.sum(), list(leaves.values()))
+    for mine, theirs in zip(found, expected, strict=True):
+        # Sums by atomic additions come in another order.
+        torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-5 * float(theirs.abs().max()))
