@@ -19,11 +19,15 @@ the two after them in a second, equal fit.
 """
 
 import argparse
+import os
 import statistics
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+
+# Torch's profiler announces its every start and stop.
+os.environ.setdefault("KINETO_LOG_LEVEL", "5")
 
 import drjit as dr
 import torch
