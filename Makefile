@@ -71,10 +71,11 @@ $(BIN)/python:
 
 # torch first and alone: the one large package, and the one with builds for CPU or GPU to choose
 # from by pip's own settings.
-.venv/.run: pyproject.toml constraints.txt | $(BIN)/python
+# The studies of the checkout come with it: commands and sections that a bare wheel lacks.
+.venv/.run: pyproject.toml constraints.txt experiments/studies/pyproject.toml | $(BIN)/python
 	@echo 'set-up: invertwin and what it stands on (first PyTorch, some 200 MB or more)'
 	@$(PIP) install "$$(grep '^torch==' constraints.txt)"
-	@$(PIP) install --constraint constraints.txt --editable .
+	@$(PIP) install --constraint constraints.txt --editable . --editable experiments/studies
 	@touch $@
 
 .venv/.dev: .venv/.run

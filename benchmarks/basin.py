@@ -50,7 +50,7 @@ from rich.table import Table
 from torch import Tensor, nn
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid, RoughPoints, rough_points
+from invertwin.channel import Grid, RoughPoints, Sampling, draw_speckle
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer, reconstruct
 from invertwin.radar import FMCW, Radar, Surrogate
@@ -109,8 +109,6 @@ class Place(nn.Module):
         beamwidths: Parameter [beamwidths in u].
     """
 
-    applies_to = "scene"
-
     def __init__(self, cells: float, beamwidths: float, beamwidth: float) -> None:
         super().__init__()
         self.cells = nn.Parameter(torch.tensor(cells, dtype=torch.float64))
@@ -135,7 +133,7 @@ class Task:
     radar: Radar
     grid: Grid
     scene: Scene
-    points: RoughPoints
+    points: RoughPoints | None
     beat: Tensor
 
     @staticmethod
@@ -150,7 +148,8 @@ class Task:
         panel = Object(plate(SIZE, SIZE), RoughDielectric(permittivity=4.0))
         with torch.no_grad():
             scene = Place(0.0, 0.0, radar.beamwidth[0])(Scene({"panel": panel}))
-            points = rough_points(scene, DENSITY, seed)
+            drawn = Sampling(depth=1, points_per_m2=DENSITY)
+            points = draw_speckle(scene, radar.link(), drawn, seed).points
             found = simulate(scene, radar, grid, points=points, snr_db=SNR_DB, seed=seed, depth=1)
         assert found.beat is not None
         return Task(seed, radar, grid, scene, points, found.beat)

@@ -58,7 +58,7 @@ from report import MetricTable, write
 from rich.table import Table
 from throughput import WAVEFORM, sionna_version
 
-from invertwin.channel import deposit_power
+from invertwin.channel import Sampling, deposit_power
 from invertwin.channel.bridge import Topology, backend, tracer
 from invertwin.radar import Radar
 from invertwin.scene import Object, RoughConductor, Scene
@@ -104,10 +104,8 @@ def step(task: Task, number: int, samples: int, depth: int) -> tuple[float, floa
         scene,
         task.radar.link(),
         task.grid,
-        samples=samples,
-        boundary_samples=samples // 10,
+        sampling=Sampling(depth=depth, samples=samples, boundary_samples=samples // 10),
         seed=number,
-        depth=depth,
     )
     middle = perf_counter()
     (power / power.detach().mean()).square().mean().backward()

@@ -26,7 +26,7 @@ from report import MetricTable, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel import Grid, deposit_power, trace_power
+from invertwin.channel import Grid, Sampling, deposit_power, trace_power
 from invertwin.channel.bridge import backend, flatten, tracer
 from invertwin.channel.rays import Shot, visible
 from invertwin.radar import FMCW, Radar
@@ -95,10 +95,8 @@ class Task:
             scene,
             self.radar.link(),
             self.grid,
-            samples=samples,
-            boundary_samples=boundary_samples,
+            sampling=Sampling(depth=1, samples=samples, boundary_samples=boundary_samples),
             seed=number,
-            depth=1,
         )
         middle = perf_counter()
         (power / power.detach().mean()).square().mean().backward()
@@ -173,14 +171,13 @@ def useful_paths(rays: int, steps: int) -> dict[str, Any]:
     scene = Scene({"target": Object(target, RoughDielectric(permittivity=4.0), at(2.0))})
     radar = Radar(single(0.0), single(0.01), WAVEFORM, torch.zeros(1, 3, dtype=torch.float64))
     link, grid = radar.link(), radar.grid(1.5, 2.6)
+    drawn = Sampling(depth=1, samples=rays, boundary_samples=0, boundary=False)
 
     def deposited(seed: int) -> None:
-        deposit_power(
-            scene, link, grid, samples=rays, boundary_samples=0, seed=seed, depth=1, boundary=False
-        )
+        deposit_power(scene, link, grid, sampling=drawn, seed=seed)
 
     def listed(seed: int) -> int:
-        paths = trace_power(scene, link, samples=rays, seed=seed, boundary=False)
+        paths = trace_power(scene, link, sampling=drawn, seed=seed)
         return int((paths.power > 0).sum())
 
     hits = listed(0)

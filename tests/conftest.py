@@ -22,7 +22,8 @@ if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):
 # Shape annotations are executed in tests only; users pay nothing for them. The numeric tower of
 # PEP 484: an int is welcome where a float is asked for.
 install_import_hook(
-    "invertwin", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+    ["invertwin", "invertwin_studies"],
+    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 
 REPOSITORY = Path(__file__).resolve().parents[1]

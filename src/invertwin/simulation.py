@@ -1,4 +1,4 @@
-"""The forward model on one page: scene → paths → signals → spectrum."""
+"""Exact signals on one page: scene → paths → beat signals → spectrum, as a real radar does it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,15 +7,7 @@ import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor
 
-from invertwin.channel import (
-    Grid,
-    Paths,
-    RoughChains,
-    RoughPoints,
-    rough_points,
-    trace_field,
-    use_backend,
-)
+from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field
 from invertwin.errors import InputError
 from invertwin.radar.impairments import Impairments
 from invertwin.radar.motion import (
@@ -28,7 +20,6 @@ from invertwin.radar.motion import (
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.spectrum import exact_spectrum
-from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
 from invertwin.scene.scene import Scene
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.
@@ -41,13 +32,13 @@ class Simulation:
 
     Attributes:
         spectrum: Power per bin, received over transmitted.
-        paths: Field paths of the exact chain (None for the surrogate).
-        beat: Beat signal of every virtual channel (None for the surrogate).
+        paths: Field paths.
+        beat: Beat signal of every virtual channel.
     """
 
     spectrum: Float[Tensor, "frame range u v"]
-    paths: Paths | None = None
-    beat: Complex128[Tensor, "frame tx rx sample"] | None = None
+    paths: Paths
+    beat: Complex128[Tensor, "frame tx rx sample"]
 
 
 def simulate(
@@ -56,146 +47,52 @@ def simulate(
     grid: Grid,
     *,
     seed: int,
-    surrogate: Surrogate | str | None = None,
-    depth: int = 3,
-    samples: int = 400_000,
-    boundary_samples: int = 50_000,
-    boundary: bool = True,
-    density: float = 20_000.0,
-    points: RoughPoints | None = None,
-    chains: RoughChains | None = None,
-    chain_count: int = 200_000,
+    sampling: Sampling | None = None,
+    speckle: Speckle | None = None,
     snr_db: float | None = None,
     noise_figure_db: float | None = None,
-    backend: str | None = None,
+    impairments: Impairments | None = None,
 ) -> Simulation:
-    """Simulate a capture of a scene.
+    """Simulate a capture of a scene: exact signals with noise.
 
-    Without a surrogate: the exact chain, as a real radar does it. With one: the expected power
-    spectrum, smooth in the scene's parameters; both have the same shape and units.
-
-    Args:
-        scene: What is seen.
-        radar: Arrays, waveform and poses.
-        grid: Bins, see ``Radar.grid``.
-        seed: Places, phases and noise.
-        surrogate: The smooth model, or its name among ``SURROGATES``; None, "exact" = exact chain.
-        depth: Most bounces of a path.
-        samples: Surrogate: rays over all frames. Exact: samples per frame on conductors.
-        boundary_samples: Silhouette samples (surrogate and conductors).
-        boundary: Off for fixed-visibility gradients.
-        density: Points per m² of rough surfaces (exact).
-        points: Rough points to reuse, so that speckle stays while the scene moves (exact).
-        chains: Rough chains of several bounces to reuse, likewise.
-        chain_count: How many to draw of each length instead (exact).
-        snr_db: Noise relative to the mean signal power per sample (exact).
-        noise_figure_db: Thermal noise of a receiver instead (exact).
-        backend: See ``deposit_power``.
-
-    Raises:
-        InputError: An object in motion: a frame is one instant. Noise on a mean spectrum.
-    """
-    smooth = chosen_surrogate(surrogate)
-    with use_backend(backend):
-        if smooth is not None:
-            if snr_db is not None or noise_figure_db is not None:
-                raise InputError(
-                    "expected no noise with a surrogate, got a noise level; the surrogate is the "
-                    "mean spectrum: leave the noise out, or simulate without a surrogate"
-                )
-            return Simulation(
-                surrogate_spectrum(
-                    scene,
-                    radar,
-                    grid,
-                    smooth,
-                    depth=depth,
-                    samples=samples,
-                    boundary_samples=boundary_samples,
-                    seed=seed,
-                    boundary=boundary,
-                )
-            )
-        moving = [name for name, item in scene.objects.items() if item.velocity is not None]
-        if moving:
-            raise InputError(
-                f"expected objects at rest, got velocities on {', '.join(moving)}; a frame is one "
-                "instant: use scene.at(time), or simulate_chirps for motion within a frame"
-            )
-        paths = trace_field(
-            scene,
-            radar.link(),
-            samples=samples,
-            density=density,
-            points=points,
-            depth=depth,
-            chains=chains,
-            chain_count=chain_count,
-            boundary_samples=boundary_samples,
-            seed=seed,
-            boundary=boundary,
-        )
-    beat = beat_signal(paths, radar)
-    if snr_db is not None or noise_figure_db is not None:
-        beat = add_noise(beat, radar, snr_db=snr_db, noise_figure_db=noise_figure_db, seed=seed)
-    return Simulation(exact_spectrum(beat, radar, grid), paths, beat)
-
-
-def surrogate_correlation(
-    scene: Scene,
-    radar: Radar,
-    grid: Grid,
-    *,
-    seed: int,
-    surrogate: Surrogate | str = "response",
-    looks: int = 16,
-    samples: int = 400_000,
-    depth: int = 3,
-    density: float = 20_000.0,
-) -> float:
-    """How well a surrogate's map is that of the exact chain, the mean over looks at the scene.
-
-    A look has its own phases of the rough surfaces. One look is speckle as strong as the map
-    itself; a scene of conductors has none, and looks the same each time.
+    The smooth mean of such spectra is predicted by ``invertwin.SurrogateMap``.
 
     Args:
         scene: What is seen.
         radar: Arrays, waveform and poses.
         grid: Bins, see ``Radar.grid``.
-        seed: Of the first look, and of the surrogate's samples.
-        surrogate: The smooth model, or its name.
-        looks: Exact spectra that are averaged.
-        samples: As in :func:`simulate`.
-        depth: Most bounces of a path.
-        density: Points per m² of rough surfaces.
-
-    Returns:
-        Pearson's correlation over all bins and frames; 0 where a map is constant.
+        seed: Of places, phases and noise.
+        sampling: How paths are sampled; None = ``Sampling()``.
+        speckle: Rough points and paths to use again, so that speckle stays while the scene moves.
+        snr_db: Noise relative to the mean signal power per sample.
+        noise_figure_db: Thermal noise of a receiver instead.
+        impairments: Of the front end; it has a noise level of its own.
 
     Raises:
-        InputError: No looks; "exact", which is no surrogate.
+        InputError: An object in motion: a frame is one instant. Two noise levels.
     """
-    smooth = chosen_surrogate(surrogate)
-    if looks < 1 or smooth is None:
+    moving = [name for name, item in scene.objects.items() if item.velocity is not None]
+    if moving:
         raise InputError(
-            f"expected looks >= 1 and a surrogate, got {looks} and {surrogate!r}; 16 looks leave "
-            "a quarter of the speckle"
+            f"expected objects at rest, got velocities on {', '.join(moving)}; a frame is one "
+            "instant: use scene.at(time), or simulate_chirps for motion within a frame"
         )
-    if all(item.material.coherent for item in scene.objects.values()):
-        looks = 1
-    with torch.no_grad():
-        mean = torch.zeros(radar.frame_count, *grid.shape, dtype=torch.float64)
-        for look in range(looks):
-            found = simulate(
-                scene, radar, grid, seed=seed + look, samples=samples, density=density, depth=depth
-            )
-            mean += found.spectrum / looks
-        twin = simulate(
-            scene, radar, grid, seed=seed, surrogate=smooth, samples=samples, depth=depth
+    noisy = snr_db is not None or noise_figure_db is not None
+    if noisy and impairments is not None:
+        raise InputError(
+            "expected the noise level in the impairments, got one beside them; give "
+            "Impairments(snr_db=...)"
         )
-        a, b = (power.double() - power.double().mean() for power in (mean, twin.spectrum))
-        norms = a.norm() * b.norm()
-    return float((a * b).sum() / norms) if norms > 0 else 0.0
+    paths = trace_field(
+        scene, radar.link(), sampling=sampling or Sampling(), seed=seed, speckle=speckle
+    )
+    if impairments is not None:
+        beat = impairments.record(paths, radar, seed=seed)
+    else:
+        beat = beat_signal(paths, radar)
+        if noisy:
+            beat = add_noise(beat, radar, snr_db=snr_db, noise_figure_db=noise_figure_db, seed=seed)
+    return Simulation(exact_spectrum(beat, radar, grid), paths, beat)
 
 
 def simulate_chirps(
@@ -204,12 +101,10 @@ def simulate_chirps(
     chirps: Chirps,
     *,
     seed: int,
+    sampling: Sampling | None = None,
     retrace: bool = False,
-    samples: int = 400_000,
-    density: float = 20_000.0,
-    points: RoughPoints | None = None,
+    speckle: Speckle | None = None,
     impairments: Impairments | None = None,
-    backend: str | None = None,
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
     """Beat signals of a moving scene, chirp by chirp; the radar rests within a frame.
 
@@ -226,13 +121,11 @@ def simulate_chirps(
         radar: Arrays, waveform and poses.
         chirps: Timing of the ramps.
         seed: Places and phases; those of rough points belong to the surface and move with it.
+        sampling: How paths are sampled, of one bounce; None = ``Sampling(depth=1)``.
         retrace: Trace visibility and amplitudes anew at every ramp, instead of moving the
             points seen at the start of the frame. A function of time always does.
-        samples: Samples per frame on conductors.
-        density: Points per m² of rough surfaces.
-        points: Rough points to reuse.
+        speckle: Rough points to use again.
         impairments: Of the front end, drawn from the seed too; phase noise only without retracing.
-        backend: See ``deposit_power``.
 
     Raises:
         InputError: See ``trace_field`` and ``moving_beat``; a function of time whose objects
@@ -242,12 +135,11 @@ def simulate_chirps(
     if again and impairments is not None:
         impairments.check_applicable()
     motion = scene.at if isinstance(scene, Scene) else scene
-    fixed = points or rough_points(motion(0.0), density, seed)
+    plan = sampling or Sampling(depth=1)
+    fixed = speckle or draw_speckle(motion(0.0), radar.link(), plan, seed)
 
     def traced(instant: Scene) -> Paths:
-        return trace_field(
-            instant, radar.link(), samples=samples, points=fixed, seed=seed, backend=backend
-        )
+        return trace_field(instant, radar.link(), sampling=plan, seed=seed, speckle=fixed)
 
     if isinstance(scene, Scene) and not again:
         front = impairments or Impairments()

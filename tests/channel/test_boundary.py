@@ -1,13 +1,13 @@
 """Silhouettes of any mesh, and the derivative of shadows that move."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.bridge import edges_of
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid, Link
@@ -16,7 +16,7 @@ from scenes import GRID, WAVELENGTH, float64, link, occluder, relative, shift_er
 
 WALL = thing(plate(2.0, 2.0, divisions=2), (0, 0, 2))
 ACROSS = Grid(1.5, 1.0, 2, u_start=-0.6, u_step=0.1, u_count=13)
-COUNTS: dict[str, Any] = {"samples": 4_000, "boundary_samples": 40_000, "seed": 1}
+COUNTS = Sampling(depth=1, samples=4_000, boundary_samples=40_000)
 
 
 def shadow_rate(screens: dict[str, Mesh], antennas: Link, boundary: bool = True) -> Tensor:
@@ -30,7 +30,9 @@ def shadow_rate(screens: dict[str, Mesh], antennas: Link, boundary: bool = True)
             for name, mesh in screens.items()
         }
     )
-    out = deposit_power(scene, antennas, ACROSS, boundary=boundary, **COUNTS)
+    out = deposit_power(
+        scene, antennas, ACROSS, sampling=replace(COUNTS, boundary=boundary), seed=1
+    )
     # One column of the Jacobian of a map is cheapest as two reverse passes over its bins.
     rows = [torch.autograd.grad(out[0, 0, u, 0], shift, retain_graph=True)[0] for u in range(13)]
     return torch.stack(rows)
@@ -98,7 +100,7 @@ def test_objects_that_start_at_one_place_may_part():
         place = torch.stack([shift, 0 * shift, 1 + 0 * shift])
         screen = Object(Mesh(moving.vertices + place, moving.faces), RoughDielectric(4.0))
         scene = Scene({"wall": WALL, "still": thing(still, (0, 0, 1)), "moving": screen})
-        out = deposit_power(scene, link(), ACROSS, **COUNTS)
+        out = deposit_power(scene, link(), ACROSS, sampling=COUNTS, seed=1)
         return torch.stack(
             [torch.autograd.grad(out[0, 0, u, 0], shift, retain_graph=True)[0] for u in range(13)]
         )
@@ -150,7 +152,13 @@ def test_a_later_call_does_not_disturb_an_earlier_one():
         place = torch.stack([x + shift, 0.05 + 0 * shift, 1 + 0 * shift])
         screen = Object(Mesh(plain().vertices + place, faces), RoughDielectric(4.0))
         scene = Scene({"wall": WALL, "screen": screen})
-        return deposit_power(scene, link(), ACROSS, memory_budget=20_000, **COUNTS).square().sum()
+        return (
+            deposit_power(
+                scene, link(), ACROSS, sampling=replace(COUNTS, memory_budget=20_000), seed=1
+            )
+            .square()
+            .sum()
+        )
 
     alone = [torch.autograd.grad(at(x), shift)[0] for x in (0.1, -0.3)]
     both = at(0.1) * 1.0, at(-0.3) * 1.0
@@ -161,7 +169,7 @@ def test_a_later_call_does_not_disturb_an_earlier_one():
 def test_second_derivatives_are_refused():
     shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     wall = Object(Mesh(WALL.vertices + shift, WALL.mesh.faces), RoughDielectric(4.0))
-    out = deposit_power(Scene({"wall": wall}), link(), GRID, **COUNTS).square().sum()
+    out = deposit_power(Scene({"wall": wall}), link(), GRID, sampling=COUNTS, seed=1).square().sum()
     (first,) = torch.autograd.grad(out, shift, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         first.sum().backward()
@@ -188,7 +196,7 @@ def test_odd_scenes_have_maps_that_a_common_shift_leaves(scene, antennas):
     )
     tx = antennas.tx.clone().requires_grad_()
     rx = tx if antennas.shared_visibility else antennas.rx.clone().requires_grad_()
-    out = deposit_power(moved, replace(antennas, tx=tx, rx=rx), GRID, **COUNTS)
+    out = deposit_power(moved, replace(antennas, tx=tx, rx=rx), GRID, sampling=COUNTS, seed=1)
     places = [tx] if rx is tx else [tx, rx]
     gradients = torch.autograd.grad(out.sum() * 1e9, [*leaves.values(), *places])
     assert bool((out >= 0).all())

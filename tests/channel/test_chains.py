@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.tracer import trace_field, trace_power
@@ -31,7 +33,7 @@ from oracles.twin import deposit_by_paths
 from scenes import float64, link, occluder, relative, thing
 
 GRID = Grid(0.4, 0.075, 60, u_start=-0.6, u_step=0.1, u_count=13)
-COUNTS: dict[str, Any] = {"samples": 10_000, "boundary_samples": 3_000, "seed": 3}
+COUNTS = Sampling(depth=1, samples=10_000, boundary_samples=3_000)
 KINDS = ("opaque", "sheet", "body")
 
 
@@ -84,10 +86,13 @@ def random_map(shape: tuple[int, ...]) -> Tensor:
 
 
 def more_than_one(
-    deposit: Callable[..., Tensor], *where: Any, depth: int, **options: Any
+    deposit: Callable[..., Tensor], *where: Any, sampling: Sampling, seed: int
 ) -> Tensor:
     """What paths of two points and more add to the map."""
-    return deposit(*where, depth=depth, **options) - deposit(*where, depth=1, **options)
+    single = replace(sampling, depth=1)
+    return deposit(*where, sampling=sampling, seed=seed) - deposit(
+        *where, sampling=single, seed=seed
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -100,10 +105,11 @@ def test_value_and_gradients_are_those_of_the_torch_twin(bistatic, kind):
     """
     values = leaves(bistatic, kind)
     where = *built(values, kind), GRID
-    options: dict[str, Any] = {**COUNTS, "boundary_samples": 0, "boundary": False}
-    options |= {"depth": 5, "seed": 9} if kind == "body" else {"depth": 3}
+    depth, seed = (5, 9) if kind == "body" else (3, 3)
+    sampling = replace(COUNTS, depth=depth, boundary_samples=0, boundary=False)
     fused, slow = (
-        more_than_one(deposit, *where, **options) for deposit in (deposit_power, deposit_by_paths)
+        more_than_one(deposit, *where, sampling=sampling, seed=seed)
+        for deposit in (deposit_power, deposit_by_paths)
     )
     assert float(slow.detach().sum()) > 0
     assert relative(fused, slow) < 1e-3
@@ -128,8 +134,8 @@ def test_value_and_gradients_are_those_of_the_torch_twin(bistatic, kind):
 def test_forward_and_reverse_mode_agree(bistatic, kind):
     """Boundary paths of both families included, and every one of them is there."""
     values = leaves(bistatic, kind)
-    options: dict[str, Any] = {**COUNTS, "depth": 3}
-    out = deposit_power(*built(values, kind), GRID, **options)
+    sampling = replace(COUNTS, depth=3)
+    out = deposit_power(*built(values, kind), GRID, sampling=sampling, seed=3)
     weights = random_map(out.shape)
     pulled = torch.autograd.grad((weights * out).sum(), list(values.values()))
     generator = torch.Generator().manual_seed(1)
@@ -141,12 +147,13 @@ def test_forward_and_reverse_mode_agree(bistatic, kind):
             tangent = tangent / (bar * tangent).sum().abs()  # all of them count alike
             dual[name] = forward_ad.make_dual(value.detach(), tangent)
             back, size = back + (bar * tangent).sum(), size + 1
-        pushed = forward_ad.unpack_dual(deposit_power(*built(dual, kind), GRID, **options)).tangent
+        moved = deposit_power(*built(dual, kind), GRID, sampling=sampling, seed=3)
+        pushed = forward_ad.unpack_dual(moved).tangent
     assert pushed is not None
     size = torch.maximum(size, (weights * pushed.abs()).sum())
     assert float(((weights * pushed).sum() - back).abs() / size) < 1e-5
-    for off in ({"boundary": False}, {"interior_edges": False}):
-        out = deposit_power(*built(values, kind), GRID, **{**options, **off})
+    for less in (replace(sampling, boundary=False), replace(sampling, interior_edges=False)):
+        out = deposit_power(*built(values, kind), GRID, sampling=less, seed=3)
         without = torch.autograd.grad((weights * out).sum(), values["front"])[0]
         assert relative(without, pulled[1]) > 1e-4
 
@@ -158,7 +165,12 @@ def test_chunks_change_nothing(kind):
     values = leaves(True, kind)
     results = []
     for budget in (1e9, 200_000):
-        out = deposit_power(*built(values, kind), GRID, depth=3, memory_budget=budget, **COUNTS)
+        out = deposit_power(
+            *built(values, kind),
+            GRID,
+            sampling=replace(COUNTS, depth=3, memory_budget=budget),
+            seed=3,
+        )
         gradients = torch.autograd.grad(out.square().sum(), list(values.values()))
         results.append([out, *gradients])
     for whole, pieces in zip(*results, strict=True):
@@ -168,8 +180,13 @@ def test_chunks_change_nothing(kind):
 def test_depth_adds_to_what_is_there():
     """Longer paths leave shorter ones alone: maps of rising depth never lose power."""
     scene, antennas = built(leaves(True, "opaque"), "opaque")
-    options: dict[str, Any] = {**COUNTS, "boundary": False}
-    maps = [deposit_power(scene, antennas, GRID, depth=d, **options).detach() for d in range(1, 6)]
+    with torch.no_grad():
+        maps = [
+            deposit_power(
+                scene, antennas, GRID, sampling=replace(COUNTS, depth=d, boundary=False), seed=3
+            )
+            for d in range(1, 6)
+        ]
     for less, more in pairwise(maps):
         assert (more - less > -1e-6 * more.max()).all()
     gains = [float((more - less).sum()) for less, more in pairwise(maps)]
@@ -179,7 +196,7 @@ def test_depth_adds_to_what_is_there():
 @pytest.mark.parametrize("depth", [0, 17])
 def test_a_depth_out_of_range_is_named(depth):
     with pytest.raises(InputError, match=f"expected a depth from 1 to 16, got {depth}"):
-        deposit_power(occluder(), link(), GRID, depth=depth, **COUNTS)
+        deposit_power(occluder(), link(), GRID, sampling=replace(COUNTS, depth=depth), seed=3)
 
 
 def hidden(shift: Tensor) -> Scene:
@@ -198,7 +215,9 @@ def hidden(shift: Tensor) -> Scene:
 def test_what_is_wholly_hidden_has_no_gradient_until_something_shows_it(rx):
     shift = float64([0.0, 0.0, 0.0]).requires_grad_()
     for depth in (1, 2, 3):
-        out = deposit_power(hidden(shift), link(rx=rx), GRID, depth=depth, **COUNTS)
+        out = deposit_power(
+            hidden(shift), link(rx=rx), GRID, sampling=replace(COUNTS, depth=depth), seed=3
+        )
         assert out.any()
         gradient = torch.autograd.grad(out.sum(), shift)[0]
         # There and back by way of the side wall takes three points; two see it with one antenna.
@@ -208,7 +227,7 @@ def test_what_is_wholly_hidden_has_no_gradient_until_something_shows_it(rx):
 def test_nothing_to_see_is_zeros_at_any_depth():
     shift = float64([0.0, 0.0, 0.0]).requires_grad_()
     behind = link(rotations=torch.diag(float64([-1.0, 1.0, -1.0]))[None], pattern=Cosine(1.0))
-    out = deposit_power(hidden(shift), behind, GRID, depth=3, **COUNTS)
+    out = deposit_power(hidden(shift), behind, GRID, sampling=replace(COUNTS, depth=3), seed=3)
     assert not out.any()
     assert not torch.autograd.grad(out.sum(), shift)[0].any()
 
@@ -227,20 +246,32 @@ def turned(mesh: Mesh) -> Mesh:
 def test_a_body_without_an_inside_is_refused(change, message):
     body = thing(change(box(0.3)), (0.0, 0.0, 1.0), material=RefractingBody(2.5))
     with pytest.raises(InputError, match=f"refracting body block, {message}"):
-        deposit_power(Scene({"block": body}), link(), GRID, depth=2, **COUNTS)
+        deposit_power(
+            Scene({"block": body}), link(), GRID, sampling=replace(COUNTS, depth=2), seed=3
+        )
 
 
 def test_explicit_paths_refuse_what_they_cannot_do():
     shift = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
     with pytest.raises(InputError, match="expected explicit paths of one bounce without sheets"):
-        trace_power(occluder(), link(shift), depth=2, **COUNTS)
+        trace_power(occluder(), link(shift), sampling=replace(COUNTS, depth=2), seed=3)
     board = occluder(occluder=Slab(2.5, thickness=0.01))
     with pytest.raises(InputError, match="expected explicit paths of one bounce without sheets"):
-        trace_power(board, link(shift), **COUNTS)
+        trace_power(board, link(shift), sampling=COUNTS, seed=3)
     with pytest.raises(InputError, match="no geometry derivative of rough field paths"):
-        trace_field(occluder(), link(shift), density=100.0, depth=2, seed=0)
+        trace_field(
+            occluder(),
+            link(shift),
+            sampling=Sampling(depth=2, samples=100_000, boundary_samples=0, points_per_m2=100.0),
+            seed=0,
+        )
     moving = occluder().replace("occluder", velocity=float64([1.0, 0.0, 0.0]))
     with pytest.raises(InputError, match="expected depth 1 for objects in motion, got 2"):
-        trace_field(moving, link(), density=100.0, depth=2, seed=0)
+        trace_field(
+            moving,
+            link(),
+            sampling=Sampling(depth=2, samples=100_000, boundary_samples=0, points_per_m2=100.0),
+            seed=0,
+        )
     with pytest.raises(InputError, match="expected objects at rest, got velocities on occluder"):
-        trace_power(moving, link(), depth=2, **COUNTS)
+        trace_power(moving, link(), sampling=replace(COUNTS, depth=2), seed=3)

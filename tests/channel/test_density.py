@@ -8,6 +8,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.density import deposit_density
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid, Link
@@ -42,7 +43,7 @@ def even(density: float, counts: tuple[int, int, int] = (9, 9, 33)) -> Tensor:
 
 
 def total(item: Object, antennas: Link, samples: int = 100_000, seed: int = 1) -> float:
-    found = deposit_density(item, antennas, BINS, samples=samples, seed=seed)
+    found = deposit_density(item, antennas, BINS, sampling=Sampling(samples=samples), seed=seed)
     return float(found.double().sum())
 
 
@@ -57,10 +58,8 @@ def test_a_dense_slab_is_a_diffuse_sheet_of_an_eighth_of_its_albedo(z: float, sh
         Scene({"sheet": sheet}),
         antennas,
         BINS,
-        samples=200_000,
-        boundary_samples=0,
+        sampling=Sampling(depth=1, samples=200_000, boundary_samples=0),
         seed=1,
-        depth=1,
     )
     # The slab answers from 1/(2σ) deeper on average: within (2 / 1600 / 1.45)·2.
     assert total(slab, antennas) == pytest.approx(float(white.double().sum()) / 8, rel=0.006)
@@ -73,7 +72,11 @@ def test_a_dense_slab_at_an_angle_follows_lommel_and_seeliger() -> None:
     slab = replace(slab, pose=rigid(turn, [0.0, 0.0, 20.0]))
     antennas = link()
     grid = Grid(19.8, 0.02, 30)
-    found = float(deposit_density(slab, antennas, grid, samples=400_000, seed=2).double().sum())
+    found = float(
+        deposit_density(slab, antennas, grid, sampling=Sampling(samples=400_000), seed=2)
+        .double()
+        .sum()
+    )
     # Two faces are lit, of cosines cos 50° and sin 50°; each returns albedo/(8π)·cosθ per m².
     faces = 0.01 * (math.cos(angle) + math.sin(angle)) / (8 * math.pi)
     scale = (antennas.wavelength / (4 * math.pi)) ** 2
@@ -96,11 +99,11 @@ def test_what_is_dense_hides_what_lies_behind() -> None:
     layers = torch.zeros(5, 5, 41, dtype=torch.float64)
     layers[..., 30:] = 5.0
     behind = deposit_density(
-        cloud_at(layers, (0.4, 0.4, 0.4)), link(), BINS, samples=100_000, seed=3
+        cloud_at(layers, (0.4, 0.4, 0.4)), link(), BINS, sampling=Sampling(samples=100_000), seed=3
     ).double()
     layers[..., 5:10] = 100.0
     both = deposit_density(
-        cloud_at(layers, (0.4, 0.4, 0.4)), link(), BINS, samples=100_000, seed=3
+        cloud_at(layers, (0.4, 0.4, 0.4)), link(), BINS, sampling=Sampling(samples=100_000), seed=3
     ).double()
     far = BINS.ranges > 1.6
     assert float(behind[0, far].sum()) > 0
@@ -124,7 +127,9 @@ def test_the_map_puts_points_where_they_are() -> None:
     item = cloud_at(even(50.0, (3, 3, 3)), (0.02, 0.02, 0.02))
     place = float64([0.3, -0.2, 1.5])
     item = replace(item, pose=rigid(translation=place))
-    power = deposit_density(item, link(), MAP, samples=20_000, seed=0).double()[0]
+    power = deposit_density(item, link(), MAP, sampling=Sampling(samples=20_000), seed=0).double()[
+        0
+    ]
     distance = float(place.norm())
     for axis, values, truth in (
         (0, MAP.ranges, distance),
@@ -183,7 +188,9 @@ def test_gradients_equal_differences_that_have_converged(kind: str, shared: bool
 
     def at(theta: Tensor, samples: int, seed: int) -> Tensor:
         item, antennas = moved(kind, theta, shared)
-        return deposit_density(item, antennas, MAP, samples=samples, seed=seed).double()
+        return deposit_density(
+            item, antennas, MAP, sampling=Sampling(samples=samples), seed=seed
+        ).double()
 
     def difference(step: float, seed: int) -> Tensor:
         ends = [at(float64(sign * step), count, seed) for sign in (1.0, -1.0)]
@@ -211,26 +218,39 @@ def test_a_scene_adds_its_clouds_and_its_surfaces() -> None:
 
     def power(**objects: Object) -> Tensor:
         return deposit_power(
-            Scene(objects), link(), BINS, samples=20_000, boundary_samples=0, seed=0, depth=1
+            Scene(objects),
+            link(),
+            BINS,
+            sampling=Sampling(depth=1, samples=20_000, boundary_samples=0),
+            seed=0,
         )
 
     both = power(wall=wall, item=item)
     torch.testing.assert_close(both, power(wall=wall) + power(item=item), rtol=1e-5, atol=0.0)
     with pytest.raises(InputError, match="surfaces"):
-        trace_power(Scene({"item": item}), link(), samples=10, boundary_samples=0, seed=0)
+        trace_power(
+            Scene({"item": item}),
+            link(),
+            sampling=Sampling(depth=1, samples=10, boundary_samples=0),
+            seed=0,
+        )
 
 
 def test_bad_input_is_refused() -> None:
     item = cloud_at(even(5.0), (0.2, 0.2, 0.2))
     with pytest.raises(InputError, match="cloud"):
-        deposit_density(replace(item, cloud=None), link(), BINS, samples=10, seed=0)
+        deposit_density(
+            replace(item, cloud=None), link(), BINS, sampling=Sampling(samples=10), seed=0
+        )
     with pytest.raises(InputError, match="samples"):
-        deposit_density(item, link(), BINS, samples=0, seed=0)
+        deposit_density(item, link(), BINS, sampling=Sampling(samples=0), seed=0)
     with pytest.raises(InputError, match="outside"):
-        deposit_density(replace(item, pose=None), link(), BINS, samples=10, seed=0)
+        deposit_density(
+            replace(item, pose=None), link(), BINS, sampling=Sampling(samples=10), seed=0
+        )
     moving = replace(item, velocity=float64([1.0, 0.0, 0.0]))
     with pytest.raises(InputError, match="at rest"):
-        deposit_density(moving, link(), BINS, samples=10, seed=0)
+        deposit_density(moving, link(), BINS, sampling=Sampling(samples=10), seed=0)
     with pytest.raises(InputError, match="least"):
         Cloud(float64([0, 0, 0]), float64([1, 1, 1]), even(-1.0))
     with pytest.raises(InputError, match="low < high"):

@@ -1,18 +1,19 @@
 """The fused deposit against its slow twins, its own adjoint, and itself."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid, Link
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,
+    Isotropic,
     Mesh,
     Object,
     RoughDielectric,
@@ -26,7 +27,7 @@ from oracles import autodiff_deposit
 from oracles.twin import deposit_by_paths
 from scenes import GRID, float64, link, occluder, relative, thing
 
-COUNTS: dict[str, Any] = {"samples": 20_000, "boundary_samples": 4_000, "seed": 3}
+COUNTS = Sampling(depth=1, samples=20_000, boundary_samples=4_000)
 BOX = Grid(
     0.4, 0.075, 34, u_start=-0.6, u_step=0.1, u_count=13, v_start=-0.6, v_step=0.2, v_count=7
 )
@@ -79,8 +80,8 @@ def random_map(shape: tuple[int, ...]) -> Tensor:
 def test_value_and_gradients_are_those_of_the_torch_twin(bistatic, grid):
     values = leaves(bistatic)
     scene, antennas = built(values)
-    fused = deposit_power(scene, antennas, grid, **COUNTS)
-    slow = deposit_by_paths(scene, antennas, grid, **COUNTS)
+    fused = deposit_power(scene, antennas, grid, sampling=COUNTS, seed=3)
+    slow = deposit_by_paths(scene, antennas, grid, sampling=COUNTS, seed=3)
     assert relative(fused, slow) < 1e-5
     weights = random_map(slow.shape)
     found, truth = (
@@ -111,7 +112,7 @@ def test_hand_written_adjoint_is_that_of_autodiff(bistatic):
     }
     if not bistatic:
         poses["rx"] = poses["tx"]
-    fused = deposit_power(moved, replace(antennas, **poses), BOX, **COUNTS)
+    fused = deposit_power(moved, replace(antennas, **poses), BOX, sampling=COUNTS, seed=3)
     wanted = {"vertices": vertices, **poses}
     found = torch.autograd.grad((weights * fused).sum(), list(wanted.values()))
     for name, gradient in zip(wanted, found, strict=True):
@@ -123,7 +124,7 @@ def test_hand_written_adjoint_is_that_of_autodiff(bistatic):
 def test_forward_and_reverse_mode_agree(bistatic):
     values = leaves(bistatic)
     scene, antennas = built(values)
-    out = deposit_power(scene, antennas, GRID, **COUNTS)
+    out = deposit_power(scene, antennas, GRID, sampling=COUNTS, seed=3)
     weights = random_map(out.shape)
     pulled = torch.autograd.grad((weights * out).sum(), list(values.values()))
     generator = torch.Generator().manual_seed(1)
@@ -132,7 +133,9 @@ def test_forward_and_reverse_mode_agree(bistatic):
         with forward_ad.dual_level():
             dual = {k: v.detach() for k, v in values.items()}
             dual[name] = forward_ad.make_dual(dual[name], tangent)
-            pushed = forward_ad.unpack_dual(deposit_power(*built(dual), GRID, **COUNTS)).tangent
+            pushed = forward_ad.unpack_dual(
+                deposit_power(*built(dual), GRID, sampling=COUNTS, seed=3)
+            ).tangent
         assert pushed is not None
         there, back = (weights * pushed).sum(), (bar * tangent).sum()
         size = (weights * pushed.abs()).sum()
@@ -146,7 +149,10 @@ def test_coinciding_antennas_may_move_apart():
     for which in ("tx", "rx"):
         own = place.clone().requires_grad_()
         antennas = replace(link(place), **{which: own})
-        maps = [f(occluder(), antennas, GRID, **COUNTS) for f in (deposit_power, deposit_by_paths)]
+        maps = [
+            deposit(occluder(), antennas, GRID, sampling=COUNTS, seed=3)
+            for deposit in (deposit_power, deposit_by_paths)
+        ]
         fused, slow = (torch.autograd.grad((weights * out).sum(), own)[0] for out in maps)
         assert relative(fused, slow) < 1e-3
         found.append(fused)
@@ -158,7 +164,13 @@ def test_chunks_change_nothing(sampling):
     values = leaves(bistatic=True)
     results = []
     for budget in (1e9, 40_000):
-        out = deposit_power(*built(values), GRID, sampling=sampling, memory_budget=budget, **COUNTS)
+        out = deposit_power(
+            *built(values),
+            GRID,
+            sampling=replace(COUNTS, memory_budget=budget),
+            seed=3,
+            scheme=sampling,
+        )
         gradients = torch.autograd.grad(out.square().sum(), list(values.values()))
         results.append([out, *gradients])
     for whole, pieces in zip(*results, strict=True):
@@ -167,7 +179,13 @@ def test_chunks_change_nothing(sampling):
 
 def test_a_seed_repeats_and_another_differs():
     first, again, other = (
-        deposit_power(occluder(), link(), GRID, samples=20_000, boundary_samples=0, seed=seed)
+        deposit_power(
+            occluder(),
+            link(),
+            GRID,
+            sampling=Sampling(depth=1, samples=20_000, boundary_samples=0),
+            seed=seed,
+        )
         for seed in (0, 0, 1)
     )
     assert relative(again, first) < 1e-6
@@ -183,10 +201,9 @@ def test_area_sampling_is_ray_sampling(rx):
                     occluder(),
                     link(rx=rx),
                     GRID,
-                    samples=200_000,
-                    boundary_samples=0,
+                    sampling=Sampling(depth=1, samples=200_000, boundary_samples=0),
                     seed=seed,
-                    sampling=sampling,
+                    scheme=sampling,
                 )
                 for seed in range(4)
             ]
@@ -201,7 +218,11 @@ def test_area_sampling_is_ray_sampling(rx):
 def test_boundary_samples_leave_the_value_alone():
     plain, full, off = (
         deposit_power(
-            occluder(), link(), GRID, samples=10_000, boundary_samples=n, seed=0, boundary=on
+            occluder(),
+            link(),
+            GRID,
+            sampling=Sampling(depth=1, samples=10_000, boundary_samples=n, boundary=on),
+            seed=0,
         )
         for n, on in ((0, True), (5_000, True), (5_000, False))
     )
@@ -212,15 +233,18 @@ def test_boundary_samples_leave_the_value_alone():
 def test_one_frame_at_a_time_is_all_frames():
     positions = float64([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
     both = deposit_power(
-        occluder(), link(positions), GRID, samples=400_000, boundary_samples=0, seed=0
+        occluder(),
+        link(positions),
+        GRID,
+        sampling=Sampling(depth=1, samples=400_000, boundary_samples=0),
+        seed=0,
     )
     for frame in range(2):
         alone = deposit_power(
             occluder(),
             link(positions[frame : frame + 1]),
             GRID,
-            samples=200_000,
-            boundary_samples=0,
+            sampling=Sampling(depth=1, samples=200_000, boundary_samples=0),
             seed=0,
         )
         assert relative(alone[0], both[frame]) < 0.01
@@ -231,19 +255,27 @@ def test_one_frame_at_a_time_is_all_frames():
     [
         ({"samples": 0}, "samples >= 1"),
         ({"boundary_samples": -1}, "boundary_samples >= 0"),
-        ({"sampling": "photons"}, "expected sampling 'rays' or 'area', got 'photons'"),
+        ({"depth": 0}, "expected a depth from 1 to 16, got 0"),
+        ({"points_per_m2": 0.0}, "expected points_per_m2 > 0"),
         ({"backend": "tpu"}, "expected backend 'cpu', 'cuda' or 'auto', got 'tpu'"),
     ],
 )
 def test_bad_options_are_named(options, message, unchecked):
     with pytest.raises(InputError, match=message):
-        deposit_power(occluder(), link(), GRID, **{**COUNTS, **options})
+        deposit_power(occluder(), link(), GRID, sampling=replace(COUNTS, **options), seed=3)
+
+
+def test_a_bad_scheme_is_named(unchecked):
+    with pytest.raises(InputError, match="expected scheme 'rays' or 'area', got 'photons'"):
+        deposit_power(occluder(), link(), GRID, sampling=COUNTS, seed=3, scheme="photons")  # type: ignore[arg-type]
 
 
 def test_a_reference_of_another_mesh_is_refused():
     other = (Scene({"ball": thing(sphere(0.1))}), link())
     with pytest.raises(InputError, match="expected a reference scene of"):
-        deposit_power(occluder(), link(), GRID, sampling="area", reference=other, **COUNTS)
+        deposit_power(
+            occluder(), link(), GRID, sampling=COUNTS, seed=3, scheme="area", reference=other
+        )
 
 
 @pytest.mark.parametrize(
@@ -266,7 +298,7 @@ def test_cuda_is_cpu(bistatic):
     values = leaves(bistatic)
     results = []
     for backend in ("cpu", "cuda"):
-        out = deposit_power(*built(values), GRID, backend=backend, **COUNTS)
+        out = deposit_power(*built(values), GRID, sampling=replace(COUNTS, backend=backend), seed=3)
         results.append([out, *torch.autograd.grad(out.square().sum(), list(values.values()))])
     for cpu, cuda in zip(*results, strict=True):
         assert relative(cuda, cpu) < 1e-3
@@ -275,9 +307,11 @@ def test_cuda_is_cpu(bistatic):
 def test_a_plate_seen_through_a_cosine_pattern():
     """A pattern only weighs: two antennas of gain g give g² where the direction is one."""
     far = Scene({"plate": thing(plate(0.02, 0.02), (0.6, 0.0, 1.5))})
-    options: dict[str, Any] = {"samples": 2_000, "boundary_samples": 0, "seed": 0}
+    sampling = Sampling(depth=1, samples=2_000, boundary_samples=0)
     grid = Grid(0.0, 4.0, 1)
-    plain = deposit_power(far, link(), grid, **options)
-    weighted = deposit_power(far, link(pattern=Cosine(3.0)), grid, **options)
+    plain, weighted = (
+        deposit_power(far, link(pattern=pattern), grid, sampling=sampling, seed=0)
+        for pattern in (Isotropic(), Cosine(3.0))
+    )
     cosine = 1.5 / (0.6**2 + 1.5**2) ** 0.5
     assert float(weighted / plain) == pytest.approx((8 * cosine**3) ** 2, rel=1e-3)

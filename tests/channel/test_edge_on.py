@@ -5,6 +5,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.bridge import edges_of
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
@@ -42,9 +43,12 @@ def rate(tilt: float) -> Tensor:
         offset = torch.stack([0.15 + shift, 0.05 + 0 * shift, 1.0 + 0 * shift])
         item = Object(Mesh(turned + offset, cube.faces), RoughDielectric(4.0))
         out = deposit_power(
-            Scene({"wall": wall, "box": item}), link(), GRID,
-            samples=100_000, boundary_samples=100_000, seed=0,
-        )  # fmt: skip
+            Scene({"wall": wall, "box": item}),
+            link(),
+            GRID,
+            sampling=Sampling(depth=1, samples=100_000, boundary_samples=100_000),
+            seed=0,
+        )
         tangent = forward_ad.unpack_dual(out).tangent
     assert tangent is not None
     return tangent.ravel()

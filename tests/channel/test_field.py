@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid, Link, Paths
 from invertwin.channel.tracer import rough_points, trace_field, trace_power
@@ -38,7 +39,9 @@ def response(paths: Paths, antennas: Link) -> Tensor:
 def cross_section(scene: Scene, distance: float, wavelength: float, samples: int) -> float:
     """σ [m²] of a target at the origin, seen from −z."""
     antennas = link(((0.0, 0.0, -distance),), wavelength=wavelength)
-    paths = trace_field(scene, antennas, samples=samples, seed=1)
+    paths = trace_field(
+        scene, antennas, sampling=Sampling(depth=1, samples=samples, boundary_samples=0), seed=1
+    )
     power = response(paths, antennas).abs().square()
     return float(power * (4 * math.pi) ** 3 * distance**4 / wavelength**2)
 
@@ -72,7 +75,12 @@ def test_a_large_plate_reflects_with_minus_one():
     distance, wavelength = 5.0, 0.1
     antennas = link(wavelength=wavelength, pattern=Cosine(20.0))
     scene = Scene({"mirror": thing(plate(8.0, 8.0), (0, 0, distance), material=METAL)})
-    found = response(trace_field(scene, antennas, samples=300_000, seed=0), antennas)
+    found = response(
+        trace_field(
+            scene, antennas, sampling=Sampling(depth=1, samples=300_000, boundary_samples=0), seed=0
+        ),
+        antennas,
+    )
     phase = -4 * math.pi / wavelength * distance
     image = 42 * wavelength / (4 * math.pi * 2 * distance) * np.exp(1j * phase)
     assert abs(complex(found) / image + 1) < 0.1
@@ -82,7 +90,9 @@ def test_phase_holds_at_long_range():
     """Below 1e-3 rad at 77 GHz and 200 m, from float64 vertices."""
     scene = Scene({"plate": thing(plate(0.3, 0.2), (40.0, -30.0, 193.6), (0.1, 0.4, 0.2), METAL)})
     antennas = link(((0.01, 0.02, 0.03),), ((-0.2, 0.1, 0.0),), shared=True)
-    paths = trace_field(scene, antennas, samples=500, seed=0)
+    paths = trace_field(
+        scene, antennas, sampling=Sampling(depth=1, samples=500, boundary_samples=0), seed=0
+    )
     points = paths.first.numpy().astype(np.longdouble)
     corners = scene["plate"].vertices.numpy().astype(np.longdouble)
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
@@ -101,7 +111,15 @@ def test_fields_are_reciprocal(material):
     scene = occluder(wall=material, occluder=material)
     there = link(((-0.3, 0.1, 0.0),), ((0.3, 0.0, 0.1),))
     back = replace(there, tx=there.rx, rx=there.tx)
-    found = [response(trace_field(scene, a, samples=20_000, seed=4), a) for a in (there, back)]
+    found = [
+        response(
+            trace_field(
+                scene, a, sampling=Sampling(depth=1, samples=20_000, boundary_samples=0), seed=4
+            ),
+            a,
+        )
+        for a in (there, back)
+    ]
     assert float((found[0] - found[1]).abs() / found[0].abs()) < 1e-6
 
 
@@ -109,7 +127,13 @@ def test_power_is_reciprocal():
     there = link(((-0.3, 0.1, 0.0),), ((0.3, 0.0, 0.1),))
     back = replace(there, tx=there.rx, rx=there.tx)
     found = [
-        deposit_power(occluder(), a, ONE_BIN, samples=200_000, boundary_samples=0, seed=4).sum()
+        deposit_power(
+            occluder(),
+            a,
+            ONE_BIN,
+            sampling=Sampling(depth=1, samples=200_000, boundary_samples=0),
+            seed=4,
+        ).sum()
         for a in (there, back)
     ]
     assert float(found[0] / found[1]) == pytest.approx(1, abs=5e-3)
@@ -119,7 +143,13 @@ def test_power_is_reciprocal():
 def test_radar_equation_of_a_small_rough_plate(distance):
     """P = (λ/4π)² R(0)/π A / r⁴, hence r⁻⁴; R = 1/9 for ε = 4."""
     scene = Scene({"plate": thing(plate(0.05, 0.05), (0, 0, distance))})
-    found = deposit_power(scene, link(), ONE_BIN, samples=4_000, boundary_samples=0, seed=0)
+    found = deposit_power(
+        scene,
+        link(),
+        ONE_BIN,
+        sampling=Sampling(depth=1, samples=4_000, boundary_samples=0),
+        seed=0,
+    )
     truth = (WAVELENGTH / (4 * math.pi)) ** 2 / 9 / math.pi * 0.05**2 / distance**4
     assert float(found.sum()) == pytest.approx(truth, rel=5e-3)
 
@@ -139,8 +169,7 @@ def test_what_leaves_is_at_most_what_arrived(tilt):
         scene,
         link(tx, distance * around),
         ONE_BIN,
-        samples=200 * count,
-        boundary_samples=0,
+        sampling=Sampling(depth=1, samples=200 * count, boundary_samples=0),
         seed=0,
     ).sum(dim=(1, 2, 3))
     # Over what a receiver at 10 m takes in per steradian, and over what the plate receives.
@@ -162,7 +191,12 @@ def test_rough_points_stay_on_their_surface():
         for name in ("face", "b1", "b2", "phase")
     )
     antennas = link(((0.0, 0.0, 0.0), (0.4, 0.1, 0.0)))
-    paths = trace_field(Scene({"wall": scene["wall"]}), antennas, density=500.0, seed=2)
+    paths = trace_field(
+        Scene({"wall": scene["wall"]}),
+        antennas,
+        sampling=Sampling(depth=1, samples=100_000, boundary_samples=0, points_per_m2=500.0),
+        seed=2,
+    )
     first, second = (paths.first[paths.frame == frame] for frame in range(2))
     phases = [paths.coefficient[paths.frame == frame].angle() for frame in range(2)]
     assert torch.equal(first, second)
@@ -178,10 +212,26 @@ def test_mean_power_of_rough_fields_is_the_power_map(density):
     x, y = torch.meshgrid(torch.arange(16.0) * 0.1, torch.arange(8.0) * 0.1, indexing="ij")
     places = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3).double() - 0.4
     antennas = link(places)
-    truth = deposit_power(scene, antennas, ONE_BIN, samples=64_000, boundary_samples=0, seed=0)
+    truth = deposit_power(
+        scene,
+        antennas,
+        ONE_BIN,
+        sampling=Sampling(depth=1, samples=64_000, boundary_samples=0),
+        seed=0,
+    )
     seeds = 100 if density < 1_000 else 60
     looks = [
-        response(trace_field(scene, antennas, density=density, seed=seed), antennas)
+        response(
+            trace_field(
+                scene,
+                antennas,
+                sampling=Sampling(
+                    depth=1, samples=100_000, boundary_samples=0, points_per_m2=density
+                ),
+                seed=seed,
+            ),
+            antennas,
+        )
         for seed in range(seeds)
     ]
     ratio = torch.stack(looks).abs().square().mean(0) / truth.flatten()
@@ -190,11 +240,26 @@ def test_mean_power_of_rough_fields_is_the_power_map(density):
 
 def test_a_mixed_scene_holds_both_kinds():
     scene = occluder(wall=METAL)
-    paths = trace_field(scene, link(), samples=1_000, density=500.0, seed=0)
+    paths = trace_field(
+        scene,
+        link(),
+        sampling=Sampling(depth=1, samples=1_000, boundary_samples=0, points_per_m2=500.0),
+        seed=0,
+    )
     assert paths.kind == "field"
-    alone = trace_field(Scene({"wall": scene["wall"]}), link(), samples=1_000, seed=0)
+    alone = trace_field(
+        Scene({"wall": scene["wall"]}),
+        link(),
+        sampling=Sampling(depth=1, samples=1_000, boundary_samples=0),
+        seed=0,
+    )
     assert alone.kind == "coherent"
-    rough = trace_field(Scene({"occluder": scene["occluder"]}), link(), density=500.0, seed=0)
+    rough = trace_field(
+        Scene({"occluder": scene["occluder"]}),
+        link(),
+        sampling=Sampling(depth=1, samples=100_000, boundary_samples=0, points_per_m2=500.0),
+        seed=0,
+    )
     assert rough.kind == "rough"
     assert 0.5 * len(alone) < len(paths) - len(rough) < len(alone)
 
@@ -206,8 +271,22 @@ def test_rough_derivatives_with_boundary_are_refused():
         (link(((0.0, 0.0, 0.0),), shift[None] + 0.3), occluder()),
     ):
         with pytest.raises(InputError, match="no geometry derivative of rough field paths"):
-            trace_field(scene, antennas, density=100.0, seed=0)
-        paths = trace_field(scene, antennas, density=100.0, seed=0, boundary=False)
+            trace_field(
+                scene,
+                antennas,
+                sampling=Sampling(
+                    depth=1, samples=100_000, boundary_samples=0, points_per_m2=100.0
+                ),
+                seed=0,
+            )
+        paths = trace_field(
+            scene,
+            antennas,
+            sampling=Sampling(
+                depth=1, samples=100_000, boundary_samples=0, boundary=False, points_per_m2=100.0
+            ),
+            seed=0,
+        )
         assert paths.delay.requires_grad
 
 
@@ -215,10 +294,21 @@ def test_silhouettes_without_samples_are_refused():
     shift = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
     metal = occluder(wall=METAL, occluder=METAL)
     for call in (
-        lambda: trace_field(metal, link(shift), samples=100, seed=0),
-        lambda: trace_power(occluder(), link(shift), samples=100, seed=0),
+        lambda: trace_field(
+            metal, link(shift), sampling=Sampling(depth=1, samples=100, boundary_samples=0), seed=0
+        ),
+        lambda: trace_power(
+            occluder(),
+            link(shift),
+            sampling=Sampling(depth=1, samples=100, boundary_samples=0),
+            seed=0,
+        ),
         lambda: deposit_power(
-            occluder(), link(shift), ONE_BIN, samples=100, boundary_samples=0, seed=0
+            occluder(),
+            link(shift),
+            ONE_BIN,
+            sampling=Sampling(depth=1, samples=100, boundary_samples=0),
+            seed=0,
         ),
     ):
         with pytest.raises(InputError, match="expected boundary_samples >= 1"):

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from invertwin.channel import Sampling
 from invertwin.channel.tracer import trace_field, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -18,8 +19,18 @@ def test_fields_pass_sheets_as_power_does():
     scene = Scene({"board": board, "target": target})
     antennas = link(((0.0, 0.0, 0.0),))
     with torch.no_grad():
-        field = trace_field(scene, antennas, density=1e4, seed=1)
-        power = trace_power(scene, antennas, samples=200_000, seed=1, boundary=False)
+        field = trace_field(
+            scene,
+            antennas,
+            sampling=Sampling(depth=1, samples=100_000, boundary_samples=0, points_per_m2=1e4),
+            seed=1,
+        )
+        power = trace_power(
+            scene,
+            antennas,
+            sampling=Sampling(depth=1, samples=200_000, boundary_samples=0, boundary=False),
+            seed=1,
+        )
     behind = [paths.delay * SPEED_OF_LIGHT / 2 > 1.8 for paths in (field, power)]
     received = field.coefficient[behind[0]].abs().square().sum()
     assert float(received) == pytest.approx(float(power.power[behind[1]].sum()), rel=0.05)
@@ -33,4 +44,9 @@ def test_a_moving_silhouette_of_a_coherent_field_past_a_sheet_is_refused():
     vertices = (mesh.vertices + torch.tensor([0.0, 0.0, 2.0])).requires_grad_()
     mirror = Object(Mesh(vertices, mesh.faces), PerfectConductor())
     with pytest.raises(InputError, match="expected no sheets where a derivative of coherent"):
-        trace_field(Scene({"board": board, "mirror": mirror}), link(), boundary_samples=100, seed=1)
+        trace_field(
+            Scene({"board": board, "mirror": mirror}),
+            link(),
+            sampling=Sampling(depth=1, samples=100_000, boundary_samples=100),
+            seed=1,
+        )

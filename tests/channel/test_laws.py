@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.tracer import trace_power
@@ -36,7 +37,11 @@ def orders(scene: Scene, antennas: Link, depth: int, samples: int, seeds: int) -
     for seed in range(seeds):
         totals = [
             deposit_power(
-                scene, antennas, BINS, samples=samples, boundary_samples=0, seed=seed, depth=d
+                scene,
+                antennas,
+                BINS,
+                sampling=Sampling(depth=d, samples=samples, boundary_samples=0),
+                seed=seed,
             )
             .double()
             .sum()
@@ -115,7 +120,12 @@ def test_two_bounces_fall_with_the_square_of_each_leg():
             }
         )
         antennas = link(((0.0, 0.0, -first),), ((-between, 0.0, -last),))
-        paths = trace_power(scene, antennas, samples=1_000_000, seed=0, depth=2, boundary=False)
+        paths = trace_power(
+            scene,
+            antennas,
+            sampling=Sampling(depth=2, samples=1_000_000, boundary_samples=0, boundary=False),
+            seed=0,
+        )
         a_then_b = (paths.first[:, 0].abs() < size) & ((paths.last[:, 0] + between).abs() < size)
         return float(paths.power[a_then_b].sum())
 

@@ -2,13 +2,13 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as functional
 
 from invertwin.capture import read
+from invertwin.channel import Sampling
 from invertwin.channel.bridge import backend, use_backend
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
@@ -28,7 +28,7 @@ from invertwin.scene import (
 )
 from scenes import GRID, float64, link, occluder, shift_error, thing
 
-COUNTS: dict[str, Any] = {"samples": 2_000, "boundary_samples": 500, "seed": 0}
+COUNTS = Sampling(depth=1, samples=2_000, boundary_samples=500)
 BACK = rotation_from_vector(float64([0.0, math.pi, 0.0]))[None]
 
 
@@ -57,7 +57,7 @@ def movable(scene: Scene) -> tuple[Scene, dict[str, torch.Tensor]]:
 def test_nothing_to_see_is_zeros(scene, antennas):
     scene, leaves = movable(scene)
     places = antennas.tx.clone().requires_grad_()
-    out = deposit_power(scene, replace(antennas, tx=places), GRID, **COUNTS)
+    out = deposit_power(scene, replace(antennas, tx=places), GRID, sampling=COUNTS, seed=0)
     assert not out.any()
     gradients = torch.autograd.grad(out.sum(), [*leaves.values(), places])
     assert not any(g.any() for g in gradients)
@@ -66,18 +66,43 @@ def test_nothing_to_see_is_zeros(scene, antennas):
 def test_paths_of_an_empty_view():
     scene = Scene({"plate": thing(plate(1.0, 1.0))})
     apart = link(((0.0, 0.0, -1.0),), ((0.0, 0.0, 1.0),))
-    assert not trace_power(scene, apart, **COUNTS).power.any()
-    assert len(trace_field(scene, apart, density=500.0, seed=0)) == 0
+    assert not trace_power(scene, apart, sampling=COUNTS, seed=0).power.any()
+    assert (
+        len(
+            trace_field(
+                scene,
+                apart,
+                sampling=Sampling(
+                    depth=1, samples=100_000, boundary_samples=0, points_per_m2=500.0
+                ),
+                seed=0,
+            )
+        )
+        == 0
+    )
     metal = scene.replace("plate", material=PerfectConductor())
-    assert len(trace_field(metal, apart, samples=100, seed=0)) == 0
+    assert (
+        len(
+            trace_field(
+                metal, apart, sampling=Sampling(depth=1, samples=100, boundary_samples=0), seed=0
+            )
+        )
+        == 0
+    )
 
 
 def test_inside_an_object_the_walls_are_seen():
     """Both sides of a triangle reflect: from inside a ball every ray lands."""
     ball = Scene({"ball": thing(sphere(1.0, subdivisions=4), material=RoughDielectric(4.0))})
-    found = deposit_power(ball, link(), GRID, samples=20_000, boundary_samples=0, seed=0)
+    found = deposit_power(
+        ball, link(), GRID, sampling=Sampling(depth=1, samples=20_000, boundary_samples=0), seed=0
+    )
     beyond = deposit_power(
-        ball, link(((0.0, 0.0, -3.0),)), GRID, samples=20_000, boundary_samples=0, seed=0
+        ball,
+        link(((0.0, 0.0, -3.0),)),
+        GRID,
+        sampling=Sampling(depth=1, samples=20_000, boundary_samples=0),
+        seed=0,
     )
     assert float(found.sum()) > float(beyond.sum()) > 0
 
@@ -85,7 +110,7 @@ def test_inside_an_object_the_walls_are_seen():
 def test_an_object_without_area_is_refused():
     point = Mesh(torch.zeros(3, 3, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
     with pytest.raises(InputError, match="expected a triangle of positive area, got none"):
-        deposit_power(Scene({"point": thing(point)}), link(), GRID, **COUNTS)
+        deposit_power(Scene({"point": thing(point)}), link(), GRID, sampling=COUNTS, seed=0)
 
 
 @pytest.mark.parametrize("radius", [0.01, 0.05])
@@ -104,7 +129,11 @@ def test_small_balls_from_a_rail_have_finite_gradients(radius):
         moved, leaves = movable(scene)
         track = places.clone().requires_grad_()
         out = deposit_power(
-            moved, link(track), grid, samples=6_000, boundary_samples=2_000, seed=seed
+            moved,
+            link(track),
+            grid,
+            sampling=Sampling(depth=1, samples=6_000, boundary_samples=2_000),
+            seed=seed,
         )
         gradients = torch.autograd.grad(out.sum(), [*leaves.values(), track])
         assert out.any()
@@ -126,13 +155,18 @@ def test_measured_track_has_the_gradients_of_points(data_folder):
     )
     grid, antennas = radar.grid(6.8, 10.2, oversample=4), radar.link()
     alone = Scene({"ball": Object(ball, surface, rigid(eye, places[1].detach()))})
-    power = deposit_power(alone, antennas, grid, samples=200_000, boundary_samples=0, seed=5)
+    plenty = Sampling(depth=1, samples=200_000, boundary_samples=0)
+    power = deposit_power(alone, antennas, grid, sampling=plenty, seed=5)
     # ∂(P R)/∂x = −3 P ∂R/∂x of every frame.
     away = functional.normalize(places[1].detach() - antennas.tx, dim=1)
     expected = -3 * (power.sum((1, 2, 3)).double()[:, None] * away).sum(0)
     for seed in (0, 36):
         out = deposit_power(
-            scene, antennas, grid, samples=20_000, boundary_samples=2_000, seed=seed
+            scene,
+            antennas,
+            grid,
+            sampling=Sampling(depth=1, samples=20_000, boundary_samples=2_000),
+            seed=seed,
         )
         (gradient,) = torch.autograd.grad((out * grid.ranges[:, None, None]).sum(), shift)
         assert float((gradient - expected).norm() / expected.norm()) < 0.02
@@ -166,13 +200,13 @@ def test_a_backward_pass_runs_where_its_forward_pass_ran(monkeypatch):
     """The choice is that of the call, not of whoever asks for the derivative later."""
     scene, leaves = movable(occluder())
     with use_backend("cpu"):
-        out = deposit_power(scene, link(), GRID, **COUNTS)
+        out = deposit_power(scene, link(), GRID, sampling=COUNTS, seed=0)
     monkeypatch.setenv("INVERTWIN_BACKEND", "nowhere")
     found = torch.autograd.grad(out.sum(), list(leaves.values()))
     monkeypatch.undo()
     scene, leaves = movable(occluder())
     with use_backend("cpu"):
-        out = deposit_power(scene, link(), GRID, **COUNTS)
+        out = deposit_power(scene, link(), GRID, sampling=COUNTS, seed=0)
         expected = torch.autograd.grad(out.sum(), list(leaves.values()))
     for mine, theirs in zip(found, expected, strict=True):
         # Sums by atomic additions come in another order.

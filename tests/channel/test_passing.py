@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
 from invertwin.channel.tracer import trace_power
@@ -35,7 +36,13 @@ def test_a_wall_behind_a_board_is_fainter_and_later(angle):
     )
     behind = Grid(1.9, 0.01, 40)
     maps = [
-        deposit_power(s, link(), behind, samples=400_000, boundary_samples=0, seed=0)
+        deposit_power(
+            s,
+            link(),
+            behind,
+            sampling=Sampling(depth=1, samples=400_000, boundary_samples=0),
+            seed=0,
+        )
         .double()
         .ravel()
         for s in (bare, covered)
@@ -68,7 +75,12 @@ def test_what_has_passed_a_body_is_late_and_spread_from_nearer():
         scene = Scene({"wall": wall} | {f"body {k}": item for k, item in enumerate(bodies)})
         antennas = link(((0.0, 0.0, 0.0),), ((0.0, 0.3, depth - 0.3),))
         paths = trace_power(
-            scene, antennas, samples=1_000_000, seed=1, depth=3 if bodies else 1, boundary=False
+            scene,
+            antennas,
+            sampling=Sampling(
+                depth=3 if bodies else 1, samples=1_000_000, boundary_samples=0, boundary=False
+            ),
+            seed=1,
         )
         on = (paths.last[:, 2] - depth).abs() < 1e-6
         if bodies:
@@ -94,7 +106,11 @@ def test_a_wall_is_seen_through_a_body_and_back():
         scene, grid = Scene({"wall": wall, **bodies}), Grid(depth - 0.03, 0.01, 30)
         maps = [
             deposit_power(
-                scene, link(), grid, samples=1_000_000, boundary_samples=0, seed=seed, depth=5
+                scene,
+                link(),
+                grid,
+                sampling=Sampling(depth=5, samples=1_000_000, boundary_samples=0),
+                seed=seed,
             )
             for seed in range(8)
         ]
@@ -118,7 +134,12 @@ def leaving(index: float) -> Tensor:
     body = RefractingBody(index**2, rms_slope=0.05)
     scene = Scene({"body": thing(box(0.4), (0.0, 0.0, 1.0), material=body)})
     antennas = link(((-1.0, 0.0, 0.0),), ((0.6, 0.0, 1.9),))
-    paths = trace_power(scene, antennas, samples=400_000, seed=0, depth=2, boundary=False)
+    paths = trace_power(
+        scene,
+        antennas,
+        sampling=Sampling(depth=2, samples=400_000, boundary_samples=0, boundary=False),
+        seed=0,
+    )
     rows = ((paths.first[:, 2] - 0.8).abs() < 1e-6) & ((paths.last[:, 0] - 0.2).abs() < 1e-6)
     return paths.power[rows]
 
@@ -137,7 +158,12 @@ def test_refraction_shifts_a_ray_as_snell_says():
     scene = Scene({"body": block(INDEX, thickness, near, slope=0.03, width=3.0), "wall": wall})
     rx = float64([0.7, 0.0, near + thickness + 0.05])
     antennas = link(((0.0, 0.0, 0.0),), rx[None])
-    paths = trace_power(scene, antennas, samples=400_000, seed=0, depth=3, boundary=False)
+    paths = trace_power(
+        scene,
+        antennas,
+        sampling=Sampling(depth=3, samples=400_000, boundary_samples=0, boundary=False),
+        seed=0,
+    )
     on = (paths.first[:, 2] - near).abs() < 1e-6
     on &= (paths.last[:, 2] - near - thickness - far).abs() < 1e-6
     first, last = paths.first[on], paths.last[on]

@@ -1,5 +1,6 @@
 """Maps of one and two bounces against a quadrature that shares no code with them."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid
 from invertwin.scene import (
@@ -51,10 +53,12 @@ def traced(scene: Scene, bounces: int, samples: int, seeds: int) -> tuple[Tensor
     """Mean map of exactly that many bounces, and its relative Monte Carlo error."""
     maps = []
     for seed in range(seeds):
-        options: dict[str, Any] = {"samples": samples, "boundary_samples": 0, "seed": seed}
-        found = deposit_power(scene, link((TX,), (RX,)), GRID, depth=bounces, **options).double()
+        drawn = Sampling(depth=bounces, samples=samples, boundary_samples=0)
+        antennas = link((TX,), (RX,))
+        found = deposit_power(scene, antennas, GRID, sampling=drawn, seed=seed).double()
         if bounces == 2:
-            found = found - deposit_power(scene, link((TX,), (RX,)), GRID, depth=1, **options)
+            drawn = replace(drawn, depth=1)
+            found = found - deposit_power(scene, antennas, GRID, sampling=drawn, seed=seed)
         maps.append(found[0, :, :, 0])
     stacked = torch.stack(maps)
     error = stacked.std(0) / seeds**0.5

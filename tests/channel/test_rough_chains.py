@@ -1,13 +1,12 @@
 """Fields of rough multiple scattering: their mean power is the map's, and they stay."""
 
 import math
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel.chains import rough_chains
+from invertwin.channel import Sampling, draw_speckle
 from invertwin.channel.deposit import deposit_power
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.tracer import trace_field
@@ -45,15 +44,22 @@ def looks() -> Link:
 def expected(scene: Scene, antennas: Link, depth: int) -> Tensor:
     """Power of two points and more per frame, of the map."""
     maps = [
-        deposit_power(scene, antennas, BINS, samples=1_000_000, boundary_samples=0, seed=0, depth=d)
+        deposit_power(
+            scene,
+            antennas,
+            BINS,
+            sampling=Sampling(depth=d, samples=1_000_000, boundary_samples=0),
+            seed=0,
+        )
         for d in (1, depth)
     ]
     return (maps[1].double() - maps[0].double()).sum(dim=(1, 2, 3))
 
 
-def chained(scene: Scene, antennas: Link, seed: int, **options: Any) -> tuple[Tensor, Tensor]:
+def chained(scene: Scene, antennas: Link, seed: int, count: int) -> tuple[Tensor, Tensor]:
     """Response and sum of powers of the chains alone, per frame."""
-    paths = trace_field(scene, antennas, density=1.0, seed=seed, **options)
+    drawn = Sampling(depth=3, points_per_m2=1.0, rough_paths=count)
+    paths = trace_field(scene, antennas, sampling=drawn, seed=seed)
     longer = (paths.first - paths.last).norm(dim=1) > 0
     phase = 2 * math.pi / antennas.wavelength * SPEED_OF_LIGHT * paths.delay[longer]
     field = paths.coefficient[longer] * torch.polar(torch.ones_like(phase), -phase)
@@ -74,9 +80,7 @@ def test_chains_carry_the_power_of_the_map(front):
     scene, antennas = corner(front), looks()
     truth = expected(scene, antennas, 3)
     for count, seeds in ((10_000, 6), (40_000, 4)):
-        sums = [
-            chained(scene, antennas, seed, depth=3, chain_count=count)[1] for seed in range(seeds)
-        ]
+        sums = [chained(scene, antennas, seed, count)[1] for seed in range(seeds)]
         ratio = torch.stack(sums).mean(1) / truth.mean()
         error = float(ratio.std()) / seeds**0.5
         assert error < 0.08
@@ -88,10 +92,7 @@ def test_mean_power_of_chained_fields_is_the_power_map():
     """E|S|² over phases, within four standard errors of at most 5 %: the phases are independent."""
     scene, antennas = corner(), looks()
     truth = expected(scene, antennas, 3)
-    found = [
-        chained(scene, antennas, seed, depth=3, chain_count=2_000)[0].abs().square() / truth
-        for seed in range(120)
-    ]
+    found = [chained(scene, antennas, seed, 2_000)[0].abs().square() / truth for seed in range(120)]
     looked = torch.stack(found).mean(1)
     error = float(looked.std()) / len(found) ** 0.5
     assert error < 0.05
@@ -101,20 +102,38 @@ def test_mean_power_of_chained_fields_is_the_power_map():
 def test_chains_stay_while_the_radar_moves():
     scene = corner()
     antennas = [link(((x, 0.0, 0.0),), ((x + 0.25, 0.0, 0.0),)) for x in (0.0, 0.07)]
-    fixed = rough_chains(scene, antennas[0], count=2_000, depth=3, seed=1)
-    paths = [trace_field(scene, a, density=10.0, depth=3, chains=fixed, seed=1) for a in antennas]
+    few = Sampling(depth=3, points_per_m2=10.0, rough_paths=2_000)
+    fixed = draw_speckle(scene, antennas[0], few, seed=1)
+    paths = [
+        trace_field(
+            scene,
+            a,
+            sampling=few,
+            seed=1,
+            speckle=fixed,
+        )
+        for a in antennas
+    ]
     assert len(paths[0]) > 200
     assert torch.equal(paths[0].first, paths[1].first)
     assert torch.equal(paths[0].last, paths[1].last)
     phases = [p.coefficient / p.coefficient.abs() for p in paths]
     assert torch.allclose(phases[0], phases[1], atol=1e-9)
     assert (paths[0].delay - paths[1].delay).abs().min() > 0
-    both = trace_field(scene, joined(antennas), density=10.0, depth=3, chains=fixed, seed=1)
+    both = trace_field(
+        scene,
+        joined(antennas),
+        sampling=few,
+        seed=1,
+        speckle=fixed,
+    )
     for number, alone in enumerate(paths):
         rows = both.frame == number
         assert sorted(both.delay[rows].tolist()) == sorted(alone.delay.tolist())
-    other = rough_chains(scene, antennas[0], count=2_000, depth=3, seed=2)
-    assert not torch.equal(other.chains[0].phase[:100], fixed.chains[0].phase[:100])
+    other = draw_speckle(scene, antennas[0], few, seed=2)
+    assert fixed.paths is not None
+    assert other.paths is not None
+    assert not torch.equal(other.paths.chains[0].phase[:100], fixed.paths.chains[0].phase[:100])
 
 
 def joined(antennas: list[Link]) -> Link:

@@ -15,12 +15,12 @@ from torch.func import functional_call
 
 from invertwin.capture import Capture
 from invertwin.capture.track import Track
-from invertwin.channel import deposit_power, trace_field
+from invertwin.channel import Sampling, deposit_power, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import gradcheck
-from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum, surrogate_spectrum
+from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.scene import (
     AntennaArray,
     Cosine,
@@ -37,7 +37,6 @@ from invertwin.scene import (
 from invertwin.scene.parameters import (
     MaterialValues,
     Pose,
-    RadarPose,
     Scale,
     Translation,
     Vertices,
@@ -179,7 +178,7 @@ def clock() -> tuple[Radar, Moves]:
     capture = Capture.from_range_profile(
         profile, torch.arange(8).double() * 0.1 + 1, single, times, track=track
     )
-    return radar, on_radar(ClockOffset(capture), lambda theta: {"shift": theta})
+    return radar, on_radar(ClockOffset(capture.positions), lambda theta: {"shift": theta})
 
 
 @dataclass(frozen=True)
@@ -215,18 +214,14 @@ def power_case(parameter: str) -> Found:
 
 
 def biased(theta: Tensor, scene: Scene, seed: int, boundary: bool, depth: int = 1) -> Tensor:
-    radar = power_radar()
+    radar = functional_call(RangeBias(), {"bias": theta}, (power_radar(),))
     return surrogate_spectrum(
         scene,
         radar,
         radar.grid(0.4, 2.8, 0.6, oversample=1),
         Surrogate(),
-        samples=50_000,
-        boundary_samples=0,
+        sampling=Sampling(depth=depth, samples=50_000, boundary_samples=0, boundary=boundary),
         seed=seed,
-        depth=depth,
-        boundary=boundary,
-        range_offset=functional_call(RangeBias(), {"bias": theta}, ()),
     ).double()
 
 
@@ -248,10 +243,10 @@ def pushed(function: Callable[[Tensor], Tensor]) -> Tensor:
         return torch.zeros_like(value) if tangent is None else tangent
 
 
-def response(scene: Scene, radar: Radar, **options: Any) -> Tensor:
+def response(scene: Scene, radar: Radar, sampling: Sampling, seed: int) -> Tensor:
     """Real and imaginary parts of the channel at the carrier, per frame."""
     antennas = radar.link()
-    paths = trace_field(scene, antennas, **options)
+    paths = trace_field(scene, antennas, sampling=sampling, seed=seed)
     phase = 2 * math.pi / antennas.wavelength * SPEED_OF_LIGHT * paths.delay
     field = paths.coefficient * torch.polar(torch.ones_like(phase), -phase)
     total = torch.zeros(antennas.frame_count, dtype=torch.complex128)
@@ -266,10 +261,8 @@ def coherent_case(parameter: str) -> Found:
     def value(theta: Tensor, seed: int, boundary: bool, samples: int, edges: int) -> Tensor:
         return response(
             *moves(scene, radar, theta),
-            samples=samples,
-            boundary_samples=edges,
-            seed=seed,
-            boundary=boundary,
+            Sampling(depth=1, samples=samples, boundary_samples=edges, boundary=boundary),
+            seed,
         )
 
     def derivative(boundary: bool) -> Tensor:
@@ -292,7 +285,8 @@ def rough_case(parameter: str) -> Found:
     scene, radar, moves = occluder(wall=ROUGH, occluder=ROUGH), field_radar(0.3), MOVES[parameter]
 
     def value(theta: Tensor) -> Tensor:
-        return response(*moves(scene, radar, theta), density=300.0, seed=0)
+        drawn = Sampling(depth=1, boundary_samples=0, points_per_m2=300.0)
+        return response(*moves(scene, radar, theta), drawn, 0)
 
     up, down = (value(torch.tensor(sign * 1e-4).double()) for sign in (1, -1))
     found = pushed(value)
@@ -357,15 +351,19 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     """Use a scene and a radar as the mechanism does."""
     if mechanism.endswith(("interior", "boundary")):
         grid = radar.grid(0.4, 2.8, 0.6)
-        counts: dict[str, Any] = {"samples": 1_000, "boundary_samples": 100, "seed": 0}
-        counts |= {
-            "boundary": mechanism.endswith("boundary"),
-            "depth": 2 if mechanism.startswith("chain") else 1,
-        }
-        surrogate_spectrum(scene, radar, grid, Surrogate(), **counts)
+        drawn = Sampling(
+            depth=2 if mechanism.startswith("chain") else 1,
+            samples=1_000,
+            boundary_samples=100,
+            boundary=mechanism.endswith("boundary"),
+        )
+        surrogate_spectrum(scene, radar, grid, Surrogate(), sampling=drawn, seed=0)
         return
     paths = trace_field(
-        scene, radar.link(), samples=1_000, density=100.0, boundary_samples=100, seed=0
+        scene,
+        radar.link(),
+        sampling=Sampling(depth=1, samples=1_000, boundary_samples=100, points_per_m2=100.0),
+        seed=0,
     )
     exact_spectrum(beat_signal(paths, radar), radar, radar.grid(0.4, 2.8, 0.6))
 
@@ -420,7 +418,8 @@ def test_refused(parameter, mechanism):
         attempt(mechanism, *change())
     if parameter in MOVES and mechanism == "rough":
         with pytest.raises(InputError, match=message):
-            pushed(lambda t: response(*MOVES[parameter](scene, radar, t), density=100.0, seed=0))
+            few = Sampling(depth=1, boundary_samples=0, points_per_m2=100.0)
+            pushed(lambda t: response(*MOVES[parameter](scene, radar, t), few, 0))
 
 
 def test_a_pattern_of_ones_own_is_refused_too():
@@ -435,10 +434,8 @@ def test_a_pattern_of_ones_own_is_refused_too():
             occluder(),
             radar.link(),
             radar.grid(0.4, 2.8),
-            samples=100,
-            boundary_samples=0,
+            sampling=Sampling(depth=1, samples=100, boundary_samples=0),
             seed=0,
-            depth=1,
         )
 
 
@@ -451,7 +448,11 @@ def test_a_lobe_that_starts_at_nothing_has_its_derivative():
         surface = RoughDielectric(4.0, 0.0, 1 - share)
         moved = scene.replace("wall", material=surface)
         return deposit_power(
-            moved, radar.link(), grid, samples=50_000, boundary_samples=0, seed=0, depth=1
+            moved,
+            radar.link(),
+            grid,
+            sampling=Sampling(depth=1, samples=50_000, boundary_samples=0),
+            seed=0,
         ).double()
 
     rate = pushed(value)

@@ -20,7 +20,7 @@ from gradients.test_capabilities import (
     pushed,
     selected,
 )
-from invertwin.channel import deposit_power
+from invertwin.channel import Sampling, deposit_power
 from invertwin.radar import Surrogate
 from invertwin.scene import Scene, plate
 from scenes import relative, thing
@@ -83,18 +83,23 @@ def chain_case(parameter: str) -> tuple[Found, Tensor]:
         scene, kernels, step = room(), Surrogate("gaussian", range_width=2.0), 3e-2
         grid = radar.grid(0.9, 4.2, oversample=1)
 
-    def value(theta: Tensor, seed: int, edges: int, **options: Any) -> Tensor:
+    def value(
+        theta: Tensor, seed: int, edges: int, reference: Any = None, **options: Any
+    ) -> Tensor:
         moved, seen = moves(scene, radar, theta)
         two, one = (
             deposit_power(
                 moved,
                 seen.link(),
                 grid,
-                samples=SAMPLES * frames,
-                boundary_samples=edges * frames,
+                sampling=Sampling(
+                    depth=depth,
+                    samples=SAMPLES * frames,
+                    boundary_samples=edges * frames,
+                    **options,
+                ),
                 seed=seed,
-                depth=depth,
-                **options,
+                reference=reference,
             ).double()
             for depth in (2, 1)
         )
@@ -151,8 +156,8 @@ def test_zero(parameter, mechanism):
     def value(theta: Tensor, boundary: bool) -> Tensor:
         moved, seen = MOVES[parameter](scene, radar, theta)
         edges = 20_000 if boundary else 0
-        settings: dict[str, Any] = {"samples": 50_000, "seed": 1, "depth": 3, "boundary": boundary}
-        return deposit_power(moved, seen.link(), grid, boundary_samples=edges, **settings).double()
+        drawn = Sampling(depth=3, samples=50_000, boundary_samples=edges, boundary=boundary)
+        return deposit_power(moved, seen.link(), grid, sampling=drawn, seed=1).double()
 
     with torch.no_grad():
         both = [pushed(lambda theta, on=on: value(theta, on)) for on in (True, False)]

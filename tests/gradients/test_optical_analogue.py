@@ -14,7 +14,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, deposit_power
+from invertwin.channel import Grid, Link, Sampling, deposit_power
 from invertwin.channel.bridge import tracer
 from invertwin.scene import (
     Cosine,
@@ -51,10 +51,10 @@ def ours(shift: Tensor, seed: int, samples: int, boundary: bool) -> Tensor:
         scene,
         antennas,
         GRID,
-        samples=samples,
-        boundary_samples=samples // 4,
+        sampling=Sampling(
+            depth=1, samples=samples, boundary_samples=samples // 4, boundary=boundary
+        ),
         seed=seed,
-        boundary=boundary,
     )
     return out.double().mean(0)[0, :, 0]
 

@@ -9,6 +9,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 
+from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, SpectrumLoss, reconstruct
 from invertwin.inversion.gauss_newton import GaussNewton
@@ -189,10 +190,8 @@ def test_a_displaced_plate_is_found_in_eight_steps(case):
                 case.radar,
                 case.grid,
                 kernels,
-                samples=40_000,
-                boundary_samples=10_000,
+                sampling=Sampling(depth=1, samples=40_000, boundary_samples=10_000),
                 seed=step,
-                depth=1,
             )
             measured = case.capture.spectrum(case.grid).float()
             return simulated, kernels.blur(measured, case.radar, case.grid)
@@ -230,9 +229,13 @@ def test_a_turned_pose_has_free_quaternion_numbers_only(case):
 
     def maps() -> tuple[Tensor, Tensor]:
         simulated = surrogate_spectrum(
-            module(case.scene), case.radar, case.grid, case.settings()["surrogate"],
-            samples=4_000, boundary_samples=1_000, seed=0, depth=1,
-        )  # fmt: skip
+            module(case.scene),
+            case.radar,
+            case.grid,
+            case.settings()["surrogate"],
+            sampling=Sampling(depth=1, samples=4_000, boundary_samples=1_000),
+            seed=0,
+        )
         return simulated, measured
 
     names = [name for name, _ in module.named_parameters()]

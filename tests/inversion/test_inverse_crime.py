@@ -16,7 +16,7 @@ from invertwin.simulation import simulate
 from scenes import occluder, radar
 
 ROOT = Path(__file__).resolve().parents[2]
-RUNS = sorted(file for file in (ROOT / "experiments").rglob("*.toml"))
+RUNS = sorted(file for file in (ROOT / "experiments").rglob("*.toml") if file.stem != "pyproject")
 PUBLIC = [
     file
     for file in RUNS

@@ -16,11 +16,11 @@ from torch import nn
 from invertwin.capture import Capture
 from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, Reconstruction, SpectrumLoss, reconstruct, reconstruction
-from invertwin.inversion.nuisances import RangeBias
 from invertwin.inversion.regularization import Laplacian
 from invertwin.radar import Surrogate
+from invertwin.radar.parameters import RadarPose, RangeBias
 from invertwin.scene import Scene
-from invertwin.scene.parameters import RadarPose, Translation, Vertices
+from invertwin.scene.parameters import Translation, Vertices
 from invertwin.simulation import simulate
 from scenes import float64
 
@@ -424,7 +424,7 @@ def test_the_exact_chain_as_the_model(case):
     first, second = (moved(fit) for fit in fits)
     assert float(first.norm()) > 0
     assert torch.allclose(first, second, rtol=1e-3)
-    with pytest.raises(InputError, match="no range bias with the exact chain"):
+    with pytest.raises(InputError, match="range_bias 0 for exact signals"):
         reconstruct(
             case.scene,
             case.radar,

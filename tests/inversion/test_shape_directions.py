@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from invertwin.inversion.shape_directions import along, along_density, along_field
 
 from invertwin.errors import InputError
-from invertwin.inversion.shape_directions import along, along_density, along_field
 from invertwin.scene import Cloud, Scene, Translation, sphere
 from invertwin.scene.geometry import DistanceGrid
 from scenes import float64, radar, thing

@@ -4,12 +4,12 @@ from functools import partial
 
 import pytest
 import torch
+from invertwin.inversion.stages import Stage, reconstruct_in_stages, stage_checkpoint
 
 from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, reconstruct
 from invertwin.inversion.regularization import Laplacian
 from invertwin.inversion.remeshing import remeshed
-from invertwin.inversion.stages import Stage, reconstruct_in_stages, stage_checkpoint
 from invertwin.scene import Mesh, SmoothVertices, plate
 from invertwin.scene.parameters import Scale, Translation, Vertices
 
@@ -130,8 +130,6 @@ def test_terms_are_of_the_scene_that_a_module_was_built_for(case):
     """A shape that another puts in place before: its own triangles are kept smooth."""
 
     class Finer(torch.nn.Module):
-        applies_to = "scene"
-
         def forward(self, scene):
             return scene.replace("plate", mesh=plate(0.3, 0.3, divisions=3))
 
@@ -151,8 +149,6 @@ def test_terms_are_of_the_scene_that_a_module_was_built_for(case):
 @pytest.mark.parametrize("sought", [("shape",), ("shape", "other")])
 def test_a_shape_that_another_replaces_is_no_parameter(case, kind, sought):
     class Replaced(torch.nn.Module):
-        applies_to = "scene"
-
         def __init__(self):
             super().__init__()
             self.place = Translation("plate")

@@ -6,7 +6,7 @@ from typing import Any
 import drjit as dr
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, replay
+from invertwin.channel import Grid, Link, Sampling, replay
 from invertwin.channel.bins import Contribution
 from invertwin.channel.bridge import backend, flatten, to_float, tracer
 from invertwin.channel.kernel import DIFFERENTIABLE, from_table
@@ -23,14 +23,10 @@ def gradients(
         geometry=flatten(scene, link.wavelength),
         link=link,
         grid=grid,
-        samples=samples,
-        boundary_samples=edges,
+        sampling=Sampling(depth=1, samples=samples, boundary_samples=edges, memory_budget=1e12),
         seed=seed,
-        sampling="rays",
+        scheme="rays",
         reference=None,
-        depth=1,
-        interior_edges=True,
-        chunk=1 << 30,
         backend=backend(),
     )
     trace = Trace(settings)

@@ -1,11 +1,9 @@
 """Slow twin of the fused deposit: explicit torch paths on explicit B-spline weights."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, Paths, trace_power
+from invertwin.channel import Grid, Link, Paths, Sampling, trace_power
 from invertwin.scene import Scene
 from oracles.bspline import deposit
 
@@ -21,6 +19,8 @@ def map_of(paths: Paths, link: Link, grid: Grid) -> Tensor:
     return torch.stack(frames)
 
 
-def deposit_by_paths(scene: Scene, link: Link, grid: Grid, **options: Any) -> Tensor:
+def deposit_by_paths(
+    scene: Scene, link: Link, grid: Grid, *, sampling: Sampling, seed: int
+) -> Tensor:
     """The same map as ``deposit_power``, from the same samples."""
-    return map_of(trace_power(scene, link, **options), link, grid)
+    return map_of(trace_power(scene, link, sampling=sampling, seed=seed), link, grid)

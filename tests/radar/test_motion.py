@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invertwin.channel import rough_points, trace_field
+from invertwin.channel import Sampling, draw_speckle, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar import (
@@ -148,14 +148,21 @@ def test_any_motion_as_a_function_of_time(name):
         return torch.cat([0.3 + 0.15 * angle.sin(), 0 * t, 4.4 + 0.15 * angle.cos()], dim=-1)
 
     scene = ball_on(way)
-    points = rough_points(scene(0.0), 2e4, seed=3)
-    paths = trace_field(scene(0.0), RADAR.link(), points=points, seed=3)
+    drawn = Sampling(depth=1, samples=100_000, boundary_samples=0)
+    speckle = draw_speckle(scene(0.0), RADAR.link(), drawn, seed=3)
+    paths = trace_field(
+        scene(0.0),
+        RADAR.link(),
+        sampling=drawn,
+        seed=3,
+        speckle=speckle,
+    )
     offsets = paths.first - way(torch.zeros((), dtype=torch.float64))
     chirps = Chirps(2, 80e-6)
     expected = oracle.moving_beat(
         RADAR, chirps, lambda times: way(times) + offsets, paths.coefficient
     )
-    found = simulate_chirps(scene, RADAR, chirps, points=points, seed=3)
+    found = simulate_chirps(scene, RADAR, chirps, points=speckle.points, seed=3)
     # Amplitudes change a little while the ball moves by up to 3 cm.
     assert relative(found, expected) < 0.02
     listed = moving_beat(

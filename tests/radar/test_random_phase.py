@@ -1,12 +1,11 @@
 """The paper's random-phase field: right on average, and blind to silhouettes on average."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 
-from invertwin.channel import Paths
+from invertwin.channel import Paths, Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar import Surrogate, random_phase_spectrum, surrogate_spectrum
 from invertwin.scene import Translation
@@ -129,14 +128,14 @@ def test_gradients_of_one_draw(view):
 
 def test_extra_width_and_offset(view):
     """Both as for powers; nothing outside of the grid is pulled in."""
-    radar = view[0].frames([0])
+    radar = replace(view[0].frames([0]), range_bias=torch.tensor(0.31, dtype=torch.float64))
     grid = radar.grid(2.5, 6.5, 0.7)
     points, r, boundary = (rows[:1] for rows in cloud())
-    one, offset = torch.ones(1, dtype=torch.float64), torch.tensor(0.31, dtype=torch.float64)
+    one = torch.ones(1, dtype=torch.float64)
     paths = paths_of(points, 2 * r / SPEED_OF_LIGHT, one, boundary, draws=1)
-    wide = random_phase_spectrum(paths, radar, grid, seed=0, range_width=1.5, range_offset=offset)
+    wide = random_phase_spectrum(paths, radar, grid, seed=0, range_width=1.5)
     spread = deposit(one, r, points[:, 0] / r, points[:, 1] / r, grid)[None]
-    twin = Surrogate("gaussian", "airy", range_width=1.5).shape(spread, radar, grid, offset)
+    twin = Surrogate("gaussian", "airy", range_width=1.5).shape(spread, radar, grid)
     assert (wide - twin).abs().max() < 0.02 * twin.max()
     far = paths_of(points, 2 * (r + 9) / SPEED_OF_LIGHT, one, boundary, draws=1)
     assert not random_phase_spectrum(far, radar, grid, seed=0).any()
@@ -147,10 +146,10 @@ def test_of_a_scene():
     radar = small_radar()
     grid = radar.grid(0.5, 2.5, 0.8)
     field = Surrogate("gaussian", "airy", phases="random")
-    settings: dict[str, Any] = {"samples": 1_500, "boundary_samples": 300, "depth": 1}
+    drawn = Sampling(depth=1, samples=1_500, boundary_samples=300)
     move = Translation("occluder")
     first, again, other = (
-        surrogate_spectrum(move(occluder()), radar, grid, field, seed=seed, **settings)
+        surrogate_spectrum(move(occluder()), radar, grid, field, sampling=drawn, seed=seed)
         for seed in (1, 1, 2)
     )
     assert first.shape == (1, *grid.shape)
@@ -161,11 +160,8 @@ def test_of_a_scene():
         radar,
         grid,
         field,
+        sampling=Sampling(depth=1, samples=1_500, boundary_samples=0, boundary=False),
         seed=1,
-        samples=1_500,
-        boundary_samples=0,
-        boundary=False,
-        depth=1,
     )
     assert torch.allclose(first, still, rtol=1e-5)
     slopes = [torch.autograd.grad(m.sum(), move.translation)[0] for m in (first, still)]

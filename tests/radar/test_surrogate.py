@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from invertwin.channel import Grid, trace_field
+from invertwin.channel import Grid, Sampling, trace_field
 from invertwin.errors import InputError
 from invertwin.radar import (
     FMCW,
@@ -294,13 +294,13 @@ def test_range_offset_moves_and_differentiates(linear):
     points, power = cloud(20)
     spread = deposited(points, power, grid)
     offset = torch.tensor(3 * grid.range_step, dtype=torch.float64)
-    moved = Surrogate().shape(spread, linear, grid, offset)
+    moved = Surrogate().shape(spread, replace(linear, range_bias=offset), grid)
     assert torch.allclose(moved[:, 3:], Surrogate().shape(spread, linear, grid)[:, :-3], atol=1e-9)
     small = replace(grid, u_count=3)
     spread = spread[:, :, 20:23].contiguous().requires_grad_()
     offset = torch.tensor(0.021, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(
-        lambda p, d: Surrogate(range_width=0.5).shape(p, linear, small, d),
+        lambda p, d: Surrogate(range_width=0.5).shape(p, replace(linear, range_bias=d), small),
         (spread, offset),
         fast_mode=True,
     )
@@ -356,9 +356,19 @@ def test_both_chains_of_a_scene_agree(mimo):
     scene = Scene({"plate": Object(plate(0.5, 0.3), RoughDielectric(5.0), pose)})
     grid = mimo.grid(2.6, 3.6, 0.5, 0.5)
     twin = surrogate_spectrum(
-        scene, mimo, grid, Surrogate(), samples=50_000, boundary_samples=0, seed=1
+        scene,
+        mimo,
+        grid,
+        Surrogate(),
+        sampling=Sampling(samples=50_000, boundary_samples=0),
+        seed=1,
     )
-    paths = trace_field(scene, mimo.link(), samples=1, density=2000.0, seed=2)
+    paths = trace_field(
+        scene,
+        mimo.link(),
+        sampling=Sampling(depth=1, samples=1, boundary_samples=0, points_per_m2=2000.0),
+        seed=2,
+    )
     count = len(paths)
     copies = replace(mimo, positions=mimo.positions.expand(count, 3))
     alone = replace(paths, frame=torch.arange(count))

@@ -10,6 +10,7 @@ from invertwin.capture import described_arrays, openradar, rail_sar, ti
 from invertwin.capture.backprojection import backproject, calibrate, locate
 from invertwin.capture.capture import Capture
 from invertwin.capture.channels import ChannelCalibration, estimate_channels
+from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.chirps import ChirpData, ChirpSettings, adc_counts, settings_of
 from invertwin.capture.track import Track
 from invertwin.errors import InputError
@@ -49,6 +50,7 @@ __all__ = [
     "READERS",
     "Capture",
     "ChannelCalibration",
+    "ChirpCapture",
     "ChirpData",
     "ChirpSettings",
     "Track",

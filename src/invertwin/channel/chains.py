@@ -21,7 +21,6 @@ from invertwin.channel.bridge import (
     to_index,
     to_torch,
     tracer,
-    use_backend,
 )
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import Shot, face_areas, next_surface, scrambled, uniform_pair, visible
@@ -232,7 +231,7 @@ def passed(
 
 
 @dataclass(frozen=True)
-class RoughChains:
+class RoughPaths:
     """The fixed chains of rough multiple scattering, from two points up.
 
     Attributes:
@@ -242,9 +241,7 @@ class RoughChains:
     chains: tuple[Chain, ...]
 
 
-def rough_chains(
-    scene: Scene, link: Link, *, count: int, depth: int, seed: int, backend: str | None = None
-) -> RoughChains:
+def rough_chains(scene: Scene, link: Link, *, count: int, depth: int, seed: int) -> RoughPaths:
     """Draw the chains that rough surfaces scatter along, once for all frames.
 
     The first point is spread over the surfaces, every object alike; the next ones follow the
@@ -261,17 +258,16 @@ def rough_chains(
         count: Chains to draw, of each length; at most a quarter of them are kept.
         depth: Most points of a chain.
         seed: Of places and phases.
-        backend: See ``deposit_power``.
 
     Source: derivations §4 (one independent phase per ordered chain).
     """
     if depth < 2:
-        return RoughChains(())
-    with use_backend(backend), torch.no_grad():
+        return RoughPaths(())
+    with torch.no_grad():
         drawer = _Drawer(flatten(scene, link.wavelength, in_motion=True), link, seed)
         rounds = -(-count // _LANES)
         parts = [drawer.draw(turn, count // rounds, depth) for turn in range(rounds)]
-        return RoughChains(tuple(map(drawer.joined, zip(*parts, strict=True))))
+        return RoughPaths(tuple(map(drawer.joined, zip(*parts, strict=True))))
 
 
 class _Drawer:

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 from invertwin.channel import bins, bridge
 from invertwin.channel.bridge import to_float, to_index, to_torch, tracer, use_backend
 from invertwin.channel.paths import Grid, Link
+from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.scene import Object
@@ -31,9 +32,8 @@ def deposit_density(
     link: Link,
     grid: Grid,
     *,
-    samples: int,
+    sampling: Sampling,
     seed: int,
-    backend: str | None = None,
 ) -> Float32[Tensor, "frame range u v"]:
     """Expected received over transmitted power of an object's cloud in every bin, per frame.
 
@@ -53,26 +53,23 @@ def deposit_density(
         item: An object with a cloud.
         link: Antennas, per frame.
         grid: Bins.
-        samples: Points on rays, over all frames.
+        sampling: How many points on rays, over all frames, and where they are traced.
         seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
-        backend: ``cpu``, ``cuda``, ``auto``; by default the one in force.
 
     Raises:
-        InputError: Fewer than one sample, an object without a cloud or in motion, an antenna
+        InputError: An object without a cloud or in motion, an antenna
             inside of the box.
     """
     if item.cloud is None:
         raise InputError(
             "expected an object with a cloud, got one without; use deposit_power for meshes"
         )
-    if samples < 1:
-        raise InputError(f"expected samples >= 1, got {samples}; give the points over all frames")
     if item.velocity is not None and bool(item.velocity.any()):
         raise InputError(
             "expected a cloud at rest, got a velocity; a frame is one instant: use scene.at(time)"
         )
-    with use_backend(backend):
-        rays = _Rays.of(item, link, samples, seed)
+    with use_backend(sampling.backend):
+        rays = _Rays.of(item, link, sampling.samples, seed)
         parts = [_Splat.apply(grid, link.frame_count, *part) for part in rays.contributions()]
     return torch.stack(parts).sum(0)
 

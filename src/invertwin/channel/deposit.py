@@ -23,12 +23,10 @@ from invertwin.channel.bridge import (
 from invertwin.channel.density import deposit_density
 from invertwin.channel.kernel import DIFFERENTIABLE, from_table, to_table
 from invertwin.channel.paths import Grid, Link
+from invertwin.channel.sampling import Sampling
 from invertwin.channel.trace import Settings, Trace
 from invertwin.errors import InputError
 from invertwin.scene.scene import Object, Scene
-
-_BYTES_PER_VERTEX = 21  # one record: triangle, two barycentrics, throughput, length, seen
-_DEEPEST = 16
 
 
 def deposit_power(
@@ -36,16 +34,10 @@ def deposit_power(
     link: Link,
     grid: Grid,
     *,
-    samples: int,
-    boundary_samples: int,
+    sampling: Sampling,
     seed: int,
-    depth: int = 1,
-    sampling: Literal["rays", "area"] = "rays",
+    scheme: Literal["rays", "area"] = "rays",
     reference: tuple[Scene, Link] | None = None,
-    boundary: bool = True,
-    interior_edges: bool = True,
-    memory_budget: float = 0.25e9,
-    backend: str | None = None,
 ) -> Float32[Tensor, "frame range u v"]:
     """Expected received over transmitted power in every bin of a map, per frame.
 
@@ -60,20 +52,11 @@ def deposit_power(
         scene: What is seen.
         link: Antennas, per frame.
         grid: Bins.
-        samples: Interior samples over all frames.
-        boundary_samples: Silhouette samples over all frames and antennas; used by derivatives
-            only, since boundary paths are zero in value.
-        depth: Most bounces of a path.
+        sampling: How many paths are drawn.
         seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
-        sampling: ``rays`` from the antenna into the caps around the objects, or ``area``.
+        scheme: ``rays`` from the antenna into the caps around the objects, or ``area``.
         reference: The scene and link that fix the density (caps around objects, enlarged by a
             tenth, or triangle areas), so that differences in θ have common random numbers.
-        boundary: Off leaves the interior term alone, for ablation.
-        interior_edges: Off leaves out the shadows that surfaces cast on each other (family 2),
-            for ablation.
-        memory_budget: Bytes of samples alive at a time; more samples go in chunks, and the
-            derivative traces them again instead of keeping them.
-        backend: ``cpu``, ``cuda``, ``auto``; by default the one in force.
 
     Source: Eq. 7–8 of the paper in material form, derivations §2–3 and §5; interior segments
     §3.3.3.
@@ -81,48 +64,32 @@ def deposit_power(
     not the divergence of Eq. 14.
 
     Raises:
-        InputError: Fewer than one sample, no silhouette samples where a derivative needs them, an
+        InputError: No silhouette samples where a derivative needs them, an
             antenna pattern that carries derivatives, objects in motion, an unknown backend.
     """
-    if samples < 1 or boundary_samples < 0:
-        raise InputError(
-            f"expected samples >= 1 and boundary_samples >= 0, got {samples} and "
-            f"{boundary_samples}; give the number of rays over all frames"
-        )
-    if not 1 <= depth <= _DEEPEST:
-        raise InputError(
-            f"expected a depth from 1 to {_DEEPEST}, got {depth}; give the most bounces of a path"
-        )
-    if sampling not in ("rays", "area"):
-        raise InputError(f"expected sampling 'rays' or 'area', got {sampling!r}; choose one")
+    if scheme not in ("rays", "area"):
+        raise InputError(f"expected scheme 'rays' or 'area', got {scheme!r}; choose one")
     surfaces, clouds = _sorted(scene)
-    soft = [
-        deposit_density(item, link, grid, samples=samples, seed=seed, backend=backend)
-        for item in clouds
-    ]
+    soft = [deposit_density(item, link, grid, sampling=sampling, seed=seed) for item in clouds]
     if surfaces is None:
         return torch.stack(soft).sum(0)
-    with use_backend(backend), one_torch_thread():
+    with use_backend(sampling.backend), one_torch_thread():
         geometry = flatten(surfaces, link.wavelength)
         fixed = None if reference is None else _sorted(reference[0])[0]
         settings = Settings(
             geometry=geometry,
             link=link,
             grid=grid,
-            samples=samples,
-            boundary_samples=boundary_samples if boundary else 0,
-            seed=seed,
             sampling=sampling,
+            seed=seed,
+            scheme=scheme,
             reference=(flatten(fixed, link.wavelength), reference[1])
             if reference and fixed
             else None,
-            depth=depth,
-            interior_edges=interior_edges,
-            chunk=max(1, int(memory_budget) // (_BYTES_PER_VERTEX * depth)),
             backend=bridge.backend(),
         )
-        if boundary:
-            require_edges(geometry, link, boundary_samples)
+        if sampling.boundary:
+            require_edges(geometry, link, sampling.boundary_samples)
         if any(differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
             raise InputError(
                 "expected an antenna pattern without derivatives, got one that carries them; "

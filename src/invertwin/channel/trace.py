@@ -14,26 +14,31 @@ from invertwin.channel.kernel import DIFFERENTIABLE, Inputs, Place
 from invertwin.channel.passage import Passage
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.rays import Shot
-from invertwin.channel.sampling import AreaSampler, RaySampler
+from invertwin.channel.sampling import Sampling
+from invertwin.channel.starts import AreaSampler, RaySampler
 from invertwin.channel.walk import Records, State, Walk
+
+_BYTES_PER_VERTEX = 21  # one record: triangle, two barycentrics, throughput, length, seen
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What one call of ``deposit_power`` is asked for; ``chunk`` is in lanes."""
+    """What one call of ``deposit_power`` is asked for."""
 
     geometry: Geometry
     link: Link
     grid: Grid
-    samples: int
-    boundary_samples: int
+    sampling: Sampling
     seed: int
-    sampling: str
+    scheme: str
     reference: tuple[Geometry, Link] | None
-    depth: int
-    interior_edges: bool
-    chunk: int
     backend: str
+
+    @property
+    def chunk(self) -> int:
+        """Lanes that fit the memory budget."""
+        per_lane = _BYTES_PER_VERTEX * self.sampling.depth
+        return max(1, int(self.sampling.memory_budget) // per_lane)
 
     @property
     def tables(self) -> list[Tensor]:
@@ -51,8 +56,10 @@ class Trace:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.shot = Shot(settings.geometry, settings.link)
-        sampler = RaySampler if settings.sampling == "rays" else AreaSampler
-        self.sampler = sampler(self.shot, settings.samples, settings.seed, settings.reference)
+        sampler = RaySampler if settings.scheme == "rays" else AreaSampler
+        self.sampler = sampler(
+            self.shot, settings.sampling.samples, settings.seed, settings.reference
+        )
         one_place = bool((settings.link.tx == settings.link.rx).all())
         self.fixed = Inputs.of(settings.geometry, settings.link, self.shot, one_place)
         self._walk = Walk(self.shot, self.fixed, settings.seed)
@@ -94,7 +101,7 @@ class Trace:
         """Walk some chains into the bins, if given, and into records, if asked (else empty)."""
         import drjit as dr
 
-        depth, shared = self.settings.depth, self.settings.link.shared_visibility
+        depth, shared = self.settings.sampling.depth, self.settings.link.shared_visibility
         one_place = depth == 1 and self.fixed.monostatic
         state = self._started(index)
         state["lane"] = dr.arange(tracer().UInt32, dr.width(index))
@@ -135,15 +142,15 @@ class Trace:
 
     def draw_boundary(self) -> None:
         """Draw the first edge points, for the derivative to come, without waiting for them."""
-        settings = self.settings
-        if settings.boundary_samples:
+        settings, sampling = self.settings, self.settings.sampling
+        if sampling.boundary and sampling.boundary_samples:
             self._points = BoundaryPoints(
                 self.shot,
                 self.fixed,
-                samples=settings.boundary_samples,
-                depth=settings.depth,
+                samples=sampling.boundary_samples,
+                depth=sampling.depth,
                 seed=settings.seed,
-                interior=settings.interior_edges,
+                interior=sampling.interior_edges,
                 chunks=lambda size: chunks(size, settings.chunk),
             )
 

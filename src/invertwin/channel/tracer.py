@@ -24,7 +24,7 @@ from invertwin.channel.boundary import (
 from invertwin.channel.bridge import Geometry, flatten, to_torch, tracer, use_backend
 from invertwin.channel.chains import (
     Chain,
-    RoughChains,
+    RoughPaths,
     chain_view,
     passed,
     rough_chains,
@@ -33,7 +33,8 @@ from invertwin.channel.chains import (
 from invertwin.channel.kernel import Inputs
 from invertwin.channel.paths import Grid, Link, Paths
 from invertwin.channel.rays import Shot, face_areas, visible
-from invertwin.channel.sampling import RaySampler
+from invertwin.channel.sampling import Sampling
+from invertwin.channel.starts import RaySampler
 from invertwin.channel.trace import Settings, Trace
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -130,33 +131,37 @@ def trace_power(
     scene: Scene,
     link: Link,
     *,
-    samples: int,
-    boundary_samples: int = 0,
+    sampling: Sampling,
     seed: int,
-    depth: int = 1,
-    boundary: bool = True,
-    backend: str | None = None,
 ) -> Paths:
     """Power paths by rays from the antenna, as explicit rows; for inspection and as an oracle.
 
-    The same samples, in the same sense, as :func:`invertwin.channel.deposit.deposit_power`.
+    The paths are those that :func:`invertwin.channel.deposit_power` sums.
+
+    Args:
+        scene: What is seen.
+        link: Antennas, per frame.
+        sampling: How many paths are drawn.
+        seed: Same seed, same paths.
 
     Raises:
         InputError: See ``deposit_power``; boundary paths of more than one bounce or past sheets.
     """
-    with use_backend(backend):
+    with use_backend(sampling.backend):
         geometry = flatten(scene, link.wavelength)
+        boundary, edges = sampling.boundary, sampling.boundary_samples
+        depth = sampling.depth
         if boundary and silhouettes_move(geometry, link) and (depth > 1 or geometry.sheets):
             raise InputError(
                 "expected explicit paths of one bounce without sheets for derivatives in which "
                 "silhouettes move; use deposit_power, or boundary=False for fixed visibility"
             )
         if depth > 1 or geometry.sheets:
-            return _power_chains(geometry, link, samples, depth, seed)
+            return _power_chains(geometry, link, sampling, seed)
         shot = Shot(geometry, link)
         if boundary:
-            require_edges(geometry, link, boundary_samples)
-        sampler = RaySampler(shot, samples, seed)
+            require_edges(geometry, link, edges)
+        sampler = RaySampler(shot, sampling.samples, seed)
         points = _drawn(sampler)
         points = points.keep(points.weight > 0)
         if not link.shared_visibility:
@@ -166,7 +171,7 @@ def trace_power(
         seen = view(geometry, link, points.frame, points.face, position, normal)
         power = seen.power * jacobian * points.weight
         inner = _paths(points.frame, seen.length, position, "power", power=power)
-        if not (boundary and boundary_samples):
+        if not (boundary and edges):
             return inner
 
         def value(edge: Edge, found: View) -> Paths:
@@ -180,16 +185,14 @@ def trace_power(
                 boundary=True,
             )
 
-        return inner + _boundary_paths(geometry, link, shot, boundary_samples, seed, value)
+        return inner + _boundary_paths(geometry, link, shot, edges, seed, value)
 
 
-def _power_chains(geometry: Geometry, link: Link, samples: int, depth: int, seed: int) -> Paths:
+def _power_chains(geometry: Geometry, link: Link, sampling: Sampling, seed: int) -> Paths:
     """The chains that ``deposit_power`` walks, evaluated in torch."""
     nowhere = Grid(0.0, 1.0, 1)
-    trace = Trace(
-        Settings(geometry, link, nowhere, samples, 0, seed, "rays", None, depth, False, samples, "")
-    )
-    parts = []
+    trace = Trace(Settings(geometry, link, nowhere, sampling, seed, "rays", None, ""))
+    parts, depth = [], sampling.depth
     for records in trace.records():
         frame = to_torch(records.frame).long()
         columns = [
@@ -247,12 +250,7 @@ def rough_points(scene: Scene, density: float, seed: int) -> RoughPoints:
         scene: Surfaces to cover.
         density: Points per m².
         seed: Hash key.
-
-    Raises:
-        InputError: A density that is not positive.
     """
-    if not density > 0:
-        raise InputError(f"expected density > 0 points per m², got {density}; try 2e4")
     columns: list[list[np.ndarray]] = [[], [], [], []]
     offset = 0
     for name, item in scene.objects.items():
@@ -280,6 +278,37 @@ def rough_points(scene: Scene, density: float, seed: int) -> RoughPoints:
     return RoughPoints(joined[0].long(), joined[1], joined[2], joined[3], density)
 
 
+@dataclass(frozen=True)
+class Speckle:
+    """The fixed random parts of fields: they stay while radar and scene move.
+
+    Attributes:
+        points: Points of rough surfaces, for paths of one bounce; None is drawn where needed.
+        paths: Rough paths of several bounces; None is drawn where needed.
+    """
+
+    points: RoughPoints | None = None
+    paths: RoughPaths | None = None
+
+
+def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Speckle:
+    """Draw the fixed points and paths that give rough surfaces their speckle.
+
+    Args:
+        scene: Surfaces.
+        link: Antennas, which suggest what rough paths are worth drawing.
+        sampling: Points per m², number and depth of rough paths.
+        seed: Of places and phases.
+    """
+    paths = None
+    if sampling.depth > 1:
+        with use_backend(sampling.backend):
+            paths = rough_chains(
+                scene, link, count=sampling.rough_paths, depth=sampling.depth, seed=seed
+            )
+    return Speckle(rough_points(scene, sampling.points_per_m2, seed), paths)
+
+
 def _hash(key: np.uint64, first: np.ndarray, second: np.ndarray, stream: int) -> np.ndarray:
     """Uniform numbers in [0, 1): SplitMix64 over the words of the key."""
     with np.errstate(over="ignore"):
@@ -296,33 +325,20 @@ def trace_field(
     scene: Scene,
     link: Link,
     *,
-    samples: int = 100_000,
-    density: float = 20_000.0,
-    points: RoughPoints | None = None,
-    depth: int = 1,
-    chains: RoughChains | None = None,
-    chain_count: int = 200_000,
-    boundary_samples: int = 0,
+    sampling: Sampling,
     seed: int,
-    boundary: bool = True,
-    backend: str | None = None,
+    speckle: Speckle | None = None,
 ) -> Paths:
     """Field paths: physical optics for conductors, fixed random-phase points for rough surfaces.
 
     Args:
         scene: What is seen.
         link: Antennas, per frame.
-        samples: Samples per frame over all coherent objects (a converging integral).
-        density: Rough points per m² (used where ``points`` is not given).
-        points: The rough points to use, so that they stay while the scene moves.
-        depth: Most bounces. From the second on, every surface scatters as a rough one does: a
-            fixed phase for every ordered chain, conductors by their lobe.
-        chains: The chains of two bounces and more to use, so that they stay while the scene moves.
-        chain_count: How many to draw of each length (used where ``chains`` is not given).
-        boundary_samples: Silhouette samples of the coherent objects.
+        sampling: How many paths are drawn. From the second bounce on, every surface scatters as a
+            rough one does: a fixed phase for every ordered path, conductors by their lobe.
         seed: Places and phases.
-        boundary: Off leaves fixed-visibility derivatives alone.
-        backend: See ``deposit_power``.
+        speckle: The rough points and paths to use, so that they stay while the scene moves. What
+            is None in it is drawn from the seed.
 
     Source: derivations §4.
     Differs from the source: rough fields have fixed points, not new phases every evaluation.
@@ -332,7 +348,9 @@ def trace_field(
             and vanish, so a realisation has no boundary term. Use power paths, or switch
             ``boundary`` off to accept fixed visibility.
     """
-    with use_backend(backend):
+    boundary, boundary_samples, depth = sampling.boundary, sampling.boundary_samples, sampling.depth
+    fixed = speckle or Speckle()
+    with use_backend(sampling.backend):
         geometry = flatten(scene, link.wavelength, in_motion=True)
         shot = Shot(geometry, link)
         parts = []
@@ -345,7 +363,7 @@ def trace_field(
                         "silhouettes, got some; use power paths, or boundary=False for fixed "
                         "visibility"
                     )
-            parts.append(_coherent(geometry, link, shot, samples, seed))
+            parts.append(_coherent(geometry, link, shot, sampling.samples, seed))
             if boundary and boundary_samples:
 
                 def value(edge: Edge, found: View) -> Paths:
@@ -364,8 +382,8 @@ def trace_field(
         if not all(geometry.coherent):
             if boundary and silhouettes_move(geometry, link):
                 raise InputError(_NO_ROUGH_DERIVATIVE)
-            fixed = points or rough_points(scene, density, seed)
-            parts.append(_rough(geometry, link, shot, fixed))
+            points = fixed.points or rough_points(scene, sampling.points_per_m2, seed)
+            parts.append(_rough(geometry, link, shot, points))
         if depth > 1:
             if geometry.velocities is not None:
                 raise InputError(
@@ -374,7 +392,9 @@ def trace_field(
                 )
             if boundary and silhouettes_move(geometry, link):
                 raise InputError(_NO_ROUGH_DERIVATIVE)
-            drawn = chains or rough_chains(scene, link, count=chain_count, depth=depth, seed=seed)
+            drawn = fixed.paths or rough_chains(
+                scene, link, count=sampling.rough_paths, depth=depth, seed=seed
+            )
             parts += _rough_chains(geometry, link, shot, drawn, depth)
         return _joined(parts)
 
@@ -440,7 +460,7 @@ def _rough(geometry: Geometry, link: Link, shot: Shot, fixed: RoughPoints) -> Pa
 
 
 def _rough_chains(
-    geometry: Geometry, link: Link, shot: Shot, drawn: RoughChains, depth: int
+    geometry: Geometry, link: Link, shot: Shot, drawn: RoughPaths, depth: int
 ) -> list[Paths]:
     """Fields of the rough chains: amplitude sqrt(f · weight), phase of the chain."""
     parts = []

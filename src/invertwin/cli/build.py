@@ -1,7 +1,7 @@
 """From the tables of a run file to the library's values: scenes, parameters, starts."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -20,7 +20,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
 from invertwin.inversion.regularization import Regularizer
-from invertwin.inversion.stages import Build
+from invertwin.radar.parameters import RadarPose
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import (
     Mesh,
@@ -34,7 +34,6 @@ from invertwin.scene import (
 from invertwin.scene.files import CONCRETE, load_mesh, load_scene_xml
 from invertwin.scene.parameters import (
     Pose,
-    RadarPose,
     Scale,
     Translation,
 )
@@ -174,7 +173,7 @@ def builders(
     tables: Sequence[schema.Parameter],
     start: Start,
     objects: Mapping[str, schema.SceneObject] | None = None,
-) -> dict[str, Build]:
+) -> dict[str, Callable[[Scene], nn.Module]]:
     """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order.
 
     Args:

@@ -16,7 +16,7 @@ from invertwin.errors import InputError
 
 COLUMNS = ("key", "value", "default", "unit or meaning")
 _NAMED = {
-    **{name: f"{name}.<name>" for name in ("scene", "truth", "variants")},
+    **{name: f"{name}.<name>" for name in ("scene", "truth", "variants", "observations")},
     **{name: f"[{name}]" for name in ("parameters", "stages")},
 }
 _WORDS = {float: "number", int: "integer", bool: "true or false", str: "text"}

@@ -6,59 +6,66 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
+from invertwin import plotting
 from invertwin.capture import Capture
-from invertwin.channel import Grid, deposit_power, rough_points, trace_field
-from invertwin.cli import build, pictures
+from invertwin.channel import Sampling, draw_speckle, trace_field
+from invertwin.cli import build
+from invertwin.cli.fits.problem import Sight, sampling_of
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import beat_signal
-from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import AntennaArray, Scene
 
 
-def landscape(
-    run: RunFile, truth: Scene, radar: Radar, grid: Grid, capture: Capture
-) -> tuple[bytes, dict[str, Any]]:
-    """The picture and the numbers of the `[landscape]` table.
+def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[Figure, dict[str, Any]]:
+    """The figure and the numbers of the `[landscape]` table.
 
     For the exact signal one channel of one frame is enough to show the shape.
 
+    Args:
+        run: The run file.
+        truth: The true scene.
+        sight: What the sensor has recorded.
+
     Returns:
-        PNG bytes; and the number of local minima of every curve.
+        The figure; and the number of local minima of every curve.
     """
     table = need(run, "landscape", "the loss landscape")
-    settings = need(run, "reconstruct", "the loss landscape")
-    samples, depth = settings.samples, settings.depth
     with torch.no_grad():
         x = np.linspace(-table.exact_span, table.exact_span, table.exact_points)
-        first = radar.frames([0])
+        first = sight.radar.frames([0])
         losses = exact_losses(
             run,
             truth,
             first,
             moved(truth, table.object, table.axis, x),
-            capture.beat[:1, :1, :1],
+            sight.capture.beat[:1, :1, :1],
             {"beat": lambda beat: beat},
             _one_channel(first),
         )
         exact = (x, losses["beat"])
         x = np.linspace(-table.span, table.span, table.points)
         scenes = moved(truth, table.object, table.axis, x)
-        wide = build.surrogate(run.surrogate)
-        sharp = replace(wide, range_width=0.0, angle_width=0.0)
-        kernels = {"surrogate, first widths": wide, "surrogate, no extra width": sharp}
-        smooth = {
-            name: (x, smooth_losses(run, radar, grid, capture, scenes, kernel, samples, depth))
-            for name, kernel in kernels.items()
+        model = sight.model(sampling_of(run))
+        assert isinstance(model, SurrogateMap)
+        models = {
+            "surrogate, first widths": model,
+            "surrogate, no extra width": model.narrowed(0.0),
         }
-    counts = {name: pictures.count_minima(losses) for name, (_, losses) in smooth.items()}
-    minima = {"exact": pictures.count_minima(exact[1]), **counts}
+        smooth = {
+            name: (x, smooth_losses(run, sight.radar, sight.capture, scenes, model))
+            for name, model in models.items()
+        }
+    counts = {name: plotting.count_minima(losses) for name, (_, losses) in smooth.items()}
+    minima = {"exact": plotting.count_minima(exact[1]), **counts}
     along = line_name(table.object, table.axis)
-    return pictures.landscape_picture(exact, smooth, along), {"local_minima": minima}
+    return plotting.landscape(exact, smooth, along), {"local_minima": minima}
 
 
 def moved(truth: Scene, name: str, axis: Sequence[float], offsets: Iterable[float]) -> list[Scene]:
@@ -106,21 +113,15 @@ def exact_losses(
     data = need(run, "data", "the loss landscape")
     assert isinstance(data, SimulatedData)
     seed = run.seed if data.seed is None else data.seed
-    points = rough_points(truth, data.density, seed)
+    sampling = Sampling(depth=1, samples=data.samples, points_per_m2=data.density, boundary=False)
     link, channels = radar.link(), seen or radar
+    speckle = draw_speckle(truth, link, sampling, seed)
     centers = link.tx[0], link.rx[0]
     own = channels.link()
     targets = {name: view(measured) for name, view in views.items()}
     rows = []
     for scene in scenes:
-        paths = trace_field(
-            scene,
-            link,
-            samples=data.samples,
-            points=points,
-            seed=seed,
-            boundary=False,
-        )
+        paths = trace_field(scene, link, sampling=sampling, seed=seed, speckle=speckle)
         # What the whole array's centre sees, at the delay to the centre of the channels.
         legs = [
             (paths.first - tx).norm(dim=1) + (paths.last - rx).norm(dim=1)
@@ -151,34 +152,21 @@ def _one_channel(radar: Radar) -> Radar:
 
 
 def smooth_losses(
-    run: RunFile,
-    radar: Radar,
-    grid: Grid,
-    capture: Capture,
-    scenes: Sequence[Scene],
-    kernel: Surrogate,
-    samples: int,
-    depth: int,
+    run: RunFile, radar: Radar, capture: Capture, scenes: Sequence[Scene], model: SurrogateMap
 ) -> np.ndarray:
-    """The `[loss]` of the surrogate's maps of scenes against the measured spectrum."""
-    measured = kernel.blur(capture.spectrum(grid).float(), radar, grid)
+    """The `[loss]` of the surrogate's maps of scenes against the measured spectrum.
+
+    Args:
+        run: Its loss and seed.
+        radar: What sees the scenes.
+        capture: The data.
+        scenes: Along a line.
+        model: The surrogate.
+    """
+    measured = model.blurred(model.observe(capture), radar)
     loss = build.loss(run.loss)
-    link = radar.link()
-
-    def at(scene: Scene) -> float:
-        # The same points of the surfaces in every scene, or steps as fine as these would show
-        # the samples.
-        power = deposit_power(
-            scene,
-            link,
-            grid,
-            samples=samples,
-            boundary_samples=0,
-            seed=run.seed,
-            depth=depth,
-            sampling="area",
-            reference=(scenes[len(scenes) // 2], link),
-        )
-        return float(loss(kernel.shape(power, radar, grid), measured))
-
-    return np.array([at(scene) for scene in scenes])
+    # The same points of the surfaces in every scene, or steps as fine as these would show the
+    # samples.
+    middle = scenes[len(scenes) // 2]
+    fixed = model.for_differences(middle, radar, model.sampling.samples, "area")
+    return np.array([float(loss(fixed.predict(s, radar, run.seed), measured)) for s in scenes])

@@ -8,8 +8,10 @@ from torch import Tensor
 from invertwin.capture import (
     Capture,
     ChannelCalibration,
+    ChirpCapture,
     ChirpData,
     described_arrays,
+    openradar,
     rail_sar,
     ti,
 )
@@ -19,6 +21,7 @@ from invertwin.cli.sensors import board_elements, rotations_of, track
 from invertwin.errors import InputError
 from invertwin.scene import AntennaArray
 
+_OPENRADAR_ORIGINAL = "github.com/PreSenseRadar/OpenRadar"
 _RAIL_SAR_ORIGINAL = "github.com/jjimmykang/bwsi-backprojection, trial 6"
 
 
@@ -37,6 +40,42 @@ def measured(data: schema.MeasuredData) -> Capture:
             with about("data.folder"):
                 return _rail_sar(Path(data.folder))
     return _of_chirps(data)
+
+
+def chirp_capture(data: schema.Data) -> ChirpCapture:
+    """The recording of a `[data]` table with every chirp of its frames.
+
+    Raises:
+        InputError: Data without chirps, or files that are missing or damaged.
+    """
+    if isinstance(data, schema.OpenRadarData):
+        with about("data.folder"):
+            chirps = _openradar(Path(data.folder))
+        with about("data.board"):
+            device = chirps.radar(*board_elements(data.board))
+    elif isinstance(data, schema.Dca1000Data | schema.ArraysData):
+        with about("data.file"):
+            chirps = _chirps(data)
+        with about("data.board"):
+            elements = _elements(data, chirps)
+        with about("data.positions"):
+            device = chirps.radar(*elements, *_poses(data, chirps.frame_count))
+    else:
+        raise InputError(
+            f'data.kind: expected data with chirps, got "{data.kind}"; give dca1000, arrays, or '
+            "simulated with [chirps]"
+        )
+    return ChirpCapture(chirps.beat, device, chirps.settings.chirps)
+
+
+def _openradar(folder: Path) -> ChirpData:
+    if not (folder / openradar.FILE).is_file():
+        raise InputError(
+            f"expected {openradar.FILE} in {folder}, got no such file; it is made from the public "
+            f"recording of {_OPENRADAR_ORIGINAL}: set INVERTWIN_DATA to the folder that holds "
+            f"{folder.name}/"
+        )
+    return openradar.read_chirps(folder)
 
 
 def _rail_sar(folder: Path) -> Capture:

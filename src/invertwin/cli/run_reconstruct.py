@@ -3,21 +3,23 @@
 import math
 import shutil
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console
 
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
-from invertwin.cli.fits.fitting import calibrated, fit, outcome
+from invertwin.cli.fits.fitting import calibrated, fit
 from invertwin.cli.fits.initial import added, guessed
 from invertwin.cli.fits.likeness import check_measures, is_shape_key
+from invertwin.cli.fits.mover import run_mover
 from invertwin.cli.fits.problem import modes_of, problem_of
 from invertwin.cli.fits.scores import (
     agreement,
     heldout,
     misfit,
-    sharp_spectrum,
+    sharp_maps,
     summary,
     without_history,
 )
@@ -32,9 +34,9 @@ from invertwin.cli.fits.writing import (
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table
 from invertwin.cli.run_file import need
-from invertwin.cli.run_openradar import run_openradar
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
-from invertwin.cli.schema import OpenRadarData, RunFile, SimulatedData
+from invertwin.cli.schema import MoverParameter, RunFile, SimulatedData
+from invertwin.inversion import Reconstruction
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry import without_clouds
 
@@ -44,8 +46,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
 
     Starts that an interrupted run has finished are not fitted again.
     """
-    if isinstance(run.data, OpenRadarData):
-        return run_openradar(run, folder, console)
+    if isinstance(next(iter(run.parameters), None), MoverParameter):
+        return run_mover(run, folder, console)
     begin = time.perf_counter()
     need(run, "reconstruct", "reconstruct")
     problem, calibration = calibrated(problem_of(run, console), folder, console)
@@ -59,19 +61,23 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     modes = modes_of(run)
     single = len(starts) * len(modes) == 1
     rows: dict[str, list[dict[str, Any]]] = {}
+    outcomes: dict[int, Callable[[], Reconstruction]] = {}
     for mode in modes:
-        rows[mode] = [
-            fit(problem, start, i, mode, folder, console, CHECKPOINT if single else None)
-            for i, start in enumerate(starts)
-        ]
+        rows[mode] = []
+        for i, start in enumerate(starts):
+            row, outcome = fit(
+                problem, start, i, mode, folder, console, CHECKPOINT if single else None
+            )
+            rows[mode].append(row)
+            if mode == modes[0]:
+                outcomes[i] = outcome
     best = min(rows[modes[0]], key=lambda row: (row["status"] == "diverged", _finite(row["loss"])))
-    begun = starts[best["start"]]
-    found = outcome(problem, begun, best, modes[0], folder)
-    start, twin, radar, offset = begun.scene, found.twin, found.radar, found.offset
+    begun, found = starts[best["start"]], outcomes[best["start"]]()
+    start, twin, radars = begun.scene, found.scene, found.sensors
     maps = {
-        "measured": problem.capture.spectrum(problem.grid).float(),
-        "start": sharp_spectrum(problem, start, problem.radar, None),
-        "twin": sharp_spectrum(problem, twin, radar, offset),
+        "measured": [s.capture.spectrum(s.grid).float() for s in problem.sights.values()],
+        "start": sharp_maps(problem, start, [s.radar for s in problem.sights.values()]),
+        "twin": sharp_maps(problem, twin, radars),
     }
     start, twin = without_clouds(start), without_clouds(twin)
     metrics = {
@@ -82,10 +88,10 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
             for key in best
             if (key in COLUMNS or is_shape_key(key)) and key != "seconds"
         },
-        "start_loss_sharp": misfit(run, maps["start"], maps["measured"]),
-        "loss_sharp": misfit(run, maps["twin"], maps["measured"]),
+        "start_loss_sharp": misfit(problem, maps["start"], maps["measured"]),
+        "loss_sharp": misfit(problem, maps["twin"], maps["measured"]),
         "parameters": best["values"],
-        **agreement(problem, twin, radar),
+        **agreement(problem, twin, radars[0]),
         **({"calibration": calibration} if calibration else {}),
         **conventional,
         **heldout(problem, rows[modes[0]], best),
@@ -98,13 +104,13 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         metrics |= {f"{key}_{mode}": same[key] for key in own}
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         console.print("computing the loss landscape")
-        png, found = landscape(run, problem.truth, problem.radar, problem.grid, problem.capture)
-        folder.write_bytes("landscape.png", png)
+        figure, found = landscape(run, problem.truth, problem.first)
+        folder.write_figure("landscape.png", figure)
         metrics["landscape"] = found
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
     tables = [*tables_of(problem, metrics, start, twin, rows), *added(metrics)]
-    draw(problem, folder, rows, metrics, start, twin, radar, maps)
+    draw(problem, folder, rows, metrics, start, twin, maps)
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:
         draw_shapes(problem, folder, rows, start, twin)

@@ -2,32 +2,31 @@
 
 import math
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from invertwin import plotting
 from invertwin.capture import Capture, described_arrays
-from invertwin.channel import Grid
-from invertwin.cli import build, pictures, sensors
-from invertwin.cli.doppler_maps import DOPPLER_NOTE, doppler_maps, panels, panels_picture
+from invertwin.channel import Grid, Sampling
+from invertwin.cli import build, sensors
 from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw
-from invertwin.cli.report import Again, Picture, Table, report_html
+from invertwin.cli.report import DOPPLER_NOTE, Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import Chirps, Impairments, RunFile, SimulatedData
+from invertwin.cli.schema import Chirps as ChirpsTable
+from invertwin.cli.schema import Impairments as ImpairmentsTable
+from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.errors import InputError
-from invertwin.radar import FMCW, exact_spectrum, velocity_span
+from invertwin.models import SurrogateMap, surrogate_correlation
+from invertwin.radar import FMCW, doppler_maps, velocity_span
+from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
-from invertwin.simulation import (
-    Simulation,
-    simulate,
-    simulate_chirps,
-    surrogate_correlation,
-)
+from invertwin.simulation import Simulation, simulate, simulate_chirps
 
 _SURROGATE_SAMPLES = 2_000_000
 _LABELS = {
@@ -60,23 +59,27 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
     seed = run.seed if data.seed is None else data.seed
     front = None if run.impairments is None else sensors.impairments(run.impairments, data)
     with torch.no_grad():
-        found = simulate(
+        return simulate(
             scene,
             radar,
             grid,
             seed=seed,
-            samples=data.samples,
-            depth=data.depth,
-            density=data.density,
-            chain_count=data.chains,
+            sampling=_sampling(data, data.depth),
             snr_db=None if front else data.snr_db,
             noise_figure_db=None if front else data.noise_figure_db,
+            impairments=front,
         )
-        if front is None:
-            return found
-        assert found.paths is not None
-        beat = front.record(found.paths, radar, seed=seed)
-        return Simulation(exact_spectrum(beat, radar, grid), found.paths, beat)
+
+
+def _sampling(data: SimulatedData, depth: int) -> Sampling:
+    return Sampling(
+        depth=depth,
+        samples=data.samples,
+        boundary_samples=0,
+        boundary=False,
+        points_per_m2=data.density,
+        rough_paths=data.chains,
+    )
 
 
 def _simulated(run: RunFile) -> SimulatedData:
@@ -101,18 +104,10 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
     begin = time.perf_counter()
     found = exact(run, scene, radar, grid)
     seconds = time.perf_counter() - begin
-    assert found.beat is not None
-    assert found.paths is not None
     with torch.no_grad():
-        smooth = simulate(
-            scene,
-            radar,
-            grid,
-            seed=run.seed,
-            surrogate=Surrogate(),
-            samples=_SURROGATE_SAMPLES,
-            depth=_simulated(run).depth,
-        ).spectrum
+        depth = _simulated(run).depth
+        model = SurrogateMap(grid, sampling=Sampling(depth=depth, samples=_SURROGATE_SAMPLES))
+        smooth = model.predict(scene, radar, run.seed)
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
     metrics = {
         "task": "simulate",
@@ -124,45 +119,53 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
         "surrogate_correlation": surrogate_correlation(
             scene,
             radar.frames([0]),
-            grid,
+            replace(model, sampling=Sampling(1, points_per_m2=_simulated(run).density)),
             seed=run.seed,
-            depth=1,
-            density=_simulated(run).density,
         ),
         "wall_seconds": seconds,
     }
     if run.raw is not None:
         metrics |= write_raw(run, radar, found.beat, folder)
-    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
-    maps = {"exact signal": found.spectrum.numpy(), "surrogate": smooth.numpy()}
-    folder.write_bytes("spectra.png", pictures.spectra_picture(maps, axes))
+    maps = {"exact signal": found.spectrum, "surrogate": smooth}
     shown = Picture(
         "Spectra",
-        (folder.path / "spectra.png").read_bytes(),
+        folder.write_figure("spectra.png", plotting.spectrum(maps, grid)),
         note="The surrogate is the mean of the exact spectrum over random phases.",
     )
     status = f"{len(found.paths)} paths, {radar.frame_count} frames."
     return _finish(run, folder, scene, radar, metrics, shown, status)
 
 
-def _chirp_train(
-    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: Chirps
-) -> list[Table]:
-    """The same for several ramps a frame, between which objects move."""
-    data, chirps = _simulated(run), sensors.chirps(table)
-    seed = run.seed if data.seed is None else data.seed
-    begin = time.perf_counter()
+def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> torch.Tensor:
+    """Exact beat signals of every chirp with the settings of `[data]` and `[chirps]`.
+
+    Args:
+        run: The run file.
+        scene: With moving objects.
+        radar: What records.
+        chirps: Timing.
+    """
+    data = _simulated(run)
+    front = sensors.impairments(run.impairments or ImpairmentsTable(), data)
     with about("chirps"), torch.no_grad():
-        beat = simulate_chirps(
+        return simulate_chirps(
             scene,
             radar,
             chirps,
-            seed=seed,
-            retrace=table.retrace,
-            samples=data.samples,
-            density=data.density,
-            impairments=sensors.impairments(run.impairments or Impairments(), data),
+            seed=run.seed if data.seed is None else data.seed,
+            sampling=_sampling(data, 1),
+            retrace=need(run, "chirps", "several ramps a frame").retrace,
+            impairments=front,
         )
+
+
+def _chirp_train(
+    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: ChirpsTable
+) -> list[Table]:
+    """Simulate several ramps a frame, between which objects move."""
+    begin = time.perf_counter()
+    chirps = sensors.chirps(table)
+    beat = chirp_train(run, scene, radar, chirps)
     seconds = time.perf_counter() - begin
     maps = doppler_maps(beat, radar, grid, chirps)
     if table.tdm and isinstance(radar.waveform, FMCW):
@@ -185,12 +188,8 @@ def _chirp_train(
     }
     if run.raw is not None:
         metrics |= write_raw(run, radar, beat, folder)
-    folder.write_bytes("doppler.png", panels_picture(panels(maps)))
-    shown = Picture(
-        "First frame",
-        (folder.path / "doppler.png").read_bytes(),
-        note=DOPPLER_NOTE,
-    )
+    png = folder.write_figure("doppler.png", plotting.range_doppler(maps))
+    shown = Picture("First frame", png, note=DOPPLER_NOTE)
     status = f"{chirps.count} chirps a frame, {radar.frame_count} frames."
     return _finish(run, folder, scene, radar, metrics, shown, status)
 
@@ -209,13 +208,8 @@ def _finish(
     folder.write_json("metrics.json", metrics)
     rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
     table = Table("Simulation", ["quantity", "value"], rows)
-    drawing = pictures.Drawing(
-        pictures.meshes_of(scene), sought=list(run.truth), radar=radar.positions.numpy()
-    )
-    folder.write_bytes(
-        "scene.png", pictures.scene_picture({"scene": drawing}, pictures.frame_of(radar))
-    )
-    seen = Picture("Scene", (folder.path / "scene.png").read_bytes())
+    figure = plotting.scene(scene, radar, highlight=list(run.truth))
+    seen = Picture("Scene", folder.write_figure("scene.png", figure))
     again = Again("simulate run.toml", {"run.toml": to_toml(run)})
     title = run.title or "Simulation"
     parts = [table, seen, shown]

@@ -1,58 +1,55 @@
 """Spectrum to loss to scene: reconstruction, and the check that its gradients are right."""
 
-from invertwin.inversion.gradcheck import Agreement, Direction, GradientReport
-from invertwin.inversion.loss import SpectrumLoss
-from invertwin.inversion.measures import (
-    Likeness,
+from invertwin.inversion.callbacks import Checkpoint, Report, Watch
+from invertwin.inversion.fit import Callback, Fit
+from invertwin.inversion.gradcheck import Agreement, Check, GradientReport
+from invertwin.inversion.loss import CorrelationLoss, SpectrumLoss
+from invertwin.inversion.metrics import (
+    ShapeMetrics,
     Topology,
     compare_shapes,
     topology,
     volume_iou,
 )
-from invertwin.inversion.mover import (
-    Echo,
-    MotionMap,
-    MovingBody,
-    fit_mover,
-    motion_map,
-    strongest_mover,
-)
-from invertwin.inversion.nuisances import ClockOffset, RangeBias
-from invertwin.inversion.prior import LatentNorm, Trained, Training, train_prior
-from invertwin.inversion.reconstruction import Optimizer, Reconstruction, reconstruct
+from invertwin.inversion.mover import Echo, MovingBody, of_point, strongest_mover
+from invertwin.inversion.observation import Observation, Unknown
+from invertwin.inversion.optimizer import Optimizer
+from invertwin.inversion.prior import LatentNorm
+from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
-from invertwin.inversion.stages import Stage, reconstruct_in_stages
+from invertwin.inversion.schedule import Schedule, Stage
 
 __all__ = [
     "Agreement",
-    "ClockOffset",
-    "Direction",
+    "Callback",
+    "Check",
+    "Checkpoint",
+    "CorrelationLoss",
     "Echo",
+    "Fit",
     "GradientReport",
     "Laplacian",
     "LatentNorm",
-    "Likeness",
-    "MotionMap",
     "MovingBody",
+    "Observation",
     "Optimizer",
-    "RangeBias",
     "Reconstruction",
     "Regularizer",
+    "Report",
+    "Schedule",
+    "ShapeMetrics",
     "SpectrumLoss",
     "Stage",
     "Topology",
-    "Trained",
-    "Training",
+    "Unknown",
+    "Watch",
     "compare_shapes",
-    "fit_mover",
-    "motion_map",
+    "of_point",
     "reconstruct",
-    "reconstruct_in_stages",
     "remeshed",
     "signed_distance",
     "strongest_mover",
     "topology",
-    "train_prior",
     "volume_iou",
 ]

@@ -11,10 +11,8 @@ from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
-from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.loss import Maps, Objective, SpectrumLoss
 from invertwin.scene.checks import checked_count
-
-Maps = Callable[[], tuple[Tensor, Tensor]]
 
 _MOST = 64  # parameters; each costs a derivative of the map per step
 _TRIES = 4  # dampings of one step
@@ -43,7 +41,7 @@ class GaussNewton:
     def __init__(
         self,
         modules: nn.Module,
-        loss: Callable[[Tensor, Tensor], Tensor],
+        objective: Objective,
         *,
         reach: float = 0.3,
         reaches: Mapping[nn.Parameter, float] | None = None,
@@ -54,7 +52,7 @@ class GaussNewton:
 
         Args:
             modules: what is fitted.
-            loss: how maps are compared, a `SpectrumLoss`.
+            objective: how maps are compared, of `SpectrumLoss` only.
             reach: the longest change of one parameter in a step, in its unit.
             reaches: of some parameters, in place of `reach`.
             damping: μ at the first step.
@@ -70,17 +68,18 @@ class GaussNewton:
             for name, parameter in module.named_parameters(recurse=False)
             if parameter.requires_grad
         ]
-        if not isinstance(loss, SpectrumLoss):
-            raise InputError(
-                f"expected a SpectrumLoss, got {type(loss).__name__}; "
-                "Gauss–Newton needs its second derivatives"
-            )
+        for loss in objective.losses:
+            if not isinstance(loss, SpectrumLoss):
+                raise InputError(
+                    f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
+                    "give one, or another kind of optimiser"
+                )
         if not self._slots or not (reach > 0 and damping > 0):
             raise InputError(
                 f"expected parameters to fit, reach > 0 and damping > 0, got {len(self._slots)}, "
                 f"{reach} and {damping}; a reach of 0.3 suits metres and radians"
             )
-        self.loss, self.damping = loss, damping
+        self.objective, self.damping = objective, damping
         own = dict(reaches or {})
         self.reach = torch.cat(
             [
@@ -92,12 +91,12 @@ class GaussNewton:
         self._known: tuple[Tensor, Tensor] | None = None  # H, and of which parameters
         self._age = 0  # steps that H has served
 
-    def step(self, maps: Maps, penalty: Callable[[], Tensor] | None = None) -> float:
+    def step(self, maps: Callable[[], Maps], penalty: Callable[[], Tensor] | None = None) -> float:
         """One step, and the loss before it.
 
         Args:
-            maps: → simulated and measured map under the present parameters; the same samples each
-                time it is called within one step.
+            maps: gives the predicted and the observed map of every observation under the present
+                parameters; the same samples each time it is called within one step.
             penalty: → a differentiable term added to the loss, such as that of a regulariser. It
                 takes part in g, and by its own second derivatives in H.
 
@@ -105,8 +104,8 @@ class GaussNewton:
             InputError: a parameter without effect on the loss, or more than 64 that matter.
         """
         parameters = [parameter for _, _, parameter in self._slots]
-        simulated, measured = maps()
-        value = self.loss(simulated, measured)
+        pairs = maps()
+        value = self.objective(pairs)
         if penalty is not None:
             value = value + penalty()
         found: Sequence[Tensor | None] = [None] * len(parameters)
@@ -129,7 +128,7 @@ class GaussNewton:
         if not bool(free.any()):
             return before
         if self._known is None or self._age >= self.every or not torch.equal(free, self._known[1]):
-            self._known = self._curvature(maps, simulated.detach(), measured, free), free
+            self._known = self._curvature(maps, pairs, free), free
             self._age = 0
         self._age += 1
         curvature = self._known[0]
@@ -139,7 +138,7 @@ class GaussNewton:
         given = self.damping
         for _ in range(_TRIES):
             self._move(start, self._solved(curvature, slope[free], self.reach[free]), free)
-            after = _value(self.loss, maps, penalty)
+            after = _value(self.objective, maps, penalty)
             if after < before + _SLACK * abs(before):
                 self.damping = max(self.damping * _EASE, _LEAST)
                 return before
@@ -196,14 +195,16 @@ class GaussNewton:
                 parameter.copy_(value + part.reshape(value.shape).to(value))
 
     def _curvature(
-        self, maps: Maps, simulated: Tensor, measured: Tensor, free: Bool[Tensor, " q"]
+        self, maps: Callable[[], Maps], pairs: Maps, free: Bool[Tensor, " q"]
     ) -> Float64[Tensor, "p p"]:
-        tangents = []
+        fixed = [(predicted.detach(), observed) for predicted, observed in pairs]
+        tangents: list[list[Tensor]] = [[] for _ in fixed]
         for index in free.nonzero()[:, 0].tolist():
             with forward_ad.dual_level(), self._along(index):
-                tangent = forward_ad.unpack_dual(maps()[0]).tangent
-            tangents.append(torch.zeros_like(simulated) if tangent is None else tangent)
-        return self.loss.curvature(simulated, measured, torch.stack(tangents))
+                found = [forward_ad.unpack_dual(predicted).tangent for predicted, _ in maps()]
+            for rows, tangent, (predicted, _) in zip(tangents, found, fixed, strict=True):
+                rows.append(torch.zeros_like(predicted) if tangent is None else tangent)
+        return self.objective.curvature(fixed, [torch.stack(rows) for rows in tangents])
 
     @contextmanager
     def _along(self, index: int) -> Iterator[None]:
@@ -228,12 +229,12 @@ class GaussNewton:
 
 
 def _value(
-    loss: Callable[[Tensor, Tensor], Tensor], maps: Maps, penalty: Callable[[], Tensor] | None
+    objective: Objective, maps: Callable[[], Maps], penalty: Callable[[], Tensor] | None
 ) -> float:
     """The loss with its term; infinite for parameters that the scene refuses."""
     with torch.no_grad():
         try:
-            return float(loss(*maps())) + (0.0 if penalty is None else float(penalty()))
+            return float(objective(maps())) + (0.0 if penalty is None else float(penalty()))
         except InputError:
             return math.inf
 
@@ -242,8 +243,8 @@ def without_effect(module: nn.Module, name: str) -> InputError:
     """What is wrong with a parameter that the loss does not depend on."""
     return InputError(
         f"expected parameters that change the map, got {name} of {type(module).__name__}, which "
-        "does not: a later one replaces what it shapes; give one shape of each object, or another "
-        "order"
+        "has no gradient; probably a later module overwrites this mesh: give one shape of each "
+        "object, or another order"
     )
 
 

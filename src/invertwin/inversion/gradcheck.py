@@ -1,83 +1,43 @@
 """Is the gradient right? Automatic derivatives of a whole map against central differences."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
-from torch import Tensor
+from torch import Tensor, nn
 
-from invertwin.channel import Grid, deposit_power
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate
-from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import rigid, rotation_from_vector
+from invertwin.inversion.lines import line_of
+from invertwin.models import ForwardModel
 from invertwin.scene.scene import Scene
+from invertwin.seeds import derived_seed
 
-KINDS = ("translation", "rotation", "scale", "material", "radar_translation", "radar_rotation")
 _LEAST_PAIRS = 4
 
 
 @dataclass(frozen=True)
-class Direction:
-    """One scalar θ that moves a scene or a radar away from θ = 0.
+class Check:
+    """How sharp a gradient check is.
 
     Attributes:
-        kind: ``translation`` [m], ``rotation`` [rad, about the object's centre], ``scale``
-            [relative], ``material`` [unit of the value], ``radar_translation`` [m] or
-            ``radar_rotation`` [rad].
-        object: The object it moves (none for the radar's).
-        axis: Unit direction of a translation, or axis of a rotation.
-        value: Name of the material value.
+        repeats: Derivatives averaged, with different seeds.
+        step: ε of the differences; ε/2 is evaluated too, and 4ε and 8ε for the order.
+        difference_samples: Samples of one end of a pair.
+        noise: Pairs are added until the relative standard error (L1) is below.
+        max_pairs: Most pairs; the report says what was reached.
+        scheme: How the differences sample surfaces: "rays" from the antenna, or by "area".
     """
 
-    kind: str
-    object: str = ""
-    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    value: str = ""
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InputError(
-                f"expected a parameter kind among {', '.join(KINDS)}, got {self.kind!r}; "
-                "gradcheck differentiates with respect to one of these"
-            )
-
-    def __call__(self, scene: Scene, radar: Radar, theta: Tensor) -> tuple[Scene, Radar]:
-        """The scene and the radar at θ."""
-        axis = torch.tensor(self.axis, dtype=torch.float64)
-        axis = axis / axis.norm()
-        if self.kind == "radar_translation":
-            return scene, radar.moved(torch.eye(3, dtype=torch.float64), axis * theta)
-        if self.kind == "radar_rotation":
-            return scene, radar.moved(rotation_from_vector(axis * theta), axis * 0)
-        item = scene[self.object]
-        if self.kind == "material":
-            material: Any = item.material
-            if self.value not in vars(material):
-                raise InputError(
-                    f"expected a value of {self.object}'s material ({', '.join(vars(material))}), "
-                    f"got {self.value!r}; choose one"
-                )
-            moved = replace(material, **{self.value: getattr(material, self.value) + theta})
-            return scene.replace(self.object, material=moved), radar
-        if self.kind == "scale":
-            # About the centre of the bounding box, in the object's own frame.
-            vertices = item.mesh.vertices
-            centre = item.mesh.center.detach()
-            mesh = Mesh(centre + (vertices - centre) * (1 + theta), item.mesh.faces)
-            return scene.replace(self.object, mesh=mesh), radar
-        pose = item.transform
-        if self.kind == "translation":
-            shift = rigid(translation=axis * theta)
-        else:
-            turn, centre = rotation_from_vector(axis * theta), item.center.detach()
-            shift = rigid(turn, centre - turn @ centre)
-        return scene.replace(self.object, pose=shift @ pose), radar
+    repeats: int = 4
+    step: float = 4e-3
+    difference_samples: int = 8_000_000
+    noise: float = 0.007
+    max_pairs: int = 64
+    scheme: Literal["rays", "area"] = "rays"
 
 
 @dataclass(frozen=True)
@@ -103,7 +63,8 @@ class GradientReport:
     """The outcome of :func:`gradcheck`.
 
     Attributes:
-        full, interior: Agreement with and without boundary paths.
+        full: Agreement with boundary paths.
+        interior: Agreement without them; the same where the model has none.
         no_interior_edges: With boundary paths, but without those of the shadows that surfaces
             cast on each other; None for paths of one bounce, which have none.
         difference_noise: ‖standard error‖₁ / ‖g_FD‖₁.
@@ -118,130 +79,101 @@ class GradientReport:
     difference_noise: float
     step_agreement: float
     pairs: int
-    value: Float64[Tensor, "frame range u v"]
-    gradient: Float64[Tensor, "frame range u v"]
-    interior_gradient: Float64[Tensor, "frame range u v"]
-    difference: Float64[Tensor, "frame range u v"]
+    value: Float64[Tensor, "frame *map"]
+    gradient: Float64[Tensor, "frame *map"]
+    interior_gradient: Float64[Tensor, "frame *map"]
+    difference: Float64[Tensor, "frame *map"]
 
 
 def gradcheck(
-    scene: Scene,
-    radar: Radar,
-    grid: Grid,
-    direction: Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]],
+    model: ForwardModel,
+    module: nn.Module,
+    tangent: Mapping[str, Tensor] | Tensor,
     *,
-    surrogate: Surrogate,
-    depth: int = 3,
-    samples: int = 4_000_000,
-    boundary_samples: int = 1_000_000,
-    repeats: int = 4,
-    step: float = 4e-3,
-    difference_samples: int = 8_000_000,
-    noise: float = 0.007,
-    max_pairs: int = 64,
-    sampling: Literal["rays", "area"] = "rays",
+    scene: Scene,
+    sensor: Any,
+    of: Literal["scene", "sensor"] = "scene",
+    check: Check | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> GradientReport:
-    """Compare the derivative of a power map with central differences that have converged.
+    """Compare the derivative of a map with central differences that have converged.
 
-    The differences use common random numbers: both ends of a pair draw the same numbers from a
-    density fixed at θ = 0, and every pair is scrambled anew. Pairs are added until the standard
-    error of their mean is below ``noise``.
+    The parameters of the module move along the tangent: p + θ · tangent. The differences use
+    common random numbers: both ends of a pair draw the same numbers from a density fixed at
+    θ = 0, and every pair draws others. Pairs are added until the standard error of their mean is
+    small enough.
 
     Args:
-        scene: The scene at θ = 0.
-        radar: Its radar.
-        grid: Bins of the map.
-        direction: θ → scene and radar, e.g. :class:`Direction`.
-        surrogate: Point spread of the map.
-        depth: Most bounces of a path.
-        samples: Interior samples of one derivative.
-        boundary_samples: Silhouette samples of one derivative.
-        repeats: Derivatives averaged, with different seeds.
-        step: ε of the differences; ε/2 is evaluated too, 4ε and 8ε for the order.
-        difference_samples: Samples of one end of a pair.
-        noise: Stop when the relative standard error (L1) is below.
-        max_pairs: Stop here in any case; the report says what was reached.
-        sampling: Sampler of the differences.
-        seed: Of everything.
+        model: What predicts the map; its ``sampling`` is that of one derivative.
+        module: A module that could be fitted; θ = 0 is the module as it is.
+        tangent: Changes of its parameters by name, or of its only parameter.
+        scene: What the module is applied to, or sees.
+        sensor: What sees the scene.
+        of: Whether the module maps the scene or the sensor.
+        check: How sharp the check is.
+        seed: Of all random numbers.
         progress: Called with one line now and then.
 
     Raises:
-        InputError: The map does not depend on θ (all differences are zero).
+        InputError: A tangent that does not fit the module, a model whose derivatives have no
+            mean, or a map that does not depend on θ (all differences are zero).
     """
-
-    def map_at(theta: Tensor, count: int, edges: int, key: int, **options: object) -> Tensor:
-        moved, seen = direction(scene, radar, theta)
-        deposit = deposit_power(
-            moved,
-            seen.link(),
-            grid,
-            samples=count,
-            boundary_samples=edges,
-            seed=key,
-            depth=depth,
-            **options,  # type: ignore[arg-type]
+    check = check or Check()
+    if not getattr(model, "smooth", True):
+        raise InputError(
+            f"expected a smooth model such as SurrogateMap, got {type(model).__name__}: "
+            "silhouettes of single rough points have no derivative"
         )
-        return surrogate.shape(deposit.double(), seen, grid)
+    target = scene if of == "scene" else sensor
+    line = line_of(module, tangent, target)
 
-    def derivative(boundary: bool, interior_edges: bool = True) -> tuple[Tensor, Tensor]:
+    def seen(moved: Any) -> tuple[Scene, Any]:
+        return (moved, sensor) if of == "scene" else (scene, moved)
+
+    with torch.no_grad():
+        middle = seen(line.at(torch.zeros((), dtype=torch.float64)))
+    paired = model.for_differences(*middle, check.difference_samples, check.scheme)
+
+    def derivative(chosen: ForwardModel) -> tuple[Tensor, Tensor]:
         primals, tangents = [], []
-        for k in range(repeats):
+        for number in range(check.repeats):
             with forward_ad.dual_level():
-                theta = forward_ad.make_dual(
-                    torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
-                )
-                edges = boundary_samples if boundary else 0
-                out = map_at(
-                    theta, samples, edges, seed + k,
-                    boundary=boundary, interior_edges=interior_edges,
-                )  # fmt: skip
-                primal, tangent = forward_ad.unpack_dual(out)
+                zero = torch.zeros((), dtype=torch.float64)
+                theta = forward_ad.make_dual(zero, torch.ones_like(zero))
+                out = chosen.predict(*seen(line.at(theta)), derived_seed(seed, 0, number)).double()
+                primal, slope = forward_ad.unpack_dual(out)
                 primals.append(primal)
-                tangents.append(torch.zeros_like(primal) if tangent is None else tangent)
+                tangents.append(torch.zeros_like(primal) if slope is None else slope)
         return torch.stack(primals).mean(0), torch.stack(tangents).mean(0)
 
-    def difference(epsilon: float, key: int) -> Tensor:
+    def difference(epsilon: float, number: int) -> Tensor:
         ends = [
-            map_at(
-                torch.tensor(sign * epsilon, dtype=torch.float64),
-                difference_samples,
-                0,
-                key,
-                sampling=sampling,
-                reference=(scene, radar.link()),
-            )
+            paired.predict(*seen(line.end(sign * epsilon)), derived_seed(seed, 1, number)).double()
             for sign in (1.0, -1.0)
         ]
         return (ends[0] - ends[1]) / (2 * epsilon)
 
     with torch.no_grad():
-        value, gradient = derivative(boundary=True)
-        _, interior_gradient = derivative(boundary=False)
-        outer_gradient = derivative(True, interior_edges=False)[1] if depth > 1 else None
-        pairs: list[Tensor] = []
-        reached = math.inf
-        while len(pairs) < max_pairs and (len(pairs) < _LEAST_PAIRS or reached > noise):
-            pairs.append(difference(step, seed + 1_000_003 * (len(pairs) + 1)))
-            if len(pairs) >= 2:
-                reached = _noise(torch.stack(pairs))
-                if progress:
-                    progress(f"{len(pairs)} pairs, difference noise {reached:.4f}")
-        stacked = torch.stack(pairs)
-        truth = stacked.mean(0)
-        size = truth.abs().sum()
-        if not size > 0:
+        value, gradient = derivative(model)
+        sampling = getattr(model, "sampling", None)
+        interior_gradient, outer_gradient = gradient, None
+        if sampling is not None and sampling.boundary:
+            interior_gradient = derivative(model.sampled_by(boundary=False))[1]
+            if sampling.depth > 1:
+                outer_gradient = derivative(model.sampled_by(interior_edges=False))[1]
+        pairs, reached = _converged(lambda n: difference(check.step, n), check, progress)
+        truth = pairs.mean(0)
+        if not truth.abs().sum() > 0:
             raise InputError(
                 "expected a map that depends on θ, got differences that are all zero; "
                 "check the grid and what the parameter moves"
             )
-        keys = [seed + 1_000_003 * (k + 1) for k in range(_LEAST_PAIRS)]
         half, far, farther = (
-            torch.stack([difference(factor * step, key) for key in keys]).mean(0)
+            torch.stack([difference(factor * check.step, n) for n in range(_LEAST_PAIRS)]).mean(0)
             for factor in (0.5, 4.0, 8.0)
         )
-        same = stacked[:_LEAST_PAIRS].mean(0)
+        same = pairs[:_LEAST_PAIRS].mean(0)
     return GradientReport(
         full=_agreement(gradient, truth, far, farther),
         interior=_agreement(interior_gradient, truth, far, farther),
@@ -256,6 +188,21 @@ def gradcheck(
         interior_gradient=interior_gradient,
         difference=truth,
     )
+
+
+def _converged(
+    difference: Callable[[int], Tensor], check: Check, progress: Callable[[str], None] | None
+) -> tuple[Tensor, float]:
+    """Difference pairs, as many as the noise asks for, and the noise of their mean."""
+    pairs: list[Tensor] = []
+    reached = math.inf
+    while len(pairs) < check.max_pairs and (len(pairs) < _LEAST_PAIRS or reached > check.noise):
+        pairs.append(difference(len(pairs)))
+        if len(pairs) >= 2:
+            reached = _noise(torch.stack(pairs))
+            if progress:
+                progress(f"{len(pairs)} pairs, difference noise {reached:.4f}")
+    return torch.stack(pairs), reached
 
 
 def _noise(pairs: Tensor) -> float:

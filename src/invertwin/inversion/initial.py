@@ -16,7 +16,7 @@ from torch import Tensor
 
 from invertwin.capture.backprojection import backproject
 from invertwin.capture.capture import Capture
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
 from invertwin.radar.detection import ordered_statistics_cfar, peaks
 from invertwin.radar.radar import Radar
@@ -333,10 +333,8 @@ def best_pose(
                 radar,
                 grid,
                 surrogate,
-                samples=samples,
-                boundary_samples=0,
+                sampling=Sampling(depth=1, samples=samples, boundary_samples=0),
                 seed=seed,
-                depth=1,
             )
             losses.append(float(loss(simulated, measured)) if bool(simulated.any()) else math.inf)
     return scenes[losses.index(min(losses))], losses

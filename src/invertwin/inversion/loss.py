@@ -1,10 +1,11 @@
 """How far a simulated power map is from a measured one."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
@@ -13,6 +14,8 @@ from invertwin.errors import InputError
 _GAIN_STEPS = 8  # of the fixed point; from the second on the gain moves by parts in a thousand
 
 BACKGROUNDS = ("none", "level", "static")
+Maps = Sequence[tuple[Tensor, Tensor]]
+"""The predicted and the observed map of every observation."""
 
 
 @dataclass(frozen=True)
@@ -189,6 +192,97 @@ class SpectrumLoss:
         if self.background == "static":
             return power - power.mean(0, keepdim=True)
         return power
+
+
+@dataclass(frozen=True)
+class CorrelationLoss:
+    """One minus Pearson's correlation of two power maps; no gain or offset changes it.
+
+    Attributes:
+        scale: ``magnitude`` (square root of power), ``power``, or ``level`` (dB, no lower than
+            40 dB below the map's own peak).
+
+    Raises:
+        InputError: An unknown scale.
+    """
+
+    scale: Literal["magnitude", "power", "level"] = "magnitude"
+
+    def __post_init__(self) -> None:
+        if self.scale not in _SCALES:
+            raise InputError(
+                f"expected a scale of {', '.join(_SCALES)}, got {self.scale!r}; choose one"
+            )
+
+    def __call__(
+        self, simulated: Float[Tensor, "*map"], measured: Float[Tensor, "*map"]
+    ) -> Float64[Tensor, ""]:
+        """The loss: 0 for maps of one pattern, 1 for unrelated ones.
+
+        Args:
+            simulated: Power.
+            measured: Power.
+
+        Raises:
+            InputError: Maps of different shapes.
+        """
+        if simulated.shape != measured.shape:
+            raise InputError(
+                f"expected maps of one shape, got {tuple(simulated.shape)} and "
+                f"{tuple(measured.shape)}; use one grid for both"
+            )
+        rows = []
+        for power in (simulated, measured):
+            row = _SCALES[self.scale](power.to(torch.float64) / power.detach().max()).flatten()
+            row = row - row.mean()
+            rows.append(row / row.norm())
+        return 1 - rows[0] @ rows[1]
+
+
+_FLOOR = 1e-4  # of the peak: below it levels are noise
+_TINY = 1e-12  # of the peak: keeps the derivative of a magnitude finite
+_SCALES: dict[str, Callable[[Tensor], Tensor]] = {
+    "magnitude": lambda share: (share + _TINY).sqrt(),
+    "power": lambda share: share,
+    "level": lambda share: share.clamp(min=_FLOOR).log(),
+}
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The weighted mean of the losses of all observations.
+
+    Attributes:
+        losses: One per observation.
+        weights: One per observation.
+    """
+
+    losses: tuple[Callable[[Tensor, Tensor], Tensor], ...]
+    weights: tuple[float, ...]
+
+    def __call__(self, maps: Maps) -> Float[Tensor, ""]:
+        """The loss of the maps of all observations."""
+        terms = [
+            weight * loss(*pair)
+            for loss, weight, pair in zip(self.losses, self.weights, maps, strict=True)
+        ]
+        return torch.stack(terms).sum() / sum(self.weights)
+
+    def curvature(
+        self, maps: Maps, tangents: Sequence[Float[Tensor, "p *map"]]
+    ) -> Float[Tensor, "p p"]:
+        """The Gauss–Newton matrix of the mean.
+
+        Args:
+            maps: Predicted and observed maps.
+            tangents: For every observation, derivatives of its predicted map with respect to p
+                parameters.
+        """
+        total = torch.zeros((), dtype=torch.float64)
+        for loss, weight, pair, rows in zip(self.losses, self.weights, maps, tangents, strict=True):
+            assert isinstance(loss, SpectrumLoss)
+            total = total + weight * loss.curvature(*pair, rows)
+        return total / sum(self.weights)
 
 
 def _pooled(power: Tensor) -> Tensor:

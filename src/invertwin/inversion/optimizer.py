@@ -1,16 +1,16 @@
 """How a gradient becomes a step: kind and rates."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from invertwin.errors import InputError
 from invertwin.inversion.gauss_newton import GaussNewton
-from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.loss import Objective
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,6 @@ class Optimizer:
         momentum: Of SGD.
         curvature_every: Of Gauss–Newton, steps from one curvature to the next: the map's
             derivatives by every parameter cost the most of a step.
-        module_rates: Rates of the modules that are fitted, in their order; None, and modules
-            beyond the last = ``rate``, and ``rotation_rate`` for rotations.
     """
 
     kind: Literal["adam", "sgd", "gauss_newton"] = "adam"
@@ -38,7 +36,6 @@ class Optimizer:
     final_rate: float | None = None
     momentum: float = 0.9
     curvature_every: int = 1
-    module_rates: tuple[float | None, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in ("adam", "sgd", "gauss_newton") or not self.rate > 0:
@@ -49,31 +46,34 @@ class Optimizer:
             )
 
     def build(
-        self, modules: nn.Module, loss: Callable[[Tensor, Tensor], Tensor] | None = None
+        self,
+        modules: nn.Module,
+        objective: Objective,
+        rates: Mapping[nn.Parameter, float] | None = None,
     ) -> torch.optim.Optimizer | GaussNewton:
-        """The optimiser over the modules' parameters.
+        """The optimiser of the modules' parameters that require a gradient.
+
+        Args:
+            modules: What is fitted.
+            objective: How maps are compared.
+            rates: Rates of single parameters, in place of this optimiser's.
 
         Raises:
             InputError: Gauss–Newton without a ``SpectrumLoss``, or for many parameters.
         """
-        rates: dict[nn.Parameter, float] = {}
-        for i, module in enumerate(modules.children()):
-            own = self.module_rates[i] if i < len(self.module_rates) else None
-            for name, parameter in module.named_parameters():
-                if parameter.requires_grad:
-                    turns = name.endswith("rotation") and self.rotation_rate is not None
-                    rates[parameter] = own or (self.rotation_rate if turns else self.rate)  # type: ignore[assignment]
-        if self.kind == "gauss_newton":
-            if not isinstance(loss, SpectrumLoss):
-                raise InputError(
-                    f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
-                    "give one, or another kind of optimiser"
+        found: dict[nn.Parameter, float] = {}
+        for name, parameter in modules.named_parameters():
+            if parameter.requires_grad:
+                turns = name.endswith("rotation") and self.rotation_rate is not None
+                found[parameter] = (rates or {}).get(
+                    parameter, self.rotation_rate if turns and self.rotation_rate else self.rate
                 )
+        if self.kind == "gauss_newton":
             return GaussNewton(
-                modules, loss, reach=self.rate, reaches=rates, every=self.curvature_every
+                modules, objective, reach=self.rate, reaches=found, every=self.curvature_every
             )
         groups: dict[float, list[nn.Parameter]] = {}
-        for parameter, rate in rates.items():
+        for parameter, rate in found.items():
             groups.setdefault(rate / self.rate, []).append(parameter)
         listed = [{"params": group, "ratio": ratio} for ratio, group in groups.items()]
         if self.kind == "adam":

@@ -1,43 +1,21 @@
-"""The loop: simulate, compare, step, until the twin answers as the real scene did."""
+"""Find the parameters of a scene that explain what one or several sensors have observed."""
 
-import math
-import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
-from invertwin.capture.capture import Capture
-from invertwin.channel import (
-    Grid,
-    RoughChains,
-    RoughPoints,
-    rough_chains,
-    rough_points,
-    use_backend,
-)
 from invertwin.errors import InputError
-from invertwin.inversion.gauss_newton import GaussNewton, without_effect
+from invertwin.inversion.fit import Callback, Fit, Settings, Status
 from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.observation import Observation, Unknown, Unknowns, named_unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
-from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
+from invertwin.inversion.schedule import Schedule, Stage, checked_stages
+from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene
-from invertwin.simulation import simulate
-
-Status = Literal["converged", "budget", "diverged"]
-
-_CHAINS = 200_000  # of each length, where the exact chain is fitted
-_DIVERGED = 1e3  # times the first loss
-_WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
-_WINDOW = 20  # steps over which convergence is judged
 
 
 @dataclass(frozen=True)
@@ -46,18 +24,17 @@ class Reconstruction:
 
     Attributes:
         scene: The twin.
-        radar: The radar with the poses of the fit.
-        parameters: The fitted modules.
-        history: One row a step: ``step``, ``loss``, ``values`` (parameters by name).
+        sensors: The sensors of all observations with what was fitted of them.
+        parameters: The fitted modules: those of the scene, then those of the sensors.
+        history: One row a step: ``step``, ``stage``, ``loss``, ``values`` (parameters by name).
         status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
             ``diverged`` (not finite, or worse than the start; then the best state is kept).
         steps: Steps done.
-        loss: Of the state returned, at the widths of the last step; of the best state of a fit
-            that has diverged, without extra widths.
+        loss: Final loss; if the fit diverged, that of the best state, without extra widths.
     """
 
     scene: Scene
-    radar: Radar
+    sensors: list[Any]
     parameters: nn.ModuleList
     history: list[dict[str, Any]]
     status: Status
@@ -67,462 +44,130 @@ class Reconstruction:
 
 def reconstruct(
     scene: Scene,
-    radar: Radar,
-    capture: Capture,
-    parameters: nn.Module | Sequence[nn.Module],
+    observations: Observation | Sequence[Observation],
+    parameters: Unknowns,
     *,
-    grid: Grid,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
     optimizer: Optimizer | None = None,
-    surrogate: Surrogate | str | None = "annealed",
-    steps: int = 200,
-    annealing: float = 0.7,
-    seed: int = 0,
-    depth: int = 3,
-    samples: int = 400_000,
-    boundary_samples: int = 50_000,
-    boundary: bool = True,
-    density: float = 20_000.0,
-    points: RoughPoints | None = None,
-    frames_per_step: int | None = None,
-    nuisances: Sequence[nn.Module] = (),
+    schedule: Schedule | Sequence[Schedule] | None = None,
     regularizers: Sequence[Regularizer] = (),
-    tolerance: float = 0.0,
-    checkpoint: str | Path | None = None,
-    checkpoint_every: int = 10,
-    resume: bool = False,
-    backend: str | None = None,
-    watch: Callable[[Scene], dict[str, float]] | None = None,
-    watch_every: int = 10,
-    progress: Callable[[dict[str, Any]], None] | None = None,
+    callbacks: Sequence[Callback] = (),
+    seed: int = 0,
 ) -> Reconstruction:
-    """Find the parameters of a scene whose simulated spectrum equals a measured one.
+    """Find the parameters of a scene whose predicted maps equal the observed ones.
 
-    Every step draws new samples, deposits power paths, shapes them with the surrogate, and
-    follows the gradient of the loss, silhouettes included. Surrogate and data are blurred by the
-    same extra widths, which fall to zero over the first ``annealing`` of the steps.
+    In every step the models predict maps of the scene as the parameters have it, the loss compares
+    them with the observed maps, and the optimiser follows its gradient, silhouettes included.
+    Extra widths of the models blur both maps; they fall to zero over the first part of a stage.
 
     Args:
         scene: Starting scene.
-        radar: The radar of the capture.
-        capture: Measured data.
-        parameters: One or more modules Scene → Scene or Radar → Radar, applied in order
-            (``scene.parameters``).
-        grid: Bins that are compared.
-        loss: How maps are compared: (simulated, measured) → a number.
+        observations: What was observed, by one or several sensors.
+        parameters: Modules Scene → Scene, applied in order; an :class:`Unknown` has a rate and
+            regularisers of its own. By name, so that stages can call them.
+        loss: How maps are compared: (predicted, observed) → a number. None = ``SpectrumLoss()``.
         optimizer: Kind and rates.
-        surrogate: Kernels, and the extra widths at the first step; or a name among
-            ``SURROGATES``. None, "exact" = the exact chain, whose loss has a minimum every half
-            wavelength and whose rough surfaces need ``boundary=False``: for comparison.
-        steps: Budget.
-        annealing: Share of the steps with extra widths.
-        seed: Of all samples; the same seed gives the same fit.
-        depth: Most bounces of a path.
-        samples: Interior samples a step, over the frames of the step.
-        boundary_samples: Silhouette samples a step.
-        boundary: Off for ablation.
-        density: Points per m² of rough surfaces (exact).
-        points: Rough points with their phases, which a twin does not know; None = drawn (exact).
-        frames_per_step: Random subset of frames a step (None = all).
-        nuisances: ``RangeBias``, ``ClockOffset``.
-        regularizers: Added to the loss, functions of the scene.
-        tolerance: Once the widths are zero, stop when the loss has fallen by less than this
-            share over 20 steps (0 = use the whole budget).
-        checkpoint: File that is written atomically every ``checkpoint_every`` steps.
-        checkpoint_every: [steps].
-        resume: Go on from ``checkpoint`` if it is there.
-        backend: See ``deposit_power``.
-        watch: Numbers about the twin, such as its distance from a known truth, which join the
-            row of every ``watch_every``-th step; they do not change the fit.
-        watch_every: [steps].
-        progress: Called with every row of the history.
+        schedule: A ``Schedule``, or stages that follow each other.
+        regularizers: Functions Scene → number, added to the loss.
+        callbacks: What watches the fit: ``Report``, ``Watch``, ``Checkpoint``.
+        seed: Of all random numbers; the same seed gives the same fit.
 
     Source: §4.2 of the paper.
-    Differs from the source: Adam and Gauss–Newton beside SGD; annealed widths.
+    Differs from the source: Adam and Gauss–Newton beside SGD; annealed widths; several sensors.
 
     Raises:
-        InputError: Nothing to fit, a map of zeros, a checkpoint of another fit; a range bias
-            with the exact chain.
+        InputError: Nothing to fit, a map of zeros, an unknown name in a stage, a checkpoint of
+            another fit.
     """
-    smooth = chosen_surrogate(surrogate)
-    if smooth is None and points is None:
-        points = rough_points(scene, density, seed)
-    chains = None
-    if smooth is None and depth > 1:
-        chains = rough_chains(scene, radar.link(), count=_CHAINS, depth=depth, seed=seed)
-    rates = optimizer or Optimizer()
-    listed = [parameters] if isinstance(parameters, nn.Module) else list(parameters)
-    fit = _Fit(
-        scene=scene,
-        radar=radar,
-        modules=nn.ModuleList([*listed, *nuisances]),
-        measured=capture.spectrum(grid).to(torch.float32),
-        grid=grid,
-        loss=loss or SpectrumLoss(),
-        optimizer=rates,
-        surrogate=smooth,
-        points=points,
-        chains=chains,
-        annealing=annealing,
-        seed=seed,
-        depth=depth,
-        samples=samples,
-        boundary_samples=boundary_samples,
-        boundary=boundary,
-        frames_per_step=frames_per_step,
-        regularizers=tuple(regularizers),
-        steps=steps,
-        watch=watch,
-        watch_every=watch_every,
-    )
-    sought = [p for p in fit.modules.parameters() if p.requires_grad]
-    if not sought or steps < 1:
-        raise InputError(
-            f"expected parameters to fit and steps >= 1, got {len(sought)} and {steps}; "
-            "give modules such as Pose('object')"
-        )
-    if smooth is None and rates.kind == "gauss_newton":
-        raise InputError(
-            "expected a surrogate with kind 'gauss_newton', got the exact chain; use 'adam'"
-        )
-    state = _State(rates.build(fit.modules, fit.loss), fit.parameters())
-    path = Path(checkpoint) if checkpoint is not None else None
-    if resume and path is not None and path.exists():
-        state.load(path, fit)
-    if state.ended is None:
-        with use_backend(backend):
-            status = _descend(fit, state, rates, tolerance, path, checkpoint_every, progress)
-            state.ended = _judged(fit, state, status)
-        if path is not None:
-            state.save(path, fit)
-    status = state.ended
-    with torch.no_grad():
-        moved, seen, _ = fit.applied()
-    loss_then = state.history[-1]["loss"]
-    if status == "diverged" and state.best is not None:
-        loss_then = state.best[1]
-    return Reconstruction(moved, seen, fit.modules, state.history, status, state.step, loss_then)
-
-
-@dataclass
-class _State:
-    """What a checkpoint holds besides the parameters."""
-
-    optimizer: torch.optim.Optimizer | GaussNewton
-    first: dict[str, Tensor]
-    step: int = 0
-    history: list[dict[str, Any]] = field(default_factory=list)
-    best: tuple[int, float, dict[str, Tensor]] | None = None
-    ended: Status | None = None
-
-    def keep_if_better(self, loss: float, fit: "_Fit", parameters: dict[str, Tensor]) -> None:
-        """Remember the parameters of the lowest loss; without extra widths beats with."""
-        if self.best is not None:
-            first = fit.annealed(self.step) and not fit.annealed(self.best[0])
-            if not first and loss >= self.best[1]:
-                return
-        self.best = (self.step, loss, parameters)
-
-    def save(self, path: Path, fit: "_Fit") -> None:
-        """Write atomically: a kill leaves the last whole file."""
-        part = path.with_suffix(path.suffix + ".part")
-        content = {
-            "modules": fit.modules.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "first": self.first,
-            "step": self.step,
-            "history": self.history,
-            "best": self.best,
-            "ended": self.ended,
-            "key": fit.key(),
-        }
-        torch.save(content, part)
-        os.replace(part, path)
-
-    def load(self, path: Path, fit: "_Fit") -> None:
-        """Restore from a file of the same fit."""
-        try:
-            content = torch.load(path, weights_only=True)
-        except Exception as error:
-            raise InputError(
-                f"expected a checkpoint in {path}, got a file that cannot be read "
-                f"({type(error).__name__}); delete it or start without resume"
-            ) from None
-        if not isinstance(content, dict) or not _same(content.get("key"), fit.key()):
-            raise InputError(
-                f"expected a checkpoint of this fit in {path}, got one of another (steps, seed, "
-                "grid, loss, optimizer, surrogate, parameters, start or data differ); start "
-                "without resume"
-            )
-        fit.modules.load_state_dict(content["modules"])
-        self.optimizer.load_state_dict(content["optimizer"])
-        self.first, self.best = content["first"], content["best"]
-        self.step, self.history = content["step"], content["history"]
-        self.ended = content["ended"]
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """The forward model and the loss of one step; pure in (parameters, step)."""
-
-    scene: Scene
-    radar: Radar
-    modules: nn.ModuleList
-    measured: Float[Tensor, "frame range u v"]
-    grid: Grid
-    loss: Callable[[Tensor, Tensor], Tensor]
-    optimizer: Optimizer
-    surrogate: Surrogate | None
-    points: RoughPoints | None
-    chains: RoughChains | None
-    annealing: float
-    seed: int
-    depth: int
-    samples: int
-    boundary_samples: int
-    boundary: bool
-    frames_per_step: int | None
-    regularizers: tuple[Regularizer, ...]
-    steps: int
-    watch: Callable[[Scene], dict[str, float]] | None
-    watch_every: int
-
-    def key(self) -> list[Any]:
-        """What must be equal for a checkpoint to be of this fit."""
-        shapes = [[n, list(p.shape)] for n, p in self.modules.named_parameters()]
-        settings = [self.annealing, self.samples, self.boundary_samples, self.frames_per_step]
-        settings += [self.depth, str(self.loss), str(self.surrogate), str(self.optimizer)]
-        sizes = [float(self.measured.double().norm())]
-        sizes += [float(item.vertices.detach().norm()) for item in self.scene.objects.values()]
-        return [
-            self.steps,
-            self.seed,
-            list(self.grid.shape),
-            self.boundary,
-            settings,
-            shapes,
-            sizes,
-        ]
-
-    def applied(self) -> tuple[Scene, Radar, Tensor | None]:
-        """Scene, radar and range offset under the present parameters."""
-        scene, radar, offset = self.scene, self.radar, None
-        for module in self.modules:
-            kind = getattr(module, "applies_to", "scene")
-            if kind in ("scene", "both"):
-                scene = module(scene)
-            if kind in ("radar", "both"):
-                radar = module(radar)
-            if kind == "range":
-                offset = module()
-        return scene, radar, offset
-
-    def watched(self, step: int) -> dict[str, float]:
-        """What is watched of the twin after so many steps."""
-        if self.watch is None or step % self.watch_every:
-            return {}
-        try:
-            with torch.no_grad():
-                return self.watch(self.applied()[0])
-        except InputError:  # parameters out of bounds, as the next step will find
-            return {}
-
-    def parameters(self) -> dict[str, Tensor]:
-        """A copy of the present parameters."""
-        return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
-
-    def widths(self, step: int) -> Surrogate | None:
-        """The surrogate with the extra widths of a step; None for the exact chain."""
-        if self.surrogate is None:
-            return None
-        left = max(0.0, 1 - step / self.widths_end)
-        return replace(
-            self.surrogate,
-            range_width=self.surrogate.range_width * left,
-            angle_width=self.surrogate.angle_width * left,
-        )
-
-    @property
-    def widths_end(self) -> float:
-        """The step from which there are no extra widths: the last one at the latest."""
-        return max(1.0, min(self.annealing * self.steps, self.steps - 1))
-
-    def annealed(self, step: int) -> bool:
-        """Whether the extra widths are zero from this step on."""
-        return self.surrogate is None or step >= self.widths_end
-
-    def maps(self, step: int) -> tuple[Tensor, Tensor]:
-        """Simulated and measured map of a step, blurred alike."""
-        scene, radar, offset = self.applied()
-        measured, kernels = self.measured, self.widths(step)
-        if self.frames_per_step is not None and self.frames_per_step < radar.frame_count:
-            rng = np.random.default_rng([self.seed, step])
-            chosen = np.sort(rng.choice(radar.frame_count, self.frames_per_step, replace=False))
-            radar, measured = radar.frames(chosen.tolist()), measured[torch.from_numpy(chosen)]
-        if kernels is None:
-            return self._exact(scene, radar, offset), measured
-        simulated = surrogate_spectrum(
-            scene,
-            radar,
-            self.grid,
-            kernels,
-            samples=self.samples,
-            boundary_samples=self.boundary_samples,
-            seed=self.seed * 1_000_003 + step,
-            depth=self.depth,
-            boundary=self.boundary,
-            range_offset=offset,
-        )
-        return simulated, kernels.blur(measured, radar, self.grid)
-
-    def penalty(self) -> Tensor:
-        """What the regularisers add to the loss."""
-        scene, total = self.applied()[0], torch.zeros((), dtype=torch.float64)
-        for term in self.regularizers:
-            total = total + term(scene)
-        return total
-
-    def evaluate(self, step: int) -> Tensor:
-        """The loss of a step."""
-        value = self.loss(*self.maps(step))
-        return value + self.penalty() if self.regularizers else value
-
-    def _exact(self, scene: Scene, radar: Radar, offset: Tensor | None) -> Tensor:
-        """The exact chain's map; the same samples and phases every step."""
-        if offset is not None:
-            raise InputError(
-                "expected no range bias with the exact chain, got one; fit it with a surrogate"
-            )
-        found = simulate(
-            scene,
-            radar,
-            self.grid,
-            seed=self.seed,
-            depth=self.depth,
-            samples=self.samples,
-            boundary_samples=self.boundary_samples,
-            boundary=self.boundary,
-            points=self.points,
-            chains=self.chains,
-        )
-        return found.spectrum.to(torch.float32)
-
-
-def _descend(
-    fit: _Fit,
-    state: _State,
-    rates: Optimizer,
-    tolerance: float,
-    checkpoint: Path | None,
-    every: int,
-    progress: Callable[[dict[str, Any]], None] | None,
-) -> Status:
-    while state.step < fit.steps:
-        rates.apply(state.optimizer, state.step / fit.steps)
-        before = fit.parameters()
-        try:
-            number = _stepped(fit, state)
-        except InputError:
-            if state.best is None:  # not lost on the way, but wrong from the start
-                raise
-            number = math.nan
-        if _lost(number, state.history):
-            if state.best is None:
+    watched = [observations] if isinstance(observations, Observation) else list(observations)
+    if not watched:
+        raise InputError("expected at least one observation, got none; give Observation(...)")
+    unknowns = named_unknowns(parameters)
+    own = [named_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(watched)]
+    names = [*unknowns, *(name for found in own for name in found)]
+    settings = Settings(loss or SpectrumLoss(), optimizer or Optimizer(), tuple(regularizers), seed)
+    stages = checked_stages(schedule, names)
+    sensor_modules = [
+        {name: item.made(o.sensor) for name, item in found.items()}
+        for o, found in zip(watched, own, strict=True)
+    ]
+    begun, sought, fit = scene, unknowns, None
+    history: list[dict[str, Any]] = []
+    modules, terms = _made(begun, sought)
+    free = _Free([modules, *sensor_modules])
+    for number, stage in enumerate(stages):
+        if fit is not None and stage.renews:
+            # What was a cloud goes on as a mesh.
+            begun = without_clouds(fit.twin())
+            for name, change in stage.remesh.items():
+                begun = begun.replace(name, mesh=change(begun[name].mesh))
+            sought = {
+                n: u for n, u in unknowns.items() if not stage.unknowns or n in stage.unknowns
+            }
+            fixed = [n for n, u in sought.items() if isinstance(u.module, nn.Module)]
+            if fixed:
                 raise InputError(
-                    f"expected a finite loss at the start, got {number}; check the capture and "
-                    "the initial parameters"
+                    f"expected functions that make the modules of a stage that rebuilds, got a "
+                    f"module for {fixed[0]!r}; give Unknown(lambda scene: ...)"
                 )
-            fit.modules.load_state_dict(state.best[2])
-            return "diverged"
-        state.keep_if_better(number, fit, before)
-        row = {"step": state.step, "loss": number, "values": _values(fit.modules)}
-        state.step += 1
-        state.history.append(row | fit.watched(state.step))
-        if progress:
-            progress(state.history[-1])
-        if checkpoint is not None and state.step % every == 0:
-            state.save(checkpoint, fit)
-        if tolerance > 0 and _settled(fit, state, tolerance):
-            return "converged"
-    return "converged" if _settled(fit, state, max(tolerance, 1e-3)) else "budget"
-
-
-def _stepped(fit: _Fit, state: _State) -> float:
-    """The loss of the present parameters, which then take a step down."""
-    if isinstance(state.optimizer, GaussNewton):
-        maps = partial(fit.maps, state.step)
-        return state.optimizer.step(maps, fit.penalty if fit.regularizers else None)
-    state.optimizer.zero_grad()
-    value = fit.evaluate(state.step)
-    number = float(value.detach())
-    if not _lost(number, state.history):
-        if value.requires_grad:
-            value.backward()
-        _require_all_used(fit.modules)
-        state.optimizer.step()
-    return number
-
-
-def _require_all_used(modules: nn.ModuleList) -> None:
-    for module in modules:
-        for name, parameter in module.named_parameters():
-            if parameter.requires_grad and parameter.grad is None:
-                raise without_effect(module, name)
-
-
-def _judged(fit: _Fit, state: _State, status: Status) -> Status:
-    """The status, or ``diverged`` for a fit that ends worse than it started; the best is kept."""
-    if state.best is None:
-        return status
-    ends = {"first": state.first, "best": state.best[2]}
-    if status != "diverged":
-        ends["last"] = fit.parameters()
-    losses = {}
+            modules, terms = _made(begun, sought)
+            free = _Free([modules, *sensor_modules])
+        free.apply(stage)
+        fit = Fit(
+            begun,
+            [o if stage.change is None else stage.change(o) for o in watched],
+            list(modules.values()),
+            [list(named.values()) for named in sensor_modules],
+            stage=stage,
+            settings=replace(settings, regularizers=(*settings.regularizers, *terms)),
+            rates=free.rates({**unknowns, **{n: u for named in own for n, u in named.items()}}),
+            position=(number, len(history), number == len(stages) - 1),
+        )
+        status = fit.run(callbacks)
+        history += fit.progress.history
+    assert fit is not None
     with torch.no_grad():
-        for name, parameters in ends.items():
-            fit.modules.load_state_dict(parameters)
-            try:
-                losses[name] = float(fit.evaluate(fit.steps))
-            except InputError:  # out of bounds
-                losses[name] = math.inf
-    last = losses.get("last", math.inf)
-    if math.isfinite(last) and last <= _WORSE * losses["first"]:
-        fit.modules.load_state_dict(ends["last"])
-        return status
-    kept = min(("first", "best"), key=lambda name: losses[name])
-    fit.modules.load_state_dict(ends[kept])
-    state.best = (state.step, losses[kept], ends[kept])
-    return "diverged"
+        twin, sensors = fit.applied()
+    final = history[-1]["loss"]
+    if status == "diverged" and fit.progress.best is not None:
+        final = fit.progress.best[1]
+    return Reconstruction(twin, sensors, fit.modules, history, status, len(history), final)
 
 
-def _same(kept: Any, own: list[Any]) -> bool:
-    """Whether two keys of fits are one, but for the rounding of the sizes."""
-    return (
-        isinstance(kept, list)
-        and kept[:-1] == own[:-1]
-        and len(kept[-1]) == len(own[-1])
-        and all(math.isclose(a, b, rel_tol=1e-3) for a, b in zip(kept[-1], own[-1], strict=True))
-    )
+def _made(scene: Scene, unknowns: Mapping[str, Unknown]) -> tuple[dict[str, nn.Module], list[Any]]:
+    """Modules by name, each for the scene as those before it leave it, and their regularisers."""
+    modules: dict[str, nn.Module] = {}
+    terms: list[Regularizer] = []
+    for name, unknown in unknowns.items():
+        modules[name] = unknown.made(scene)
+        if unknown.regularize is not None:
+            terms += unknown.regularize(modules[name], scene)
+        with torch.no_grad():
+            scene = modules[name](scene)
+    return modules, terms
 
 
-def _lost(loss: float, history: list[dict[str, Any]]) -> bool:
-    return not math.isfinite(loss) or bool(history and loss > _DIVERGED * history[0]["loss"])
+class _Free:
+    """Which parameters are free: those that were so at first, of the unknowns of a stage."""
 
+    def __init__(self, groups: Sequence[Mapping[str, nn.Module]]) -> None:
+        self._modules = {name: module for group in groups for name, module in group.items()}
+        self._first = {
+            p: p.requires_grad for module in self._modules.values() for p in module.parameters()
+        }
 
-def _settled(fit: _Fit, state: _State, tolerance: float) -> bool:
-    """Whether the loss, averaged over two windows without extra widths, no longer falls."""
-    rows = [row["loss"] for row in state.history[-2 * _WINDOW :]]
-    if len(rows) < 2 * _WINDOW or not fit.annealed(state.step - 2 * _WINDOW):
-        return False
-    before, after = np.mean(rows[:_WINDOW]), np.mean(rows[_WINDOW:])
-    return bool(before - after < tolerance * before)
+    def apply(self, stage: Stage) -> None:
+        """Free the unknowns of a stage, and hold the others."""
+        for name, module in self._modules.items():
+            for parameter in module.parameters():
+                wanted = not stage.unknowns or name in stage.unknowns
+                parameter.requires_grad_(self._first[parameter] and wanted)
 
-
-def _values(modules: nn.ModuleList) -> dict[str, Any]:
-    """Parameters by name as plain numbers; long ones (vertices) are left to the checkpoint."""
-    rows: dict[str, Any] = {}
-    for module in modules:
-        for name, value in getattr(module, "values", dict)().items():
-            if value.numel() <= 16:
-                rows[name] = value.tolist()
-    return rows
+    def rates(self, unknowns: Mapping[str, Unknown]) -> dict[nn.Parameter, float]:
+        """Learning rates of single parameters."""
+        found = {}
+        for name, module in self._modules.items():
+            rate = unknowns[name].rate
+            if rate is not None:
+                found |= dict.fromkeys(module.parameters(), rate)
+        return found

@@ -13,8 +13,7 @@ from scipy.special import gammaincc, gammaincinv
 from scipy.stats import beta, f
 from torch import Tensor
 
-from invertwin.channel import Grid
-from invertwin.channel.bridge import differentiated
+from invertwin.channel import Grid, differentiated
 from invertwin.errors import InputError
 from invertwin.radar.doppler import velocity_axis, velocity_span
 from invertwin.radar.motion import Chirps

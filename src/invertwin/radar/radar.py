@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link
+from invertwin.channel import Grid, Link, differentiated
 from invertwin.errors import InputError
 from invertwin.radar.waveform import (
     WINDOWS,
@@ -44,6 +44,8 @@ class Radar:
         array_window: Taper of the virtual array along x and along y.
         shared_visibility: One visibility test for both antennas; None = when the phase centres
             are at most 0.1 m apart.
+        range_bias: Moves everything that the surrogate shows to larger ranges [m]; may carry a
+            gradient. Exact signals refuse it.
 
     Raises:
         InputError: Wrong shapes, values that are not finite, matrices that are not rotations,
@@ -58,6 +60,7 @@ class Radar:
     window: str = "hamming"
     array_window: str = "hamming"
     shared_visibility: bool | None = None
+    range_bias: float | Float64[Tensor, ""] = 0.0
 
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per pose"
@@ -112,6 +115,14 @@ class Radar:
     def elements(self) -> tuple[Float64[Tensor, "frame tx 3"], Float64[Tensor, "frame rx 3"]]:
         """World positions of all TX and RX elements [m]."""
         return self._world(self.transmitters.positions), self._world(self.receivers.positions)
+
+    @property
+    def biased(self) -> bool:
+        """Whether ranges have a bias, or a derivative with respect to one."""
+        bias = self.range_bias
+        if isinstance(bias, Tensor):
+            return differentiated(bias) or bool(bias)
+        return bias != 0
 
     def link(self) -> Link:
         """What the channel needs to know: phase centres, axes, patterns."""

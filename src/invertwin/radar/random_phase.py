@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Paths
@@ -22,7 +22,6 @@ def random_phase_spectrum(
     seed: int,
     range_width: float = 0.0,
     aperture_radius: float | None = None,
-    range_offset: Float[Tensor, ""] | None = None,
 ) -> Float64[Tensor, "frame range u v"]:
     """|Σ α e^{jφ} G(R) E(u, v)|² with Gaussian G, Airy E and independent uniform phases φ.
 
@@ -44,12 +43,11 @@ def random_phase_spectrum(
     Args:
         paths: Power paths, from ``trace_power``. A boundary path's α is its power over the
             square root of the mean power of the frame's other paths.
-        radar: Its arrays, waveform and poses.
+        radar: Its arrays, waveform, poses and range bias.
         grid: Bins.
         seed: Of the phases.
         range_width: Standard deviation added to the Gaussian of one range cell [range cells].
         aperture_radius: As ``Surrogate.aperture_radius``.
-        range_offset: Moves everything to larger ranges [m]; differentiable.
     """
     inside = (paths.range > grid.ranges[0]) & (paths.range < grid.ranges[-1])
     generator = torch.Generator().manual_seed(seed)
@@ -61,9 +59,7 @@ def random_phase_spectrum(
         amplitude = _amplitudes(paths.power[rows], paths.boundary[rows])
         field = amplitude * torch.polar(torch.ones_like(amplitude.detach()), phase[rows])
         for some, part in zip(rows.split(_CHUNK), field.split(_CHUNK), strict=True):
-            total = total + _spread(
-                paths, some, part, radar, grid, range_width, aperture_radius, range_offset
-            )
+            total = total + _spread(paths, some, part, radar, grid, range_width, aperture_radius)
         maps.append(total.abs().square())
     return torch.stack(maps).unflatten(2, (grid.u_count, grid.v_count))
 
@@ -83,11 +79,10 @@ def _spread(
     grid: Grid,
     range_width: float,
     aperture_radius: float | None,
-    range_offset: Tensor | None,
 ) -> Tensor:
     cell = radar.waveform.range_resolution
     sigma = math.hypot(SIGMA_PER_FWHM, range_width) * cell
-    place = paths.range[rows] if range_offset is None else paths.range[rows] + range_offset
+    place = paths.range[rows] + radar.range_bias
     # The square of a field's Gaussian of √2 σ is a power's of σ; peak 1 with no extra width.
     scale = (SIGMA_PER_FWHM * cell / sigma) ** 0.5 * 2 * math.pi**0.5 * sigma / grid.range_step
     along = scale * normalized_gaussian(place, grid.ranges, math.sqrt(2) * sigma)

@@ -4,12 +4,13 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, deposit_power, trace_power
+from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
 from invertwin.errors import InputError
 from invertwin.radar.point_spread import (
     airy,
@@ -98,7 +99,6 @@ class Surrogate:
         deposit: Float[Tensor, "frame range u v"],
         radar: Radar,
         grid: Grid,
-        range_offset: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "frame range u v"]:
         """Deposited power as the radar would show it on average over random phases.
 
@@ -108,9 +108,8 @@ class Surrogate:
 
         Args:
             deposit: From ``deposit_power`` on the same grid.
-            radar: Its window, arrays and waveform.
+            radar: Its window, arrays, waveform and range bias.
             grid: Bins.
-            range_offset: Moves everything to larger ranges [m]; differentiable.
 
         Raises:
             InputError: The map does not have the grid's shape; random phases, which belong to
@@ -124,8 +123,8 @@ class Surrogate:
             )
         for kernel in self._kernels(radar, grid):
             offset = None
-            if kernel.dims == (1,) and range_offset is not None:
-                offset = range_offset / grid.range_step
+            if kernel.dims == (1,) and radar.biased:
+                offset = torch.as_tensor(radar.range_bias) / grid.range_step
             deposit = kernel.apply(deposit, self._extra(kernel.dims, radar, grid), offset)
         return deposit
 
@@ -202,13 +201,10 @@ def surrogate_spectrum(
     grid: Grid,
     surrogate: Surrogate,
     *,
-    samples: int,
-    boundary_samples: int,
+    sampling: Sampling,
     seed: int,
-    depth: int = 3,
-    boundary: bool = True,
-    interior_edges: bool = True,
-    range_offset: Float[Tensor, ""] | None = None,
+    scheme: Literal["rays", "area"] = "rays",
+    reference: tuple[Scene, Link] | None = None,
 ) -> Float[Tensor, "frame range u v"]:
     """Power spectrum of a scene, differentiable in it: deposit, then shape.
 
@@ -219,31 +215,21 @@ def surrogate_spectrum(
         radar: Arrays, waveform and poses.
         grid: Bins, see ``Radar.grid``.
         surrogate: Kernels and their extra widths.
-        samples: Interior samples over all frames.
-        boundary_samples: Silhouette samples over all frames.
+        sampling: How many paths are drawn.
         seed: Same seed, same spectrum.
-        depth: Most bounces of a path.
-        boundary: Off leaves the visibility terms out of the gradient, for ablation.
-        interior_edges: Off leaves out those between two surfaces, for ablation.
-        range_offset: Moves everything to larger ranges [m]; differentiable.
+        scheme: See ``deposit_power``.
+        reference: See ``deposit_power``.
 
     Raises:
         InputError: See ``deposit_power``; random phases on paths of several bounces.
     """
     if surrogate.phases == "random":
-        if depth != 1:
+        if sampling.depth != 1:
             raise InputError(
-                f"expected depth 1 with random phases, got {depth}; give depth=1, or a surrogate "
-                "with phases='mean'"
+                f"expected depth 1 with random phases, got {sampling.depth}; give depth=1, or a "
+                "surrogate with phases='mean'"
             )
-        paths = trace_power(
-            scene,
-            radar.link(),
-            samples=samples,
-            boundary_samples=boundary_samples,
-            seed=seed,
-            boundary=boundary,
-        )
+        paths = trace_power(scene, radar.link(), sampling=sampling, seed=seed)
         return random_phase_spectrum(
             paths,
             radar,
@@ -251,20 +237,17 @@ def surrogate_spectrum(
             seed=seed,
             range_width=surrogate.range_width,
             aperture_radius=surrogate.aperture_radius,
-            range_offset=range_offset,
         )
     deposit = deposit_power(
         scene,
         radar.link(),
         grid,
-        samples=samples,
-        boundary_samples=boundary_samples,
+        sampling=sampling,
         seed=seed,
-        depth=depth,
-        boundary=boundary,
-        interior_edges=interior_edges,
+        scheme=scheme,
+        reference=reference,
     )
-    return surrogate.shape(deposit, radar, grid, range_offset)
+    return surrogate.shape(deposit, radar, grid)
 
 
 @dataclass(frozen=True, eq=False)

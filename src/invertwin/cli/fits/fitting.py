@@ -5,8 +5,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -22,75 +23,84 @@ from invertwin.cli.fits.likeness import CURVE, watch_of
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
-    density_of,
-    nuisances_of,
+    observations_of,
+    sampling_of,
     stages_of,
     steps_of,
+    unknowns_of,
     varied,
 )
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.run_file import need
 from invertwin.cli.runs import PARTS, RunFolder
-from invertwin.inversion.nuisances import ClockOffset, RangeBias
-from invertwin.inversion.reconstruction import Reconstruction, reconstruct
-from invertwin.inversion.stages import reconstruct_in_stages, stage_checkpoint
-from invertwin.radar.radar import Radar
+from invertwin.errors import InputError
+from invertwin.inversion import (
+    Checkpoint,
+    Observation,
+    Reconstruction,
+    Report,
+    Schedule,
+    Watch,
+    reconstruct,
+)
+from invertwin.inversion.callbacks import stage_file
+from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.scene import Scene
+from invertwin.seeds import derived_seed
 
 
 def calibrated(
     problem: Problem, folder: RunFolder, console: Console
 ) -> tuple[Problem, dict[str, Any]]:
-    """The problem with range bias and clock offset found on an object whose place is known."""
+    """The problem with range bias and clock offset found on an object whose place is known.
+
+    Args:
+        problem: With one sensor.
+        folder: Keeps the checkpoint.
+        console: Shows progress.
+    """
     table = problem.run.calibration
     if table is None:
         return problem, {}
-    center = problem.truth[table.object].center
+    if len(problem.sights) > 1:
+        raise InputError(
+            "calibration: expected one sensor, got several; calibrate each recording by itself"
+        )
+    sight, target = problem.first, problem.truth[table.object]
     if table.method == "backprojection":
-        capture, row = calibrate(problem.capture, center), {}
+        capture, row = calibrate(sight.capture, target.center), {}
     else:
-        alone = Scene({table.object: problem.truth[table.object]})
-        nuisances = [RangeBias(), ClockOffset(problem.capture)]
-        checkpoint = f"{PARTS}/calibration.pt"
+        bias, clock = RangeBias(), ClockOffset(sight.capture.positions)
         rate = table.rate or problem.run.optimizer.rate
-        steps = table.steps or steps_of(problem)
-        options = _options(problem)
-        options["optimizer"] = replace(options["optimizer"], rate=rate)
-        with _watched(Bar(console, "calibration", steps)) as advance:
+        stage = replace(stages_of(problem.run)[0], steps=table.steps or steps_of(problem.run))
+        checkpoint = folder.file(f"{PARTS}/calibration.pt")
+        every = need(problem.run, "reconstruct", "reconstruct").checkpoint_every
+        with watched(Bar(console, "calibration", stage.steps)) as advance:
             found = reconstruct(
-                alone,
-                problem.radar,
-                problem.capture,
-                nuisances,
-                steps=steps,
+                Scene({table.object: target}),
+                Observation(
+                    sight.model(sampling_of(problem.run)),
+                    sight.radar,
+                    sight.capture,
+                    parameters=[bias, clock],
+                ),
+                [],
+                loss=build.loss(problem.run.loss),
+                optimizer=replace(build.optimizer(problem.run.optimizer), rate=rate),
+                schedule=Schedule(
+                    stage.steps, stage.annealing, stage.frames_per_step, stage.tolerance
+                ),
+                callbacks=[*advance, Checkpoint(checkpoint, every, resume=True)],
                 seed=problem.run.seed,
-                checkpoint=folder.file(checkpoint),
-                resume=True,
-                progress=advance,
-                **options,
             )
-        capture = problem.capture.recalibrated(
-            problem.capture.clock_offset + float(nuisances[1].shift.detach()),
-            problem.capture.range_bias + float(nuisances[0].bias.detach()),
+        capture = sight.capture.recalibrated(
+            sight.capture.clock_offset + float(clock.shift.detach()),
+            sight.capture.range_bias + float(bias.bias.detach()),
         )
         row = {"loss": found.loss, "status": found.status}
     row |= {"clock_offset_s": capture.clock_offset, "range_bias_m": capture.range_bias}
-    return replace(problem, capture=capture, radar=capture.radar()), row
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a finished fit has found.
-
-    Attributes:
-        twin: The scene.
-        radar: With the poses of the fit.
-        offset: Range offset [m], where one is fitted along.
-    """
-
-    twin: Scene
-    radar: Radar
-    offset: torch.Tensor | None
+    found = replace(sight, capture=capture, radar=capture.radar())
+    return replace(problem, sights=dict.fromkeys(problem.sights, found)), row
 
 
 def fit(
@@ -101,21 +111,35 @@ def fit(
     folder: RunFolder,
     console: Console,
     checkpoint: str | None,
-) -> dict[str, Any]:
-    """One fit, or what an interrupted run has kept of it."""
+) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
+    """One fit, or what an interrupted run has kept of it.
+
+    Args:
+        problem: What is to be fitted.
+        start: From where.
+        index: Number of the start.
+        mode: The run's own way to fit, or a variant.
+        folder: Keeps results and checkpoints.
+        console: Shows progress.
+        checkpoint: Name of the checkpoint; None = one among the parts.
+
+    Returns:
+        The row of the fit, and a function that gives its outcome.
+    """
     part = f"{PARTS}/{mode}_{index:02d}"
-    done = folder.read_json(f"{part}.json")
-    if done is not None:
-        return done
+    checkpoint = checkpoint or f"{part}.pt"
+    own = varied(problem, mode)
+    row = folder.read_json(f"{part}.json")
+    if row is not None:
+        # The checkpoints say what the fit found; nothing is fitted again.
+        return row, partial(_staged, own, start, index, None, folder, checkpoint)
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    checkpoint = checkpoint or f"{part}.pt"
-    problem = varied(problem, mode)
-    bar = Bar(console, name, steps_of(problem))
-    found = _staged(problem, start, index, nuisances_of(problem), bar, folder, checkpoint)
+    bar = Bar(console, name, steps_of(own.run))
+    found = _staged(own, start, index, bar, folder, checkpoint)
     row = {
         "start": index,
-        **scores(problem, start, found.scene),
+        **scores(own, start, found.scene),
         "loss": found.loss,
         "status": found.status,
         "steps": found.steps,
@@ -126,54 +150,42 @@ def fit(
         "curve": [[step["step"] + 1, step[CURVE]] for step in found.history if CURVE in step],
     }
     folder.write_json(f"{part}.json", row)
-    return row
-
-
-def outcome(
-    problem: Problem, start: build.Start, row: dict[str, Any], mode: str, folder: RunFolder
-) -> Outcome:
-    """Twin, radar and range offset of a finished fit, from its checkpoints."""
-    problem = varied(problem, mode)
-    nuisances = nuisances_of(problem)
-    found = _staged(problem, start, row["start"], nuisances, None, folder, row["checkpoint"])
-    offsets = [module() for module in nuisances if getattr(module, "applies_to", "") == "range"]
-    offset = offsets[-1].detach() if offsets else None
-    return Outcome(found.scene, found.radar, offset)
+    return row, lambda: found
 
 
 def _staged(
     problem: Problem,
     start: build.Start,
     index: int,
-    nuisances: list[nn.Module],
     bar: "Bar | None",
     folder: RunFolder,
     checkpoint: str,
 ) -> Reconstruction:
     run = problem.run
-    tables = build.named(run.parameters)
-    stages = stages_of(problem)
+    stages = stages_of(run)
     for k in range(len(stages) - 1):
-        folder.file(stage_checkpoint(checkpoint, k))
-    own = {name: getattr(table, "rate", None) for name, table in tables.items()}
-    rates = {name: float(rate) for name, rate in own.items() if rate is not None}
-    with _watched(bar) as advance:
-        return reconstruct_in_stages(
+        folder.file(str(stage_file(Path(checkpoint), k)))
+    watch = watch_of(problem)
+    every = run.measures.every if run.measures else 1
+    with watched(bar) as advance:
+        return reconstruct(
             start.scene,
-            problem.radar,
-            problem.capture,
-            build.builders(run.parameters, start, run.scene),
-            stages,
-            rates=rates,
-            regularize=partial(build.regularizers, tables),
-            checkpoint=folder.file(checkpoint),
-            resume=True,  # from its own unfinished part; open_run has settled what may be there
-            seed=run.seed + index,
-            nuisances=nuisances,
-            watch=watch_of(problem),
-            watch_every=run.measures.every if run.measures else 1,
-            progress=advance,
-            **_options(problem),
+            observations_of(problem),
+            unknowns_of(run, start),
+            loss=build.loss(run.loss),
+            optimizer=build.optimizer(run.optimizer),
+            schedule=stages,
+            callbacks=[
+                *([] if watch is None else [Watch(watch, every)]),
+                *advance,
+                # From its own unfinished part; open_run has settled what may be there.
+                Checkpoint(
+                    folder.file(checkpoint),
+                    need(run, "reconstruct", "reconstruct").checkpoint_every,
+                    resume=True,
+                ),
+            ],
+            seed=derived_seed(run.seed, index),
         )
 
 
@@ -186,31 +198,11 @@ def _values(modules: nn.ModuleList) -> dict[str, Any]:
     return rows
 
 
-def _options(problem: Problem) -> dict[str, Any]:
-    """What all fits of a run have in common."""
-    settings, table = need(problem.run, "reconstruct", "reconstruct"), problem.run.surrogate
-    return {
-        "grid": problem.grid,
-        "loss": build.loss(problem.run.loss),
-        "optimizer": build.optimizer(problem.run.optimizer),
-        "surrogate": None if table.exact else build.surrogate(table),
-        "density": density_of(problem.run),
-        "annealing": settings.annealing,
-        "samples": settings.samples,
-        "boundary_samples": settings.boundary_samples,
-        "depth": settings.depth,
-        "boundary": settings.boundary,
-        "frames_per_step": settings.frames_per_step,
-        "tolerance": settings.tolerance,
-        "checkpoint_every": settings.checkpoint_every,
-    }
-
-
 @contextmanager
-def _watched(bar: "Bar | None") -> Iterator[Callable[[dict[str, Any]], None] | None]:
+def watched(bar: "Bar | None") -> Iterator[list[Report]]:
     """Progress that is shown; Ctrl-C waits for the end of the step."""
     if bar is None:
-        yield None
+        yield []
         return
     with bar, _interrupted_between_steps() as heed:
 
@@ -218,7 +210,7 @@ def _watched(bar: "Bar | None") -> Iterator[Callable[[dict[str, Any]], None] | N
             bar.advance(row)
             heed()
 
-        yield advance
+        yield [Report(advance)]
 
 
 @contextmanager

@@ -86,7 +86,8 @@ def added(metrics: dict[str, Any]) -> list[Table]:
 def _placed(
     problem: Problem, table: Initial, low: list[float], high: list[float]
 ) -> tuple[Scene, dict[str, Any]]:
-    capture, grid, radar = problem.capture, problem.grid, problem.radar
+    sight = problem.first
+    capture, grid, radar = sight.capture, sight.grid, sight.radar
     if table.method == "points":
         points = detected_points(capture, grid, low, high, false_alarm=table.false_alarm)
     else:
@@ -132,8 +133,8 @@ def _clouded(problem: Problem, table: Initial, scene: Scene) -> Scene:
         if sought.kind == "density" and sought.object == table.object:
             item = scene[table.object]
             grid = guess_density(
-                problem.capture,
-                problem.grid,
+                problem.first.capture,
+                problem.first.grid,
                 item,
                 table.object,
                 sought.low,

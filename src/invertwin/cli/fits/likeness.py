@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
+import torch
+
 from invertwin.cli.fits.problem import Problem
 from invertwin.cli.run_file import about
 from invertwin.errors import InputError
-from invertwin.inversion.measures import (
-    Likeness,
+from invertwin.inversion.metrics import (
+    ShapeMetrics,
     compare_shapes,
     is_watertight,
     topology,
@@ -111,7 +113,7 @@ def watch_of(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
     return watch
 
 
-def _likeness(problem: Problem, scene: Scene, seen: bool) -> Likeness:
+def _likeness(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics:
     table = problem.run.measures
     assert table is not None
     return compare_shapes(
@@ -123,8 +125,8 @@ def _likeness(problem: Problem, scene: Scene, seen: bool) -> Likeness:
     )
 
 
-def _tried(problem: Problem, scene: Scene, seen: bool) -> Likeness | None:
-    """The same; None of a shape without area, or that is not seen."""
+def _tried(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics | None:
+    """Like ``_likeness``; None if the shape is empty or invisible."""
     try:
         return _likeness(problem, scene, seen)
     except InputError:
@@ -132,7 +134,9 @@ def _tried(problem: Problem, scene: Scene, seen: bool) -> Likeness | None:
 
 
 def _eyes(problem: Problem, seen: bool) -> Any:
-    return problem.radar.positions if seen else None
+    if not seen:
+        return None
+    return torch.cat([sight.radar.positions.detach() for sight in problem.sights.values()])
 
 
 def _placed(scene: Scene, name: str) -> Mesh:
@@ -156,7 +160,7 @@ def _parted(key: str) -> tuple[str, str]:
     return key, ""
 
 
-def _rows(found: Likeness | None, ending: str) -> dict[str, Any]:
+def _rows(found: ShapeMetrics | None, ending: str) -> dict[str, Any]:
     if found is None:
         return {}
     rows: dict[str, Any] = {f"chamfer{ending}_m": found.chamfer}

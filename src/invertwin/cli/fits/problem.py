@@ -1,6 +1,8 @@
-"""What is to be fitted: scene, data, radar and grid of a run file."""
+"""What is to be fitted: scene, observations and unknowns of a run file."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -8,11 +10,11 @@ from rich.console import Console
 from torch import nn
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.recordings import measured
-from invertwin.cli.run_file import need
+from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.schema import (
     MoverParameter,
@@ -24,16 +26,49 @@ from invertwin.cli.schema import (
     VerticesParameter,
 )
 from invertwin.cli.schema import Stage as StageTable
+from invertwin.cli.schema import Surrogate as SurrogateTable
+from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
-from invertwin.inversion.nuisances import ClockOffset, RangeBias
-from invertwin.inversion.remeshing import remeshed
-from invertwin.inversion.stages import Stage
+from invertwin.inversion import Observation, Stage, Unknown, remeshed
+from invertwin.models import ExactMap, ForwardModel, SurrogateMap
+from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
+from invertwin.seeds import derived_seed
 
 FULL, INTERIOR = "full", "interior_only"
 
-_DENSITY = 2_000.0  # points per m²
+_POINTS_PER_M2 = 2_000.0
+_OWN = ("radar", "grid", "data", "surrogate", "chirps")  # sections of a sensor
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What one sensor has recorded.
+
+    Attributes:
+        capture: The data.
+        radar: What measured them.
+        grid: Bins that are compared.
+        surrogate: The `[surrogate]` table of this sensor.
+        weight: Share in the loss.
+    """
+
+    capture: Capture
+    radar: Radar
+    grid: Grid
+    surrogate: SurrogateTable
+    weight: float = 1.0
+
+    def model(self, sampling: Sampling) -> ForwardModel:
+        """The forward model that is fitted.
+
+        Args:
+            sampling: How it samples paths.
+        """
+        if self.surrogate.exact:
+            return ExactMap(self.grid, sampling)
+        return SurrogateMap(self.grid, build.surrogate(self.surrogate), sampling)
 
 
 @dataclass(frozen=True)
@@ -45,9 +80,7 @@ class Problem:
         scene: The scene as known.
         truth: The true scene, where the run file knows it.
         known: Names of the objects whose true pose is known.
-        capture: The data.
-        radar: What measured them.
-        grid: Bins that are compared.
+        sights: What every sensor has recorded, by name.
         target: The object that is scored, if any moves.
     """
 
@@ -55,50 +88,80 @@ class Problem:
     scene: Scene
     truth: Scene
     known: frozenset[str]
-    capture: Capture
-    radar: Radar
-    grid: Grid
-    target: str | None
+    sights: Mapping[str, Sight] = field(default_factory=dict)
+    target: str | None = None
+
+    @property
+    def first(self) -> Sight:
+        """The only sensor, or the first one."""
+        return next(iter(self.sights.values()))
 
 
 def problem_of(run: RunFile, console: Console) -> Problem:
-    """Builds the problem; simulated data are simulated here.
+    """Build the problem; simulated data are simulated here.
+
+    Args:
+        run: The run file.
+        console: Where progress is told.
 
     Raises:
         InputError: A section is missing or does not fit the data.
     """
     need(run, "parameters", "reconstruct")
-    table = need(run, "grid", "reconstruct")
     scene, truth = build.scene(run), build.true_scene(run)
-    data = need(run, "data", "reconstruct")
     for i, parameter in enumerate(run.parameters):
         if isinstance(parameter, MoverParameter):
             raise InputError(
-                f'parameters[{i}].kind: expected "mover" with data.kind = "openradar" only, got '
-                f'"{data.kind}"; use "translation", "pose" or another kind'
+                f"parameters[{i}].kind: expected a mover as the only parameter, got "
+                f"{len(run.parameters)} parameters; leave only that"
             )
     # Their errors come before any work.
     build.parameters(run.parameters, scene, sought_bodies(run), run.scene)
+    sights = {}
+    for name, (own, weight) in observed_runs(run).items():
+        with about(f"observations.{name}") if name else nullcontext():
+            sights[name] = _sight(own, weight, truth, console)
+    simulated = all(isinstance(own.data, SimulatedData) for own, _ in observed_runs(run).values())
+    known = frozenset(truth.names if simulated else run.truth)
+    target = run.starts.object if run.starts else next(iter(sought_objects(run)), None)
+    return Problem(run, scene, truth, known, sights, target)
+
+
+def observed_runs(run: RunFile) -> dict[str, tuple[RunFile, float]]:
+    """The run file with the sections of every sensor, and the sensor's weight, by name.
+
+    The only sensor of a run file without `[observations]` has an empty name.
+    """
+    if not run.observations:
+        return {"": (run, 1.0)}
+    found = {}
+    for number, (name, table) in enumerate(run.observations.items()):
+        keys = [key for key in _OWN if getattr(table, key) is not None]
+        own = {key: getattr(table, key) for key in keys}
+        if "data" not in own and isinstance(run.data, SimulatedData):
+            # The noise of one radar is not that of another.
+            seed = derived_seed(run.seed if run.data.seed is None else run.data.seed, number)
+            own["data"] = run.data.model_copy(update={"seed": seed})
+        found[name] = (run.model_copy(update={**own, "observations": {}}), table.weight)
+    return found
+
+
+def _sight(run: RunFile, weight: float, truth: Scene, console: Console) -> Sight:
+    data, table = need(run, "data", "reconstruct"), need(run, "grid", "reconstruct")
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
         grid = build.grid(table, radar)
         console.print("simulating the exact signals of the true scene")
-        beat = exact(run, truth, radar, grid).beat
-        assert beat is not None
-        capture = Capture.from_beat(beat, radar)
-        known = frozenset(truth.names)
-    else:
-        if run.radar is not None:
-            raise InputError(
-                f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
-                "remove it: a capture brings its radar along"
-            )
-        capture = measured(data)
-        radar = capture.radar()
-        grid = build.grid(table, radar)
-        known = frozenset(run.truth)
-    target = run.starts.object if run.starts else next(iter(sought_objects(run)), None)
-    return Problem(run, scene, truth, known, capture, radar, grid, target)
+        capture = Capture.from_beat(exact(run, truth, radar, grid).beat, radar)
+        return Sight(capture, radar, grid, run.surrogate, weight)
+    if run.radar is not None:
+        raise InputError(
+            f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
+            "remove it: a capture brings its radar along"
+        )
+    capture = measured(data)
+    radar = capture.radar()
+    return Sight(capture, radar, build.grid(table, radar), run.surrogate, weight)
 
 
 def sought_objects(run: RunFile) -> list[str]:
@@ -109,16 +172,38 @@ def sought_objects(run: RunFile) -> list[str]:
 def varied(problem: Problem, mode: str) -> Problem:
     """The problem of a mode: the run's own, without boundary terms, or a variant.
 
-    Its run file holds the parameters of this fit only.
+    Args:
+        problem: With all parameters and sensors.
+        mode: Its name.
+
+    Returns:
+        The problem with the parameters and the sensors of this fit only.
     """
-    return replace(problem, run=varied_run(problem.run, mode))
+    wanted = _wanted(problem.run, mode)
+    widths = {k: v for k, v in _given(wanted).items() if k in ("range_width", "angle_width")}
+    chosen = getattr(wanted, "observations", None) or problem.sights
+    sights = {
+        name: replace(sight, surrogate=sight.surrogate.model_copy(update=widths))
+        for name, sight in problem.sights.items()
+        if name in chosen
+    }
+    return replace(problem, run=varied_run(problem.run, mode), sights=sights)
+
+
+def _wanted(run: RunFile, mode: str) -> Variant:
+    if mode in (FULL, INTERIOR):
+        return Variant() if mode == FULL else Variant(boundary=False)
+    return run.variants[mode]
 
 
 def varied_run(run: RunFile, mode: str) -> RunFile:
-    """The run file of a mode, with the parameters of this fit only."""
-    wanted = Variant() if mode == FULL else Variant(boundary=False)
-    if mode not in (FULL, INTERIOR):
-        wanted = run.variants[mode]
+    """The run file of a mode, with the parameters of this fit only.
+
+    Args:
+        run: The whole run file.
+        mode: Name of the mode.
+    """
+    wanted = _wanted(run, mode)
     given = _given(wanted)
     changes: dict[str, Any] = {}
     stages = run.stages if wanted.stages is None else wanted.stages
@@ -156,45 +241,55 @@ def _given(table: Settings) -> dict[str, Any]:
     return found
 
 
-def stages_of(problem: Problem) -> list[Stage]:
+def stages_of(run: RunFile) -> list[Stage]:
     """The stages of a fit, as the library takes them."""
-    return run_stages(problem.run)
-
-
-def run_stages(run: RunFile) -> list[Stage]:
-    """The same of a run file."""
     settings = need(run, "reconstruct", "reconstruct")
-    if not run.stages:
-        return [Stage(settings.steps)]
-    return [_stage(run, table) for table in run.stages]
-
-
-def _stage(run: RunFile, table: StageTable) -> Stage:
-    given = _given(table)
-    options = {
-        key: given[key]
-        for key in ("samples", "boundary_samples", "frames_per_step", "annealing")
-        if key in given
+    common = {
+        "annealing": settings.annealing,
+        "frames_per_step": settings.frames_per_step,
+        "tolerance": settings.tolerance,
     }
+    if not run.stages:
+        return [Stage(settings.steps, **common)]
+    return [_stage(run, table, common) for table in run.stages]
+
+
+def _stage(run: RunFile, table: StageTable, common: dict[str, Any]) -> Stage:
+    given = _given(table)
+    own = {key: given[key] for key in ("frames_per_step", "annealing") if key in given}
     rates = {key: given[key] for key in ("kind", "rate", "final_rate") if key in given}
+    counts = {key: given[key] for key in ("samples", "boundary_samples") if key in given}
     widths = {key: given[key] for key in ("range_width", "angle_width") if key in given}
-    if rates:
-        options["optimizer"] = build.optimizer(run.optimizer.model_copy(update=rates))
-    if widths and not run.surrogate.exact:
-        options["surrogate"] = build.surrogate(run.surrogate.model_copy(update=widths))
     remesh = {}
     if table.remesh is not None:
         tables = build.named(run.parameters)
         sought = [tables[name] for name in table.parameters or tables]
         change = partial(remeshed, edge=table.remesh)
         remesh = {t.object: change for t in sought if isinstance(t, VerticesParameter)}
-    steps = table.steps or need(run, "reconstruct", "reconstruct").steps
-    return Stage(steps, tuple(table.parameters), table.rebuild, remesh, options)
+    return Stage(
+        steps=table.steps or need(run, "reconstruct", "reconstruct").steps,
+        unknowns=tuple(table.parameters),
+        rebuild=table.rebuild,
+        remesh=remesh,
+        optimizer=build.optimizer(run.optimizer.model_copy(update=rates)) if rates else None,
+        change=partial(_changed, counts, widths) if counts or widths else None,
+        **{**common, **own},
+    )
 
 
-def steps_of(problem: Problem) -> int:
+def _changed(
+    counts: Mapping[str, int], widths: Mapping[str, float], observation: Observation
+) -> Observation:
+    """An observation with what a stage says of samples and extra widths."""
+    model = observation.model.sampled_by(**counts)
+    if widths and isinstance(model, SurrogateMap):
+        model = replace(model, surrogate=replace(model.kernels, **widths))
+    return replace(observation, model=model)
+
+
+def steps_of(run: RunFile) -> int:
     """The budget of a fit."""
-    return sum(stage.steps for stage in stages_of(problem))
+    return sum(stage.steps for stage in stages_of(run))
 
 
 def modes_of(run: RunFile) -> list[str]:
@@ -206,24 +301,71 @@ def modes_of(run: RunFile) -> list[str]:
     return [*modes, *run.variants]
 
 
-def density_of(run: RunFile) -> float:
-    """Rough points per m² of the exact chain: those of simulated data, or enough of them."""
-    return run.data.density if isinstance(run.data, SimulatedData) else _DENSITY
+def sampling_of(run: RunFile) -> Sampling:
+    """How the model of a fit samples paths."""
+    settings = need(run, "reconstruct", "reconstruct")
+    return Sampling(
+        depth=settings.depth,
+        samples=settings.samples,
+        boundary_samples=settings.boundary_samples,
+        boundary=settings.boundary,
+        points_per_m2=points_per_m2(run),
+    )
+
+
+def points_per_m2(run: RunFile) -> float:
+    """Rough points of the exact chain: those of simulated data, or enough of them."""
+    return run.data.density if isinstance(run.data, SimulatedData) else _POINTS_PER_M2
 
 
 def annealed_until(run: RunFile) -> float | None:
     """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
-    settings, stages = need(run, "reconstruct", "reconstruct"), run_stages(run)
+    stages = stages_of(run)
     if len(stages) > 1 or run.surrogate.exact:
         return None
-    options = stages[0].options
-    widths = options.get("surrogate", run.surrogate)
-    wide = widths.range_width > 0 or widths.angle_width > 0
-    return options.get("annealing", settings.annealing) * stages[0].steps if wide else None
+    given = _given(run.stages[0]) if run.stages else {}
+    wide = any(given.get(k, getattr(run.surrogate, k)) > 0 for k in ("range_width", "angle_width"))
+    return stages[0].annealing * stages[0].steps if wide else None
 
 
-def nuisances_of(problem: Problem) -> list[nn.Module]:
-    """New modules of what is fitted along."""
-    made = {"range_bias": RangeBias, "clock_offset": lambda: ClockOffset(problem.capture)}
-    names = need(problem.run, "reconstruct", "reconstruct").nuisances
-    return [made[name]() for name in names]
+def observations_of(problem: Problem) -> list[Observation]:
+    """What is fitted of every sensor: data, model and the sensor's own unknowns."""
+    run = problem.run
+    poses = {
+        name: Unknown(lambda _: RadarPose(), getattr(table, "rate", None))
+        for name, table in build.named(run.parameters).items()
+        if isinstance(table, RadarParameter)
+    }
+    return [
+        Observation(
+            sight.model(sampling_of(run)),
+            sight.radar,
+            sight.capture,
+            sight.weight,
+            {**poses, **_nuisances(run, sight, name)},
+        )
+        for name, sight in problem.sights.items()
+    ]
+
+
+def _nuisances(run: RunFile, sight: Sight, name: str) -> dict[str, nn.Module]:
+    """Modules of what is wrong with a measurement, fitted along."""
+    made = {"range_bias": RangeBias, "clock_offset": lambda: ClockOffset(sight.capture.positions)}
+    kinds = need(run, "reconstruct", "reconstruct").nuisances
+    return {f"{name}.{kind}" if name else kind: made[kind]() for kind in kinds}
+
+
+def unknowns_of(run: RunFile, start: build.Start) -> dict[str, Unknown]:
+    """What is fitted of the scene, by name.
+
+    Args:
+        run: Its parameters.
+        start: Where the fit starts.
+    """
+    tables = build.named(run.parameters)
+    makers = build.builders(run.parameters, start, run.scene)
+    return {
+        name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
+        for name, table in tables.items()
+        if not isinstance(table, RadarParameter)
+    }

@@ -8,19 +8,20 @@ from typing import Any
 import torch
 
 from invertwin.capture import calibrate, locate
+from invertwin.channel import Sampling
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import shape_scores
-from invertwin.cli.fits.problem import Problem, density_of
+from invertwin.cli.fits.problem import Problem, Sight, points_per_m2, sampling_of
 from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import need
-from invertwin.cli.schema import MaterialParameter, Parameter, RunFile, SimulatedData
+from invertwin.cli.schema import MaterialParameter, Parameter, SimulatedData
 from invertwin.errors import InputError
+from invertwin.inversion.loss import Objective
+from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Scene
 from invertwin.scene.geometry import without_clouds
-from invertwin.simulation import surrogate_correlation
 
 
 def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
@@ -56,7 +57,7 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
     if "scale" in kinds:
         rows |= {"scale_error": abs(after.scale - 1)}
     sought = [p for p in problem.run.parameters if _made_known(problem, p)]
-    frequency = problem.radar.waveform.center_frequency
+    frequency = problem.first.radar.waveform.center_frequency
     return rows | shapes | value_errors(sought, twin, problem.truth, frequency)
 
 
@@ -72,12 +73,26 @@ def _made_known(problem: Problem, parameter: Parameter) -> bool:
 def summary(
     problem: Problem, rows: dict[str, list[dict[str, Any]]], modes: Sequence[str]
 ) -> dict[str, Any]:
-    """Successes with and, where asked for, without boundary terms."""
+    """Successes of every way to fit; of several sensors, together and each alone.
+
+    Args:
+        problem: With the truth.
+        rows: Of every fit, by mode.
+        modes: The run's own first.
+    """
     if problem.target not in problem.known or "success" not in rows[modes[0]][0]:
         return {}
     counts = {mode: sum(row.get("success", False) for row in rows[mode]) for mode in modes}
     found = {"successes": counts[modes[0]], "starts_count": len(rows[modes[0]])}
-    return found | {f"successes_{mode}": counts[mode] for mode in modes[1:]}
+    found |= {f"successes_{mode}": counts[mode] for mode in modes[1:]}
+    alone = {
+        variant.observations[0]: counts[mode]
+        for mode, variant in problem.run.variants.items()
+        if variant.observations and len(variant.observations) == 1
+    }
+    if alone:
+        found |= {"joint_successes": counts[modes[0]], "alone_successes": alone}
+    return found
 
 
 def heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) -> dict[str, Any]:
@@ -87,7 +102,7 @@ def heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) 
     if table is None or name is None or name not in problem.known or name == table.object:
         return {}
     truth, known = problem.truth[name].center, problem.truth[table.object].center
-    focused = calibrate(problem.capture, known)
+    focused = calibrate(problem.first.capture, known)
     peak = locate(focused, truth)
     places = torch.tensor([row["position"] for row in rows], dtype=torch.float64)
     spread = (places - places.mean(0)).norm(dim=1).max()
@@ -109,51 +124,68 @@ def without_history(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def sharp_spectrum(
-    problem: Problem, scene: Scene, radar: Radar, offset: torch.Tensor | None
-) -> torch.Tensor:
-    """The surrogate's map of a scene without extra widths."""
+def sharp_maps(problem: Problem, scene: Scene, radars: Sequence[Radar]) -> list[torch.Tensor]:
+    """The surrogate's map of every sensor, without extra widths.
+
+    Args:
+        problem: With the run's kernels.
+        scene: What is seen.
+        radars: The sensors in order, with what was fitted of them.
+    """
     settings = need(problem.run, "reconstruct", "reconstruct")
+    counts = {"samples": 4 * settings.samples, "boundary_samples": 0}
     with torch.no_grad():
-        return surrogate_spectrum(
-            scene,
-            radar,
-            problem.grid,
-            sharp_surrogate(problem),
-            samples=4 * settings.samples,
-            boundary_samples=0,
-            seed=problem.run.seed,
-            depth=settings.depth,
-            range_offset=offset,
-        )
+        return [
+            sharp_model(problem, sight).sampled_by(**counts).predict(scene, radar, problem.run.seed)
+            for sight, radar in zip(problem.sights.values(), radars, strict=True)
+        ]
 
 
 def agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
-    """How well the surrogate is the mean of the exact chain, one bounce, first frame."""
+    """How well the surrogate is the mean of the exact chain, one bounce, first frame.
+
+    Args:
+        problem: With the run's kernels.
+        twin: The scene that was found.
+        radar: The first sensor, with what was fitted of it.
+    """
     if not isinstance(radar.waveform, SampledWaveform):
         return {}
-    found = surrogate_correlation(
-        twin,
-        radar.frames([0]),
-        problem.grid,
-        seed=problem.run.seed,
-        surrogate=sharp_surrogate(problem),
-        depth=1,
-        density=density_of(problem.run),
+    model = replace(
+        sharp_model(problem, problem.first),
+        sampling=Sampling(depth=1, points_per_m2=points_per_m2(problem.run)),
     )
+    first = replace(radar.frames([0]), range_bias=0.0)
+    found = surrogate_correlation(twin, first, model, seed=problem.run.seed)
     return {"surrogate_correlation": found}
 
 
-def sharp_surrogate(problem: Problem) -> Surrogate:
-    """The run's kernels without extra widths, mean over phases."""
-    return replace(
-        build.surrogate(problem.run.surrogate), range_width=0.0, angle_width=0.0, phases="mean"
-    )
+def sharp_model(problem: Problem, sight: Sight) -> SurrogateMap:
+    """The kernels of a sensor without extra widths, mean over phases.
+
+    Args:
+        problem: Says how paths are sampled.
+        sight: The sensor.
+    """
+    kernels = build.surrogate(sight.surrogate)
+    sharp = replace(kernels, range_width=0.0, angle_width=0.0, phases="mean")
+    return SurrogateMap(sight.grid, sharp, sampling_of(problem.run))
 
 
-def misfit(run: RunFile, simulated: torch.Tensor, measured: torch.Tensor) -> float | None:
-    """The loss of two maps; None where a map without power has none."""
+def misfit(
+    problem: Problem, simulated: Sequence[torch.Tensor], measured: Sequence[torch.Tensor]
+) -> float | None:
+    """The weighted mean of the losses of all sensors; None where a map without power has none.
+
+    Args:
+        problem: Its loss and weights.
+        simulated: A map of every sensor.
+        measured: The measured ones.
+    """
+    loss = build.loss(problem.run.loss)
+    weights = tuple(sight.weight for sight in problem.sights.values())
     try:
-        return float(build.loss(run.loss)(simulated, measured))
+        pairs = list(zip(simulated, measured, strict=True))
+        return float(Objective((loss,) * len(weights), weights)(pairs))
     except InputError:
         return None

@@ -6,16 +6,15 @@ from typing import Any, get_args
 
 import torch
 
-from invertwin.cli import build, pictures
+from invertwin import plotting
+from invertwin.cli import build
 from invertwin.cli.fits.likeness import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, annealed_until, sought_objects
 from invertwin.cli.report import Again, Picture, Table, report_html, shown
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import MaterialValue, RunFile, SimulatedData
-from invertwin.cli.shape_pictures import convergence_picture, turntable_gif
-from invertwin.radar.radar import Radar
-from invertwin.scene import Scene
+from invertwin.scene import Mesh, Scene
 
 _ENDS = {
     "converged": "the loss no longer falls",
@@ -199,37 +198,40 @@ def draw(
     metrics: dict[str, Any],
     start: Scene,
     twin: Scene,
-    radar: Radar,
-    maps: dict[str, torch.Tensor],
+    maps: dict[str, list[torch.Tensor]],
 ) -> None:
-    """Writes the pictures of the best fit."""
+    """Write the pictures of the best fit.
+
+    Args:
+        problem: What was fitted.
+        folder: Where to write.
+        rows: Of every fit, by mode.
+        metrics: Of the run.
+        start: Scene at the start.
+        twin: Scene that was found.
+        maps: By what they show, one for every sensor.
+    """
     sought = sought_objects(problem.run)
-    places = radar.positions.detach().numpy()
-    truth = pictures.meshes_of(problem.truth)
-    outline = {k: v for k, v in truth.items() if k in problem.known and k in sought}
-    scenes = {"truth": problem.truth} if outline else {}
+    truth = problem.truth
+    known = {k: truth[k] for k in truth.names if k in problem.known and k in sought}
+    scenes = {"truth": truth} if known else {}
     scenes |= {"start": start, "twin": twin}
-    folder.write_bytes(
-        "scene.png",
-        pictures.scene_picture(
-            {
-                name: pictures.Drawing(pictures.meshes_of(scene), sought, outline, places)
-                for name, scene in scenes.items()
-            },
-            pictures.frame_of(radar),
-        ),
-    )
-    grid = problem.grid
-    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
+    outline = Scene(known) if known else None
+    radars = [sight.radar for sight in problem.sights.values()]
+    figure = plotting.scene(scenes, radars, highlight=sought, outline=outline)
+    folder.write_figure("scene.png", figure)
     simulated = isinstance(problem.run.data, SimulatedData)
     data = "data (exact simulation)" if simulated else "data (measured)"
     titles = {"measured": data, "start": "surrogate, start", "twin": "surrogate, twin"}
-    titled = {titles[name]: power.numpy() for name, power in maps.items()}
-    folder.write_bytes("spectra.png", pictures.spectra_picture(titled, axes))
+    for number, (name, sight) in enumerate(problem.sights.items()):
+        titled = {titles[key]: found[number] for key, found in maps.items()}
+        file = f"spectra_{name}.png" if name else "spectra.png"
+        folder.write_figure(file, plotting.spectrum(titled, sight.grid))
     losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
     annealed = annealed_until(problem.run)
     before = metrics["start_loss_sharp"] if annealed else None
-    folder.write_bytes("loss.png", pictures.loss_picture(losses, annealed, before))
+    figure = plotting.convergence(losses, annealed=annealed, before=before)
+    folder.write_figure("loss.png", figure)
 
 
 def draw_shapes(
@@ -244,13 +246,15 @@ def draw_shapes(
     assert table is not None
     scenes = {"truth": problem.truth} if table.object in problem.known else {}
     scenes |= {"start": start, "twin": twin}
-    up = pictures.frame_of(problem.radar)[:, 1]
-    meshes = {name: pictures.meshes_of(scene)[table.object] for name, scene in scenes.items()}
-    folder.write_bytes("turntable.gif", turntable_gif(meshes, up))
+    turns = problem.first.radar.rotations
+    up = (0.0, 1.0, 0.0) if turns is None else turns.detach().mean(0)[:, 1]
+    found = {name: scene[table.object] for name, scene in scenes.items()}
+    meshes = {name: Mesh(item.vertices, item.mesh.faces) for name, item in found.items()}
+    folder.write_bytes("turntable.gif", plotting.turntable(meshes, up))
     curves = {_mode(mode, rows): [_curve(row) for row in fits] for mode, fits in rows.items()}
     if any(curve for fits in curves.values() for curve in fits):
         losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
-        folder.write_bytes("convergence.png", convergence_picture(losses, curves))
+        folder.write_figure("convergence.png", plotting.convergence(losses, curves))
 
 
 def _curve(row: dict[str, Any]) -> list[list[float]]:
@@ -269,9 +273,14 @@ def write_report(
         "loss": _loss_note(run, metrics),
         "landscape": _landscape_note(run, metrics),
     }
+    spectra = ["spectra", *(f"spectra_{name}" for name in run.observations)]
     shown = [
-        Picture(name.capitalize(), (folder.path / f"{name}.png").read_bytes(), notes.get(name, ""))
-        for name in ("scene", "spectra", "loss", "convergence", "landscape")
+        Picture(
+            name.capitalize().replace("_", ", "),
+            (folder.path / f"{name}.png").read_bytes(),
+            notes.get(name.split("_")[0], ""),
+        )
+        for name in ("scene", *spectra, "loss", "convergence", "landscape")
         if f"{name}.png" in folder.names
     ]
     title = run.title or "Reconstruction"

@@ -380,6 +380,8 @@ class Truth(Section):
     """factor"""
     material: Material | None = None
     """what it is really made of"""
+    velocity: Vector | None = None
+    """m/s"""
     angles_deg: dict[str, Vector] | None = None
     """of a body, all of its joints that are not at rest"""
     parts: Annotated[list[Part], Field(min_length=1)] | None = None

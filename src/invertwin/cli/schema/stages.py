@@ -48,6 +48,8 @@ class Variant(Settings):
 
     parameters: Annotated[list[str], Field(min_length=1)] | None = None
     """names of what is sought; without it all"""
+    observations: Annotated[list[str], Field(min_length=1)] | None = None
+    """names of the sensors that are fitted; without it all"""
     boundary: bool | None = None
     """with boundary terms"""
     smooth: NonNegative | None = None

@@ -1,0 +1,164 @@
+"""`invertwin loss-scan`: losses along a line, the paper's figure of periodic local minima."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from invertwin.capture import Capture
+from invertwin.channel import Grid, Sampling
+from invertwin.cli import build
+from invertwin.cli.landscape import exact_losses, line_name, moved, smooth_losses
+from invertwin.cli.report import Again, Picture, Table, report_html
+from invertwin.cli.run_file import need, to_toml
+from invertwin.cli.run_simulate import exact
+from invertwin.cli.runs import RunFolder
+from invertwin.cli.schema import RunFile
+from invertwin.errors import InputError
+from invertwin.models import SurrogateMap
+from invertwin.radar.direction import music
+from invertwin.radar.radar import Radar
+from invertwin.radar.range_profile import range_profile
+from invertwin_studies.figures import Curve, deep_minima, scan
+from invertwin_studies.sections import LossScan
+
+TITLES = {
+    "beat": "raw beat signal",
+    "range_profile": "range profile (FFT)",
+    "music": "MUSIC spectrum",
+    "surrogate": "surrogate",
+}
+"""Keys of the metrics, and what reports call them."""
+
+_NOTE = (
+    "The loss when one object is moved off its true place, all else true. Beat signals, complex "
+    "range profiles and MUSIC spectra: relative squared error, of the exact chain against the data "
+    "of the first frame, with the same rough points. Surrogate: the loss of the run file, against "
+    "the spectra of all frames of the same data. A minimum counts if it is deeper than a "
+    "thousandth of the curve's span; the true place counts as one. Wavelengths are those of "
+    "displacement: an echo's path changes by up to two of them for one."
+)
+
+
+def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
+    """Scans the line of a run file, writes the folder, and returns the table to print."""
+    begin = time.perf_counter()
+    settings: LossScan = need(run, "loss_scan", "loss-scan")
+    truth = build.true_scene(run)
+    radar = build.radar(need(run, "radar", "loss-scan"))
+    grid = build.grid(need(run, "grid", "loss-scan"), radar)
+    depth = getattr(need(run, "data", "loss-scan"), "depth", 1)
+    if run.surrogate.exact:
+        raise InputError(
+            "surrogate.exact: expected a smooth map beside the exact signals, got the exact chain; "
+            "remove it"
+        )
+    if depth > 1:
+        raise InputError(f"data.depth: expected 1 for loss-scan, got {depth}; set depth = 1")
+    found = exact(run, truth, radar, grid)
+    near, wide = _losses(run, settings, truth, radar, grid, found.beat)
+    wavelengths = 2 * settings.span / radar.waveform.wavelength
+    minima = {name: deep_minima(losses) for name, (_, losses) in near.items()}
+    metrics: dict[str, Any] = {
+        "task": "loss-scan",
+        "wavelength_m": radar.waveform.wavelength,
+        "span_wavelengths": wavelengths,
+        "minima": minima,
+        "minima_per_wavelength": {name: n / wavelengths for name, n in minima.items()},
+        "minima_wide": deep_minima(wide[1]),
+        "lowest_m": {name: _lowest(curve) for name, curve in near.items()},
+        "wall_seconds": time.perf_counter() - begin,
+    }
+    folder.write_json("metrics.json", metrics)
+    along = line_name(settings.object, settings.axis)
+    figure = scan({TITLES[name]: curve for name, curve in near.items()}, wide, along)
+    png = folder.write_figure("losses.png", figure)
+    table = _table(metrics, along)
+    folder.write_text(
+        "report.html",
+        report_html(
+            run.title or "Losses along a line",
+            f"{along}, {2 * settings.span:g} m in {settings.points} steps.",
+            run.note,
+            [table, Picture("Loss against displacement", png)],
+            Again("loss-scan run.toml", {"run.toml": to_toml(run)}),
+        ),
+    )
+    return [table]
+
+
+def _losses(
+    run: RunFile,
+    settings: LossScan,
+    truth: Any,
+    radar: Radar,
+    grid: Grid,
+    measured: Tensor,
+) -> tuple[dict[str, Curve], Curve]:
+    """The four curves near the truth, and the surrogate's farther away."""
+    capture = Capture.from_beat(measured, radar)
+    sampling = Sampling(depth=1, samples=settings.samples)
+    model = SurrogateMap(grid, build.surrogate(run.surrogate), sampling)
+
+    def line(span: float, points: int) -> tuple[np.ndarray, list[Any]]:
+        x = np.linspace(-span, span, points)
+        return x, moved(truth, settings.object, settings.axis, x)
+
+    def smooth(scenes: list[Any]) -> np.ndarray:
+        return smooth_losses(run, radar, capture, scenes, model)
+
+    with torch.no_grad():
+        x, scenes = line(settings.span, settings.points)
+        first = radar.frames([0])
+        views = _views(settings, first, grid)
+        losses = exact_losses(run, truth, first, scenes, measured[:1], views)
+        near = {name: (x, values) for name, values in losses.items()}
+        near["surrogate"] = (x, smooth(scenes))
+        x, scenes = line(settings.wide_span, settings.wide_points)
+        return near, (x, smooth(scenes))
+
+
+def _views(settings: LossScan, radar: Radar, grid: Grid) -> dict[str, Callable[[Tensor], Tensor]]:
+    """What is compared, of a beat signal."""
+
+    def profile(beat: Tensor) -> Tensor:
+        return range_profile(beat, radar, grid)
+
+    def spectrum(beat: Tensor) -> Tensor:
+        return music(
+            profile(beat)[:, None],
+            radar,
+            grid,
+            sources=settings.sources,
+            smoothing=(settings.smoothing[0], settings.smoothing[1]),
+            forward_backward=True,
+        )
+
+    return {"beat": lambda beat: beat, "range_profile": profile, "music": spectrum}
+
+
+def _lowest(curve: Curve) -> float:
+    """Where the loss is lowest [m]."""
+    return float(curve[0][np.argmin(curve[1])])
+
+
+def _table(metrics: dict[str, Any], along: str) -> Table:
+    rows = [
+        [
+            title,
+            metrics["minima"][name],
+            metrics["minima_per_wavelength"][name],
+            1e3 * metrics["lowest_m"][name],
+        ]
+        for name, title in TITLES.items()
+    ]
+    columns = ("loss of", "local minima", "per wavelength", "lowest at [mm]")
+    wavelength = 1e3 * metrics["wavelength_m"]
+    title = (
+        f"Local minima: {along}, over {metrics['span_wavelengths']:.3g} wavelengths of "
+        f"{wavelength:.3g} mm"
+    )
+    return Table(title, columns, rows, _NOTE)

@@ -1,0 +1,121 @@
+"""What may watch a fit: a display, numbers about a known truth, a checkpoint."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from invertwin.errors import InputError
+from invertwin.inversion.fit import Callback, Fit
+from invertwin.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Report(Callback):
+    """Calls a function with the row of every step.
+
+    Attributes:
+        function: Takes the row: ``step``, ``stage``, ``loss``, ``values``.
+    """
+
+    function: Callable[[dict[str, Any]], None]
+
+    def step(self, fit: Fit, row: dict[str, Any]) -> None:
+        """Report a row."""
+        self.function(row)
+
+
+@dataclass(frozen=True)
+class Watch(Callback):
+    """Adds numbers about the twin to rows, such as its distance from a known truth.
+
+    They do not change the fit.
+
+    Attributes:
+        function: Scene → numbers by name.
+        every: Steps from one call to the next.
+    """
+
+    function: Callable[[Scene], dict[str, float]]
+    every: int = 10
+
+    def annotate(self, fit: Fit) -> dict[str, Any]:
+        """The numbers of the present twin."""
+        if fit.progress.step % self.every:
+            return {}
+        try:
+            with torch.no_grad():
+                return self.function(fit.applied()[0])
+        except InputError:  # parameters out of bounds, as the next step will find
+            return {}
+
+
+@dataclass(frozen=True)
+class Checkpoint(Callback):
+    """Writes the state of the fit to a file, atomically, and can go on from it.
+
+    Stages before the last one have files of their own: ``fit_stage0.pt`` beside ``fit.pt``. A
+    checkpoint knows its fit by content: a changed model, loss, regulariser, scene, material or
+    datum is refused, and a loss function of one's own is recognised in a new process.
+
+    Attributes:
+        file: Where.
+        every: Steps from one file to the next.
+        resume: Go on from the file if it is there.
+    """
+
+    file: str | Path
+    every: int = 10
+    resume: bool = False
+
+    def begin(self, fit: Fit) -> None:
+        """Go on from the file.
+
+        Raises:
+            InputError: A file that cannot be read, or of another fit.
+        """
+        path = self._path(fit)
+        if not (self.resume and path.exists()):
+            return
+        try:
+            state = torch.load(path, weights_only=True)
+        except Exception as error:
+            raise InputError(
+                f"expected a checkpoint in {path}, got a file that cannot be read "
+                f"({type(error).__name__}); delete it or start without resume"
+            ) from None
+        if not isinstance(state, dict) or not fit.restore(state):
+            raise InputError(
+                f"expected a checkpoint of this fit in {path}, got one of another (schedule, "
+                "seed, model, loss, optimizer, regularizers, parameters, scene or data differ); "
+                "start without resume"
+            )
+
+    def step(self, fit: Fit, row: dict[str, Any]) -> None:
+        """Write the file now and then."""
+        if fit.progress.step % self.every == 0:
+            self.end(fit)
+
+    def end(self, fit: Fit) -> None:
+        """Write the file; a kill leaves the last whole one."""
+        path = self._path(fit)
+        part = path.with_suffix(path.suffix + ".part")
+        torch.save(fit.state(), part)
+        os.replace(part, path)
+
+    def _path(self, fit: Fit) -> Path:
+        path = Path(self.file)
+        return path if fit.last else stage_file(path, fit.number)
+
+
+def stage_file(file: Path, stage: int) -> Path:
+    """The checkpoint of a stage that is not the last.
+
+    Args:
+        file: Checkpoint of the last stage.
+        stage: Number of the stage, from 0.
+    """
+    return file.with_name(f"{file.stem}_stage{stage}{file.suffix}")

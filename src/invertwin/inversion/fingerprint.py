@@ -1,0 +1,122 @@
+"""What a fit is, as a short fingerprint: equal in every process, different for every change."""
+
+import hashlib
+import inspect
+import math
+import types
+from collections.abc import Mapping, Sequence, Set
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+_PROJECTIONS = 6  # of a tensor onto fixed waves: one changed number changes them
+_ROUNDING = 1e-5  # of a tensor's norm: what another order of additions may change
+_OWN_TO_TORCH = frozenset(vars(nn.Module()))
+
+
+class Fingerprint:
+    """The digest of values by their content.
+
+    Dataclasses, modules and objects count by class and fields, functions by their code and what
+    they enclose, tensors of numbers by projections that tolerate rounding. No address of a value
+    takes part, so that a function of one's own has the same fingerprint in a new process.
+    """
+
+    def __init__(self, *values: Any) -> None:
+        """Take the fingerprint of these values, in this order."""
+        self._hash = hashlib.sha256()
+        self._numbers: list[float] = []
+        self._open: set[int] = set()
+        for value in values:
+            self._add(value)
+
+    def content(self) -> dict[str, Any]:
+        """Plain values for a checkpoint."""
+        return {"digest": self._hash.hexdigest(), "numbers": list(self._numbers)}
+
+    def matches(self, kept: Any) -> bool:
+        """Whether kept content is of equal values, but for rounding."""
+        if not isinstance(kept, dict) or kept.get("digest") != self._hash.hexdigest():
+            return False
+        pairs = zip(kept["numbers"], self._numbers, strict=True)
+        return all(math.isclose(a, b, rel_tol=_ROUNDING, abs_tol=_ROUNDING) for a, b in pairs)
+
+    def _note(self, *words: object) -> None:
+        self._hash.update(("|".join(map(str, words)) + ";").encode())
+
+    def _add(self, value: Any) -> None:
+        if value is None or isinstance(value, bool | int | str | bytes):
+            self._note(type(value).__name__, value)
+        elif isinstance(value, float):
+            self._note("float", repr(value))
+        elif isinstance(value, Tensor | np.ndarray):
+            self._add_tensor(torch.as_tensor(value).detach())
+        elif id(value) in self._open:
+            self._note("again")
+        else:
+            self._open.add(id(value))
+            self._add_compound(value)
+            self._open.discard(id(value))
+
+    def _add_compound(self, value: Any) -> None:
+        if isinstance(value, Mapping):
+            self._note("mapping", len(value))
+            for key, item in value.items():
+                self._add(key)
+                self._add(item)
+        elif isinstance(value, Sequence | Set):
+            items = sorted(value, key=repr) if isinstance(value, Set) else value
+            self._note("sequence", len(items))
+            for item in items:
+                self._add(item)
+        elif isinstance(value, partial):
+            self._note("partial")
+            self._add([value.func, list(value.args), dict(value.keywords)])
+        elif isinstance(value, types.MethodType):
+            self._note("method", value.__func__.__qualname__)
+            self._add([value.__func__, value.__self__])
+        elif isinstance(value, types.FunctionType):
+            self._add_function(value)
+        elif isinstance(value, types.CodeType):
+            self._note("code", value.co_code.hex(), *value.co_names)
+            self._add(value.co_consts)
+        elif isinstance(value, type | types.BuiltinFunctionType | types.ModuleType):
+            self._note(getattr(value, "__module__", ""), getattr(value, "__qualname__", value))
+        else:
+            self._add_object(value)
+
+    def _add_function(self, value: types.FunctionType) -> None:
+        self._note("function", value.__module__, value.__qualname__)
+        enclosed = inspect.getclosurevars(value).nonlocals if value.__closure__ else {}
+        self._add([value.__code__, value.__defaults__, value.__kwdefaults__, enclosed])
+
+    def _add_object(self, value: Any) -> None:
+        self._note("object", type(value).__module__, type(value).__qualname__)
+        if isinstance(value, nn.Module):
+            self._add(dict(value.named_parameters(recurse=False)))
+            self._add({n: p.requires_grad for n, p in value.named_parameters(recurse=False)})
+            self._add(dict(value.named_buffers(recurse=False)))
+            self._add(dict(value.named_children()))
+        kept = getattr(value, "__dict__", {})
+        slots = [n for c in type(value).__mro__ for n in getattr(c, "__slots__", ())]
+        fields = {n: getattr(value, n) for n in slots if hasattr(value, n) and n != "__weakref__"}
+        self._add({n: v for n, v in (fields | kept).items() if n not in _OWN_TO_TORCH})
+
+    def _add_tensor(self, value: Tensor) -> None:
+        self._note("tensor", value.dtype, tuple(value.shape))
+        flat = value.cpu().reshape(-1)
+        if not (flat.is_floating_point() or flat.is_complex()):
+            self._hash.update(flat.contiguous().numpy().tobytes())
+            return
+        numbers = torch.view_as_real(flat).reshape(-1) if flat.is_complex() else flat
+        numbers = torch.nan_to_num(numbers.double())
+        norm = float(numbers.norm())
+        place = torch.arange(len(numbers), dtype=torch.float64)
+        waves = [
+            float((numbers * torch.cos((0.7 + k) * place + k)).sum()) for k in range(_PROJECTIONS)
+        ]
+        # In units of the norm, so that one tolerance serves all of them.
+        self._numbers += [math.log(norm) if norm > 0 else -1e9, *(w / (norm or 1.0) for w in waves)]

@@ -1,0 +1,374 @@
+"""One stage of a fit: a model predicts, a loss compares, an optimiser steps."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.inversion.fingerprint import Fingerprint
+from invertwin.inversion.gauss_newton import GaussNewton, without_effect
+from invertwin.inversion.loss import Maps, Objective
+from invertwin.inversion.observation import Observation
+from invertwin.inversion.optimizer import Optimizer
+from invertwin.inversion.regularization import Regularizer
+from invertwin.inversion.schedule import Stage
+from invertwin.scene.scene import Scene
+from invertwin.seeds import derived_seed
+
+Status = Literal["converged", "budget", "diverged"]
+
+_DIVERGED = 1e3  # times the first loss
+_WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
+_WINDOW = 20  # steps over which convergence is judged
+_SUBSETS = 2**16  # keys of the seeds that choose frames, beyond those of observations
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a fit has come: all that a checkpoint holds besides parameters and optimiser.
+
+    Attributes:
+        first: The parameters at the start.
+        step: Steps done.
+        history: One row a step.
+        best: Step, loss and parameters of the lowest loss.
+        ended: How the fit has ended, once it has.
+    """
+
+    first: dict[str, Tensor]
+    step: int = 0
+    history: list[dict[str, Any]] = field(default_factory=list)
+    best: tuple[int, float, dict[str, Tensor]] | None = None
+    ended: Status | None = None
+
+
+class Callback:
+    """Something that watches a fit. Every method does nothing unless it is overridden."""
+
+    def begin(self, fit: "Fit") -> None:
+        """Called before the first step of every stage."""
+
+    def annotate(self, fit: "Fit") -> dict[str, Any]:
+        """Numbers that join the row of the step that was just done."""
+        return {}
+
+    def step(self, fit: "Fit", row: dict[str, Any]) -> None:
+        """Called after every step, with its complete row."""
+
+    def end(self, fit: "Fit") -> None:
+        """Called when a stage has ended."""
+
+
+class Fit:
+    """The state of one stage of a fit.
+
+    Attributes:
+        scene: The scene before any module is applied.
+        observations: With prepared models.
+        unknowns: Modules of the scene, applied in order.
+        sensor_unknowns: Modules of the sensor of every observation.
+        stage: Its schedule.
+        number: Number of the stage, from 0.
+        last: Whether it is the last stage.
+        progress: How far it has come.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        observations: Sequence[Observation],
+        unknowns: Sequence[nn.Module],
+        sensor_unknowns: Sequence[Sequence[nn.Module]],
+        *,
+        stage: Stage,
+        settings: "Settings",
+        rates: Mapping[nn.Parameter, float],
+        position: tuple[int, int, bool],
+    ) -> None:
+        """Prepare a stage. See :func:`invertwin.reconstruct` for what the arguments mean."""
+        self.scene, self.stage = scene, stage
+        self.number, self._before, self.last = position
+        self.unknowns, self.sensor_unknowns = list(unknowns), [list(m) for m in sensor_unknowns]
+        listed = [*self.unknowns, *(m for modules in self.sensor_unknowns for m in modules)]
+        self.modules = nn.ModuleList(dict.fromkeys(listed))
+        self._settings = settings
+        self.observations = list(observations)
+        self._observed = [observation.observed().detach() for observation in observations]
+        losses = tuple(o.loss or settings.loss for o in observations)
+        self.objective = Objective(losses, tuple(o.weight for o in observations))
+        sought = [p for p in self.modules.parameters() if p.requires_grad]
+        if not sought or stage.steps < 1:
+            raise InputError(
+                f"expected parameters to fit and steps >= 1, got {len(sought)} and "
+                f"{stage.steps}; give modules such as Pose('object')"
+            )
+        rules = stage.optimizer or settings.optimizer
+        rough = [o.model for o in observations if not getattr(o.model, "smooth", True)]
+        if rough and rules.kind == "gauss_newton":
+            raise InputError(
+                "expected smooth models such as SurrogateMap with kind 'gauss_newton', got "
+                f"{type(rough[0]).__name__}; use 'adam'"
+            )
+        # Before the models draw anything: what is drawn follows from the rest.
+        self.fingerprint = Fingerprint(
+            (position, stage, settings, self.modules, scene),
+            [
+                (o.model, o.sensor, o.weight, o.loss, observed)
+                for o, observed in zip(observations, self._observed, strict=True)
+            ],
+        )
+        self._models = [
+            o.model.prepared(scene, o.sensor, derived_seed(settings.seed, k))
+            for k, o in enumerate(observations)
+        ]
+        self.rules, self.optimizer = rules, rules.build(self.modules, self.objective, rates)
+        self.progress = Progress(self.parameters())
+
+    def run(self, callbacks: Sequence[Callback]) -> Status:
+        """Take all steps.
+
+        Args:
+            callbacks: What watches the fit.
+
+        Returns:
+            How the fit has ended.
+        """
+        for callback in callbacks:
+            callback.begin(self)
+        if self.progress.ended is None:
+            status = self._descend(callbacks)
+            self._note(ended=self._judged(status))
+        for callback in callbacks:
+            callback.end(self)
+        assert self.progress.ended is not None
+        return self.progress.ended
+
+    def applied(self) -> tuple[Scene, list[Any]]:
+        """The scene and all sensors under the present parameters."""
+        scene = self.scene
+        for module in self.unknowns:
+            scene = module(scene)
+        sensors = []
+        for observation, modules in zip(self.observations, self.sensor_unknowns, strict=True):
+            sensor = observation.sensor
+            for module in modules:
+                sensor = module(sensor)
+            sensors.append(sensor)
+        return scene, sensors
+
+    def twin(self) -> Scene:
+        """The scene under the present parameters, without derivatives."""
+        with torch.no_grad():
+            return self.applied()[0]
+
+    def maps(self, step: int) -> Maps:
+        """The predicted and the observed map of every observation in a step, blurred alike.
+
+        Args:
+            step: Number of the step; the same step has the same random numbers.
+        """
+        scene, sensors = self.applied()
+        share = max(0.0, 1 - step / self.stage.widths_end)
+        pairs = []
+        for k, (model, sensor, observed) in enumerate(
+            zip(self._models, sensors, self._observed, strict=True)
+        ):
+            sensor, observed = self._subset(k, step, sensor, observed)
+            model = model.narrowed(share)
+            key = (self.number, step, k) if model.redraws else (k,)
+            predicted = model.predict(scene, sensor, derived_seed(self._settings.seed, *key))
+            pairs.append((predicted, model.blurred(observed, sensor)))
+        return pairs
+
+    def penalty(self) -> Tensor:
+        """What the regularisers add to the loss."""
+        scene, total = self.applied()[0], torch.zeros((), dtype=torch.float64)
+        for term in self._settings.regularizers:
+            total = total + term(scene)
+        return total
+
+    def evaluate(self, step: int) -> Tensor:
+        """The loss of a step.
+
+        Args:
+            step: Number of the step.
+        """
+        value = self.objective(self.maps(step))
+        return value + self.penalty() if self._settings.regularizers else value
+
+    def parameters(self) -> dict[str, Tensor]:
+        """A copy of the present parameters."""
+        return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on later."""
+        return {
+            "modules": self.modules.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "progress": vars(self.progress),
+            "fingerprint": self.fingerprint.content(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> bool:
+        """Go on from a state.
+
+        Args:
+            state: From ``state`` of the same fit.
+
+        Returns:
+            Whether it is a state of this fit; if not, nothing has changed.
+        """
+        if not self.fingerprint.matches(state.get("fingerprint")):
+            return False
+        self.modules.load_state_dict(state["modules"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.progress = Progress(**state["progress"])
+        return True
+
+    def annealed(self, step: int) -> bool:
+        """Whether the extra widths are zero from this step on.
+
+        Args:
+            step: Number of the step.
+        """
+        return step >= self.stage.widths_end or not any(m.widened for m in self._models)
+
+    def _note(self, **changes: Any) -> None:
+        self.progress = Progress(**{**vars(self.progress), **changes})
+
+    def _subset(self, k: int, step: int, sensor: Any, observed: Tensor) -> tuple[Any, Tensor]:
+        """The frames of one observation that a step compares."""
+        count = self.stage.frames_per_step
+        if count is None or count >= len(observed):
+            return sensor, observed
+        rng = np.random.default_rng(
+            derived_seed(self._settings.seed, self.number, step, _SUBSETS + k)
+        )
+        chosen = np.sort(rng.choice(len(observed), count, replace=False))
+        return sensor.frames(chosen.tolist()), observed[torch.from_numpy(chosen)]
+
+    def _descend(self, callbacks: Sequence[Callback]) -> Status:
+        stage = self.stage
+        while (step := self.progress.step) < stage.steps:
+            self.rules.apply(self.optimizer, step / stage.steps)
+            before = self.parameters()
+            try:
+                number = self._stepped(step)
+            except InputError:
+                if self.progress.best is None:  # not lost on the way, but wrong from the start
+                    raise
+                number = math.nan
+            if _lost(number, self.progress.history):
+                if self.progress.best is None:
+                    raise InputError(
+                        f"expected a finite loss at the start, got {number}; check the data and "
+                        "the initial parameters"
+                    )
+                self.modules.load_state_dict(self.progress.best[2])
+                return "diverged"
+            self._keep_if_better(number, before)
+            row: dict[str, Any] = {"step": self._before + step, "stage": self.number}
+            row |= {"loss": number, "values": _values(self.modules)}
+            self._note(step=step + 1)
+            for callback in callbacks:
+                row |= callback.annotate(self)
+            self.progress.history.append(row)
+            for callback in callbacks:
+                callback.step(self, row)
+            if stage.tolerance > 0 and self._settled(stage.tolerance):
+                return "converged"
+        return "converged" if self._settled(max(stage.tolerance, 1e-3)) else "budget"
+
+    def _stepped(self, step: int) -> float:
+        """The loss of the present parameters, which then take a step down."""
+        if isinstance(self.optimizer, GaussNewton):
+            penalty = self.penalty if self._settings.regularizers else None
+            return self.optimizer.step(partial(self.maps, step), penalty)
+        self.optimizer.zero_grad()
+        value = self.evaluate(step)
+        number = float(value.detach())
+        if not _lost(number, self.progress.history):
+            if value.requires_grad:
+                value.backward()
+            _require_all_used(self.modules)
+            self.optimizer.step()
+        return number
+
+    def _keep_if_better(self, loss: float, parameters: dict[str, Tensor]) -> None:
+        """Remember the parameters of the lowest loss; without extra widths beats with."""
+        best, step = self.progress.best, self.progress.step
+        if best is not None:
+            first = self.annealed(step) and not self.annealed(best[0])
+            if not first and loss >= best[1]:
+                return
+        self._note(best=(step, loss, parameters))
+
+    def _judged(self, status: Status) -> Status:
+        """The status, or ``diverged`` if the fit ends worse than it started; the best is kept."""
+        best = self.progress.best
+        if best is None:
+            return status
+        ends = {"first": self.progress.first, "best": best[2]}
+        if status != "diverged":
+            ends["last"] = self.parameters()
+        losses = {}
+        with torch.no_grad():
+            for name, parameters in ends.items():
+                self.modules.load_state_dict(parameters)
+                try:
+                    losses[name] = float(self.evaluate(self.stage.steps))
+                except InputError:  # out of bounds
+                    losses[name] = math.inf
+        last = losses.get("last", math.inf)
+        if math.isfinite(last) and last <= _WORSE * losses["first"]:
+            self.modules.load_state_dict(ends["last"])
+            return status
+        kept = min(("first", "best"), key=lambda name: losses[name])
+        self.modules.load_state_dict(ends[kept])
+        self._note(best=(self.progress.step, losses[kept], ends[kept]))
+        return "diverged"
+
+    def _settled(self, tolerance: float) -> bool:
+        """Whether the loss, averaged over two windows without extra widths, no longer falls."""
+        rows = [row["loss"] for row in self.progress.history[-2 * _WINDOW :]]
+        if len(rows) < 2 * _WINDOW or not self.annealed(self.progress.step - 2 * _WINDOW):
+            return False
+        before, after = np.mean(rows[:_WINDOW]), np.mean(rows[_WINDOW:])
+        return bool(before - after < tolerance * before)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all stages of a fit have in common. See :func:`invertwin.reconstruct`."""
+
+    loss: Callable[[Tensor, Tensor], Tensor]
+    optimizer: Optimizer
+    regularizers: tuple[Regularizer, ...]
+    seed: int
+
+
+def _require_all_used(modules: nn.ModuleList) -> None:
+    for module in modules:
+        for name, parameter in module.named_parameters():
+            if parameter.requires_grad and parameter.grad is None:
+                raise without_effect(module, name)
+
+
+def _lost(loss: float, history: list[dict[str, Any]]) -> bool:
+    return not math.isfinite(loss) or bool(history and loss > _DIVERGED * history[0]["loss"])
+
+
+def _values(modules: nn.ModuleList) -> dict[str, Any]:
+    """Parameters by name as plain numbers; long ones (vertices) are left to the checkpoint."""
+    rows: dict[str, Any] = {}
+    for module in modules:
+        for name, value in getattr(module, "values", dict)().items():
+            if value.numel() <= 16:
+                rows[name] = value.tolist()
+    return rows

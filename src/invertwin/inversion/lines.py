@@ -1,0 +1,135 @@
+"""A line through the parameters of a module: what a gradient check moves along."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.scene.mesh import Mesh
+
+_NEWTON = 8  # steps along a normal, onto the zero of the changed field
+_ON = 1e-9  # m, how near a point is to that zero
+
+
+class Line:
+    """The parameters of a module, moved by θ times a tangent."""
+
+    def __init__(self, module: nn.Module, tangent: Mapping[str, Tensor], target: Any) -> None:
+        """Move the parameters of a module.
+
+        Args:
+            module: Maps the target.
+            tangent: Changes of parameters by name.
+            target: The scene or the sensor that the module maps.
+
+        Raises:
+            InputError: A name or a shape that the module's parameters do not have.
+        """
+        self._module, self._tangent, self._target = module, dict(tangent), target
+        self._start = {name: value.detach() for name, value in module.named_parameters()}
+        for name, change in self._tangent.items():
+            expected = self._start.get(name)
+            if expected is None or expected.shape != change.shape:
+                shapes = ", ".join(f"{n} {tuple(v.shape)}" for n, v in self._start.items())
+                raise InputError(
+                    f"expected changes of parameters of {type(module).__name__} ({shapes}), got "
+                    f"{name} {tuple(change.shape)}; give tensors of these shapes"
+                )
+
+    def at(self, theta: Tensor) -> Any:
+        """The module's result at θ, which may carry a derivative.
+
+        Args:
+            theta: A scalar.
+        """
+        moved = {n: self._start[n] + theta * change for n, change in self._tangent.items()}
+        return torch.func.functional_call(self._module, moved, (self._target,))
+
+    def end(self, theta: float) -> Any:
+        """The module's result at one end of a difference.
+
+        Args:
+            theta: How far from the start.
+        """
+        return self.at(torch.tensor(theta, dtype=torch.float64))
+
+
+class FieldLine(Line):
+    """A line of a signed distance, whose differences keep the triangles of θ = 0.
+
+    Differences with common random numbers need triangles that stay the same ones, so ends are not
+    meshed anew: the points of the first mesh follow the changed field's zero along their normals.
+    Derivatives go through the module as it is, its marching cubes included.
+    """
+
+    def __init__(self, module: nn.Module, tangent: Mapping[str, Tensor], target: Any) -> None:
+        """See ``Line``; the module has an ``object`` and its ``distance`` at points."""
+        super().__init__(module, tangent, target)
+        self._field, self._object = _Field(module), str(module.object)
+        with torch.no_grad():
+            self._scene = module(target)
+        self._mesh = self._scene[self._object].mesh
+        _, slope = self._slopes(0.0, self._mesh.vertices.detach())
+        self._normals = slope / slope.norm(dim=1, keepdim=True)
+
+    def end(self, theta: float) -> Any:
+        """The scene with the first mesh moved onto the changed surface. See ``Line.end``."""
+        places = self._mesh.vertices.detach()
+        for _ in range(_NEWTON):
+            found, slope = self._slopes(theta, places)
+            places = places - self._normals * (found / (slope * self._normals).sum(1))[:, None]
+        found, _ = self._slopes(theta, places)
+        if not bool(found.abs().max() < _ON):
+            raise InputError(
+                "expected a surface that follows θ along its normals, got points that do not meet "
+                f"it at θ = {theta:.3g}; take a smaller step"
+            )
+        return self._scene.replace(self._object, mesh=Mesh(places, self._mesh.faces))
+
+    def _slopes(self, theta: float, places: Tensor) -> tuple[Tensor, Tensor]:
+        """The changed distance at points, and its gradient there."""
+        at = places.detach().requires_grad_()
+        moved = {
+            f"shape.{name}": self._start[name] + theta * change
+            for name, change in self._tangent.items()
+        }
+        with torch.enable_grad():
+            found = torch.func.functional_call(self._field, moved, (at,))
+            (slope,) = torch.autograd.grad(found.sum(), at)
+        return found.detach(), slope
+
+
+def line_of(module: nn.Module, tangent: Mapping[str, Tensor] | Tensor, target: Any) -> Line:
+    """The line of a module's parameters along a tangent.
+
+    Args:
+        module: Maps the target.
+        tangent: Changes of parameters by name, or of its only parameter.
+        target: The scene or the sensor that the module maps.
+
+    Raises:
+        InputError: A tangent that does not fit the module's parameters.
+    """
+    if isinstance(tangent, Tensor):
+        names = [name for name, _ in module.named_parameters()]
+        if len(names) != 1:
+            raise InputError(
+                f"expected changes by name for {type(module).__name__} ({', '.join(names)}), got "
+                "a tensor; give a dict"
+            )
+        tangent = {names[0]: tangent}
+    meshed_anew = hasattr(module, "distance") and hasattr(module, "object")
+    return (FieldLine if meshed_anew else Line)(module, tangent, target)
+
+
+class _Field(nn.Module):
+    """The distance of a shape as a module's own call."""
+
+    def __init__(self, shape: nn.Module) -> None:
+        super().__init__()
+        self.shape = shape
+
+    def forward(self, places: Tensor) -> Tensor:
+        return self.shape.distance(places)  # type: ignore[operator]

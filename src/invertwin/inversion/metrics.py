@@ -1,0 +1,278 @@
+"""Metrics of shape: distances between two surfaces, shared volume, normals, parts and holes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float64
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from invertwin.channel import Link
+from invertwin.channel.bridge import flatten
+from invertwin.channel.rays import Shot, visible
+from invertwin.errors import InputError
+from invertwin.scene.antenna import Isotropic
+from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.scene.material import PerfectConductor
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Object, Scene
+
+POINTS = 20_000  # of each surface
+VOXEL = 0.02  # [m]
+_MOST_VOXELS = 200_000_000
+_CHUNK = 4_000_000  # voxels at a time
+
+
+@dataclass(frozen=True)
+class ShapeMetrics:
+    """How close a found surface is to the true one.
+
+    Attributes:
+        chamfer: mean of both directions of the distance to the closest point [m], not squared.
+            Points are drawn at random, so equal surfaces of area A are ½ √(A / points) apart.
+        fscore: harmonic mean of precision and recall, by threshold [m]. Precision is the part of
+            the found surface within the threshold of the true one; recall is the reverse.
+        normal_consistency: mean of both directions of |n · n′| at closest points: 1 for equal
+            surfaces, 0.5 for normals that are independent of each other.
+        iou: volume of the intersection over that of the union; None if a mesh is not watertight,
+            or if the volume was left out.
+    """
+
+    chamfer: float
+    fscore: dict[float, float]
+    normal_consistency: float
+    iou: float | None
+
+
+@dataclass(frozen=True)
+class Topology:
+    """Number of parts and holes of a closed surface.
+
+    Attributes:
+        components: connected parts of the surface; the wall of a cavity is one too.
+        euler_number: vertices − edges + triangles: 2 for every part, minus 2 for every hole
+            through it.
+    """
+
+    components: int
+    euler_number: int
+
+
+def compare_shapes(
+    found: Mesh,
+    truth: Mesh,
+    *,
+    seen_from: ArrayLike | None = None,
+    thresholds: Sequence[float] = (0.02,),
+    count: int = POINTS,
+    voxel: float | None = VOXEL,
+    seed: int = 0,
+) -> ShapeMetrics:
+    """Compare two meshes in one frame.
+
+    With `seen_from`, only what some radar position sees counts. On each surface these are the
+    points that the rest of the mesh does not hide; they are compared with the whole of the other
+    surface. In the volume these are the voxels whose closest surface point is seen.
+
+    Args:
+        found: the result.
+        truth: what it should be.
+        seen_from: radar positions [n, 3] in the frame of the meshes (m); None counts everything.
+        thresholds: of the F-score [m].
+        count: points drawn on each surface.
+        voxel: edge of the voxels for the volume [m]; None leaves the volume out.
+        seed: of the points.
+
+    Raises:
+        InputError: meshes without area, nothing that is seen, or numbers that are not positive.
+    """
+    if not thresholds or any(not t > 0 for t in thresholds):
+        raise InputError(f"expected thresholds > 0 [m], got {list(thresholds)}; give e.g. 0.02")
+    clouds = [surface_points(mesh, count, seed, k) for k, mesh in enumerate((found, truth))]
+    masks = [np.ones(count, dtype=bool)] * 2
+    if seen_from is not None:
+        masks = [
+            seen_points(points, mesh, seen_from).numpy()
+            for (points, _), mesh in zip(clouds, (found, truth), strict=True)
+        ]
+        for name, mask in zip(("found", "true"), masks, strict=True):
+            if not mask.any():
+                raise InputError(
+                    f"expected a {name} surface that some position sees, got none of "
+                    f"{count} points; check positions and frame"
+                )
+    trees = [KDTree(points.numpy()) for points, _ in clouds]
+    distances, alignments = [], []
+    for own, other in ((0, 1), (1, 0)):
+        points, normals = (part.numpy()[masks[own]] for part in clouds[own])
+        gap, nearest = trees[other].query(points)
+        distances.append(np.asarray(gap))
+        closest = clouds[other][1].numpy()[nearest]
+        alignments.append(float(np.abs((normals * closest).sum(1)).mean()))
+    within = {float(t): [float((d <= t).mean()) for d in distances] for t in thresholds}
+    iou = None
+    if voxel is not None and is_watertight(found) and is_watertight(truth):
+        keep = None if seen_from is None else (clouds, masks)
+        iou = _shared_volume(found, truth, voxel, keep)
+    return ShapeMetrics(
+        chamfer=float(np.mean([d.mean() for d in distances])),
+        fscore={t: 2 * a * b / max(a + b, 1e-300) for t, (a, b) in within.items()},
+        normal_consistency=float(np.mean(alignments)),
+        iou=iou,
+    )
+
+
+def volume_iou(found: Mesh, truth: Mesh, voxel: float = VOXEL) -> float:
+    """Volume of the intersection of two closed meshes over that of their union, in voxels.
+
+    A voxel is inside if the mesh winds around its centre, so overlapping closed parts count once
+    and cavities are empty.
+
+    Args:
+        found: the result.
+        truth: what it should be.
+        voxel: edge [m].
+
+    Raises:
+        InputError: a mesh that is not watertight, or voxels that are too many.
+    """
+    for name, mesh in (("found", found), ("true", truth)):
+        if not is_watertight(mesh):
+            raise InputError(
+                f"expected a watertight {name} mesh, whose edges all have two triangles that run "
+                "along them in opposite directions, got an open one; close it, or compare surfaces"
+            )
+    return _shared_volume(found, truth, voxel, None)
+
+
+def is_watertight(mesh: Mesh) -> bool:
+    """Whether every edge has two triangles, which run along it in opposite directions."""
+    solid = _solid(mesh)
+    return bool(solid.is_watertight and solid.is_winding_consistent)
+
+
+def topology(mesh: Mesh) -> Topology:
+    """Number of parts and holes of a closed surface, whose triangles meet in shared vertices.
+
+    Raises:
+        InputError: a mesh that is not watertight.
+    """
+    if not is_watertight(mesh):
+        raise InputError(
+            "expected a watertight mesh, whose edges all have two triangles that run along them in "
+            "opposite directions, got an open one; close it"
+        )
+    solid = _solid(mesh)
+    parts = trimesh.graph.connected_components(solid.edges_unique)
+    return Topology(len(parts), int(solid.euler_number))
+
+
+def surface_points(
+    mesh: Mesh, count: int, seed: int, stream: int = 0
+) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
+    """Points drawn uniformly over a surface [m], and the unit normals of their triangles.
+
+    Args:
+        mesh: the surface.
+        count: number of points.
+        seed: of the points.
+        stream: streams of one seed are independent.
+
+    Raises:
+        InputError: a surface without area.
+    """
+    solid = _solid(mesh)
+    if not solid.area > 0:
+        raise InputError("expected a surface with area, got none; check the mesh")
+    number = checked_count(count, "points", 1)
+    points, rows = trimesh.sample.sample_surface(solid, number, seed=[seed, stream])
+    normals = solid.face_normals[rows]
+    return torch.from_numpy(np.array(points)), torch.from_numpy(np.array(normals))
+
+
+def seen_points(
+    points: Float64[Tensor, "n 3"], mesh: Mesh, positions: ArrayLike
+) -> Bool[Tensor, " n"]:
+    """Which points of a surface are seen from at least one position, past the rest of the mesh.
+
+    Args:
+        points: on the surface [m].
+        mesh: the surface, in the frame of the points.
+        positions: [p, 3], metres.
+
+    Raises:
+        InputError: wrong shapes, or NaN.
+    """
+    places = checked_tensor(positions, (None, 3), "radar positions [m]", "give x, y, z of each")
+    scene = Scene({"surface": Object(Mesh(mesh.vertices.detach(), mesh.faces), PerfectConductor())})
+    turns = torch.eye(3, dtype=torch.float64).expand(len(places), 3, 3)
+    antenna = Isotropic()
+    # Visibility does not depend on the wavelength.
+    link = Link(places, places, turns, antenna, antenna, 1e-2, True)
+    shot = Shot(flatten(scene, link.wavelength), link)
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for place in places:
+        hidden = torch.nonzero(~seen)[:, 0]
+        clear = visible(shot, points[hidden], place.expand(len(hidden), 3))
+        seen[hidden[clear]] = True
+    return seen
+
+
+def _shared_volume(
+    found: Mesh,
+    truth: Mesh,
+    voxel: float,
+    keep: tuple[list[tuple[Tensor, Tensor]], list[np.ndarray]] | None,
+) -> float:
+    edge = checked_number(voxel, "voxel [m]", 0.0, open_low=True)
+    both = torch.cat([found.vertices, truth.vertices]).detach().numpy()
+    # Centres on a lattice of the frame, so that both meshes are cut alike wherever they are.
+    first = np.floor(both.min(0) / edge).astype(np.int64)
+    shape = np.ceil(both.max(0) / edge).astype(np.int64) - first
+    if math.prod(map(int, shape)) > _MOST_VOXELS:
+        raise InputError(
+            f"expected at most {_MOST_VOXELS} voxels, got {' × '.join(map(str, shape))}; "
+            "give a larger voxel"
+        )
+    inside = [_inside(mesh, first, shape, edge) for mesh in (found, truth)]
+    joint, shared = inside[0] | inside[1], inside[0] & inside[1]
+    if keep is not None:
+        clouds, masks = keep
+        tree = KDTree(np.concatenate([points.numpy() for points, _ in clouds]))
+        index = np.argwhere(joint)
+        _, nearest = tree.query((index + first + 0.5) * edge)
+        rows = tuple(index[np.concatenate(masks)[nearest]].T)
+        joint, shared = joint[rows], shared[rows]
+    total = int(joint.sum())
+    if not total:
+        raise InputError("expected volumes that hold voxels, got none; give a smaller voxel")
+    return float(shared.sum() / total)
+
+
+def _inside(mesh: Mesh, first: np.ndarray, shape: np.ndarray, edge: float) -> np.ndarray:
+    """Whether a closed mesh winds around the centres of voxels [x, y, z].
+
+    Source: Barill et al. 2018, "Fast winding numbers for soups and clouds".
+    """
+    solid, size = _solid(mesh), tuple(map(int, shape))
+    vertices, faces = np.array(solid.vertices), np.array(solid.faces)
+    inside = np.zeros(size, dtype=bool)
+    step = max(1, _CHUNK // max(size[1] * size[2], 1))
+    for start in range(0, size[0], step):
+        part = inside[start : start + step]
+        index = np.indices(part.shape).reshape(3, -1).T + np.array([start, 0, 0])
+        winding = igl.fast_winding_number(vertices, faces, (index + first + 0.5) * edge)
+        part[:] = (np.abs(winding) > 0.5).reshape(part.shape)
+    return inside
+
+
+def _solid(mesh: Mesh) -> trimesh.Trimesh:
+    """The mesh for trimesh, without triangles that have shrunk to an edge."""
+    faces = mesh.faces.numpy()
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    return trimesh.Trimesh(mesh.vertices.detach().numpy(), faces, process=False)

@@ -1,0 +1,93 @@
+"""How long a fit lasts, and its stages: which unknowns are free when, coarse before fine."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from invertwin.errors import InputError
+from invertwin.inversion.observation import Observation
+from invertwin.inversion.optimizer import Optimizer
+from invertwin.scene.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long a fit lasts.
+
+    Attributes:
+        steps: Budget.
+        annealing: Share of the steps with extra widths.
+        frames_per_step: Random frames of every observation in a step; None = all.
+        tolerance: Once the widths are zero, the fit stops when the loss has fallen by less than
+            this share over 20 steps; 0 = it uses the whole budget.
+    """
+
+    steps: int = 200
+    annealing: float = 0.7
+    frames_per_step: int | None = None
+    tolerance: float = 0.0
+
+    @property
+    def widths_end(self) -> float:
+        """The step from which there are no extra widths: the last one at the latest."""
+        return max(1.0, min(self.annealing * self.steps, self.steps - 1))
+
+
+@dataclass(frozen=True)
+class Stage(Schedule):
+    """A part of a fit. It goes on from where the stage before has ended.
+
+    Attributes:
+        unknowns: Names of those that are free; the others keep their values. Empty = all.
+        rebuild: Begin from the twin of the stage before, with new modules of these unknowns only:
+            for another kind of shape, or a finer mesh.
+        remesh: For every object named here, a function of its mesh that is applied before modules
+            are made anew.
+        optimizer: In place of the optimizer of the whole fit.
+        change: What the stage changes of every observation, such as its model's sampling.
+    """
+
+    unknowns: tuple[str, ...] = ()
+    rebuild: bool = False
+    remesh: Mapping[str, Callable[[Mesh], Mesh]] = field(default_factory=dict)
+    optimizer: Optimizer | None = None
+    change: Callable[[Observation], Observation] | None = None
+
+    @property
+    def renews(self) -> bool:
+        """Whether modules are made anew."""
+        return self.rebuild or bool(self.remesh)
+
+
+def checked_stages(
+    schedule: Schedule | Sequence[Schedule] | None, names: Sequence[str]
+) -> list[Stage]:
+    """The schedule as stages.
+
+    Args:
+        schedule: One part or several; None = one with the defaults.
+        names: Of all unknowns of the scene.
+
+    Raises:
+        InputError: No stages, an unknown name, or an unknown that an earlier stage has dropped.
+    """
+    parts = [schedule or Schedule()] if isinstance(schedule, Schedule | None) else list(schedule)
+    if not parts:
+        raise InputError("expected at least one stage, got none; give Stage(steps)")
+    stages = [part if isinstance(part, Stage) else Stage(**vars(part)) for part in parts]
+    kept = set(names)
+    for number, stage in enumerate(stages):
+        for name in stage.unknowns:
+            if name not in names:
+                raise InputError(
+                    f"expected names of parameters in stage {number + 1} ({', '.join(names)}), "
+                    f"got {name!r}; correct it"
+                )
+        if number and stage.renews:
+            kept = set(stage.unknowns or names)
+        gone = [name for name in stage.unknowns if name not in kept]
+        if gone:
+            raise InputError(
+                f"expected parameters that a stage before has kept, got {gone[0]!r} in stage "
+                f"{number + 1}; rebuild it there"
+            )
+    return stages

@@ -1,0 +1,382 @@
+"""Forward models: what a sensor would show of a scene, and a recording in the same form.
+
+A model is a frozen value. ``predict`` maps a scene and a sensor to a map, ``observe`` maps a
+recording to a map of the same shape; a loss compares the two. Any object with these methods
+serves ``reconstruct`` and ``gradcheck``; deriving from :class:`ForwardModel` supplies the rest.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from invertwin.capture.capture import Capture
+from invertwin.capture.chirp_capture import ChirpCapture
+from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_power
+from invertwin.errors import InputError
+from invertwin.radar.doppler import range_doppler_angle, velocity_axis
+from invertwin.radar.motion import Chirps
+from invertwin.radar.moving_power import moving_power
+from invertwin.radar.radar import Radar
+from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
+from invertwin.scene.scene import Scene
+from invertwin.simulation import simulate
+
+
+class ForwardModel(ABC):
+    """What a sensor would show of a scene.
+
+    Attributes:
+        redraws: Whether a fit gives the model another seed at every step. False for a model
+            whose random numbers belong to the scene.
+        smooth: Whether the derivative of the mean is the mean of derivatives, visibility
+            included. Gauss–Newton and gradient checks need that.
+    """
+
+    redraws: ClassVar[bool] = True
+    smooth: ClassVar[bool] = True
+
+    @abstractmethod
+    def predict(self, scene: Scene, sensor: Any, seed: int) -> Float[Tensor, "frame *map"]:
+        """The map that the sensor would show.
+
+        Args:
+            scene: What is seen.
+            sensor: What sees it, with its poses.
+            seed: Same seed, same map.
+        """
+
+    @abstractmethod
+    def observe(self, recording: Any) -> Float[Tensor, "frame *map"]:
+        """A recording as a map of the same form."""
+
+    def prepared(self, scene: Scene, sensor: Any, seed: int) -> "ForwardModel":
+        """The model with everything drawn that stays the same during a fit.
+
+        Args:
+            scene: The scene at the start of the fit.
+            sensor: What sees it.
+            seed: Of what is drawn.
+        """
+        return self
+
+    def for_differences(
+        self, scene: Scene, sensor: Any, samples: int, scheme: Literal["rays", "area"]
+    ) -> "ForwardModel":
+        """The model with common random numbers for scenes that differ a little.
+
+        Args:
+            scene: The scene at the middle of the difference.
+            sensor: The sensor there.
+            samples: Samples of one map.
+            scheme: "rays" or "area": how surfaces are sampled.
+        """
+        return self
+
+    def sampled_by(self, **changes: Any) -> "ForwardModel":
+        """The model with other fields of its ``sampling``, where it has one."""
+        return replace(self, sampling=replace(self.sampling, **changes))  # type: ignore
+
+    @property
+    def widened(self) -> bool:
+        """Whether the model has extra widths."""
+        return False
+
+    def narrowed(self, share: float) -> "ForwardModel":
+        """The model with this share of its extra widths; 0 takes them away."""
+        return self
+
+    def blurred(self, observed: Tensor, sensor: Any) -> Tensor:
+        """An observed map with the model's extra widths.
+
+        Args:
+            observed: From ``observe``.
+            sensor: What recorded it.
+        """
+        return observed
+
+
+@dataclass(frozen=True)
+class SurrogateMap(ForwardModel):
+    """Expected power over range and direction, smooth in the scene's parameters.
+
+    Attributes:
+        grid: Bins, see ``Radar.grid``.
+        surrogate: Kernels and extra widths, or a name among ``SURROGATES``.
+        sampling: How paths are sampled.
+
+    Raises:
+        InputError: An unknown name, or "exact", which is ``ExactMap``.
+    """
+
+    grid: Grid
+    surrogate: Surrogate | str = "response"
+    sampling: Sampling = Sampling()
+    _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(
+        default=None, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        chosen = chosen_surrogate(self.surrogate)
+        if chosen is None:
+            raise InputError(
+                'expected a surrogate for a SurrogateMap, got "exact"; use ExactMap(grid)'
+            )
+        object.__setattr__(self, "surrogate", chosen)
+
+    @property
+    def kernels(self) -> Surrogate:
+        """The surrogate as a value."""
+        assert isinstance(self.surrogate, Surrogate)
+        return self.surrogate
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """The expected power spectrum. See ``ForwardModel.predict``."""
+        scheme: Literal["rays", "area"] = "rays"
+        reference = None
+        if self._reference is not None:
+            fixed, device, scheme = self._reference
+            reference = (fixed, device.link())
+        return surrogate_spectrum(
+            scene,
+            sensor,
+            self.grid,
+            self.kernels,
+            sampling=self.sampling,
+            seed=seed,
+            scheme=scheme,
+            reference=reference,
+        )
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
+        """The measured power spectrum of a capture."""
+        return recording.spectrum(self.grid).to(torch.float32)
+
+    def for_differences(
+        self, scene: Scene, sensor: Radar, samples: int, scheme: Literal["rays", "area"]
+    ) -> "SurrogateMap":
+        """Samples come from a density that belongs to this scene."""
+        sampling = replace(self.sampling, samples=samples, boundary_samples=0)
+        return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
+
+    @property
+    def widened(self) -> bool:
+        """Whether the surrogate has extra widths."""
+        return self.kernels.range_width > 0 or self.kernels.angle_width > 0
+
+    def narrowed(self, share: float) -> "SurrogateMap":
+        """The same kernels with this share of the extra widths."""
+        kernels = self.kernels
+        return replace(
+            self,
+            surrogate=replace(
+                kernels,
+                range_width=kernels.range_width * share,
+                angle_width=kernels.angle_width * share,
+            ),
+        )
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
+        """A measured spectrum with the extra widths."""
+        return self.kernels.blur(observed, sensor, self.grid)
+
+
+@dataclass(frozen=True)
+class ExactMap(ForwardModel):
+    """The power spectrum of one realisation, as the radar itself computes it.
+
+    Its loss has a minimum every half wavelength, and rough surfaces need
+    ``Sampling(boundary=False)``. It serves comparisons and data.
+
+    Attributes:
+        grid: Bins, see ``Radar.grid``.
+        sampling: How paths are sampled.
+        speckle: Rough points and paths with their phases, which a twin does not know; None =
+            drawn from the seed.
+    """
+
+    grid: Grid
+    sampling: Sampling = Sampling()
+    speckle: Speckle | None = None
+
+    redraws: ClassVar[bool] = False
+    smooth: ClassVar[bool] = False
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """The spectrum of the exact beat signals. See ``ForwardModel.predict``."""
+        found = simulate(
+            scene, sensor, self.grid, seed=seed, sampling=self.sampling, speckle=self.speckle
+        )
+        return found.spectrum.to(torch.float32)
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
+        """The measured power spectrum of a capture."""
+        return recording.spectrum(self.grid).to(torch.float32)
+
+    def prepared(self, scene: Scene, sensor: Radar, seed: int) -> "ExactMap":
+        """The model with rough points that stay while the scene moves."""
+        if self.speckle is not None:
+            return self
+        return replace(self, speckle=draw_speckle(scene, sensor.link(), self.sampling, seed))
+
+
+@dataclass(frozen=True, eq=False)
+class MotionMap(ForwardModel):
+    """Power over range rate, range and direction of what moves.
+
+    What stands still is taken out of a recording as the mean over the chirps; so a prediction
+    holds the objects with a velocity alone. Other objects hide them. A silhouette has no boundary
+    term: a rough convex body goes dark towards its edge.
+
+    Attributes:
+        grid: Ranges and directions.
+        chirps: Timing of the ramps.
+        rates: Range rates to show, positive moves away [m/s]; some of those of ``bins``.
+        bins: Bins of range rate over the whole unambiguous span.
+        sampling: How paths are sampled; one bounce, fixed visibility.
+    """
+
+    grid: Grid
+    chirps: Chirps
+    rates: Float64[Tensor, " velocity"]
+    bins: int
+    sampling: Sampling = Sampling(depth=1, boundary=False)
+
+    @classmethod
+    def of(
+        cls,
+        radar: Radar,
+        grid: Grid,
+        chirps: Chirps,
+        oversample: int = 2,
+        sampling: Sampling | None = None,
+    ) -> "MotionMap":
+        """All range rates that the chirps tell apart.
+
+        Args:
+            radar: What records.
+            grid: Ranges and directions.
+            chirps: Timing of the ramps.
+            oversample: Bins of range rate per cell.
+            sampling: How paths are sampled.
+        """
+        bins = oversample * chirps.count
+        rates = velocity_axis(radar, chirps, bins)
+        return cls(grid, chirps, rates, bins, sampling or cls.sampling)
+
+    def __post_init__(self) -> None:
+        if self.sampling.depth != 1 or self.sampling.boundary:
+            raise InputError(
+                "expected Sampling(depth=1, boundary=False) for a MotionMap, got depth "
+                f"{self.sampling.depth} and boundary {self.sampling.boundary}; moving paths have "
+                "one bounce and fixed visibility"
+            )
+
+    def predict(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Float[Tensor, "frame velocity range u v"]:
+        """The expected power of what moves. See ``ForwardModel.predict``.
+
+        Raises:
+            InputError: No object has a velocity.
+        """
+        if all(item.velocity is None for item in scene.objects.values()):
+            raise InputError(
+                "expected an object with a velocity for a MotionMap, got none; give one a "
+                "velocity, or fit a MovingBody"
+            )
+        paths = trace_power(scene, sensor.link(), sampling=self.sampling, seed=seed)
+        assert paths.velocity is not None
+        moves = (paths.velocity.detach() != 0).any(1)
+        return self.expected(_chosen(paths, moves), sensor)
+
+    def expected(self, paths: Paths, radar: Radar) -> Float[Tensor, "frame velocity range u v"]:
+        """What moving paths look like in this map. See ``moving_power``.
+
+        Args:
+            paths: With velocities.
+            radar: What records them.
+        """
+        assert paths.velocity is not None
+        return moving_power(paths, paths.velocity, radar, self.grid, self.chirps, self.rates)
+
+    def observe(self, recording: ChirpCapture) -> Float[Tensor, "frame velocity range u v"]:
+        """The measured power of what moves.
+
+        Raises:
+            InputError: A recording of another number of chirps.
+        """
+        beat, radar = recording.beat, recording.radar()
+        moving = (beat - beat.mean(1, keepdim=True)).to(torch.complex128)
+        power = range_doppler_angle(moving, radar, self.grid, self.chirps, bins=self.bins)
+        every = velocity_axis(radar, self.chirps, self.bins)
+        rows = (every - self.rates[:, None]).abs().argmin(1)
+        return power[:, rows]
+
+    def around(self, range_: float, rate: float, cells: int, radar: Radar) -> "MotionMap":
+        """The cells at most so many range and Doppler cells from an echo, in all directions.
+
+        Args:
+            range_: Of the echo [m].
+            rate: Range rate of the echo [m/s].
+            cells: To either side.
+            radar: What records.
+        """
+        doppler = velocity_axis(radar, self.chirps).diff()[0] if self.chirps.count > 1 else math.inf
+        near = (self.grid.ranges - range_).abs() / radar.waveform.range_resolution
+        slow = (self.rates - rate).abs() / doppler
+        ranges, rates = (torch.nonzero(d <= cells)[:, 0] for d in (near, slow))
+        if not len(ranges) or not len(rates):
+            raise InputError(
+                f"expected an echo within the map, got one at {range_:.3g} m and {rate:.3g} m/s; "
+                "widen the grid"
+            )
+        start, count = float(self.grid.ranges[ranges[0]]), len(ranges)
+        grid = replace(self.grid, range_start=start, range_count=count)
+        return replace(self, grid=grid, rates=self.rates[rates])
+
+
+def _chosen(paths: Paths, mask: Bool[Tensor, " path"]) -> Paths:
+    rows = {name: value[mask] for name, value in vars(paths).items() if isinstance(value, Tensor)}
+    return replace(paths, **rows)
+
+
+def surrogate_correlation(
+    scene: Scene, radar: Radar, model: SurrogateMap, *, seed: int, looks: int = 16
+) -> float:
+    """How well a surrogate's map is that of the exact chain, the mean over looks at the scene.
+
+    A look has its own phases of the rough surfaces. One look is speckle as strong as the map
+    itself; a scene of conductors has none, and looks the same each time.
+
+    Args:
+        scene: What is seen.
+        radar: Arrays, waveform and poses.
+        model: The surrogate; its ``sampling`` serves the exact chain too.
+        seed: Of the first look, and of the surrogate's samples.
+        looks: Exact spectra that are averaged.
+
+    Returns:
+        Pearson's correlation over all bins and frames; 0 where a map is constant.
+
+    Raises:
+        InputError: No looks.
+    """
+    if looks < 1:
+        raise InputError(
+            f"expected looks >= 1, got {looks}; 16 looks leave a quarter of the speckle"
+        )
+    if all(item.material.coherent for item in scene.objects.values()):
+        looks = 1
+    exact = ExactMap(model.grid, model.sampling)
+    with torch.no_grad():
+        mean = torch.zeros(radar.frame_count, *model.grid.shape, dtype=torch.float64)
+        for look in range(looks):
+            mean += exact.predict(scene, radar, seed + look) / looks
+        a, b = (p.double() - p.double().mean() for p in (mean, model.predict(scene, radar, seed)))
+        norms = a.norm() * b.norm()
+    return float((a * b).sum() / norms) if norms > 0 else 0.0

@@ -1,0 +1,17 @@
+"""Independent random numbers from one seed."""
+
+import numpy as np
+
+
+def derived_seed(seed: int, *key: int) -> int:
+    """A seed of its own for every key, independent of the seeds of all other keys.
+
+    Args:
+        seed: Of the whole.
+        key: Numbers ≥ 0 that say what the seed is for, such as stage, step and observation.
+
+    Returns:
+        A number in [0, 2³¹). It is the same on every machine.
+    """
+    words = np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint32)
+    return int(words[0] >> 1)
