@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.channel.bins import Bins, Contribution
-from invertwin.channel.bridge import tracer
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid
+from invertwin.channel.power.bins import Bins, Contribution
+from invertwin.channel.rays.backend import mi
 
 FRAMES, PATHS = 2, 50_000
 GRIDS = {
@@ -22,7 +22,6 @@ GRIDS = {
 
 def paths() -> tuple[Contribution, tuple, object]:
     """Paths on the grids and beside them, their derivatives, and which of them exist."""
-    mi = tracer()
     draw = np.random.default_rng(1).uniform
 
     def column(low: float, high: float) -> object:
@@ -97,7 +96,6 @@ def test_bins_hold_what_falls_on_them(name, derivative):
 
 def test_sums_of_many_paths_are_rounded_little():
     """Differences of maps live in the last digits of such sums."""
-    mi = tracer()
     power = np.random.default_rng(2).uniform(0, 1, 4_000_000).astype(np.float32)
     frame = mi.UInt32(np.zeros(len(power), dtype=np.uint32))
     still = mi.Float(2.3)

@@ -7,10 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel import Sampling
-from invertwin.channel.bridge import edges_of
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid, Link
+from invertwin.channel import Grid, Link, Sampling, deposit_power
+from invertwin.channel.rays.topology import edges_of
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, sphere
 from scenes import GRID, WAVELENGTH, float64, link, occluder, relative, shift_error, thing
 

@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel.bridge import Geometry, flatten
-from invertwin.channel.chains import Chain, chain_view, rough_chains
-from invertwin.channel.paths import Link
-from invertwin.channel.rays import Shot, face_areas
+from invertwin.channel import Link
+from invertwin.channel.field.rough_paths import draw_rough_paths
+from invertwin.channel.rays.geometry import Geometry, flatten
+from invertwin.channel.rays.scene import RayScene, face_areas
+from invertwin.channel.reference.radar_equation import SurfacePaths, path_view
 from invertwin.scene import RoughConductor, Scene, plate
 from scenes import link, thing
 
@@ -36,7 +37,7 @@ def antennas(*x: float) -> Link:
     return link(tuple((value, 0.0, 0.0) for value in x))
 
 
-def by_area(geometry: Geometry, count: int, seed: int) -> Chain:
+def by_area(geometry: Geometry, count: int, seed: int) -> SurfacePaths:
     """Chains from wall to item to wall, every point uniform on its object: the plain integral."""
     generator = torch.Generator().manual_seed(seed)
     areas = face_areas(geometry)
@@ -51,13 +52,15 @@ def by_area(geometry: Geometry, count: int, seed: int) -> Chain:
         for column, values in zip(columns, (face, b[0], b[1]), strict=True):
             column.append(values)
     face, b1, b2 = (torch.stack(column, dim=1) for column in columns)
-    return Chain(face, b1, b2, torch.full((count,), weight).double(), torch.zeros(count).double())
+    return SurfacePaths(
+        face, b1, b2, torch.full((count,), weight).double(), torch.zeros(count).double()
+    )
 
 
-def powers(geometry: Geometry, poses: Link, chain: Chain, frame: int) -> Tensor:
+def powers(geometry: Geometry, poses: Link, chain: SurfacePaths, frame: int) -> Tensor:
     """What every chain carries in a frame."""
     frames = torch.full((len(chain.weight),), frame)
-    return chain_view(geometry, poses, Shot(geometry, poses), frames, chain).power * chain.weight
+    return path_view(RayScene(geometry, poses), frames, chain).power * chain.weight
 
 
 @pytest.mark.parametrize("where", ["at the reference poses", "from another pose"])
@@ -71,7 +74,7 @@ def test_an_echo_by_a_wall_has_its_power_and_many_chains(where):
     assert error < 0.02
     found = []
     for seed in (1, 2, 3):
-        chain = rough_chains(whole, drawn_for, count=COUNT, depth=3, seed=seed).chains[1]
+        chain = draw_rough_paths(whole, drawn_for, count=COUNT, depth=3, seed=seed).by_length[1]
         objects = geometry.face_object[chain.face]
         chain = chain.keep((objects == torch.tensor([WALL, ITEM, WALL])).all(1))
         found.append(powers(geometry, poses, chain, 1))
@@ -86,10 +89,11 @@ def test_an_echo_by_a_wall_has_its_power_and_many_chains(where):
 def test_chains_are_kept_by_what_they_carry():
     """A quarter of the draws at most, their phases of their own, and the same for the same seed."""
     one, same, other = (
-        rough_chains(scene(), antennas(0.0), count=COUNT, depth=3, seed=seed) for seed in (1, 1, 2)
+        draw_rough_paths(scene(), antennas(0.0), count=COUNT, depth=3, seed=seed)
+        for seed in (1, 1, 2)
     )
     for k in range(2):
-        assert 1_000 < len(one.chains[k].weight) < 1.01 * COUNT / 4
+        assert 1_000 < len(one.by_length[k].weight) < 1.01 * COUNT / 4
         for name in ("face", "b1", "weight", "phase"):
-            assert torch.equal(getattr(one.chains[k], name), getattr(same.chains[k], name))
-        assert not torch.equal(one.chains[k].phase[:500], other.chains[k].phase[:500])
+            assert torch.equal(getattr(one.by_length[k], name), getattr(same.by_length[k], name))
+        assert not torch.equal(one.by_length[k].phase[:500], other.by_length[k].phase[:500])

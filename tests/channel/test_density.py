@@ -8,11 +8,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from invertwin.channel import Sampling
-from invertwin.channel.density import deposit_density
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid, Link
-from invertwin.channel.tracer import trace_power
+from invertwin.channel import Grid, Link, Sampling, deposit_density, deposit_power, trace_power
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cloud,

@@ -7,9 +7,8 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from invertwin.channel import Sampling
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid, Link
+from invertwin.channel import Grid, Link, Sampling, deposit_power
+from invertwin.channel.rays.geometry import flatten
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,
@@ -99,8 +98,6 @@ def test_hand_written_adjoint_is_that_of_autodiff(bistatic):
     truth = autodiff_deposit.gradients(
         scene, antennas, BOX, weights, samples=20_000, edges=4_000, seed=3
     )
-    from invertwin.channel.bridge import flatten
-
     geometry = flatten(scene, antennas.wavelength)
     vertices = geometry.vertices.clone().requires_grad_()
     split = len(scene["wall"].mesh.vertices)

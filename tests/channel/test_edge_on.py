@@ -5,10 +5,8 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from invertwin.channel import Sampling
-from invertwin.channel.bridge import edges_of
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid, Sampling, deposit_power
+from invertwin.channel.rays.topology import edges_of
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, rotation_from_vector
 from scenes import float64, link, relative, thing
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from invertwin.channel.bridge import tracer, use_backend
-from invertwin.channel.edges import _Proportional
+from invertwin.channel import use_backend
+from invertwin.channel.power.edges import _Proportional
+from invertwin.channel.rays.backend import mi
 
 
 def drawn(weights, count):
     """Entries, rests and probabilities of numbers spread evenly over [0, 1)."""
-    mi = tracer()
     spread = (np.arange(count, dtype=np.float32) + 0.5) / count
     with use_backend("cpu"):
         return tuple(np.array(c) for c in _Proportional(mi.Float(weights)).draw(mi.Float(spread)))

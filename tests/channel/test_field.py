@@ -8,10 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel import Sampling
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid, Link, Paths
-from invertwin.channel.tracer import rough_points, trace_field, trace_power
+from invertwin.channel import Grid, Link, Paths, Sampling, deposit_power, trace_field, trace_power
+from invertwin.channel.field.rough_points import draw_rough_points
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import (
@@ -184,10 +182,10 @@ def test_what_leaves_is_at_most_what_arrived(tilt):
 
 def test_rough_points_stay_on_their_surface():
     scene = occluder()
-    fixed = rough_points(scene, 500.0, seed=2)
+    fixed = draw_rough_points(scene, 500.0, seed=2)
     moved = scene.replace("occluder", pose=scene["occluder"].transform + 0.0)
     assert all(
-        torch.equal(getattr(fixed, name), getattr(rough_points(moved, 500.0, seed=2), name))
+        torch.equal(getattr(fixed, name), getattr(draw_rough_points(moved, 500.0, seed=2), name))
         for name in ("face", "b1", "b2", "phase")
     )
     antennas = link(((0.0, 0.0, 0.0), (0.4, 0.1, 0.0)))
@@ -201,7 +199,7 @@ def test_rough_points_stay_on_their_surface():
     phases = [paths.coefficient[paths.frame == frame].angle() for frame in range(2)]
     assert torch.equal(first, second)
     assert torch.allclose(phases[0], phases[1], atol=1e-9)
-    other = rough_points(scene, 500.0, seed=3)
+    other = draw_rough_points(scene, 500.0, seed=3)
     assert not torch.equal(fixed.phase[:100], other.phase[:100])
 
 

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from invertwin.channel import Sampling
-from invertwin.channel.tracer import trace_field, trace_power
+from invertwin.channel import Sampling, trace_field, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, Object, PerfectConductor, RoughDielectric, Scene, plate, rigid

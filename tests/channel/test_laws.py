@@ -6,10 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel import Sampling
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid, Link
-from invertwin.channel.tracer import trace_power
+from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import (
     Dielectric,

@@ -7,12 +7,16 @@ import pytest
 import torch
 import torch.nn.functional as functional
 
-from invertwin.capture import read
-from invertwin.channel import Sampling
-from invertwin.channel.bridge import backend, use_backend
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import trace_field, trace_power
+from invertwin.channel import (
+    Grid,
+    Sampling,
+    backend,
+    deposit_power,
+    trace_field,
+    trace_power,
+    use_backend,
+)
+from invertwin.datasets import rail_sar
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,
@@ -143,7 +147,7 @@ def test_small_balls_from_a_rail_have_finite_gradients(radius):
 def test_measured_track_has_the_gradients_of_points(data_folder):
     """Small balls are points: the power falls with R⁴. Seed 36 once gave NaN, from a boundary ray
     in the plane of the triangle that it met."""
-    capture = read(data_folder / "rail_sar", "rail_sar", clock_offset=9.216, range_bias=0.46257)
+    capture = rail_sar.read(data_folder / "rail_sar", clock_offset=9.216, range_bias=0.46257)
     survey, radar = capture.survey, capture.radar()
     assert survey is not None
     shift = float64([-0.6, -0.04, 0.0]).requires_grad_()

@@ -6,10 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel import Sampling
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid
-from invertwin.channel.tracer import trace_power
+from invertwin.channel import Grid, Sampling, deposit_power, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import Object, RefractingBody, RoughConductor, Scene, Slab, box, plate
 from scenes import WAVELENGTH, float64, link, thing

@@ -8,9 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel import Sampling
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.paths import Grid
+from invertwin.channel import Grid, Sampling, deposit_power
 from invertwin.scene import (
     Object,
     RoughConductor,

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
 
 _GAIN_STEPS = 8  # of the fixed point; from the second on the gain moves by parts in a thousand
 
@@ -50,10 +51,10 @@ class SpectrumLoss:
     """
 
     kind: Literal["mse", "likelihood"] = "mse"
-    levels: int = 3
+    levels: Count = 3
     gain: Literal["fitted", "one"] = "fitted"
     background: Literal["none", "level", "static"] = "none"
-    floor: float = 0.01
+    floor: Positive = 0.01
 
     def __post_init__(self) -> None:
         if self.kind not in ("mse", "likelihood"):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
@@ -107,10 +108,10 @@ class FMCW(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    bandwidth: float
-    duration: float
-    samples: int
+    start_frequency: Positive
+    bandwidth: Positive
+    duration: Positive
+    samples: Count
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -171,10 +172,10 @@ class SteppedFrequency(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    step: float
-    samples: int
-    dwell: float
+    start_frequency: Positive
+    step: Positive
+    samples: Count
+    dwell: Positive
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -228,9 +229,9 @@ class OFDM(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    spacing: float
-    subcarriers: int
+    start_frequency: Positive
+    spacing: Positive
+    subcarriers: Count
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -325,8 +326,8 @@ class Impulse(Waveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    center_frequency: float
-    bandwidth: float
+    center_frequency: Positive
+    bandwidth: Positive
 
     def __post_init__(self) -> None:
         _check_frequency("center_frequency", self.center_frequency)
