@@ -292,8 +292,9 @@ class _Kernel:
         taps = torch.fft.irfft(transfer, _padded(count))
         place = torch.arange(count)
         matrix = taps[(place[:, None] - place[None]) % len(taps)].to(power)
-        rows = power.movedim(dim, 0)
-        return (matrix @ rows.reshape(count, -1)).reshape(rows.shape).movedim(0, dim)
+        if dim == power.ndim - 1:
+            return power @ matrix.T
+        return (matrix @ power.flatten(dim + 1)).reshape(power.shape)
 
 
 @lru_cache(maxsize=16)
