@@ -185,7 +185,7 @@ def surface_points(
     if not solid.area > 0:
         raise InputError("expected a surface with area, got none; check the mesh")
     number = checked_count(count, "points", 1)
-    points, rows = trimesh.sample.sample_surface(solid, number, seed=[seed, stream])
+    points, rows = trimesh.sample.sample_surface(solid, number, seed=[seed, stream])[:2]
     normals = solid.face_normals[rows]
     return torch.from_numpy(np.array(points)), torch.from_numpy(np.array(normals))
 

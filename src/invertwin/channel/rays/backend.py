@@ -2,7 +2,7 @@
 
 import importlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -75,31 +75,31 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(count)
 
 
-class _Lazy:
-    """A module that is imported when it is first used: torch users need not have it loaded."""
-
-    def __init__(self, load: Callable[[], Any]) -> None:
-        self._load = load
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._load(), name)
-
-
-def _mitsuba() -> Any:
-    name = backend()
-    module = _loaded("mitsuba", name)
-    if module.variant() != VARIANTS[name]:
-        module.set_variant(VARIANTS[name])
-    return module
-
-
 @cache
 def _loaded(module: str, name: str) -> Any:
     doctor.require(name)
     return importlib.import_module(module)
 
 
-mi: Any = _Lazy(_mitsuba)
-"""Mitsuba, set to the backend in force."""
-dr: Any = _Lazy(lambda: _loaded("drjit", backend()))
-"""Dr.Jit."""
+class _Mitsuba:
+    """Mitsuba, set to the backend in force; imported when it is first used."""
+
+    def __getattr__(self, name: str) -> Any:
+        wanted = _chosen[-1] if _chosen else backend()
+        module = _loaded("mitsuba", wanted)
+        if module.variant() != VARIANTS[wanted]:
+            module.set_variant(VARIANTS[wanted])
+        return getattr(module, name)
+
+
+class _DrJit:
+    """Dr.Jit, imported when it is first used."""
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(_loaded("drjit", backend()), name)
+        setattr(self, name, found)  # the same for all backends, so that no one asks again
+        return found
+
+
+mi: Any = _Mitsuba()
+dr: Any = _DrJit()

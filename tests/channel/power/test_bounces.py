@@ -270,5 +270,5 @@ def test_explicit_paths_refuse_what_they_cannot_do():
             sampling=Sampling(depth=2, samples=100_000, boundary_samples=0, points_per_m2=100.0),
             seed=0,
         )
-    with pytest.raises(InputError, match="expected objects at rest, got velocities on occluder"):
+    with pytest.raises(InputError, match="expected depth 1 for objects in motion, got 2"):
         trace_power(moving, link(), sampling=replace(COUNTS, depth=2), seed=3)
