@@ -88,10 +88,15 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
     kind = _named(attributes, "waveform", WAVEFORMS)
     # Numbers come back from a file as NumPy scalars.
     values = {
-        field.name: (int if field.type is int else float)(attribute(attributes, field.name))
+        field.name: (int if _whole(field.type) else float)(attribute(attributes, field.name))
         for field in fields(kind)
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
+
+
+def _whole(kind: Any) -> bool:
+    """Whether a field holds an integer, with limits or without."""
+    return getattr(kind, "__origin__", kind) is int
 
 
 def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
