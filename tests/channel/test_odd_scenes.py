@@ -180,7 +180,7 @@ def test_backend_by_argument_and_by_environment(monkeypatch):
 
 
 def test_cuda_where_there_is_none(monkeypatch):
-    monkeypatch.setattr("invertwin.channel.bridge._cuda_found", lambda: False)
+    monkeypatch.setattr("invertwin.channel.rays.backend._cuda_found", lambda: False)
     with (
         pytest.raises(InputError, match="expected an NVIDIA GPU for backend 'cuda'"),
         use_backend("cuda"),

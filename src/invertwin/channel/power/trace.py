@@ -130,11 +130,12 @@ class Trace:
             drawn.frame, False, integrand.to_radar(self.fixed, drawn.frame, -back)
         )
         weight = drawn.weight * drawn.transmittance * self.fixed.scale * gain / dr.square(distance)
+        passed = Passage(drawn.transmittance, drawn.extra)
         return walk.start(
             index, drawn.frame, drawn.face, drawn.b1, drawn.b2, back,
             throughput=dr.select(drawn.weight > 0, weight, 0.0),
             length=distance + drawn.extra,
-            passed=Passage(drawn.transmittance, drawn.extra) if self.fixed.surfaces.sheets else None,
+            passed=passed if self.fixed.surfaces.sheets else None,
         )  # fmt: skip
 
     @cached_property
