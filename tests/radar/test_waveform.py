@@ -124,7 +124,8 @@ def test_wrong_radar(unchecked, changes, message):
 
 def test_positions_from_lists_are_float64(unchecked):
     radar = small(positions=[[0, 0, 1], [0, 0, 2]])
-    assert radar.positions.dtype == torch.float64
+    expected = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]], dtype=torch.float64)
+    torch.testing.assert_close(radar.positions, expected, rtol=0, atol=0)
 
 
 def test_shared_visibility_follows_the_distance():

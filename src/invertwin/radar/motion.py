@@ -11,6 +11,7 @@ from torch import Tensor
 from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
 from invertwin.radar.nonuniform import (
     beat_of_delays,
     instants_derivative,
@@ -44,8 +45,8 @@ class Chirps:
             every transmitter once, or one of transmitters that send at once.
     """
 
-    count: int
-    interval: float
+    count: Count
+    interval: Positive
     tdm: bool = True
     order: tuple[int, ...] | None = None
 

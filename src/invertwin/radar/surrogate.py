@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, Float64
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
 from invertwin.errors import InputError
+from invertwin.limits import NonNegative, Positive
 from invertwin.radar.point_spread import (
     airy,
     airy_radii,
@@ -60,20 +61,16 @@ class Surrogate:
             kernels than the paper's or an extra angular width.
     """
 
-    range_kernel: str = "response"
-    angle_kernel: str = "response"
-    range_width: float = 0.0
-    angle_width: float = 0.0
-    aperture_radius: float | None = None
-    phases: str = "mean"
+    range_kernel: Literal["response", "gaussian", "dirichlet"] = "response"
+    angle_kernel: Literal["response", "airy"] = "response"
+    range_width: NonNegative = 0.0
+    angle_width: NonNegative = 0.0
+    aperture_radius: Positive | None = None
+    phases: Literal["mean", "random"] = "mean"
 
     def __post_init__(self) -> None:
-        choices = {
-            "range_kernel": ("response", "gaussian", "dirichlet"),
-            "angle_kernel": ("response", "airy"),
-            "phases": ("mean", "random"),
-        }
-        for name, allowed in choices.items():
+        for name in ("range_kernel", "angle_kernel", "phases"):
+            allowed = get_args(type(self).__annotations__[name])
             if getattr(self, name) not in allowed:
                 raise InputError(
                     f"expected {name} to be one of {', '.join(allowed)}, "
@@ -295,8 +292,9 @@ class _Kernel:
         taps = torch.fft.irfft(transfer, _padded(count))
         place = torch.arange(count)
         matrix = taps[(place[:, None] - place[None]) % len(taps)].to(power)
-        rows = power.movedim(dim, 0)
-        return (matrix @ rows.reshape(count, -1)).reshape(rows.shape).movedim(0, dim)
+        if dim == power.ndim - 1:
+            return power @ matrix.T
+        return (matrix @ power.flatten(dim + 1)).reshape(power.shape)
 
 
 @lru_cache(maxsize=16)

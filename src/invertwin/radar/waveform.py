@@ -13,6 +13,7 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
@@ -120,10 +121,10 @@ class FMCW(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    bandwidth: float
-    duration: float
-    samples: int
+    start_frequency: Positive
+    bandwidth: Positive
+    duration: Positive
+    samples: Count
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -184,10 +185,10 @@ class SteppedFrequency(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    step: float
-    samples: int
-    dwell: float
+    start_frequency: Positive
+    step: Positive
+    samples: Count
+    dwell: Positive
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -241,9 +242,9 @@ class OFDM(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    spacing: float
-    subcarriers: int
+    start_frequency: Positive
+    spacing: Positive
+    subcarriers: Count
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -338,8 +339,8 @@ class Impulse(Waveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    center_frequency: float
-    bandwidth: float
+    center_frequency: Positive
+    bandwidth: Positive
 
     def __post_init__(self) -> None:
         _check_frequency("center_frequency", self.center_frequency)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.limits import Count, NonNegative, Positive
 from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 
 COSINE_COUNT = 2049
@@ -63,7 +64,7 @@ class Cosine(Pattern):
         InputError: a negative exponent.
     """
 
-    exponent: float
+    exponent: NonNegative
 
     def __post_init__(self) -> None:
         checked_number(self.exponent, "pattern exponent", 0.0)
@@ -185,7 +186,7 @@ class AntennaArray:
 
 
 def linear_array(
-    count: int, spacing: float, axis: Literal["x", "y"] = "x", pattern: Pattern | None = None
+    count: Count, spacing: Positive, axis: Literal["x", "y"] = "x", pattern: Pattern | None = None
 ) -> AntennaArray:
     """Elements in a row, centred at the origin of the radar frame.
 

@@ -2,15 +2,18 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Ge, Len
 from torch import Tensor
 
 from invertwin.errors import InputError
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
+Point = Annotated[ArrayLike, Len(3, 3)]
+Counts = Annotated[Sequence[Annotated[int, Ge(2)]], Len(3, 3)]
 
 
 def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: str) -> Tensor:

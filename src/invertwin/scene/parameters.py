@@ -14,6 +14,7 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.limits import Axes
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.scene.material.values import RANGES, Texture, Value, checked_value, evaluated
 from invertwin.scene.mesh import Mesh
@@ -37,7 +38,7 @@ class Translation(nn.Module):
         translation: parameter [3], metres.
     """
 
-    def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: str = "xyz") -> None:
+    def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: Axes = "xyz") -> None:
         """Move `object`, by `initial` [m] at the start.
 
         Args:
@@ -122,8 +123,8 @@ class Pose(RigidMotion):
         object: str,
         translation: ArrayLike = ORIGIN,
         rotation: ArrayLike = ORIGIN,
-        axes: str = "xyz",
-        rotation_axes: str = "xyz",
+        axes: Axes = "xyz",
+        rotation_axes: Axes = "xyz",
     ) -> None:
         """Move `object`, from these values at the start.
 

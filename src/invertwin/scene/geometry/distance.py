@@ -10,7 +10,15 @@ from jaxtyping import Float64
 from scipy.fft import dctn, idctn
 from torch import Tensor, nn
 
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.limits import Count, Positive
+from invertwin.scene.checks import (
+    ArrayLike,
+    Counts,
+    Point,
+    checked_count,
+    checked_number,
+    checked_tensor,
+)
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice, cubic
 from invertwin.scene.geometry.smooth_vertices import smoothed
@@ -166,14 +174,14 @@ class NeuralDistance(_Distance):
     def __init__(
         self,
         object: str,
-        low: ArrayLike,
-        high: ArrayLike,
-        counts: Sequence[int],
+        low: Point,
+        high: Point,
+        counts: Counts,
         *,
-        radius: float,
-        width: int = 32,
-        depth: int = 2,
-        frequency: float = 8.0,
+        radius: Positive,
+        width: Count = 32,
+        depth: Count = 2,
+        frequency: Positive = 8.0,
         seed: int = 0,
     ) -> None:
         """Shape `object` by a network, from a ball in the middle of the box at the start.
