@@ -408,6 +408,7 @@ def test_one_switch_for_all(linear):
         chosen_surrogate("bessel")
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_wrong_input(planar):
     grid = planar.grid(4, 5)
     with pytest.raises(InputError, match="expected a map of shape"):
