@@ -2,7 +2,7 @@
 
 from collections.abc import Hashable, Mapping
 from dataclasses import asdict, fields
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import torch
@@ -21,9 +21,10 @@ from invertwin.radar.waveform import (
 )
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, Table
 
-WAVEFORMS: dict[str, type[FMCW] | type[Impulse] | type[SteppedFrequency] | type[OFDM]] = {
+WAVEFORMS: dict[str, type[Waveform]] = {
     kind.__name__: kind for kind in (FMCW, Impulse, SteppedFrequency, OFDM)
 }
+"""Dataclasses that a file may name. Add one of your own to keep what it has measured."""
 
 _VISIBILITY = {None: "auto", True: "shared", False: "separate"}
 
@@ -44,7 +45,7 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     }
     attributes: dict[str, Any] = {
         "waveform": kind,
-        **asdict(waveform),
+        **asdict(waveform),  # type: ignore[call-overload]
         "window": radar.window,
         "array_window": radar.array_window,
         "visibility": _VISIBILITY[radar.shared_visibility],
@@ -86,10 +87,11 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
         InputError: an unknown waveform or a missing field.
     """
     kind = _named(attributes, "waveform", WAVEFORMS)
+    hints = get_type_hints(kind)  # without limits
     # Numbers come back from a file as NumPy scalars.
     values = {
-        field.name: (int if field.type is int else float)(attribute(attributes, field.name))
-        for field in fields(kind)
+        field.name: (int if hints[field.name] is int else float)(attribute(attributes, field.name))
+        for field in fields(kind)  # type: ignore[arg-type]
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
 

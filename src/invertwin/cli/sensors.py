@@ -10,6 +10,7 @@ from annotated_types import Ge, Gt, Le, Len, MinLen
 from pydantic import Tag, model_validator
 from torch import Tensor
 
+from invertwin.capture.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
 from invertwin.cli.registry import Group, OneOf, Registry, Table
 from invertwin.cli.section import (
@@ -292,6 +293,7 @@ def radar(table: RadarTable) -> Radar:
     with about("radar"):
         with about("waveform"):
             waveform = table.waveform.build()
+        WAVEFORMS.setdefault(type(waveform).__name__, type(waveform))
         if table.board is not None:
             with about("board"):
                 transmitters, receivers = board_elements(table.board)
