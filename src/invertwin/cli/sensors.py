@@ -49,7 +49,7 @@ from invertwin.scene import Table as PatternTable
 
 _MOST_BINS = 1e9  # 4 GB a map
 Numbers = Annotated[list[Count], MinLen(1)]
-Window = Literal[tuple(WINDOWS)]  # type: ignore[valid-type]
+Window: Any = Literal[tuple(WINDOWS)]
 Elements = tuple[AntennaArray, AntennaArray]
 
 
@@ -234,8 +234,8 @@ def own_board(tx_places: _Places, rx_places: _Places, design_frequency: Positive
         rx_places: column, row of RX1, RX2, … in half wavelengths.
         design_frequency: Hz, whose half wavelength is the unit.
     """
-    ends = (tuple((x, y) for x, y in places) for places in (tx_places, rx_places))
-    return boards.Board("the board", *ends, design_frequency)
+    tx, rx = (tuple((x, y) for x, y in places) for places in (tx_places, rx_places))
+    return boards.Board("the board", tx, rx, design_frequency)
 
 
 def line(start: Vector, stop: Vector, count: Count) -> Tensor:
