@@ -364,5 +364,5 @@ def unknowns_of(run: RunFile, start: build.Start) -> dict[str, Unknown]:
     return {
         name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
         for name, table in tables.items()
-        if not table.kind == "radar_pose"
+        if table.kind != "radar_pose"
     }
