@@ -8,25 +8,28 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors", "limits"}
+FOUNDATION = {"constants", "errors", "limits", "seeds"}
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "channel"}
 RADAR = CHANNEL - {"doctor"} | {"radar"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
-INVERSION = SIMULATION | CAPTURE | {"inversion"}
+MODELS = SIMULATION | CAPTURE | {"models"}
+INVERSION = MODELS | {"inversion"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
 ALLOWED = {
     "constants": set(),
     "errors": set(),
     "limits": set(),
+    "seeds": set(),
     "doctor": FOUNDATION,
     "scene": SCENE,
     "channel": CHANNEL,
     "radar": RADAR,
     "simulation": SIMULATION,
     "capture": CAPTURE,
+    "models": MODELS,
     "inversion": INVERSION,
     "plotting": INVERSION | {"plotting"},
     "datasets": CAPTURE | {"datasets", "cli"},

@@ -22,7 +22,8 @@ def test_both_chains_have_one_shape_and_one_unit():
     assert smooth.beat is None
     looks = []
     for seed in range(60):
-        exact = simulate(scene, device, grid, seed=seed, density=400.0)
+        # A flat plate has no paths of several bounces; to look for them takes most of the time.
+        exact = simulate(scene, device, grid, seed=seed, density=400.0, depth=1)
         assert exact.spectrum.shape == smooth.spectrum.shape == (8, *grid.shape)
         assert exact.paths is not None
         assert exact.beat is not None

@@ -1,5 +1,7 @@
 """Captures: what they hold, their files, and what is refused."""
 
+from typing import Any
+
 import pytest
 import torch
 import xarray as xr
@@ -18,7 +20,7 @@ FRAMES = 3
 
 def fmcw_radar(pattern=None, **changes) -> Radar:
     vectors = torch.tensor([[0.0, 0.1, 0.2], [0.3, 0.0, 0.0], [0.1, -0.2, 0.5]]).double()
-    settings = {
+    settings: dict[str, Any] = {
         "transmitters": linear_array(2, 0.0078, pattern=pattern),
         "receivers": linear_array(4, 0.0019, pattern=Cosine(1.5)),
         "waveform": FMCW(76e9, 1e9, 40e-6, 32),

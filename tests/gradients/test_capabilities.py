@@ -417,8 +417,8 @@ def test_refused(parameter, mechanism):
     with pytest.raises(InputError, match=message):
         attempt(mechanism, *change())
     if parameter in MOVES and mechanism == "rough":
+        few = Sampling(depth=1, boundary_samples=0, points_per_m2=100.0)
         with pytest.raises(InputError, match=message):
-            few = Sampling(depth=1, boundary_samples=0, points_per_m2=100.0)
             pushed(lambda t: response(*MOVES[parameter](scene, radar, t), few, 0))
 
 

@@ -98,7 +98,7 @@ def theta_of(table: schema.GradientParameter, run: schema.RunFile, scene: Scene)
         case "joint":
             return Theta(*_joint(table, item), shape=True)
         case "latent":
-            return Theta(*_latent(table, item, scene), shape=True)
+            return Theta(*_latent(table, item), shape=True)
     low, high, counts = _box(table)
     distance = partial(signed_distance, scene[name].mesh)
     if table.kind == "distance":
@@ -154,7 +154,7 @@ def _joint(table: schema.GradientParameter, item: Any) -> tuple[SkinnedBody, dic
 
 
 def _latent(
-    table: schema.GradientParameter, item: Any, scene: Scene
+    table: schema.GradientParameter, item: Any
 ) -> tuple[LinearShape | PriorShape, dict[str, Tensor]]:
     index, name = table.index or 0, table.object or ""
     whole = item is not None and item.scale == 1

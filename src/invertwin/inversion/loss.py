@@ -162,13 +162,17 @@ class SpectrumLoss:
                 mixed = torch.stack([(a * b).mean() / n for (a, b), n in both]).sum()
                 power = torch.stack([(a * a).mean() / n for (a, _), n in both]).sum()
                 return (mixed / power.clamp_min(1e-30)).clamp_min(0.0)
+            # The maps are large: what does not change is computed once, the rest in place.
+            lit = [a.clamp_min(0.0) for a, _ in pairs]
+            data = [
+                a * (b.clamp_min(0.0) + self.floor) for a, (_, b) in zip(lit, pairs, strict=True)
+            ]
             for _ in range(_GAIN_STEPS):
                 up, down = torch.zeros(()), torch.zeros(())
-                for a, b in pairs:
-                    lit = a.clamp_min(0.0)
-                    model = gain * lit + self.floor
-                    up = up + (lit * (b.clamp_min(0.0) + self.floor) / model.square()).mean()
-                    down = down + (lit / model).mean()
+                for a, b in zip(lit, data, strict=True):
+                    inverse = (a * gain).add_(self.floor).reciprocal_()
+                    down = down + (a * inverse).mean()
+                    up = up + inverse.square_().mul_(b).mean()
                 gain = gain * (up / down.clamp_min(1e-30))
         return gain
 

@@ -214,7 +214,7 @@ class Impairments:
     def apply(
         self, beat: Complex128[Tensor, "frame *chirp tx rx sample"], radar: Radar, *, seed: int
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-        """The same for a beat signal, of frames or of trains; all but phase noise.
+        """Impair a beat signal, of frames or of trains, with everything except phase noise.
 
         Args:
             beat: Without impairments.

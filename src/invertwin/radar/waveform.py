@@ -1,5 +1,8 @@
 """Waveforms and the radar: what is transmitted, from where, and which bins it resolves."""
 
+# Fields of the base class may be properties of a waveform.
+# pyright: reportIncompatibleVariableOverride=false
+
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -46,7 +49,12 @@ class Waveform(ABC):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """Power of a point target at a distance from its range [m], peak 1."""
+        """Power of a point target beside its range, peak 1.
+
+        Args:
+            distance: From the target's range [m].
+            window: Taper of the samples.
+        """
 
 
 class SampledWaveform(Waveform):
@@ -86,7 +94,12 @@ class SampledWaveform(Waveform):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """|Σ w_n exp(2πj n d/R_max) / Σ w_n|²."""
+        """Power |Σ w_n exp(2πj n d/R_max) / Σ w_n|² of a point target beside its range.
+
+        Args:
+            distance: d, from the target's range [m].
+            window: Taper w of the samples.
+        """
         weight = sample_window(self, window)
         cycles = distance[:, None] / self.max_range * torch.arange(self.samples)
         return (torch.exp(2j * math.pi * cycles) @ (weight / weight.sum() + 0j)).abs().square()
@@ -336,7 +349,12 @@ class Impulse(Waveform):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """The pulse; it has no samples that a window could taper."""
+        """Power of the pulse beside the target's range, peak 1.
+
+        Args:
+            distance: From the target's range [m].
+            window: Ignored: a pulse has no samples to taper.
+        """
         return gaussian_response(self, distance)
 
 
@@ -362,7 +380,12 @@ def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[T
 
 
 def sample_window(waveform: SampledWaveform, window: str) -> Float64[Tensor, " sample"]:
-    """Taper of the beat signal's samples."""
+    """Taper of the beat signal's samples.
+
+    Args:
+        waveform: Its number of samples.
+        window: Name of the taper.
+    """
     position = torch.linspace(0, 1, waveform.samples, dtype=torch.float64)
     return taper(window, position, waveform.samples)
 
@@ -370,7 +393,12 @@ def sample_window(waveform: SampledWaveform, window: str) -> Float64[Tensor, " s
 def gaussian_response(
     waveform: Waveform, distance: Float64[Tensor, " point"]
 ) -> Float64[Tensor, " point"]:
-    """Gaussian of one range cell full width at half maximum, peak 1."""
+    """Gaussian whose full width at half maximum is one range cell, peak 1.
+
+    Args:
+        waveform: Its range cell.
+        distance: From the peak [m].
+    """
     sigma = SIGMA_PER_FWHM * waveform.range_resolution
     return torch.exp(-0.5 * (distance / sigma).square())
 

@@ -260,7 +260,7 @@ def _resampled(theta: Tensor, phi: Tensor, gains: Tensor) -> Tensor:
         # A multiple of the given number, so that evenly spaced angles stay nodes.
         count = len(phi) * -(-360 // len(phi))
         around = -np.pi + 2 * np.pi * np.arange(count) / count
-        rows: Sequence = [
+        rows: Sequence[np.ndarray | Tensor] = [
             np.interp(around, phi.detach().numpy(), row, period=2 * np.pi) for row in given
         ]
         given = np.stack(rows)

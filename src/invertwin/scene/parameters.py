@@ -70,6 +70,14 @@ class RigidMotion(nn.Module):
     def __init__(
         self, translation: ArrayLike, rotation: ArrayLike, axes: str, rotation_axes: str
     ) -> None:
+        """Move from these values at the start.
+
+        Args:
+            translation: [m].
+            rotation: rotation vector of any angle [3] (rad), or q itself [4].
+            axes: world axes along which the fit may move.
+            rotation_axes: components of the rotation vector that the fit may change.
+        """
         super().__init__()
         self.translation = nn.Parameter(_vector(translation, "initial translation [m]"))
         self.rotation = nn.Parameter(_rotation_numbers(rotation))
@@ -159,6 +167,10 @@ class Scale(nn.Module):
             object: name of the object.
             initial: factor.
 
+        Args:
+            object: name of the object.
+            initial: factor.
+
         Raises:
             InputError: `initial` is not positive.
         """
@@ -187,6 +199,10 @@ class Vertices(nn.Module):
 
     def __init__(self, object: str, count: int) -> None:
         """Move the `count` vertices of `object`, by zero at the start.
+
+        Args:
+            object: name of the object.
+            count: number of its vertices.
 
         Raises:
             InputError: no vertices.

@@ -98,7 +98,15 @@ class DistanceGrid(_Distance):
         distance: Callable[[Tensor], Tensor],
         smoothing: float = 0.0,
     ) -> "DistanceGrid":
-        """The grid that holds a signed distance, a function of points [p, 3], at its nodes.
+        """A grid that holds a signed distance at its nodes.
+
+        Args:
+            object: name of the object.
+            low: corner of the box in the object's frame [m].
+            high: the opposite corner [m].
+            counts: nodes along x, y and z.
+            distance: signed distance [m] of points [p, 3], negative inside.
+            smoothing: λ, as above.
 
         Raises:
             InputError: as above.
@@ -124,6 +132,12 @@ class GridSmoother:
     """I + λL of a grid, L its graph Laplacian, by cosine transforms, which diagonalise it."""
 
     def __init__(self, shape: tuple[int, ...], amount: float) -> None:
+        """Prepare I + λL.
+
+        Args:
+            shape: nodes along each axis.
+            amount: λ.
+        """
         self.amount = amount
         squares = np.zeros(shape)
         for axis, count in enumerate(shape):
