@@ -87,7 +87,6 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
         InputError: an unknown waveform or a missing field.
     """
     kind = _named(attributes, "waveform", WAVEFORMS)
-    hints = get_type_hints(kind)  # without limits
     # Numbers come back from a file as NumPy scalars.
     types = get_type_hints(kind)  # without the limits that annotations may have
     values = {
