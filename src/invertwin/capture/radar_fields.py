@@ -10,6 +10,7 @@ import xarray as xr
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.limits import Count
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import (
     FMCW,
@@ -88,7 +89,7 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
     kind = _named(attributes, "waveform", WAVEFORMS)
     # Numbers come back from a file as NumPy scalars.
     values = {
-        field.name: (int if field.type is int else float)(attribute(attributes, field.name))
+        field.name: (int if field.type in (int, Count) else float)(attribute(attributes, field.name))
         for field in fields(kind)
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
