@@ -89,7 +89,9 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
     kind = _named(attributes, "waveform", WAVEFORMS)
     # Numbers come back from a file as NumPy scalars.
     values = {
-        field.name: (int if field.type in (int, Count) else float)(attribute(attributes, field.name))
+        field.name: (int if field.type in (int, Count) else float)(
+            attribute(attributes, field.name)
+        )
         for field in fields(kind)
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
