@@ -22,7 +22,7 @@ from invertwin.radar.boards import board
 BOARD = {"name": "xWR1843", "elevation": -1, "transmitters": [1, 3, 2]}
 WAVE = RADAR["waveform"]
 MEASURED = RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]
-SIMULATED = 'kind = "simulated"\ndensity = 2e3\nsnr_db = 20.0\n'
+SIMULATED = 'kind = "simulated"\ndepth = 1\ndensity = 2e3\nsnr_db = 20.0\n'
 # The plate before the wall, seen by a board with two transmitters.
 TRAIN = (
     (
