@@ -87,11 +87,11 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
         InputError: an unknown waveform or a missing field.
     """
     kind = _named(attributes, "waveform", WAVEFORMS)
-    hints = get_type_hints(kind)  # without limits
     # Numbers come back from a file as NumPy scalars.
+    types = get_type_hints(kind)  # without the limits that annotations may have
     values = {
-        field.name: (int if hints[field.name] is int else float)(attribute(attributes, field.name))
-        for field in fields(kind)  # type: ignore[arg-type]
+        field.name: (int if types[field.name] is int else float)(attribute(attributes, field.name))
+        for field in fields(kind)
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
 
