@@ -8,7 +8,7 @@ serves ``reconstruct`` and ``gradcheck``; deriving from :class:`ForwardModel` su
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -54,7 +54,7 @@ class ForwardModel(ABC):
     def observe(self, recording: Any) -> Float[Tensor, "frame *map"]:
         """A recording as a map of the same form."""
 
-    def prepared(self, scene: Scene, sensor: Any, seed: int) -> Self:
+    def prepared(self, scene: Scene, sensor: Any, seed: int) -> "ForwardModel":
         """The model with everything drawn that stays the same during a fit.
 
         Args:
@@ -66,7 +66,7 @@ class ForwardModel(ABC):
 
     def for_differences(
         self, scene: Scene, sensor: Any, samples: int, scheme: Literal["rays", "area"]
-    ) -> Self:
+    ) -> "ForwardModel":
         """The model with common random numbers for scenes that differ a little.
 
         Args:
@@ -77,7 +77,7 @@ class ForwardModel(ABC):
         """
         return self
 
-    def sampled_by(self, **changes: Any) -> Self:
+    def sampled_by(self, **changes: Any) -> "ForwardModel":
         """The model with other fields of its ``sampling``, where it has one."""
         return replace(self, sampling=replace(self.sampling, **changes))  # type: ignore
 
@@ -86,7 +86,7 @@ class ForwardModel(ABC):
         """Whether the model has extra widths."""
         return False
 
-    def narrowed(self, share: float) -> Self:
+    def narrowed(self, share: float) -> "ForwardModel":
         """The model with this share of its extra widths; 0 takes them away."""
         return self
 

@@ -28,6 +28,11 @@ class Unknown:
     rate: float | None = None
     regularize: Callable[[nn.Module, Any], Sequence[Regularizer]] | None = None
 
+    @property
+    def depends(self) -> bool:
+        """Whether it must know the scene (or sensor) as the unknowns before it leave it."""
+        return not isinstance(self.module, nn.Module) or self.regularize is not None
+
     def made(self, target: Any) -> nn.Module:
         """The module, for a scene or a sensor."""
         return self.module if isinstance(self.module, nn.Module) else self.module(target)

@@ -1,11 +1,14 @@
-"""Range bias and clock offset: what a measurement gets wrong about itself."""
+"""Unknowns of a radar in a fit: what a measurement gets wrong about itself."""
 
 import pytest
 import torch
 
+from fits import fit
 from invertwin.capture import Capture, Track
-from invertwin.inversion import ClockOffset, Optimizer, RangeBias, reconstruct
+from invertwin.channel import Sampling
+from invertwin.inversion import Optimizer
 from invertwin.radar import FMCW, Radar, Surrogate
+from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.parameters import Translation
 from invertwin.simulation import simulate
@@ -17,21 +20,22 @@ BIAS = 0.12
 def test_range_bias_is_found_in_shifted_data(case):
     """A beat of frequency S 2b/c more is a target b farther."""
     with torch.no_grad():
-        beat = simulate(case.scene, case.radar, case.grid, depth=1, density=3_000.0, seed=7).beat
-    assert beat is not None
+        drawn = Sampling(depth=1, points_per_m2=3_000.0)
+        beat = simulate(case.scene, case.radar, case.grid, sampling=drawn, seed=7).beat
     waveform = case.radar.waveform
     phase = 2 * torch.pi * waveform.slope * 2 * BIAS / 299_792_458.0 * waveform.sample_times
     shifted = Capture.from_beat(beat * torch.polar(torch.ones_like(phase), phase), case.radar)
     bias = RangeBias()
-    found = reconstruct(
+    found = fit(
         case.scene,
         case.radar,
         shifted,
         [],
-        nuisances=[bias],
+        of_radar=[bias],
         **case.settings(steps=40, optimizer=Optimizer(rate=0.02)),
     )
     assert float(bias.bias.detach()) == pytest.approx(BIAS, abs=0.01)
+    assert float(found.sensors[0].range_bias) == float(bias.bias.detach())
     assert found.history[-1]["values"].keys() == {"range_bias"}
     assert found.scene["plate"].center.equal(case.scene["plate"].center)
 
@@ -51,7 +55,10 @@ def recording() -> tuple[Capture, Radar]:
 
 def test_clock_offset_moves_the_radar_along_its_track():
     capture, radar = recording()
-    still, shifted = ClockOffset(capture)(radar), ClockOffset(capture, 0.15)(radar)
+    still, shifted = (
+        ClockOffset(capture.positions)(radar),
+        ClockOffset(capture.positions, 0.15)(radar),
+    )
     assert torch.allclose(still.positions, radar.positions)
     assert capture.track is not None
     assert torch.allclose(shifted.positions, capture.track.at(capture.times + 0.25))
@@ -59,24 +66,25 @@ def test_clock_offset_moves_the_radar_along_its_track():
 
 def test_clock_offset_has_the_gradient_of_the_track():
     capture, radar = recording()
-    module, step = ClockOffset(capture, 0.02), 1e-4
+    module, step = ClockOffset(capture.positions, 0.02), 1e-4
     weights = torch.rand(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     (weights * module(radar).positions).sum().backward()
     ends = [
-        (weights * ClockOffset(capture, 0.02 + s)(radar).positions).sum() for s in (step, -step)
+        (weights * ClockOffset(capture.positions, 0.02 + s)(radar).positions).sum()
+        for s in (step, -step)
     ]
     truth = float((ends[0] - ends[1]).detach()) / (2 * step)
     assert module.shift.grad is not None
     assert float(module.shift.grad) == pytest.approx(truth, rel=1e-6)
 
 
-def test_nuisances_are_named_in_the_history(case):
-    found = reconstruct(
+def test_unknowns_of_the_radar_are_named_in_the_history(case):
+    found = fit(
         case.scene,
         case.radar,
         case.capture,
         [Translation("plate")],
-        nuisances=[RangeBias(0.05)],
+        of_radar=[RangeBias(0.05)],
         **case.settings(steps=2, samples=2_000, boundary_samples=500, surrogate=Surrogate()),
     )
     assert found.history[-1]["values"].keys() == {"plate.translation", "range_bias"}
