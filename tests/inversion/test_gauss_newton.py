@@ -287,6 +287,6 @@ def test_reconstruct_takes_its_steps_and_resumes(case, tmp_path):
         fitted(resume=True, **kept)
     with pytest.raises(
         InputError,
-        match="smooth models .* 'gauss_newton', got ExactMap",
+        match=r"smooth models .* 'gauss_newton', got ExactMap",
     ):
         fitted(surrogate="exact")
