@@ -8,6 +8,8 @@ SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo -n)
 MAY_APT := command -v apt-get >/dev/null && $(SUDO) true 2>/dev/null
 APT := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -q
 LLVM_USABLE := $(BIN)/python -c 'from invertwin import doctor; doctor.require()' 2>/dev/null
+# Two processes, a file at a time: files share what is slow to make.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
 NEW_ENOUGH := -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
 
 .PHONY: help demo test test-fast test-gpu check format bench clean
@@ -26,10 +28,10 @@ demo: .venv/.run .venv/.llvm
 	$(BIN)/invertwin demo
 
 test: .venv/.dev .venv/.llvm
-	$(BIN)/python -m pytest -m 'not gpu'
+	$(PYTEST) -m 'not gpu'
 
 test-fast: .venv/.dev .venv/.llvm
-	$(BIN)/python -m pytest -m 'not gpu and not slow'
+	$(PYTEST) -m 'not gpu and not slow'
 
 test-gpu: .venv/.dev .venv/.llvm
 	$(BIN)/python -m pytest -m gpu
@@ -69,10 +71,11 @@ $(BIN)/python:
 
 # torch first and alone: the one large package, and the one with builds for CPU or GPU to choose
 # from by pip's own settings.
-.venv/.run: pyproject.toml constraints.txt | $(BIN)/python
+# The studies of the checkout come with it: commands and sections that a bare wheel lacks.
+.venv/.run: pyproject.toml constraints.txt experiments/studies/pyproject.toml | $(BIN)/python
 	@echo 'set-up: invertwin and what it stands on (first PyTorch, some 200 MB or more)'
 	@$(PIP) install "$$(grep '^torch==' constraints.txt)"
-	@$(PIP) install --constraint constraints.txt --editable .
+	@$(PIP) install --constraint constraints.txt --editable . --editable experiments/studies
 	@touch $@
 
 .venv/.dev: .venv/.run

@@ -109,8 +109,6 @@ class Place(nn.Module):
         beamwidths: Parameter [beamwidths in u].
     """
 
-    applies_to = "scene"
-
     def __init__(self, cells: float, beamwidths: float, beamwidth: float) -> None:
         super().__init__()
         self.cells = nn.Parameter(torch.tensor(cells, dtype=torch.float64))

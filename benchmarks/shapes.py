@@ -5,8 +5,8 @@
 Prints a table and writes `metrics.json` and `shapes.png` into DIR (default `out/shapes`). Cars that
 an interrupted run has finished are not fitted again.
 
-Radar, data, fits and measures are those of `experiments/shape_car_prior.toml`; every car has a
-shape, start, speckle and noise of its own. The cars are drawn from the public learned space of
+Radar, data, fits and measures are those of `experiments/shape_car_prior_public.toml`; every car has
+a shape, start, speckle and noise of its own. The cars are drawn from the public learned space of
 vehicles (coordinates of a normal distribution, cut at two standard deviations), which the prior of
 the package has never seen: it was trained on procedural cars. Settings were chosen on other cars of
 that space than these. A start is the prior's mean car, 0.3 m off in some direction on the road and
@@ -52,7 +52,7 @@ from invertwin.cli.run_file import load_run, to_toml
 from invertwin.cli.runs import open_run
 from invertwin.cli.schema import RunFile
 
-RUN = Path(__file__).parents[1] / "experiments" / "shape_car_prior.toml"
+RUN = Path(__file__).parents[1] / "experiments" / "shape_car_prior_public.toml"
 CARS = 20
 MODES = {"pose_only": "pose_only", "free": "free", "prior": FULL}
 MODES_OF_SPACE = 78

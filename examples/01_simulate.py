@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import torch
-from matplotlib.figure import Figure
 
 import invertwin as iw
 from invertwin.scene import RoughDielectric, linear_array, plate, rigid, rotation_from_vector, text
@@ -40,17 +39,8 @@ recorded = iw.simulate(scene, radar, grid, seed=1, depth=1, snr_db=20.0)
 # The surrogate: the mean over all such surfaces, smooth in everything that may move.
 expected = iw.simulate(scene, radar, grid, seed=1, depth=1, surrogate=iw.Surrogate())
 
-figure = Figure(figsize=(9, 4), layout="constrained")
-panels = figure.subplots(1, 2, sharey=True)
 maps = {"one recording (exact)": recorded.spectrum, "on average (surrogate)": expected.spectrum}
-levels = {title: 10 * torch.log10(p[0, :, :, 0].clamp_min(1e-30)) for title, p in maps.items()}
-top = max(float(level.max()) for level in levels.values())  # one scale for both panels
-for panel, (title, level) in zip(panels, levels.items(), strict=True):
-    u, ranges = grid.u.numpy(), grid.ranges.numpy()
-    image = panel.pcolormesh(u, ranges, level.numpy(), vmin=top - 40, vmax=top)
-    panel.set(title=title, xlabel="u = x/R")
-figure.colorbar(image, ax=panels, label="received over transmitted power [dB]")
-panels[0].set_ylabel("range [m]")
+figure = iw.plotting.spectrum(maps, grid, relative=False)  # one scale for both
 figure.savefig(folder / "simulate.png", dpi=100)
 
 print(f"beat signal {tuple(recorded.beat.shape)} (frame, tx, rx, sample)")

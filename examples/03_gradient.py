@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import torch
-from matplotlib.figure import Figure
 
 import invertwin as iw
 from invertwin.inversion import Direction
@@ -36,24 +35,15 @@ report = iw.gradcheck(
     difference_samples=2_000_000, max_pairs=4,
 )  # fmt: skip
 
-peak, u, ranges = report.value.max(), grid.u.numpy(), grid.ranges.numpy()
+peak = report.value.max()
 derivatives = {
     "derivative by differences": report.difference,
     f"invertwin: {report.full.relative_l1:.1%} off": report.gradient,
     f"without boundary paths: {report.interior.relative_l1:.0%} off": report.interior_gradient,
 }
-figure = Figure(figsize=(13, 3.4), layout="constrained")
-first, *others = figure.subplots(1, 4, sharey=True)
-level = 10 * torch.log10((report.value[0, :, :, 0] / peak).clamp_min(1e-12))
-image = first.pcolormesh(u, ranges, level.numpy(), vmin=-30, vmax=0)
-first.set(title="power", ylabel="range [m]")
-figure.colorbar(image, ax=first, label="dB from the peak")
-for panel, (title, values) in zip(others, derivatives.items(), strict=True):
-    share = values[0, :, :, 0] / peak
-    image = panel.pcolormesh(u, ranges, share.numpy(), vmin=-1.5, vmax=1.5, cmap="RdBu_r")
-    panel.set(title=title)
-figure.colorbar(image, ax=others, label="peaks per metre moved")
-figure.supxlabel("direction u = x/R", fontsize=10)
+shares = {title: values / peak for title, values in derivatives.items()}
+label = "peaks per metre moved"
+figure = iw.plotting.gradient(shares, grid, label=label, power=report.value)
 figure.savefig(folder / "gradient.png", dpi=100, metadata={"Software": None})
 print(f"with boundary paths:    L1 error {report.full.relative_l1:.4f}")
 print(f"without boundary paths: L1 error {report.interior.relative_l1:.4f}")

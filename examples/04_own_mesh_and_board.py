@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import torch
-from matplotlib.figure import Figure
 
 import invertwin as iw
 from invertwin.scene import Cosine, PerfectConductor, linear_array, rigid, save_mesh, sphere
@@ -44,16 +43,11 @@ capture.save(folder / "ball.nc")
 
 loaded = iw.Capture.load(folder / "ball.nc")
 assert torch.equal(loaded.beat, capture.beat)
-spectrum = loaded.spectrum(grid)[0, :, :, 0]
-level = 10 * torch.log10(spectrum.clamp_min(1e-30)).numpy()
+spectrum = loaded.spectrum(grid)
 row, column = divmod(int(spectrum.argmax()), grid.u_count)
 nearest = min(ball.vertices, key=torch.linalg.norm)  # a smooth ball shines there
 
-figure = Figure(figsize=(5, 4), layout="constrained")
-panel = figure.subplots()
-image = panel.pcolormesh(grid.u.numpy(), grid.ranges.numpy(), level, vmin=level.max() - 60)
-panel.set(title="received over transmitted power [dB]", xlabel="u = x/R", ylabel="range [m]")
-figure.colorbar(image, ax=panel)
+figure = iw.plotting.spectrum(spectrum, grid, relative=False, dynamic_range=60.0)
 figure.savefig(folder / "ball.png", dpi=100)
 print(f"strongest echo: R = {grid.ranges[row]:.2f} m, u = {grid.u[column]:+.2f}")
 print(f"nearest point:  R = {nearest.norm():.2f} m, u = {nearest[0] / nearest.norm():+.2f}")

@@ -1,4 +1,4 @@
-"""What every test shares: run-time shape checks, the data folder, the GPU marker."""
+"""What every test shares: run-time shape checks, the data folder, the markers."""
 
 import os
 from collections.abc import Iterator
@@ -12,13 +12,25 @@ from jaxtyping import config, install_import_hook
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
+# Workers of pytest-xdist share the cores out among themselves, before Dr.Jit starts a thread for
+# every core that it may use. What a worker starts inherits its share.
+if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):
+    cores, workers = sorted(os.sched_getaffinity(0)), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    number = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
+    os.sched_setaffinity(0, cores[number % len(cores) :: workers])
+
 # Shape annotations are executed in tests only; users pay nothing for them. The numeric tower of
 # PEP 484: an int is welcome where a float is asked for.
 install_import_hook(
-    "invertwin", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+    ["invertwin", "invertwin_studies"],
+    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("INVERTWIN_DATA", REPOSITORY.parent / "shared" / "data"))
+# A user has no measured data. A test that reads some without the fixture `data_folder` fails
+# everywhere, not only on machines without data.
+os.environ["INVERTWIN_DATA"] = str(REPOSITORY / "no measured data: ask for the fixture data_folder")
 
 
 @pytest.fixture(scope="session")
@@ -27,14 +39,13 @@ def repository() -> Path:
     return REPOSITORY
 
 
-@pytest.fixture(scope="session")
-def data_folder() -> Path:
+@pytest.fixture
+def data_folder(monkeypatch: pytest.MonkeyPatch) -> Path:
     """Measured data: `$INVERTWIN_DATA`, by default `../shared/data` beside the checkout."""
-    default = REPOSITORY.parent / "shared" / "data"
-    folder = Path(os.environ.get("INVERTWIN_DATA", default))
-    if not folder.is_dir():
-        pytest.skip(f"no measured data in {folder}: set INVERTWIN_DATA")
-    return folder
+    if not DATA.is_dir():
+        pytest.skip(f"no measured data in {DATA}: set INVERTWIN_DATA")
+    monkeypatch.setenv("INVERTWIN_DATA", str(DATA))
+    return DATA
 
 
 @pytest.fixture
@@ -45,7 +56,12 @@ def unchecked() -> Iterator[None]:
     config.update("jaxtyping_disable", False)
 
 
+# Before the items are selected by their marks.
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "data_folder" in getattr(item, "fixturenames", ()):
+            item.add_marker("data")
     marked = [item for item in items if item.get_closest_marker("gpu")]
     if not marked:
         return

@@ -25,7 +25,7 @@ NEEDS_DATA = ["measured_data.md"]
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 
 SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-NAME = re.compile(r"`(invertwin(?:\.\w+)+)`")
+NAME = re.compile(r"`(invertwin(?:_studies)?(?:\.\w+)+)`")
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 RUN_FILE = re.compile(r"\b(?:experiments|examples|benchmarks|tests)/[\w/*.]*\w")
 WRITES = {
@@ -180,8 +180,8 @@ def test_every_difference_from_the_source_is_listed():
 
 def differing():
     """Qualified names of modules, classes and functions whose docstring has the remark."""
-    source = REPOSITORY / "src"
-    for path in sorted((source / "invertwin").rglob("*.py")):
+    sources = [REPOSITORY / "src", REPOSITORY / "experiments" / "studies" / "src"]
+    for source, path in ((s, path) for s in sources for path in sorted(s.rglob("*.py"))):
         module = ".".join(path.relative_to(source).with_suffix("").parts)
         for node in ast.walk(ast.parse(path.read_text())):
             documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)

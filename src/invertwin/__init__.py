@@ -4,7 +4,7 @@ Data flows one way. ``scene`` turns parameters θ (``scene/parameters.py``) into
 and antennas; ``channel`` traces them into paths; ``radar`` makes beat signals and spectra of paths,
 or their smooth mean, the surrogate; ``inversion`` compares spectra with a capture and moves θ.
 ``simulation.py`` is the way from scene to spectrum on one page. Beside it, ``capture`` holds
-measured data and ``cli`` the commands.
+measured data, ``plotting`` draws figures and ``cli`` has the commands.
 
 The names below are the public menu. Each is loaded when it is first used, so ``import invertwin``
 is quick, and ``invertwin doctor`` runs where no ray tracer can.
@@ -15,9 +15,9 @@ from typing import Any
 
 from invertwin import doctor
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
-_ROOMS = ("capture", "channel", "inversion", "radar", "scene")
+_ROOMS = ("capture", "channel", "inversion", "plotting", "radar", "scene")
 
 # Name → module.
 _MENU = {

@@ -21,6 +21,7 @@ def script(name: str) -> Any:
 
 basin = script("basin")
 edges = script("edges")
+house = script("house")
 multibounce = script("multibounce")
 report = script("report")
 shapes = script("shapes")

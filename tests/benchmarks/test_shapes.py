@@ -2,12 +2,16 @@
 
 import json
 import math
+from pathlib import Path
 
 import pytest
+import torch
+from invertwin.scene.geometry.vehicles import Car, car_mesh
 
 from invertwin.cli import build
 from invertwin.cli.fits.problem import varied_run
 from invertwin.cli.run_file import need
+from invertwin.scene import load_mesh
 
 
 def curve(*values):
@@ -155,6 +159,47 @@ def test_both_run_files_are_one_experiment(shapes):
             for found in fits
         )
         assert first == second
+
+
+def test_the_public_run_file_is_the_experiment_with_another_car(shapes):
+    public = shapes.load_run(shapes.RUN)
+    own = shapes.load_run(shapes.RUN.with_name("shape_car_prior.toml"))
+    other = {name: getattr(own, name) for name in ("title", "note", "truth")}
+    assert public.model_copy(update=other) == own
+    (theirs,), (mine,) = public.truth["car"].parts, own.truth["car"].parts
+    assert (theirs.shape, Path(mine.file).name) == ("vehicle", "car.ply")
+
+
+def test_the_car_of_the_project_is_made_by_its_generator(shapes):
+    """The mesh in the repository can be made anew."""
+    car = Car(
+        length=4.38,
+        width=1.79,
+        height=1.51,
+        clearance=0.17,
+        wheelbase=2.62,
+        front_overhang=0.86,
+        wheel_radius=0.315,
+        nose_height=0.76,
+        bumper_height=0.47,
+        cowl_height=1.0,
+        cowl_setback=0.42,
+        screen_angle=30.0,
+        roof_peak=0.35,
+        roof_rear_drop=0.11,
+        deck_height=1.01,
+        deck_length=0.06,
+        rear_angle=57.0,
+        tail_lean=0.09,
+        belt_height=0.96,
+        belt_rise=0.08,
+        shoulder_height=0.71,
+        tumblehome=17.0,
+        rounding=0.07,
+    )
+    made, kept = car_mesh(car, spacing=0.1), load_mesh(shapes.RUN.with_name("car.ply"))
+    assert torch.equal(made.faces, kept.faces)
+    assert float((made.vertices - kept.vertices).abs().max()) < 1e-6
 
 
 @pytest.mark.slow

@@ -69,9 +69,10 @@ def chained(scene: Scene, antennas: Link, seed: int, count: int) -> tuple[Tensor
     return total, power.index_add(0, frames, field.abs().square())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "front",
-    [False, pytest.param(True, marks=pytest.mark.slow)],
+    [False, True],
     ids=["corner", "with a board"],
 )
 def test_chains_carry_the_power_of_the_map(front):

@@ -60,6 +60,7 @@ def test_version(monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("invertwin ")
 
 
+@pytest.mark.slow
 def test_simulate_then_reconstruct_from_the_saved_capture(run_file, monkeypatch, capsys):
     assert call(monkeypatch, "simulate", run_file) == 0
     out = run_file.parent / "out" / "small"
@@ -119,6 +120,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert "complete already" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_many_starts_with_and_without_boundary_terms(run_file, monkeypatch):
     run_file.write_text(RUN + "also_interior_only = true\n" + STARTS)
     assert call(monkeypatch, "reconstruct", run_file) == 0
@@ -135,6 +137,7 @@ def test_many_starts_with_and_without_boundary_terms(run_file, monkeypatch):
     assert not (out / "parts").exists()
 
 
+@pytest.mark.slow
 def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
     files = []
     for name in ("first", "second"):

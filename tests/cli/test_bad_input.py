@@ -162,6 +162,7 @@ def shapes() -> dict[str, Mesh]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shapes())
 def test_odd_meshes_are_fitted(run_file, monkeypatch, name):
     save_mesh(run_file.with_name("odd.ply"), shapes()[name])
@@ -178,6 +179,7 @@ def test_odd_meshes_are_fitted(run_file, monkeypatch, name):
     assert metrics["loss"] < 1
 
 
+@pytest.mark.slow
 def test_start_out_of_sight_ends_without_an_exception(run_file, monkeypatch):
     # The data hold the wall alone; the plate stands where the grid does not reach.
     text = RUN.replace("[0.02, 0.01, 1.2]", "[0.0, 0.0, 9.0]").replace("steps = 8", "steps = 2")
@@ -189,6 +191,7 @@ def test_start_out_of_sight_ends_without_an_exception(run_file, monkeypatch):
     assert np.allclose(metrics["parameters"]["plate.translation"], 0, atol=0.05)
 
 
+@pytest.mark.slow
 def test_isotropic_antenna_sees_behind_itself(run_file, monkeypatch):
     text = BEHIND.replace('kind = "cosine", exponent = 1.0', 'kind = "isotropic"')
     run_file.write_text(text.replace("[0.02, 0.01, 1.2]", "[0.02, 0.01, -1.2]"))
@@ -197,6 +200,7 @@ def test_isotropic_antenna_sees_behind_itself(run_file, monkeypatch):
     assert metrics["peak_range_m"] == pytest.approx(1.2, abs=0.5)
 
 
+@pytest.mark.slow
 def test_parameters_that_are_not_numbers_end_as_diverged(run_file, monkeypatch):
     run_file.write_text(RUN + "[optimizer]\nrate = 1.7e308\n")
     assert call(monkeypatch, "reconstruct", run_file) == 0

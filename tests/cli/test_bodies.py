@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 import torch
+from invertwin.cli.gradient_shapes import shape_direction
 
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
-from invertwin.cli.gradient_shapes import shape_direction
 from invertwin.cli.run_file import validate
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError

@@ -18,8 +18,7 @@ from invertwin.capture import (
     described_arrays,
 )
 from invertwin.capture.ti import write_cfg, write_samples, write_setup, write_studio
-from invertwin.cli.doppler_maps import sharp_map, snapshots_of
-from invertwin.radar import Chirps, Radar, velocity_span
+from invertwin.radar import Chirps, Radar, sharp_map, snapshots_of, velocity_span
 from invertwin.radar.boards import board
 from oracles.moving_point import moving_point
 

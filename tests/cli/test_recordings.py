@@ -165,6 +165,7 @@ def test_impairments_reach_the_front_end():
         sensors.impairments(run.impairments, data)
 
 
+@pytest.mark.slow
 def test_impairments_are_in_simulated_data(run_file, monkeypatch):
     """Channel errors alone: every channel keeps its signal but for one factor."""
     text = RUN.replace("snr_db = 20.0\n", "")
@@ -238,6 +239,7 @@ def test_raw_files_show_what_was_simulated(train, monkeypatch):
         assert seen[key] == pytest.approx(simulated[key], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_raw_files_are_data_of_a_fit(train, run_file, monkeypatch):
     monkeypatch.chdir(train)
     table = f'kind = "dca1000"\nfile = "{train}/raw/capture.bin"\n'

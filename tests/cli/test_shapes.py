@@ -78,6 +78,7 @@ def check(text: str, tmp_path):
     return validate(tomllib.loads(text), tmp_path / "run.toml")
 
 
+@pytest.mark.slow
 def test_a_shape_is_fitted_in_stages_and_compared(tmp_path, monkeypatch, capsys):
     (tmp_path / "shape.toml").write_text(shapes())
     out = tmp_path / "out"
@@ -133,6 +134,7 @@ def letters() -> str:
     return HEAD.replace(flat, 'shape = "sphere"\nradius = 0.2') + LETTERS
 
 
+@pytest.mark.slow
 def test_parts_and_holes_are_told_where_the_surface_is_closed(tmp_path, monkeypatch, capsys):
     (tmp_path / "run.toml").write_text(letters())
     out = tmp_path / "out"

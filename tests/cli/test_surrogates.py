@@ -41,6 +41,7 @@ def test_a_wrong_one_is_named(line, message, tmp_path):
         validate(tomllib.loads(named(line)), tmp_path / "run.toml")
 
 
+@pytest.mark.slow
 def test_the_exact_chain_is_fitted_where_visibility_is_fixed(tmp_path, monkeypatch, capsys):
     text = named('surrogate = "exact"').replace("steps = 8", "steps = 3")
     (tmp_path / "exact.toml").write_text(text)
@@ -65,6 +66,7 @@ def test_no_gradient_check_of_the_exact_chain(tmp_path, monkeypatch, capsys):
     assert "surrogate.exact: expected a smooth map" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_reports_say_how_well_the_surrogate_agrees(tmp_path, monkeypatch):
     (tmp_path / "run.toml").write_text(RUN)
     out = tmp_path / "out"

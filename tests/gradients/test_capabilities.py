@@ -19,8 +19,8 @@ from invertwin.channel import Sampling, deposit_power, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import gradcheck
-from invertwin.inversion.nuisances import ClockOffset, RangeBias
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum, surrogate_spectrum
+from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.scene import (
     AntennaArray,
     Cosine,
@@ -37,7 +37,6 @@ from invertwin.scene import (
 from invertwin.scene.parameters import (
     MaterialValues,
     Pose,
-    RadarPose,
     Scale,
     Translation,
     Vertices,
@@ -179,7 +178,7 @@ def clock() -> tuple[Radar, Moves]:
     capture = Capture.from_range_profile(
         profile, torch.arange(8).double() * 0.1 + 1, single, times, track=track
     )
-    return radar, on_radar(ClockOffset(capture), lambda theta: {"shift": theta})
+    return radar, on_radar(ClockOffset(capture.positions), lambda theta: {"shift": theta})
 
 
 @dataclass(frozen=True)
@@ -215,7 +214,7 @@ def power_case(parameter: str) -> Found:
 
 
 def biased(theta: Tensor, scene: Scene, seed: int, boundary: bool, depth: int = 1) -> Tensor:
-    radar = replace(power_radar(), range_bias=functional_call(RangeBias(), {"bias": theta}, ()))
+    radar = functional_call(RangeBias(), {"bias": theta}, (power_radar(),))
     return surrogate_spectrum(
         scene,
         radar,

@@ -63,6 +63,7 @@ def test_gradient_is_that_of_converged_differences(file):
         assert report.interior.relative_l1 > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], ids="xy")
 def test_a_fine_mesh_keeps_its_silhouette(axis):
     """Triangles nearly edge-on beside a silhouette must not block its own boundary rays."""

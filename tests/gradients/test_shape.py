@@ -5,10 +5,10 @@ import math
 
 import pytest
 import torch
+from invertwin.inversion.shape_directions import ShapeDirection, along, along_field
 from torch import Tensor
 
 from invertwin.inversion.gradcheck import gradcheck
-from invertwin.inversion.shape_directions import ShapeDirection, along, along_field
 from invertwin.radar import Surrogate
 from invertwin.scene import Mesh, Scene, box, plate, rigid, rotation_from_vector, sphere
 from invertwin.scene.geometry import (

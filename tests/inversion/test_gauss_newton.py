@@ -260,6 +260,7 @@ class InterruptError(Exception):
     """Stands for whatever ends a run."""
 
 
+@pytest.mark.slow
 def test_reconstruct_takes_its_steps_and_resumes(case, tmp_path):
     def fitted(**changes: Any) -> Any:
         settings = case.settings(steps=4, optimizer=Optimizer("gauss_newton", rate=0.1))

@@ -63,6 +63,7 @@ def test_a_displaced_plate_is_found(case, kind):
     assert found.history[-1]["values"].keys() == {"plate.translation"}
 
 
+@pytest.mark.slow
 def test_momentum_finds_it_too(case):
     found = fit(
         case.scene,

@@ -5,7 +5,7 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.inversion import compare_shapes
-from invertwin.inversion.measures import is_watertight
+from invertwin.inversion.metrics import is_watertight
 from invertwin.inversion.remeshing import closest_points, remeshed, signed_distance
 from invertwin.scene import Mesh, box, plate, sphere, text
 from scenes import float64

@@ -1,18 +1,15 @@
-"""Unknowns of a radar in a fit: what a measurement gets wrong about itself."""
+"""A range bias is found by a fit, and shows in its history."""
 
 import pytest
 import torch
 
 from fits import fit
-from invertwin.capture import Capture, Track
+from invertwin.capture import Capture
 from invertwin.channel import Sampling
 from invertwin.inversion import Optimizer
-from invertwin.radar import FMCW, Radar, Surrogate
-from invertwin.radar.parameters import ClockOffset, RangeBias
-from invertwin.scene.antenna import AntennaArray
+from invertwin.radar import RangeBias, Surrogate
 from invertwin.scene.parameters import Translation
 from invertwin.simulation import simulate
-from scenes import float64
 
 BIAS = 0.12
 
@@ -38,44 +35,6 @@ def test_range_bias_is_found_in_shifted_data(case):
     assert float(found.sensors[0].range_bias) == float(bias.bias.detach())
     assert found.history[-1]["values"].keys() == {"range_bias"}
     assert found.scene["plate"].center.equal(case.scene["plate"].center)
-
-
-def recording() -> tuple[Capture, Radar]:
-    """Empty range profiles of a radar on a track that bends."""
-    one = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
-    times = torch.linspace(0, 1, 5, dtype=torch.float64)
-    track = Track(float64([-1.0, 0.45, 2.0]), float64([[-1.0, 0, 0], [0.0, 0.2, 0], [1.5, 0, 0.1]]))
-    radar = Radar(one, one, FMCW(76e9, 2e9, 50e-6, 64), track.at(times + 0.1))
-    profile = torch.ones(5, 4, dtype=torch.complex128)
-    capture = Capture.from_range_profile(
-        profile, 1 + torch.arange(4).double(), radar, times, track=track, clock_offset=0.1
-    )
-    return capture, radar
-
-
-def test_clock_offset_moves_the_radar_along_its_track():
-    capture, radar = recording()
-    still, shifted = (
-        ClockOffset(capture.positions)(radar),
-        ClockOffset(capture.positions, 0.15)(radar),
-    )
-    assert torch.allclose(still.positions, radar.positions)
-    assert capture.track is not None
-    assert torch.allclose(shifted.positions, capture.track.at(capture.times + 0.25))
-
-
-def test_clock_offset_has_the_gradient_of_the_track():
-    capture, radar = recording()
-    module, step = ClockOffset(capture.positions, 0.02), 1e-4
-    weights = torch.rand(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    (weights * module(radar).positions).sum().backward()
-    ends = [
-        (weights * ClockOffset(capture.positions, 0.02 + s)(radar).positions).sum()
-        for s in (step, -step)
-    ]
-    truth = float((ends[0] - ends[1]).detach()) / (2 * step)
-    assert module.shift.grad is not None
-    assert float(module.shift.grad) == pytest.approx(truth, rel=1e-6)
 
 
 def test_unknowns_of_the_radar_are_named_in_the_history(case):

@@ -260,6 +260,7 @@ def test_frames_and_empty_frames(point_paths):
     assert not moving_beat(replace(none, velocity=none.first), radar, CHIRPS).any()
 
 
+@pytest.mark.slow
 def test_gradients_of_moving_points(point_paths):
     """In places, velocities and coefficients, at a low carrier where differences are accurate."""
     radar = replace(RADAR, waveform=FMCW(1e9, 0.2e9, 50e-6, 12))

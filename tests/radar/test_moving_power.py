@@ -108,6 +108,7 @@ def test_world_and_frames_turn_with_the_radar():
     assert not there[0].any()
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     radar = make_radar()
     grid, chirps = radar.grid(2.6, 3.2), Chirps(16, 60e-6)

@@ -346,6 +346,7 @@ def test_impulse_is_a_gaussian_pulse():
     assert half_width(maps[0][0, :, 0, 0], grid.range_step) == pytest.approx(cell, rel=0.02)
 
 
+@pytest.mark.slow
 def test_both_chains_of_a_scene_agree(mimo):
     """Ray-traced: the rough points' exact spectra, summed in power, are the surrogate's map."""
     pose = rigid(

@@ -1,7 +1,6 @@
 """Parameters: identity at the start, composition, gradients."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -19,7 +18,6 @@ from invertwin.scene import (
     Object,
     PerfectConductor,
     Pose,
-    RadarPose,
     RoughDielectric,
     Scale,
     Scene,
@@ -296,47 +294,12 @@ def test_conductor_lobe_can_be_fitted():
     assert material.lobe_width == pytest.approx(0.2)
 
 
-@dataclass(frozen=True)
-class StandIn:
-    """A radar as far as `RadarPose` knows one."""
-
-    rotation: Tensor
-    translation: Tensor
-
-    def moved(self, rotation: Tensor, translation: Tensor) -> "StandIn":
-        return StandIn(rotation @ self.rotation, rotation @ self.translation + translation)
-
-
-RADAR = StandIn(torch.eye(3, dtype=torch.float64), vector(0.0, 0.0, 1.0))
-
-
-def test_radar_pose_moves_the_radar():
-    module = RadarPose([0.1, 0.2, 0.3], [0.0, math.pi / 2, 0.0])
-    moved = module(RADAR)
-    assert moved.translation.tolist() == pytest.approx([1.1, 0.2, 0.3])
-    moved.translation.sum().backward()
-    assert module.rotation.grad is not None
-    assert module.rotation.grad.abs().sum() > 0
-    assert torch.equal(RadarPose()(RADAR).translation, RADAR.translation)
-
-
-def test_composition_of_both_kinds_maps_what_it_is_given():
-    both = Compose(Translation("block", [1.0, 0.0, 0.0]), Compose(RadarPose([0.0, 1.0, 0.0])))
-    assert both.applies_to == "both"
-    assert both(RADAR).translation.tolist() == [0.0, 1.0, 1.0]
-    expected = scene()["block"].vertices + vector(1.0, 0.0, 0.0)
-    assert torch.allclose(both(scene())["block"].vertices, expected)
-    assert Compose(Scale("block")).applies_to == "scene"
-    assert Compose(RadarPose()).applies_to == "radar"
-
-
 def test_any_module_from_scene_to_scene_composes():
     class Decoder(nn.Module):
         def forward(self, scene: Scene) -> Scene:
             return scene.replace("block", material=PerfectConductor())
 
     composed = Compose(Decoder(), Scale("block"))
-    assert composed.applies_to == "scene"
     assert isinstance(composed(scene())["block"].material, PerfectConductor)
     assert list(composed.values()) == ["block.scale"]
 
@@ -348,7 +311,6 @@ def test_values_are_physical_and_detached():
         Scale("block", 2.0),
         MaterialValues("block", permittivity=3.0),
         Vertices("block", 8),
-        RadarPose(),
     )
     values = module.values()
     assert values["wall.translation"].tolist() == [1.0, 2.0, 3.0]
@@ -356,7 +318,6 @@ def test_values_are_physical_and_detached():
     assert float(values["block.scale"]) == pytest.approx(2.0)
     assert float(values["block.permittivity"]) == pytest.approx(3.0)
     assert values["block.offsets"].shape == (8, 3)
-    assert values["radar.rotation"].tolist() == [0.0, 0.0, 0.0]
     assert not any(value.requires_grad for value in values.values())
 
 
@@ -377,12 +338,6 @@ def test_initial_values_are_copied():
     assert start.tolist() == [1.0, 2.0, 3.0]
 
 
-class Elsewhere(nn.Module):
-    """Maps neither scenes nor radars."""
-
-    applies_to = "range"
-
-
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("make", "message"),
@@ -396,7 +351,6 @@ class Elsewhere(nn.Module):
         (lambda: Scale("block", 0.0), "initial scale"),
         (lambda: Vertices("block", 0), "number of vertices"),
         (lambda: Vertices("block", 7)(scene()), "expected 7 vertices in 'block', got 8"),
-        (lambda: Compose(Elsewhere()), "map scenes or radars, got Elsewhere for range"),
         (lambda: MaterialValues("block"), "at least one of permittivity"),
         (lambda: MaterialValues("block", colour=1.0), "at least one of permittivity.*got colour"),
         (lambda: MaterialValues("block", layer=0, thickness=1.0)(scene()), "a layer below 0"),

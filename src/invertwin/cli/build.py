@@ -20,6 +20,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
 from invertwin.inversion.regularization import Regularizer
+from invertwin.radar.parameters import RadarPose
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import (
     Mesh,
@@ -33,7 +34,6 @@ from invertwin.scene import (
 from invertwin.scene.files import CONCRETE, load_mesh, load_scene_xml
 from invertwin.scene.parameters import (
     Pose,
-    RadarPose,
     Scale,
     Translation,
 )

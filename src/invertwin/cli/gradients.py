@@ -1,6 +1,6 @@
 """The scalar θ of a gradient check, from the tables of a run file: a module and a tangent."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,8 +10,10 @@ from torch import Tensor, nn
 from invertwin.cli import schema
 from invertwin.cli.bodies import template
 from invertwin.errors import InputError
+from invertwin.inversion.lines import Line
 from invertwin.inversion.remeshing import signed_distance
 from invertwin.radar.parameters import RadarPose
+from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 from invertwin.scene.geometry import (
     DensityGrid,
@@ -54,6 +56,16 @@ class Theta:
     tangent: Mapping[str, Tensor]
     of_radar: bool = False
     shape: bool = False
+
+    def direction(self) -> Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]:
+        """A function that moves scene and radar by θ."""
+
+        def moved(scene: Scene, radar: Radar, theta: Tensor) -> tuple[Scene, Radar]:
+            if self.of_radar:
+                return scene, Line(self.module, self.tangent, radar).at(theta)
+            return Line(self.module, self.tangent, scene).at(theta), radar
+
+        return moved
 
 
 def theta_of(table: schema.GradientParameter, run: schema.RunFile, scene: Scene) -> Theta:

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
+from invertwin import plotting
 from invertwin.capture import Capture
 from invertwin.channel import Sampling, draw_speckle, trace_field
-from invertwin.cli import build, pictures
+from invertwin.cli import build
 from invertwin.cli.fits.problem import Sight, sampling_of
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData
@@ -21,8 +23,8 @@ from invertwin.radar.range_profile import beat_signal
 from invertwin.scene import AntennaArray, Scene
 
 
-def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[bytes, dict[str, Any]]:
-    """The picture and the numbers of the `[landscape]` table.
+def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[Figure, dict[str, Any]]:
+    """The figure and the numbers of the `[landscape]` table.
 
     For the exact signal one channel of one frame is enough to show the shape.
 
@@ -32,7 +34,7 @@ def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[bytes, dict[str
         sight: What the sensor has recorded.
 
     Returns:
-        PNG bytes; and the number of local minima of every curve.
+        The figure; and the number of local minima of every curve.
     """
     table = need(run, "landscape", "the loss landscape")
     with torch.no_grad():
@@ -60,10 +62,10 @@ def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[bytes, dict[str
             name: (x, smooth_losses(run, sight.radar, sight.capture, scenes, model))
             for name, model in models.items()
         }
-    counts = {name: pictures.count_minima(losses) for name, (_, losses) in smooth.items()}
-    minima = {"exact": pictures.count_minima(exact[1]), **counts}
+    counts = {name: plotting.count_minima(losses) for name, (_, losses) in smooth.items()}
+    minima = {"exact": plotting.count_minima(exact[1]), **counts}
     along = line_name(table.object, table.axis)
-    return pictures.landscape_picture(exact, smooth, along), {"local_minima": minima}
+    return plotting.landscape(exact, smooth, along), {"local_minima": minima}
 
 
 def moved(truth: Scene, name: str, axis: Sequence[float], offsets: Iterable[float]) -> list[Scene]:

@@ -1,26 +1,21 @@
 """report.html: one file that opens anywhere, pictures inside."""
 
 import base64
-import html
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from typing import Any
+
+from jinja2 import Environment
 
 from invertwin import __version__
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
-       color: #1b1f24; background: #fff; }
-h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-p { max-width: 60rem; } p.status { font-size: 1.15rem; }
-img { max-width: 100%; height: auto; } details { margin: .5rem 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { border-bottom: 1px solid #d8dce2; padding: .25rem .8rem; text-align: right; }
-th:first-child, td:first-child { text-align: left; } thead th { border-bottom-color: #6b7280; }
-div.wide { overflow-x: auto; } pre { background: #f4f5f7; padding: 1rem; overflow-x: auto; }
-"""
+DOPPLER_NOTE = (
+    "Range rates are modulo the unambiguous span; phases that transmitters in turn add to movers "
+    "are taken out for range rates within it. Directions show the strongest of the other axis."
+)
 
 
 @dataclass(frozen=True)
@@ -67,20 +62,19 @@ def report_html(
         parts: Tables and pictures in reading order.
         again: How the run is done again.
     """
-    body = [f"<h1>{html.escape(title)}</h1>", f'<p class="status">{html.escape(status)}</p>']
-    body += [f"<p>{html.escape(text)}</p>" for text in note.split("\n\n") if text.strip()]
-    for part in parts:
-        body.append(f"<h2>{html.escape(part.title)}</h2>")
-        body.append(_table(part) if isinstance(part, Table) else _image(part))
-        if part.note:
-            body.append(f"<p>{html.escape(part.note)}</p>")
-    body += _again(again)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>\n<body>\n"
-        + "\n".join(body)
-        + "\n</body></html>\n"
+    pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    pages.filters |= {"shown": shown, "base64": lambda png: base64.b64encode(png).decode("ascii")}
+    template = resources.files("invertwin.cli") / "report.html.jinja"
+    backend = os.environ.get("INVERTWIN_BACKEND")
+    return pages.from_string(template.read_text(encoding="utf-8")).render(
+        title=title,
+        status=status,
+        note=note,
+        parts=parts,
+        version=__version__,
+        command=f"invertwin {again.command} -o again"
+        + (f" --backend {backend}" if backend else ""),
+        files=again.files,
     )
 
 
@@ -100,32 +94,3 @@ def shown(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(shown(item) for item in value)
     return str(value)
-
-
-def _again(again: Again) -> list[str]:
-    backend = os.environ.get("INVERTWIN_BACKEND")
-    command = f"invertwin {again.command} -o again" + (f" --backend {backend}" if backend else "")
-    lines = [
-        "<h2>The same run again</h2>",
-        f"<p>In this folder, with invertwin {__version__}:</p>",
-        f"<pre>{html.escape(command)}</pre>",
-    ]
-    for name, text in again.files.items():
-        lines.append(f"<details><summary>{html.escape(name)}</summary>")
-        lines.append(f"<pre>{html.escape(text)}</pre></details>")
-    return lines
-
-
-def _table(table: Table) -> str:
-    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(shown(cell))}</td>" for cell in row) + "</tr>\n"
-        for row in table.rows
-    )
-    inner = f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
-    return f'<div class="wide"><table>{inner}</table></div>'
-
-
-def _image(picture: Picture) -> str:
-    data = base64.b64encode(picture.png).decode("ascii")
-    return f'<img alt="{html.escape(picture.title)}" src="data:image/png;base64,{data}">'

@@ -16,6 +16,7 @@ from invertwin.cli.schema import TAG_MARK, RunFile
 from invertwin.errors import InputError
 
 _MOST_ERRORS = 4  # in one line
+_STUDIES = ("methods", "loss_scan")  # sections of the package in experiments/studies
 _WORDS = {
     r"a valid dictionary( or .*)?": "a table",
     r"a valid string": "a text in quotes",
@@ -146,10 +147,11 @@ def _explain(error: ErrorDetails) -> str:
     match error["type"]:
         case "unknown_key":
             key, allowed = context["key"], context["allowed"]
+            said = f"expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
+            if not path and key in _STUDIES:
+                return f"{key}: {said}install the studies: pip install -e ./experiments/studies"
             return (
-                f"{path}.{key}".lstrip(".")
-                + f": expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
-                + _nearest(key, allowed, "remove the key")
+                f"{path}.{key}".lstrip(".") + f": {said}" + _nearest(key, allowed, "remove the key")
             )
         case "unknown_object":
             return unknown_object(context["path"], context["name"], list(error["input"]["scene"]))

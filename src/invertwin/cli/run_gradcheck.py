@@ -3,18 +3,19 @@
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
+from matplotlib.figure import Figure
+from torch import Tensor
 
+from invertwin import plotting
 from invertwin.channel import Grid, Sampling
-from invertwin.cli import build, pictures
+from invertwin.cli import build
 from invertwin.cli.gradients import UNITS, theta_of
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, about_file, need, to_toml
-from invertwin.cli.run_methods import compare, methods_table
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
@@ -49,10 +50,54 @@ _LEGEND = (
     "their step is halved, noise included. order: how the gap to the differences grows with their "
     "step; 2 for a right gradient, 0 for a wrong one. pairs: difference pairs averaged."
 )
-_METHODS = (
-    "Derivatives summed over elevation (range × azimuth) and over range (elevation × azimuth). "
-    "Red: grows with θ; blue: falls. One colour scale for all that have a unit of power."
-)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A gradient check that is done, for the studies that compare something with it.
+
+    Attributes:
+        run: Its run file.
+        scene: At θ = 0.
+        radar: At θ = 0.
+        grid: Bins of the map.
+        direction: θ → scene and radar.
+        step: ε of the differences.
+        report: Differences, gradient, and the gradient of the interior alone.
+        say: Takes a line of progress.
+    """
+
+    run: RunFile
+    scene: Scene
+    radar: Radar
+    grid: Grid
+    direction: Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]
+    step: float
+    report: GradientReport
+    say: Callable[[str], None]
+
+
+@runtime_checkable
+class GradcheckStudy(Protocol):
+    """A run-file section of a plugin that compares something with a gradient check.
+
+    The section's name is the key of its results in metrics.json.
+    """
+
+    picture_note: str
+
+    def compare(self, checked: Checked) -> tuple[dict[str, Any], Figure]:
+        """Results for metrics.json, and a figure."""
+        ...
+
+    def table(self, name: str, found: Mapping[str, Any]) -> Table:
+        """The table of those results.
+
+        Args:
+            name: Of the gradient check.
+            found: What `compare` returned, also when it was read back from JSON.
+        """
+        ...
 
 
 def run_gradcheck(
@@ -68,7 +113,8 @@ def run_gradcheck(
     begin = time.perf_counter()
     scenes: dict[str, Any] = {}
     parts: list[Picture] = []
-    methods: list[Table] = []
+    studies: list[Table] = []
+    compared: dict[str, Any] = {}
     for name, run in runs.items():
         part = f"{PARTS}/{name}.json"
         found = folder.read_json(part)
@@ -81,26 +127,27 @@ def run_gradcheck(
             Picture(run.title or name, (folder.path / f"{name}_scene.png").read_bytes()),
             Picture(name, (folder.path / f"{name}.png").read_bytes(), note=_note(run, found)),
         ]
-        if "methods" in found:
-            methods.append(methods_table(name, found["methods"]))
-            png = (folder.path / f"{name}_methods.png").read_bytes()
-            parts.append(Picture(methods[-1].title, png, note=_METHODS))
+        for key, study in _studies(run).items():
+            compared[key] = found[key]
+            studies.append(study.table(name, found[key]))
+            png = (folder.path / f"{name}_{key}.png").read_bytes()
+            parts.append(Picture(studies[-1].title, png, note=study.picture_note))
     seconds = time.perf_counter() - begin
     rows = [_row(*item) for item in scenes.items()]
     table = Table("Agreement with central differences", COLUMNS, rows, _LEGEND)
     metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": seconds}
-    if len(scenes) == 1 and methods:
-        metrics["methods"] = next(iter(scenes.values()))["methods"]
+    if len(scenes) == 1:
+        metrics |= compared
     folder.write_json("metrics.json", metrics)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
     folder.write_text(
         "report.html",
         report_html(
-            "Gradient check", f"{count} checked.", "", [table, *methods, *parts], _again(runs)
+            "Gradient check", f"{count} checked.", "", [table, *studies, *parts], _again(runs)
         ),
     )
     folder.remove([f"{PARTS}/{name}.json" for name in runs])
-    return [table, *methods]
+    return [table, *studies]
 
 
 def _again(runs: Mapping[str, RunFile]) -> Again:
@@ -127,9 +174,9 @@ def _check(
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
     with about("gradcheck.parameter"):
         theta = theta_of(table, run, scene)
-    if theta.shape and run.methods is not None:
+    for key in _studies(run) if theta.shape else ():
         raise InputError(
-            "methods: expected a parameter that moves something, got one of a shape; remove it"
+            f"{key}: expected a parameter that moves something, got one of a shape; remove it"
         )
     sampling = Sampling(
         depth=settings.depth,
@@ -157,13 +204,14 @@ def _check(
     )
     outer = report.no_interior_edges
     unit = UNITS.get(table.kind, f"per unit of {table.value}")
-    folder.write_bytes(f"{name}.png", _maps(report, grid, unit))
-    folder.write_bytes(f"{name}_scene.png", _picture(scene, radar, settings.parameter.object))
+    folder.write_figure(f"{name}.png", _maps(report, grid, unit))
+    moved = [table.object] if table.object else []
+    folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=moved))
     others = {}
-    if run.methods is not None:
-        compared = compare(run, scene, radar, grid, theta, check.step, report, say)
-        folder.write_bytes(f"{name}_methods.png", compared.picture)
-        others["methods"] = compared.found
+    checked = Checked(run, scene, radar, grid, theta.direction(), check.step, report, say)
+    for key, study in _studies(run).items():
+        others[key], figure = study.compare(checked)
+        folder.write_figure(f"{name}_{key}.png", figure)
     return {
         "full": asdict(report.full),
         "interior": asdict(report.interior),
@@ -176,25 +224,21 @@ def _check(
     }
 
 
-def _maps(report: GradientReport, grid: Grid, unit: str) -> bytes:
+def _studies(run: RunFile) -> dict[str, GradcheckStudy]:
+    """The sections that compare something with the gradient check."""
+    values = {key: getattr(run, key) for key in type(run).model_fields}
+    return {key: value for key, value in values.items() if isinstance(value, GradcheckStudy)}
+
+
+def _maps(report: GradientReport, grid: Grid, unit: str) -> Figure:
     maps = {
         "differences": report.difference,
         "full": report.gradient,
         "interior only": report.interior_gradient,
     }
-    error = ("full − differences, own scale", np.asarray(report.gradient - report.difference))
-    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
-    maps = {name: np.asarray(value) for name, value in maps.items()}
-    return pictures.gradient_picture(maps, error, axes, unit)
-
-
-def _picture(scene: Scene, radar: Radar, sought: str | None) -> bytes:
-    drawing = pictures.Drawing(
-        pictures.meshes_of(scene),
-        sought=[] if sought is None else [sought],
-        radar=radar.positions.numpy(),
-    )
-    return pictures.scene_picture({"scene": drawing}, pictures.frame_of(radar))
+    error = {"full − differences, own scale": report.gradient - report.difference}
+    label = f"∂ power (received/sent) [{unit}]"
+    return plotting.gradient(maps, grid, label=label, own_scale=error)
 
 
 def _row(name: str, found: Mapping[str, Any]) -> list[Any]:

@@ -19,23 +19,22 @@ from invertwin.capture import (
 )
 from invertwin.capture.elements import elements
 from invertwin.channel import Grid
-from invertwin.cli.doppler_maps import (
-    DOPPLER_NOTE,
-    Panel,
-    direction_panels,
+from invertwin.cli.report import DOPPLER_NOTE, Again, Picture, Table, report_html
+from invertwin.cli.runs import RunFolder
+from invertwin.errors import InputError
+from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
+from invertwin.radar import (
+    Radar,
+    SampledWaveform,
     doppler_maps,
-    panels,
-    panels_picture,
     points_csv,
     points_of,
+    range_profile,
     sharp_map,
     snapshots_of,
     still_peak,
+    velocity_span,
 )
-from invertwin.cli.report import Again, Picture, Table, report_html
-from invertwin.cli.runs import RunFolder
-from invertwin.errors import InputError
-from invertwin.radar import Radar, SampledWaveform, range_profile, velocity_span
 from invertwin.scene import AntennaArray
 
 _ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"
@@ -150,18 +149,17 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
         points = points_of(recording.chirps.beat, radar, grid, timing, look.frame)
     if radar.frame_count > 1:
         profiles = recording.capture.spectrum(replace(grid, u_count=1, v_count=1))
-        power = profiles[:, :, 0, 0].T.double().numpy()
-        times = torch.arange(radar.frame_count).numpy()
-        shown["all frames"] = Panel(power, grid.ranges.numpy(), times, "frame")
+        times = torch.arange(radar.frame_count)
+        shown["all frames"] = Panel(profiles[:, :, 0, 0].T.double(), grid.ranges, times, "frame")
     recording.capture.save(folder.file("capture.nc"))
     if points is not None:
         metrics["points"] = len(points)
         folder.write_text("points.csv", points_csv(points))
     folder.write_json("metrics.json", metrics)
-    folder.write_bytes("look.png", panels_picture(shown))
+    png = folder.write_figure("look.png", panels(shown))
     rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
     table = Table(look.recording.name, ["quantity", "value"], rows)
-    picture = Picture(f"Frame {look.frame}", (folder.path / "look.png").read_bytes(), DOPPLER_NOTE)
+    picture = Picture(f"Frame {look.frame}", png, DOPPLER_NOTE)
     text = report_html(
         look.recording.name,
         f"{radar.frame_count} frames, read as {recording.reader}.",
@@ -311,18 +309,17 @@ def _maps(
     if recording.chirps is not None:
         chirps = recording.chirps.settings.chirps
         maps = doppler_maps(recording.chirps.beat, radar, grid, chirps, frame)
-        return panels(maps), {
+        return doppler_panels(maps), {
             "chirps": chirps.count,
             "velocity_span_m_s": velocity_span(radar, chirps),
             **maps.strongest.metrics("peak"),
             **({} if maps.mover is None else maps.mover.metrics("mover")),
         }
     spectrum = recording.capture.frames([frame]).spectrum(grid)[0].double()
-    shown = direction_panels("range and direction", spectrum.numpy(), grid)
+    shown = direction_panels("range and direction", spectrum, grid)
     numbers = still_peak(spectrum, grid).metrics("peak")
     del numbers["peak_velocity_m_s"]
     if not shown:
         del numbers["peak_azimuth_deg"]
-        line = spectrum[:, :, 0].numpy()
-        shown["range"] = Panel(line, grid.ranges.numpy(), torch.zeros(1).numpy(), "one channel")
+        shown["range"] = Panel(spectrum[:, :, 0], grid.ranges, torch.zeros(1), "one channel")
     return shown, numbers

@@ -104,8 +104,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         metrics |= {f"{key}_{mode}": same[key] for key in own}
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         console.print("computing the loss landscape")
-        png, found = landscape(run, problem.truth, problem.first)
-        folder.write_bytes("landscape.png", png)
+        figure, found = landscape(run, problem.truth, problem.first)
+        folder.write_figure("landscape.png", figure)
         metrics["landscape"] = found
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from invertwin import plotting
 from invertwin.capture import Capture, described_arrays
 from invertwin.channel import Grid, Sampling
-from invertwin.cli import build, pictures, sensors
-from invertwin.cli.doppler_maps import DOPPLER_NOTE, doppler_maps, panels, panels_picture
+from invertwin.cli import build, sensors
 from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw
-from invertwin.cli.report import Again, Picture, Table, report_html
+from invertwin.cli.report import DOPPLER_NOTE, Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import Chirps as ChirpsTable
@@ -21,7 +21,7 @@ from invertwin.cli.schema import Impairments as ImpairmentsTable
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap, surrogate_correlation
-from invertwin.radar import FMCW, velocity_span
+from invertwin.radar import FMCW, doppler_maps, velocity_span
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
@@ -126,12 +126,10 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
     }
     if run.raw is not None:
         metrics |= write_raw(run, radar, found.beat, folder)
-    axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
-    maps = {"exact signal": found.spectrum.numpy(), "surrogate": smooth.numpy()}
-    folder.write_bytes("spectra.png", pictures.spectra_picture(maps, axes))
+    maps = {"exact signal": found.spectrum, "surrogate": smooth}
     shown = Picture(
         "Spectra",
-        (folder.path / "spectra.png").read_bytes(),
+        folder.write_figure("spectra.png", plotting.spectrum(maps, grid)),
         note="The surrogate is the mean of the exact spectrum over random phases.",
     )
     status = f"{len(found.paths)} paths, {radar.frame_count} frames."
@@ -190,12 +188,8 @@ def _chirp_train(
     }
     if run.raw is not None:
         metrics |= write_raw(run, radar, beat, folder)
-    folder.write_bytes("doppler.png", panels_picture(panels(maps)))
-    shown = Picture(
-        "First frame",
-        (folder.path / "doppler.png").read_bytes(),
-        note=DOPPLER_NOTE,
-    )
+    png = folder.write_figure("doppler.png", plotting.range_doppler(maps))
+    shown = Picture("First frame", png, note=DOPPLER_NOTE)
     status = f"{chirps.count} chirps a frame, {radar.frame_count} frames."
     return _finish(run, folder, scene, radar, metrics, shown, status)
 
@@ -214,13 +208,8 @@ def _finish(
     folder.write_json("metrics.json", metrics)
     rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
     table = Table("Simulation", ["quantity", "value"], rows)
-    drawing = pictures.Drawing(
-        pictures.meshes_of(scene), sought=list(run.truth), radar=radar.positions.numpy()
-    )
-    folder.write_bytes(
-        "scene.png", pictures.scene_picture({"scene": drawing}, pictures.frame_of(radar))
-    )
-    seen = Picture("Scene", (folder.path / "scene.png").read_bytes())
+    figure = plotting.scene(scene, radar, highlight=list(run.truth))
+    seen = Picture("Scene", folder.write_figure("scene.png", figure))
     again = Again("simulate run.toml", {"run.toml": to_toml(run)})
     title = run.title or "Simulation"
     parts = [table, seen, shown]

@@ -11,11 +11,14 @@ import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from invertwin.cli.run_file import to_toml
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
+
+if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
+    from matplotlib.figure import Figure
 
 MANIFEST = ".invertwin.json"
 PREVIOUS = ".previous"
@@ -83,6 +86,14 @@ class RunFolder:
     def write_bytes(self, name: str, data: bytes) -> None:
         """Writes a result file so that a kill leaves the old or the new one, never half of it."""
         _replace(self.file(name), data)
+
+    def write_figure(self, name: str, figure: "Figure") -> bytes:
+        """Writes a figure as PNG, and returns its bytes."""
+        from invertwin.plotting import png_bytes
+
+        png = png_bytes(figure)
+        self.write_bytes(name, png)
+        return png
 
     def write_text(self, name: str, text: str) -> None:
         """Writes a result file as UTF-8, in the way of `write_bytes`."""

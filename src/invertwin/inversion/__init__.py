@@ -4,8 +4,8 @@ from invertwin.inversion.callbacks import Checkpoint, Report, Watch
 from invertwin.inversion.fit import Callback, Fit
 from invertwin.inversion.gradcheck import Agreement, Check, GradientReport
 from invertwin.inversion.loss import CorrelationLoss, SpectrumLoss
-from invertwin.inversion.measures import (
-    Likeness,
+from invertwin.inversion.metrics import (
+    ShapeMetrics,
     Topology,
     compare_shapes,
     topology,
@@ -14,7 +14,7 @@ from invertwin.inversion.measures import (
 from invertwin.inversion.mover import Echo, MovingBody, of_point, strongest_mover
 from invertwin.inversion.observation import Observation, Unknown
 from invertwin.inversion.optimizer import Optimizer
-from invertwin.inversion.prior import LatentNorm, Trained, Training, train_prior
+from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
@@ -31,7 +31,6 @@ __all__ = [
     "GradientReport",
     "Laplacian",
     "LatentNorm",
-    "Likeness",
     "MovingBody",
     "Observation",
     "Optimizer",
@@ -39,11 +38,10 @@ __all__ = [
     "Regularizer",
     "Report",
     "Schedule",
+    "ShapeMetrics",
     "SpectrumLoss",
     "Stage",
     "Topology",
-    "Trained",
-    "Training",
     "Unknown",
     "Watch",
     "compare_shapes",
@@ -53,6 +51,5 @@ __all__ = [
     "signed_distance",
     "strongest_mover",
     "topology",
-    "train_prior",
     "volume_iou",
 ]

@@ -1,12 +1,18 @@
-"""New triangles for the surface of a fit: even ones between stages, and distances to it."""
+"""New triangles for the surface of a fit: even ones between stages, and distances to it.
+
+Remeshing is written out here because no library does it (as of 2026) for everyone: gpytoolbox has
+no wheels for Linux on ARM, pymeshlab is GPL, trueform is for noncommercial use, pyacvd needs VTK
+and keeps neither borders nor topology, and MMG (mmgpy) leaves edges of 1.8 times the target length,
+and folds a box unless its ridges are frozen.
+"""
 
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import igl
 import numpy as np
 import torch
 from jaxtyping import Float64
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from invertwin.errors import InputError
@@ -16,9 +22,6 @@ from invertwin.scene.mesh import Mesh
 _ROUNDS = 5  # of split, collapse, flip, relax; the lengths settle within these
 _LONG, _SHORT = 4 / 3, 4 / 5  # of the target: edges that are split, edges that are collapsed
 _FLAT = 0.5  # least cosine between two triangles whose edge is flipped: corners stay
-_SAMPLES = 20_000  # on a surface, to find the triangles that may be closest
-_CANDIDATES = 8
-_CHUNK = 4_000_000  # pairs of points and triangles at a time
 
 
 def remeshed(mesh: Mesh, edge: float) -> Mesh:
@@ -54,7 +57,7 @@ def remeshed(mesh: Mesh, edge: float) -> Mesh:
 def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
     """Distance of points to a surface [m], negative where it winds around them.
 
-    Parts of a closed mesh may overlap: their union is inside. Across a hole in a mesh the sign
+    Overlapping parts of a closed mesh count as their union. Across a hole in a mesh the sign
     changes where half of the directions meet the surface.
 
     Args:
@@ -63,103 +66,24 @@ def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tenso
     """
     if not len(points):
         return torch.zeros(0, dtype=torch.float64)
-    places = points.detach().numpy()
-    gap = np.linalg.norm(places - closest_points(mesh, places), axis=1)
-    corners = mesh.vertices.detach().numpy()[mesh.faces.numpy()]
-    tree, sign = KDTree(places), np.zeros(len(places))
-    # No sign changes within a ball that does not reach the surface: few points need the sum.
-    order = np.argsort(-gap)
-    step = max(1, _CHUNK // len(corners))
-    while len(order):
-        chosen, taken = [], np.zeros(len(places), dtype=bool)
-        for row in order:
-            if not taken[row]:
-                near = tree.query_ball_point(places[row], 0.999 * gap[row])
-                chosen.append((row, near))
-                taken[near] = True
-                taken[row] = True
-                if len(chosen) == step:
-                    break
-        rows = [row for row, _ in chosen]
-        inside = _winding(corners, places[rows]) > 0.5
-        for (row, near), within in zip(chosen, inside, strict=True):
-            sign[[row, *near]] = -1.0 if within else 1.0
-        order = order[sign[order] == 0]
-    return torch.from_numpy(sign * gap)
+    places, surface = points.detach().numpy(), _arrays(mesh)
+    square, _, _ = igl.point_mesh_squared_distance(places, *surface)
+    inside = igl.winding_number(*surface, places) > 0.5
+    return torch.from_numpy(np.where(inside, -1.0, 1.0) * np.sqrt(square))
 
 
 def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Points of a surface closest to others [p, 3].
+    """Closest points of a surface [p, 3].
 
-    Exact among the triangles of the nearest of some 20 000 points of the surface; another triangle
-    may be nearer by the square of their spacing over twice the distance.
+    Args:
+        mesh: the surface.
+        points: in the mesh's frame [p, 3], metres.
     """
-    corners = mesh.vertices.detach().numpy()[mesh.faces.numpy()]
-    area = 0.5 * np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    spacing = max(float(np.sqrt(area.sum() / _SAMPLES)), 1e-12)
-    places, owners = [], []
-    longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(1)
-    pieces = np.clip(np.ceil(longest / spacing), 1, 256).astype(int)
-    for count in np.unique(pieces):
-        rows = np.nonzero(pieces == count)[0]
-        # Centres of the small triangles that a triangle is cut into, along both directions.
-        i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
-        keep = i + j < count
-        a, b = (i[keep] + 1 / 3) / count, (j[keep] + 1 / 3) / count
-        weights = np.stack([1 - a - b, a, b], axis=1)
-        places.append(np.einsum("sk,rkx->rsx", weights, corners[rows]).reshape(-1, 3))
-        owners.append(np.repeat(rows, len(weights)))
-    cloud, owner = np.concatenate(places), np.concatenate(owners)
-    _, nearest = KDTree(cloud).query(points, min(_CANDIDATES, len(cloud)))
-    faces = owner[np.asarray(nearest).reshape(len(points), -1)]
-    best, gap = np.zeros((len(points), 3)), np.full(len(points), np.inf)
-    for column in faces.T:
-        place = _closest_on_triangles(points, corners[column])
-        away = np.linalg.norm(points - place, axis=1)
-        nearer = away < gap
-        best[nearer], gap[nearer] = place[nearer], away[nearer]
-    return best
+    return igl.point_mesh_squared_distance(points, *_arrays(mesh))[2]
 
 
-def _closest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Of every triangle [p, 3, 3] the point closest to its own point: inside, or on a side."""
-    best, gap = np.zeros_like(points), np.full(len(points), np.inf)
-    for k in range(3):
-        start, along = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
-        size = np.maximum((along * along).sum(1), 1e-300)
-        t = np.clip(((points - start) * along).sum(1) / size, 0, 1)
-        place = start + t[:, None] * along
-        away = ((points - place) ** 2).sum(1)
-        nearer = away < gap
-        best[nearer], gap[nearer] = place[nearer], away[nearer]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    square = (normal * normal).sum(1)
-    height = ((points - corners[:, 0]) * normal).sum(1) / np.maximum(square, 1e-300)
-    foot = points - height[:, None] * normal
-    inside = square > 0
-    for k in range(3):
-        side = np.cross(corners[:, (k + 1) % 3] - corners[:, k], foot - corners[:, k])
-        inside &= (side * normal).sum(1) >= 0
-    best[inside] = foot[inside]
-    return best
-
-
-def _winding(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """How often a surface winds around points: its solid angle over 4π.
-
-    Source: Van Oosterom and Strackee 1983; Jacobson, Kavan and Sorkine 2013.
-    """
-    total = np.zeros(len(points))
-    step = max(1, _CHUNK // len(points))
-    for part in np.array_split(corners, -(-len(corners) // step)):
-        a, b, c = (part[None, :, k] - points[:, None] for k in range(3))
-        la, lb, lc = (np.linalg.norm(v, axis=2) for v in (a, b, c))
-        volume = (a * np.cross(b, c)).sum(2)
-        flat = la * lb * lc + (a * b).sum(2) * lc + (b * c).sum(2) * la + (c * a).sum(2) * lb
-        total += np.arctan2(volume, flat).sum(1) / (2 * np.pi)
-    return total
+def _arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    return mesh.vertices.detach().numpy(), mesh.faces.numpy()
 
 
 class _Surface:

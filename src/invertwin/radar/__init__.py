@@ -20,6 +20,16 @@ from invertwin.radar.doppler import (
     velocity_axis,
     velocity_span,
 )
+from invertwin.radar.doppler_maps import (
+    DopplerMaps,
+    Peak,
+    doppler_maps,
+    points_csv,
+    points_of,
+    sharp_map,
+    snapshots_of,
+    still_peak,
+)
 from invertwin.radar.impairments import (
     ADC,
     Impairments,
@@ -32,6 +42,7 @@ from invertwin.radar.impairments import (
     residual_phase,
 )
 from invertwin.radar.motion import Chirps, moving_beat, range_rate
+from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.radar.point_spread import airy, dirichlet, normalized_gaussian
 from invertwin.radar.radar import Radar
 from invertwin.radar.random_phase import random_phase_spectrum
@@ -61,13 +72,18 @@ __all__ = [
     "SURROGATES",
     "Board",
     "Chirps",
+    "ClockOffset",
+    "DopplerMaps",
     "Impairments",
     "Impulse",
     "Leakage",
+    "Peak",
     "PhaseNoise",
     "PhysicsWarning",
     "PointCloud",
     "Radar",
+    "RadarPose",
+    "RangeBias",
     "SampledWaveform",
     "Spectrogram",
     "SteppedFrequency",
@@ -85,6 +101,7 @@ __all__ = [
     "chosen_surrogate",
     "compensate_tdm",
     "dirichlet",
+    "doppler_maps",
     "exact_spectrum",
     "leakage_signal",
     "micro_doppler",
@@ -95,6 +112,8 @@ __all__ = [
     "ordered_statistics_cfar",
     "peaks",
     "point_cloud",
+    "points_csv",
+    "points_of",
     "quantize",
     "random_phase_spectrum",
     "range_doppler",
@@ -103,7 +122,10 @@ __all__ = [
     "range_rate",
     "residual_phase",
     "resolve_fold",
+    "sharp_map",
+    "snapshots_of",
     "source_count",
+    "still_peak",
     "surrogate_spectrum",
     "velocity_axis",
     "velocity_span",

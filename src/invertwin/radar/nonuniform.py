@@ -1,4 +1,4 @@
-"""Sums of many exponentials: non-uniform FFTs on the CPU and, where tensors are there, on CUDA."""
+"""The beat signal of a channel: one non-uniform FFT, on the CPU or, where tensors are, on CUDA."""
 
 import math
 from functools import cache, lru_cache
@@ -13,10 +13,7 @@ from torch import Tensor
 
 from invertwin.radar.waveform import SampledWaveform
 
-
-def sums_on_gpu(values: Tensor) -> bool:
-    """Whether sums over these values run on their GPU: they are there, and cufinufft is."""
-    return values.is_cuda and _cufinufft() is not None
+_SHARED_PATHS = 20_000  # sums of fewer paths are too short for several threads
 
 
 @cache
@@ -92,12 +89,7 @@ def beat_of_delays(
     else:
         # Any line will do, since the rest takes up what it leaves; so it needs no gradient.
         turns = ((cycles[-1] - cycles[0]) / (instants[-1] - instants[0])).detach()
-    rest = cycles - place * turns
-    # Reduced before the radians: at 77 GHz and 200 m there are 1e5 cycles.
-    phase = 2 * math.pi * (rest - rest.detach().round())
-    strengths = torch.polar(torch.ones_like(phase), phase) * coefficient.conj()
-    rate = 2 * math.pi * (turns - turns.detach().round())
-    sums = NonUniformSum.apply(strengths, rate, samples, tolerance)
+    sums = NonUniformSum.apply(coefficient, cycles - place * turns, turns, samples, tolerance)
     if count == 1:
         return sums[0]
     return (sums * _interpolation(samples, count).to(sums)).sum(0)
@@ -113,59 +105,72 @@ def phase_cycles(
 
 
 class NonUniformSum(torch.autograd.Function):
-    """Σ_i strengths_ki exp(j (n − N//2) rate_i), with derivatives in both, either mode."""
+    """Σ_i conj(a_i) exp(2πj (rest_ki + (n − N//2) turns_i)), with derivatives in both modes.
+
+    It keeps its real inputs only: the phasors of many channels would fill the memory.
+    """
 
     @staticmethod
     def forward(
         ctx: Any,
-        strengths: Complex128[Tensor, "sum path"],
-        rate: Float64[Tensor, " path"],
+        coefficient: Complex128[Tensor, " path"],
+        rest: Float64[Tensor, "sum path"],
+        turns: Float64[Tensor, " path"],
         samples: int,
         tolerance: float,
     ) -> Complex128[Tensor, "sum sample"]:
-        ctx.save_for_backward(strengths, rate)
-        ctx.save_for_forward(strengths, rate)
+        ctx.save_for_backward(coefficient, rest, turns)
+        ctx.save_for_forward(coefficient, rest, turns)
         ctx.samples, ctx.tolerance = samples, tolerance
-        if len(rate) == 0:
-            return strengths.new_zeros(len(strengths), samples)
-        return _transform(1, rate, strengths, samples, tolerance)
+        return _transform(1, turns, coefficient.conj() * _phasor(rest), samples, tolerance)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        strengths, rate = ctx.saved_tensors
-        grad, samples = grads[0], grads[0].shape[-1]
-        if len(rate) == 0:
-            return torch.zeros_like(strengths), torch.zeros_like(rate), None, None
-        with_rate = ctx.needs_input_grad[1]
-        if with_rate:
-            place = torch.arange(samples, dtype=torch.float64, device=grad.device) - samples // 2
-            grad = torch.cat([grad, grad * place])
-        sums = _transform(2, rate, grad, samples, ctx.tolerance)
-        of_rate = None
-        if with_rate:
-            of_rate = (strengths.conj() * sums[len(strengths) :]).imag.sum(0)
-        return sums[: len(strengths)], of_rate, None, None
+        coefficient, rest, turns = ctx.saved_tensors
+        grad, phasor = grads[0], _phasor(rest)
+        with_turns = ctx.needs_input_grad[2]
+        if with_turns:
+            grad = torch.cat([grad, grad * _places(ctx.samples, turns)])
+        # Multiplied with the conjugate phasors: the gradients with respect to conj(a).
+        sums = _transform(2, turns, grad, ctx.samples, ctx.tolerance).unflatten(0, (-1, len(rest)))
+        sums = sums * phasor.conj()
+        of_phase = (2 * math.pi) * (coefficient * sums).imag
+        of_turns = of_phase[1].sum(0) if with_turns else None
+        return sums[0].sum(0).conj(), of_phase[0], of_turns, None, None
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
-        strengths, rate = ctx.saved_tensors
-        samples, tolerance = ctx.samples, ctx.tolerance
-        change = strengths.new_zeros(len(strengths), samples)
-        if len(rate) == 0:
-            return change
+        coefficient, rest, turns = ctx.saved_tensors
+        samples, phasor = ctx.samples, _phasor(rest)
+        strengths, change = coefficient.conj() * phasor, torch.zeros_like(phasor)
         if tangents[0] is not None:
-            change = change + _transform(1, rate, tangents[0], samples, tolerance)
+            change = tangents[0].conj() * phasor
         if tangents[1] is not None:
-            place = torch.arange(samples, dtype=torch.float64, device=rate.device) - samples // 2
-            turned = _transform(1, rate, strengths * tangents[1], samples, tolerance)
-            change = change + 1j * place * turned
-        return change
+            change = change + 2j * math.pi * tangents[1] * strengths
+        sums = _transform(1, turns, change, samples, ctx.tolerance)
+        if tangents[2] is not None:
+            turned = _transform(1, turns, strengths * tangents[2], samples, ctx.tolerance)
+            sums = sums + 2j * math.pi * _places(samples, turns) * turned
+        return sums
 
 
-def _transform(kind: int, rate: Tensor, values: Tensor, samples: int, tolerance: float) -> Tensor:
-    """Type 1 (to samples) with the exponential's plus sign, type 2 (to paths) with minus."""
-    rate, values = rate.detach().contiguous(), values.detach().resolve_conj().contiguous()
+def _phasor(cycles: Tensor) -> Tensor:
+    # Reduced before the radians: at 77 GHz and 200 m there are 1e5 cycles.
+    phase = (2 * math.pi) * (cycles - cycles.round())
+    return torch.polar(torch.ones_like(phase), phase)
+
+
+def _places(samples: int, like: Tensor) -> Tensor:
+    return torch.arange(samples, dtype=like.dtype, device=like.device) - samples // 2
+
+
+def _transform(kind: int, turns: Tensor, values: Tensor, samples: int, tolerance: float) -> Tensor:
+    """Type 1 (paths to samples) with exp(+j…), type 2 (samples to paths) with exp(−j…)."""
+    if len(turns) == 0:
+        return values.new_zeros(len(values), samples if kind == 1 else 0)
+    rate = (2 * math.pi) * (turns - turns.round()).detach().contiguous()
+    values = values.detach().resolve_conj().contiguous()
     sign = 1 if kind == 1 else -1
     library = _cufinufft() if values.is_cuda else None
     if library is not None:
@@ -181,14 +186,8 @@ def _transform(kind: int, rate: Tensor, values: Tensor, samples: int, tolerance:
         )
         plan.setpts(rate)
         return plan.execute(values, out=out)
-    plan = finufft.Plan(
-        kind,
-        (samples,),
-        len(values),
-        eps=tolerance,
-        isign=sign,
-        nthreads=torch.get_num_threads(),
-    )
+    threads = torch.get_num_threads() if len(rate) > _SHARED_PATHS else 1
+    plan = finufft.Plan(kind, (samples,), len(values), eps=tolerance, isign=sign, nthreads=threads)
     plan.setpts(rate.cpu().numpy())
     found = torch.from_numpy(plan.execute(values.cpu().numpy())).to(values.device)
     return found.reshape(len(values), -1)

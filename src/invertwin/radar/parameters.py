@@ -1,4 +1,4 @@
-"""Unknowns of a radar: modules that map a radar to a radar."""
+"""What can be fitted of a radar: modules Radar → Radar for its pose, range bias and clock."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,14 +7,52 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.radar.radar import Radar
-from invertwin.scene.parameters import RadarPose as RadarPose
+from invertwin.scene.checks import ArrayLike
+from invertwin.scene.parameters import ORIGIN, RigidMotion
+
+
+class RadarPose(RigidMotion):
+    """Turns and moves all poses of a radar together, as `Radar.moved` defines it.
+
+    Attributes:
+        translation: parameter [3], metres.
+        rotation: parameter [4], as in `Pose`.
+    """
+
+    def __init__(
+        self,
+        translation: ArrayLike = ORIGIN,
+        rotation: ArrayLike = ORIGIN,
+        axes: str = "xyz",
+        rotation_axes: str = "xyz",
+    ) -> None:
+        """Move the radar, from these values at the start.
+
+        Args:
+            translation: [m].
+            rotation: rotation vector of any angle [3] (rad), or q itself [4].
+            axes: world axes along which the fit may move it.
+            rotation_axes: components of the rotation vector that the fit may change.
+
+        Raises:
+            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
+        """
+        super().__init__(translation, rotation, axes, rotation_axes)
+
+    def forward(self, radar: Radar) -> Radar:
+        """The moved radar."""
+        return radar.moved(self.rotation_matrix, self.shift)
+
+    def values(self) -> dict[str, Tensor]:
+        """Translation [m] and rotation vector [rad] by name, for progress and reports."""
+        return self.named_values("radar")
 
 
 class RangeBias(nn.Module):
     """All measured ranges are too large by this.
 
     Attributes:
-        bias: Parameter [m].
+        bias: parameter [m].
     """
 
     def __init__(self, initial: float = 0.0) -> None:
@@ -22,30 +60,37 @@ class RangeBias(nn.Module):
         self.bias = nn.Parameter(torch.tensor(initial, dtype=torch.float64))
 
     def forward(self, radar: Radar) -> Radar:
-        """The radar with the bias added."""
+        """The radar with the bias added to its own."""
         return replace(radar, range_bias=radar.range_bias + self.bias)
 
     def values(self) -> dict[str, Tensor]:
-        """The bias by name, for progress and reports."""
+        """Bias [m] by name, for progress and reports."""
         return {"range_bias": self.bias.detach().clone()}
 
 
 class ClockOffset(nn.Module):
-    """The track's clock is ahead of the radar's by this much more than the capture says.
+    """The clock of the track is ahead of the radar's by this much more than recorded.
 
     Attributes:
-        shift: Parameter [s].
+        shift: parameter [s].
     """
 
     def __init__(self, positions: Callable[[Tensor], Tensor], initial: float = 0.0) -> None:
+        """Shift the clock, by `initial` at the start.
+
+        Args:
+            positions: positions [frame, 3] in metres at a shift of the clock [s], differentiable;
+                such as `Capture.positions`.
+            initial: [s].
+        """
         super().__init__()
         self._positions = positions
         self.shift = nn.Parameter(torch.tensor(initial, dtype=torch.float64))
 
     def forward(self, radar: Radar) -> Radar:
-        """The radar at the positions of the shifted times."""
+        """The radar at its positions of the shifted times."""
         return replace(radar, positions=self._positions(self.shift))
 
     def values(self) -> dict[str, Tensor]:
-        """The shift by name, for progress and reports."""
+        """Shift [s] by name, for progress and reports."""
         return {"clock_shift": self.shift.detach().clone()}

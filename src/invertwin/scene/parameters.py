@@ -1,13 +1,13 @@
-"""What can be fitted: modules that map a scene to a scene, or a radar to a radar.
+"""What can be fitted of a scene: modules Scene → Scene, and their composition.
 
 Every module starts as the identity unless initial values are given, and composes with the others.
-`applies_to` says what a module maps; any torch module Scene → Scene without it serves as well.
+Any torch module Scene → Scene serves as well.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float64
@@ -27,6 +27,7 @@ from invertwin.scene.pose import (
 from invertwin.scene.scene import Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
+_T = TypeVar("_T")
 
 
 class Translation(nn.Module):
@@ -35,8 +36,6 @@ class Translation(nn.Module):
     Attributes:
         translation: parameter [3], metres.
     """
-
-    applies_to = "scene"
 
     def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: str = "xyz") -> None:
         """Move `object`, by `initial` [m] at the start.
@@ -56,7 +55,7 @@ class Translation(nn.Module):
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the object moved."""
-        motion = rigid(translation=_sought(self.translation, self._axes))
+        motion = rigid(translation=_free(self.translation, self._axes))
         return scene.replace(self.object, pose=compose(scene[self.object].transform, motion))
 
     def values(self) -> dict[str, Tensor]:
@@ -64,7 +63,7 @@ class Translation(nn.Module):
         return {f"{self.object}.translation": self.translation.detach().clone()}
 
 
-class _Motion(nn.Module):
+class RigidMotion(nn.Module):
     """A translation and a rotation without singularities: quaternion ∝ (w, r/2)."""
 
     def __init__(
@@ -82,24 +81,25 @@ class _Motion(nn.Module):
 
     @property
     def shift(self) -> Float64[Tensor, "3"]:
-        """The translation [m], with a derivative along the axes that are sought."""
-        return _sought(self.translation, self._axes)
+        """The translation [m], with a derivative along the free axes."""
+        return _free(self.translation, self._axes)
 
     @property
     def _quaternion(self) -> Tensor:
         # Halving r makes (1, r) the rotation vector r [rad] to first order, so that one learning
         # rate in rad serves all components.
         halves = self.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
-        return _sought(self.rotation, self._rotation_axes) * halves
+        return _free(self.rotation, self._rotation_axes) * halves
 
-    def _named_values(self, name: str) -> dict[str, Tensor]:
+    def named_values(self, name: str) -> dict[str, Tensor]:
+        """Translation [m] and rotation vector [rad] of `name`, for progress and reports."""
         return {
             f"{name}.translation": self.translation.detach().clone(),
             f"{name}.rotation": vector_from_quaternion(self._quaternion.detach()),
         }
 
 
-class Pose(_Motion):
+class Pose(RigidMotion):
     """Turns an object about its centre, then moves it along the world axes.
 
     Attributes:
@@ -108,8 +108,6 @@ class Pose(_Motion):
             (1, 0, 0, 0), r is the rotation vector in the world [rad]. Any q but zero is a
             rotation, and its derivative is finite everywhere.
     """
-
-    applies_to = "scene"
 
     def __init__(
         self,
@@ -143,7 +141,7 @@ class Pose(_Motion):
 
     def values(self) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] by name, for progress and reports."""
-        return self._named_values(self.object)
+        return self.named_values(self.object)
 
 
 class Scale(nn.Module):
@@ -152,8 +150,6 @@ class Scale(nn.Module):
     Attributes:
         log_scale: parameter, natural logarithm of the factor.
     """
-
-    applies_to = "scene"
 
     def __init__(self, object: str, initial: float = 1.0) -> None:
         """Scale `object`, by the factor `initial` at the start.
@@ -183,8 +179,6 @@ class Vertices(nn.Module):
     Attributes:
         offsets: parameter [v, 3] in the object's frame, metres.
     """
-
-    applies_to = "scene"
 
     def __init__(self, object: str, count: int) -> None:
         """Move the `count` vertices of `object`, by zero at the start.
@@ -226,8 +220,6 @@ class MaterialValues(nn.Module):
         raw: unbounded parameters by field: for values with one limit, such as the permittivity,
             the logarithm of what is above it; for values between two, the logit of their place.
     """
-
-    applies_to = "scene"
 
     def __init__(self, object: str, *, layer: int | None = None, **start: Value | None) -> None:
         """Fit the given values of the material of `object`, from these values at the start.
@@ -304,89 +296,20 @@ class MaterialValues(nn.Module):
             )
 
 
-@runtime_checkable
-class _Movable(Protocol):
-    """What `RadarPose` needs of a radar; this room knows no more of it."""
-
-    def moved(self, rotation: Tensor, translation: Tensor) -> Any: ...
-
-
-class RadarPose(_Motion):
-    """Turns and moves all poses of a radar together, as `radar.moved` defines it.
-
-    Attributes:
-        translation: parameter [3], metres.
-        rotation: parameter [4], as in `Pose`.
-    """
-
-    applies_to = "radar"
-
-    def __init__(
-        self,
-        translation: ArrayLike = ORIGIN,
-        rotation: ArrayLike = ORIGIN,
-        axes: str = "xyz",
-        rotation_axes: str = "xyz",
-    ) -> None:
-        """Move the radar, from these values at the start.
-
-        Args:
-            translation: [m].
-            rotation: rotation vector of any angle [3] (rad), or q itself [4].
-            axes: world axes along which the fit may move it.
-            rotation_axes: components of the rotation vector that the fit may change.
-
-        Raises:
-            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
-        """
-        super().__init__(translation, rotation, axes, rotation_axes)
-
-    def forward(self, radar: _Movable) -> Any:
-        """The radar, moved."""
-        return radar.moved(self.rotation_matrix, self.shift)
-
-    def values(self) -> dict[str, Tensor]:
-        """Translation [m] and rotation vector [rad] by name, for progress and reports."""
-        return self._named_values("radar")
-
-
 class Compose(nn.Module):
-    """Several modules, applied from first to last.
+    """Several modules that map the same kind of thing, applied from first to last.
 
-    Called with a scene it applies those that map scenes, called with anything else those that map
-    radars; what no module maps comes back unchanged.
-
-    Attributes:
-        applies_to: "scene", "radar", or "both".
+    All map scenes, or all map radars.
     """
 
     def __init__(self, *modules: nn.Module) -> None:
-        """Compose the given modules.
-
-        Raises:
-            InputError: a module that maps neither scenes nor radars, which would never be applied.
-        """
         super().__init__()
-        for module in modules:
-            if _applies_to(module) not in ("scene", "radar", "both"):
-                raise InputError(
-                    "expected modules that map scenes or radars, "
-                    f"got {type(module).__name__} for {_applies_to(module)}; pass it separately"
-                )
         self.parts = nn.ModuleList(modules)
 
-    @property
-    def applies_to(self) -> str:
-        """What the modules map: "scene", "radar", or "both"."""
-        kinds = {_applies_to(part) for part in self.parts}
-        return kinds.pop() if len(kinds) == 1 else "both"
-
-    def forward(self, target: Any) -> Any:
-        """The scene or the radar after all modules that map it."""
-        kind = "scene" if isinstance(target, Scene) else "radar"
+    def forward(self, target: _T) -> _T:
+        """The scene, or the radar, after all modules."""
         for part in self.parts:
-            if _applies_to(part) in (kind, "both"):
-                target = part(target)
+            target = part(target)
         return target
 
     def values(self) -> dict[str, Tensor]:
@@ -421,17 +344,13 @@ def _unbounded(name: str, value: Tensor) -> Tensor:
     return above.log() if math.isinf(span.high) else torch.logit(above / (span.high - span.low))
 
 
-def _applies_to(module: nn.Module) -> str:
-    return getattr(module, "applies_to", "scene")
-
-
 def _checked_axes(axes: str) -> str:
     if set(axes) - set("xyz"):
         raise InputError(f"expected axes among x, y and z, got {axes!r}; write them as 'xy'")
     return axes
 
 
-def _sought(parameter: Tensor, axes: str) -> Tensor:
+def _free(parameter: Tensor, axes: str) -> Tensor:
     """The parameter, with no derivative in its last three numbers along the other axes."""
     mask = torch.ones_like(parameter)
     mask[-3:] = torch.tensor([float(axis in axes) for axis in "xyz"])

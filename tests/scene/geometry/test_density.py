@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.inversion.measures import volume_iou
+from invertwin.inversion.metrics import volume_iou
 from invertwin.scene import DensityGrid, Object, RoughDielectric, Scene, plate, sphere
 from invertwin.scene.geometry import without_clouds
 from invertwin.scene.parameters import Scale, Translation

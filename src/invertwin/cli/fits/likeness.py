@@ -8,8 +8,8 @@ import torch
 from invertwin.cli.fits.problem import Problem
 from invertwin.cli.run_file import about
 from invertwin.errors import InputError
-from invertwin.inversion.measures import (
-    Likeness,
+from invertwin.inversion.metrics import (
+    ShapeMetrics,
     compare_shapes,
     is_watertight,
     topology,
@@ -113,7 +113,7 @@ def watch_of(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
     return watch
 
 
-def _likeness(problem: Problem, scene: Scene, seen: bool) -> Likeness:
+def _likeness(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics:
     table = problem.run.measures
     assert table is not None
     return compare_shapes(
@@ -125,7 +125,7 @@ def _likeness(problem: Problem, scene: Scene, seen: bool) -> Likeness:
     )
 
 
-def _tried(problem: Problem, scene: Scene, seen: bool) -> Likeness | None:
+def _tried(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics | None:
     """Like ``_likeness``; None if the shape is empty or invisible."""
     try:
         return _likeness(problem, scene, seen)
@@ -160,7 +160,7 @@ def _parted(key: str) -> tuple[str, str]:
     return key, ""
 
 
-def _rows(found: Likeness | None, ending: str) -> dict[str, Any]:
+def _rows(found: ShapeMetrics | None, ending: str) -> dict[str, Any]:
     if found is None:
         return {}
     rows: dict[str, Any] = {f"chamfer{ending}_m": found.chamfer}

@@ -10,12 +10,11 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
+from invertwin import plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Grid, Sampling
-from invertwin.cli import build, pictures, sensors
-from invertwin.cli.doppler_maps import Panel, doppler_maps, panels, panels_picture
+from invertwin.cli import build, sensors
 from invertwin.cli.fits.fitting import Bar, watched
-from invertwin.cli.pictures import U_LABEL
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
@@ -35,6 +34,8 @@ from invertwin.inversion import (
     strongest_mover,
 )
 from invertwin.models import MotionMap
+from invertwin.plotting import RATE_LABEL, U_LABEL, Panel, png_bytes
+from invertwin.radar import doppler_maps
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 
@@ -307,12 +308,7 @@ def _pictures(
     }
     with torch.no_grad():
         start = MovingBody(whole.body.object, scene, radar, whole.echo)(scene)
-    drawings = {
-        name: pictures.Drawing(
-            pictures.meshes_of(drawn), [whole.body.object], {}, radar.positions.numpy()
-        )
-        for name, drawn in (("start", start), ("twin", moving))
-    }
+    scenes = {"start": start, "twin": moving}
     losses = {
         name: [[row["loss"] for row in found.fit.history]]
         for name, found in (("twin", whole), ("twin of the first half", half))
@@ -320,40 +316,41 @@ def _pictures(
     return {
         "recording": Picture(
             "The recording",
-            panels_picture(panels(doppler_maps(recording.beat, radar, grid, chirps))),
+            png_bytes(plotting.range_doppler(doppler_maps(recording.beat, radar, grid, chirps))),
             "Range rates are modulo the unambiguous span; phases that transmitters in turn add to "
             "movers are taken out.",
         ),
         "twin_doppler": Picture(
-            "The mover over range and range rate", panels_picture(_over_rates(maps, wide))
+            "The mover over range and range rate",
+            png_bytes(plotting.panels(_over_rates(maps, wide))),
         ),
         "twin_direction": Picture(
             "The mover over range and azimuth",
-            panels_picture(_over_directions(maps, wide)),
+            png_bytes(plotting.panels(_over_directions(maps, wide))),
             "Each map in dB below its own peak, the strongest over the axis that is not shown.",
         ),
         "scene": Picture(
             "Where it is",
-            pictures.scene_picture(drawings, pictures.frame_of(radar)),
+            png_bytes(plotting.scene(scenes, radar, highlight=[whole.body.object])),
             "In the middle of the frame. Place and motion in height are given, not found: one row "
             "of antennas does not resolve it.",
         ),
-        "loss": Picture("1 − correlation of the magnitudes", pictures.loss_picture(losses)),
+        "loss": Picture(
+            "1 − correlation of the magnitudes", png_bytes(plotting.convergence(losses))
+        ),
     }
 
 
 def _over_rates(maps: Mapping[str, Tensor], wide: MotionMap) -> dict[str, Panel]:
-    ranges, rates = wide.grid.ranges.numpy(), wide.rates.numpy()
     return {
-        name: Panel(power.amax((2, 3)).T.numpy(), ranges, rates, "range rate [m/s], away > 0")
+        name: Panel(power.amax((2, 3)).T, wide.grid.ranges, wide.rates, RATE_LABEL)
         for name, power in maps.items()
     }
 
 
 def _over_directions(maps: Mapping[str, Tensor], wide: MotionMap) -> dict[str, Panel]:
-    ranges, cosines = wide.grid.ranges.numpy(), wide.grid.u.numpy()
     return {
-        name: Panel(power.amax((0, 3)).numpy(), ranges, cosines, U_LABEL)
+        name: Panel(power.amax((0, 3)), wide.grid.ranges, wide.grid.u, U_LABEL)
         for name, power in maps.items()
     }
 

@@ -6,15 +6,15 @@ from typing import Any, get_args
 
 import torch
 
-from invertwin.cli import build, pictures
+from invertwin import plotting
+from invertwin.cli import build
 from invertwin.cli.fits.likeness import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, annealed_until, sought_objects
 from invertwin.cli.report import Again, Picture, Table, report_html, shown
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import MaterialValue, RunFile, SimulatedData
-from invertwin.cli.shape_pictures import convergence_picture, turntable_gif
-from invertwin.scene import Scene
+from invertwin.scene import Mesh, Scene
 
 _ENDS = {
     "converged": "the loss no longer falls",
@@ -212,34 +212,26 @@ def draw(
         maps: By what they show, one for every sensor.
     """
     sought = sought_objects(problem.run)
-    places = torch.cat([s.radar.positions.detach() for s in problem.sights.values()]).numpy()
-    truth = pictures.meshes_of(problem.truth)
-    outline = {k: v for k, v in truth.items() if k in problem.known and k in sought}
-    scenes = {"truth": problem.truth} if outline else {}
+    truth = problem.truth
+    known = {k: truth[k] for k in truth.names if k in problem.known and k in sought}
+    scenes = {"truth": truth} if known else {}
     scenes |= {"start": start, "twin": twin}
-    folder.write_bytes(
-        "scene.png",
-        pictures.scene_picture(
-            {
-                name: pictures.Drawing(pictures.meshes_of(scene), sought, outline, places)
-                for name, scene in scenes.items()
-            },
-            pictures.frame_of(problem.first.radar),
-        ),
-    )
+    outline = Scene(known) if known else None
+    radars = [sight.radar for sight in problem.sights.values()]
+    figure = plotting.scene(scenes, radars, highlight=sought, outline=outline)
+    folder.write_figure("scene.png", figure)
     simulated = isinstance(problem.run.data, SimulatedData)
     data = "data (exact simulation)" if simulated else "data (measured)"
     titles = {"measured": data, "start": "surrogate, start", "twin": "surrogate, twin"}
     for number, (name, sight) in enumerate(problem.sights.items()):
-        grid = sight.grid
-        axes = pictures.Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
-        titled = {titles[key]: maps[key][number].numpy() for key in maps}
+        titled = {titles[key]: found[number] for key, found in maps.items()}
         file = f"spectra_{name}.png" if name else "spectra.png"
-        folder.write_bytes(file, pictures.spectra_picture(titled, axes))
+        folder.write_figure(file, plotting.spectrum(titled, sight.grid))
     losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
     annealed = annealed_until(problem.run)
     before = metrics["start_loss_sharp"] if annealed else None
-    folder.write_bytes("loss.png", pictures.loss_picture(losses, annealed, before))
+    figure = plotting.convergence(losses, annealed=annealed, before=before)
+    folder.write_figure("loss.png", figure)
 
 
 def draw_shapes(
@@ -254,13 +246,15 @@ def draw_shapes(
     assert table is not None
     scenes = {"truth": problem.truth} if table.object in problem.known else {}
     scenes |= {"start": start, "twin": twin}
-    up = pictures.frame_of(problem.first.radar)[:, 1]
-    meshes = {name: pictures.meshes_of(scene)[table.object] for name, scene in scenes.items()}
-    folder.write_bytes("turntable.gif", turntable_gif(meshes, up))
+    turns = problem.first.radar.rotations
+    up = (0.0, 1.0, 0.0) if turns is None else turns.detach().mean(0)[:, 1]
+    found = {name: scene[table.object] for name, scene in scenes.items()}
+    meshes = {name: Mesh(item.vertices, item.mesh.faces) for name, item in found.items()}
+    folder.write_bytes("turntable.gif", plotting.turntable(meshes, up))
     curves = {_mode(mode, rows): [_curve(row) for row in fits] for mode, fits in rows.items()}
     if any(curve for fits in curves.values() for curve in fits):
         losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
-        folder.write_bytes("convergence.png", convergence_picture(losses, curves))
+        folder.write_figure("convergence.png", plotting.convergence(losses, curves))
 
 
 def _curve(row: dict[str, Any]) -> list[list[float]]:

@@ -2,11 +2,12 @@
 
 import json
 import re
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import model_validator
+from pydantic import Field, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
+from invertwin.cli.registry import load_plugins
 from invertwin.cli.schema.initial import Initial
 from invertwin.cli.schema.inversion import (
     Calibration,
@@ -30,7 +31,6 @@ from invertwin.cli.schema.recording import Chirps, Impairments, Raw
 from invertwin.cli.schema.section import Positive, Section, Seed, fail
 from invertwin.cli.schema.sensor import Grid, Radar
 from invertwin.cli.schema.stages import Measures, Stage, Variant
-from invertwin.cli.schema.studies import LossScan, Methods
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "interior_only", "whole", "seen", "count", "m", "number", "consistency")
@@ -53,7 +53,7 @@ class Observed(Section):
     """share in the loss"""
 
 
-class RunFile(Section):
+class _RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
     task: Literal["simulate", "reconstruct", "gradcheck", "loss-scan", "demo"]
@@ -110,13 +110,9 @@ class RunFile(Section):
     """losses along a line"""
     gradcheck: Gradcheck | None = None
     """the gradient check"""
-    methods: Methods | None = None
-    """other ways to its derivative, to compare"""
-    loss_scan: LossScan | None = None
-    """losses of signals and of the surrogate along a line"""
 
     @model_validator(mode="after")
-    def _names_exist(self) -> "RunFile":
+    def _names_exist(self) -> "_RunFile":
         if self.scene_file is None:
             if not self.scene:
                 fail("expected at least 1 object, got none; add [scene.<name>]", "scene")
@@ -129,7 +125,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _variants_are_named(self) -> "RunFile":
+    def _variants_are_named(self) -> "_RunFile":
         for name in self.variants:
             if name in _TAKEN or not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", name):
                 fail(
@@ -140,7 +136,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _parameters_are_named(self) -> "RunFile":
+    def _parameters_are_named(self) -> "_RunFile":
         known = self.parameter_names
         doubled = next((name for name in known if known.count(name) > 1), None)
         staged = [("stages", self.stages)]
@@ -157,7 +153,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _turned_joints_are_sought(self) -> "RunFile":
+    def _turned_joints_are_sought(self) -> "_RunFile":
         if self.starts is not None and self.starts.joint_deg > 0:
             name = self.starts.object
             if not any(p.kind == "body" and p.object == name for p in self.parameters):
@@ -169,7 +165,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _stages_remesh_what_they_seek(self) -> "RunFile":
+    def _stages_remesh_what_they_seek(self) -> "_RunFile":
         names = self.parameter_names
         free = {n for n, p in zip(names, self.parameters, strict=True) if p.kind == "vertices"}
         own = set(self.reconstruct.parameters if self.reconstruct else []) or set(names)
@@ -191,7 +187,7 @@ class RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _learned_shapes_have_their_own_size(self) -> "RunFile":
+    def _learned_shapes_have_their_own_size(self) -> "_RunFile":
         for parameter in self.parameters:
             if not isinstance(parameter, ShapeSpaceParameter | PriorParameter):
                 continue
@@ -214,16 +210,10 @@ class RunFile(Section):
         for i, parameter in enumerate(self.parameters):
             if not isinstance(parameter, RadarParameter):
                 used.append((f"parameters[{i}].object", parameter.object))
-        for section in (
-            "starts",
-            "initial",
-            "landscape",
-            "calibration",
-            "loss_scan",
-            "measures",
-        ):
-            if getattr(self, section) is not None:
-                used.append((f"{section}.object", getattr(self, section).object))
+        for section in type(self).model_fields:
+            name = getattr(getattr(self, section), "object", None)
+            if name is not None:
+                used.append((f"{section}.object", name))
         if self.gradcheck is not None and self.gradcheck.parameter.object is not None:
             used.append(("gradcheck.parameter.object", self.gradcheck.parameter.object))
         return used
@@ -234,3 +224,18 @@ def _named(used: list[str], known: list[str], path: str) -> None:
         if name not in known:
             got = f'expected names of parameters ({", ".join(known)}), got "{name}"; correct it'
             fail(got, path)
+
+
+def _with_plugins() -> type[_RunFile]:
+    """The run file with the sections of installed plugins."""
+    added: Any = {
+        name: (model | None, Field(None, description=(model.__doc__ or "").split(".")[0]))
+        for name, model in load_plugins().sections.items()
+    }
+    return create_model("RunFile", __base__=_RunFile, __doc__=_RunFile.__doc__, **added)
+
+
+if TYPE_CHECKING:
+    RunFile = _RunFile
+else:
+    RunFile = _with_plugins()

@@ -16,11 +16,9 @@ from invertwin.scene.geometry.person import person
 from invertwin.scene.geometry.prior import PriorShape, ShapePrior, load_prior
 from invertwin.scene.geometry.shape_space import LinearShape, ShapeSpace, load_vehicle_space
 from invertwin.scene.geometry.smooth_vertices import SmoothVertices
-from invertwin.scene.geometry.vehicles import Car, car_distance, car_mesh, sample_car
 
 __all__ = [
     "BodyTemplate",
-    "Car",
     "DensityGrid",
     "DistanceGrid",
     "Lattice",
@@ -33,8 +31,6 @@ __all__ = [
     "SkinnedBody",
     "SmoothVertices",
     "articulated_template",
-    "car_distance",
-    "car_mesh",
     "cloud_surface",
     "iso_surface",
     "load_anny",
@@ -42,6 +38,5 @@ __all__ = [
     "load_smpl",
     "load_vehicle_space",
     "person",
-    "sample_car",
     "without_clouds",
 ]

@@ -224,8 +224,6 @@ class SkinnedBody(nn.Module):
         shape: parameter [n], shape coordinates of the template.
     """
 
-    applies_to = "scene"
-
     def __init__(
         self,
         object: str,

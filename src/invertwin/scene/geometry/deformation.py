@@ -24,8 +24,6 @@ class LatticeDeformation(nn.Module):
             lattice's nodes and of one more on every side.
     """
 
-    applies_to = "scene"
-
     def __init__(
         self, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int] = (4, 4, 4)
     ) -> None:

@@ -30,8 +30,6 @@ class DensityGrid(nn.Module):
         albedo: of the cloud.
     """
 
-    applies_to = "scene"
-
     def __init__(
         self,
         object: str,

@@ -20,8 +20,6 @@ from invertwin.scene.scene import Scene
 class _Distance(nn.Module):
     """A field whose zero is the object's surface."""
 
-    applies_to = "scene"
-
     def __init__(self, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int]) -> None:
         super().__init__()
         self.object = object

@@ -208,8 +208,6 @@ class PriorShape(nn.Module):
         latent: parameter [k], in standard deviations.
     """
 
-    applies_to = "scene"
-
     def __init__(
         self,
         object: str,

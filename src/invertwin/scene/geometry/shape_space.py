@@ -83,8 +83,6 @@ class LinearShape(nn.Module):
         latent: parameter [k], in standard deviations.
     """
 
-    applies_to = "scene"
-
     def __init__(self, object: str, space: ShapeSpace, initial: ArrayLike | int) -> None:
         """Shape `object` by a space, from these coordinates at the start.
 

@@ -29,8 +29,6 @@ class SmoothVertices(nn.Module):
         latent: parameter u [v, 3] in the object's frame, metres.
     """
 
-    applies_to = "scene"
-
     def __init__(self, object: str, mesh: Mesh, smoothing: float = 20.0) -> None:
         """Move the vertices of `object`, by zero at the start.
 

@@ -21,10 +21,10 @@ from invertwin.channel.bridge import Geometry, differentiated, flatten, to_float
 from invertwin.channel.rays import Shot, visible
 from invertwin.channel.tracer import view
 from invertwin.errors import InputError
-from invertwin.peers.binning import binned
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene.scene import Scene
+from invertwin_studies.peers.binning import binned
 
 _CHUNK = 250_000  # samples at a time, which bounds the memory
 _ASIDE = 2e-5  # rad, from an edge to the surfaces on its two sides; float32 tells no less

@@ -10,20 +10,20 @@ from torch import Tensor
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
-from invertwin.cli import build, pictures
-from invertwin.cli.figures import deep_minima, scan_picture
+from invertwin.cli import build
 from invertwin.cli.landscape import exact_losses, line_name, moved, smooth_losses
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import need, to_toml
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.studies import LossScan
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap
 from invertwin.radar.direction import music
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
+from invertwin_studies.figures import Curve, deep_minima, scan
+from invertwin_studies.sections import LossScan
 
 TITLES = {
     "beat": "raw beat signal",
@@ -74,8 +74,8 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
     }
     folder.write_json("metrics.json", metrics)
     along = line_name(settings.object, settings.axis)
-    png = scan_picture({TITLES[name]: curve for name, curve in near.items()}, wide, along)
-    folder.write_bytes("losses.png", png)
+    figure = scan({TITLES[name]: curve for name, curve in near.items()}, wide, along)
+    png = folder.write_figure("losses.png", figure)
     table = _table(metrics, along)
     folder.write_text(
         "report.html",
@@ -97,7 +97,7 @@ def _losses(
     radar: Radar,
     grid: Grid,
     measured: Tensor,
-) -> tuple[dict[str, pictures.Curve], pictures.Curve]:
+) -> tuple[dict[str, Curve], Curve]:
     """The four curves near the truth, and the surrogate's farther away."""
     capture = Capture.from_beat(measured, radar)
     sampling = Sampling(depth=1, samples=settings.samples)
@@ -140,7 +140,7 @@ def _views(settings: LossScan, radar: Radar, grid: Grid) -> dict[str, Callable[[
     return {"beat": lambda beat: beat, "range_profile": profile, "music": spectrum}
 
 
-def _lowest(curve: pictures.Curve) -> float:
+def _lowest(curve: Curve) -> float:
     """Where the loss is lowest [m]."""
     return float(curve[0][np.argmin(curve[1])])
 

@@ -1,26 +1,21 @@
 """The ways to the derivative of one map, side by side: the gradient figure of the paper."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
-from invertwin.channel import Grid, Sampling, draw_speckle
+from invertwin.channel import Sampling, draw_speckle
 from invertwin.cli import build
-from invertwin.cli.figures import Panel, derivatives_picture
-from invertwin.cli.pictures import Axes
 from invertwin.cli.report import Table
-from invertwin.cli.run_file import need
-from invertwin.cli.schema import RunFile
-from invertwin.inversion.gradcheck import Direction, GradientReport
-from invertwin.peers.edge_sampling import edge_sampling_derivative
-from invertwin.peers.music import MusicMap
-from invertwin.peers.sionna import sionna_derivative, sionna_version
-from invertwin.radar.radar import Radar
-from invertwin.scene import Scene
+from invertwin.cli.run_gradcheck import Checked
+from invertwin_studies.figures import Derivative, derivatives
+from invertwin_studies.peers.edge_sampling import edge_sampling_derivative
+from invertwin_studies.peers.music import MusicMap
+from invertwin_studies.peers.sionna import sionna_derivative, sionna_version
+from invertwin_studies.sections import Methods
 
 NAMES = {
     "music_difference": "differences through MUSIC",
@@ -43,42 +38,18 @@ NOTE = (
 _NO_UNIT = ("music_difference", "music_direct")
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """What came out of :func:`compare`.
-
-    Attributes:
-        found: Per method, what metrics.json holds.
-        picture: PNG.
-    """
-
-    found: dict[str, Any]
-    picture: bytes
-
-
-def compare(
-    run: RunFile,
-    scene: Scene,
-    radar: Radar,
-    grid: Grid,
-    direction: Direction,
-    step: float,
-    report: GradientReport,
-    say: Callable[[str], None],
-) -> Comparison:
+def compare(settings: Methods, checked: Checked) -> tuple[dict[str, Any], Figure]:
     """All methods on the scene of a gradient check that is done.
 
     Args:
-        run: With a section `methods`.
-        scene: Its scene.
-        radar: Its radar.
-        grid: Its bins.
-        direction: Its θ.
-        step: ε of its differences, which MUSIC's take too.
-        report: The gradient check: the differences, ours, and the interior alone.
-        say: Called with a line of progress.
+        settings: Of the methods.
+        checked: The gradient check; MUSIC's differences take its step, too.
+
+    Returns:
+        Per method, what metrics.json holds; and the figure of all derivatives.
     """
-    settings = need(run, "methods", "the comparison of methods")
+    run, scene, radar, grid = checked.run, checked.scene, checked.radar, checked.grid
+    direction, report, say = checked.direction, checked.report, checked.say
     surrogate = build.surrogate(run.surrogate)
     truth = report.difference
     say("MUSIC")
@@ -89,11 +60,11 @@ def compare(
             scene, radar.link(), Sampling(depth=1, points_per_m2=settings.density), run.seed
         ),
         settings.sources,
-        tuple(settings.smoothing),
+        (settings.smoothing[0], settings.smoothing[1]),
         run.seed,
     )
     maps: dict[str, Tensor | None] = {
-        "music_difference": music.difference(scene, direction, step),
+        "music_difference": music.difference(scene, direction, checked.step),
         "music_direct": music.derivative(scene, direction),
         "interior_only": report.interior_gradient,
     }
@@ -124,12 +95,11 @@ def compare(
     maps["invertwin"] = report.gradient
     found = {name: scores(maps[name], truth, fitted=name in _NO_UNIT) for name in NAMES}
     found["sionna_rt"] |= {"version": installed, "note": _of_sionna(maps["sionna_rt"])}
-    panels = [
-        Panel("differences through the surrogate (truth)", np.asarray(truth)),
-        *(_panel(name, values) for name, values in maps.items()),
+    shown = [
+        Derivative("differences through the surrogate (truth)", truth),
+        *(_shown(name, values) for name, values in maps.items()),
     ]
-    axes = Axes(grid.ranges.numpy(), grid.u.numpy(), grid.v.numpy())
-    return Comparison(found, derivatives_picture(panels, axes))
+    return found, derivatives(shown, grid)
 
 
 def scores(values: Tensor | None, truth: Tensor, *, fitted: bool) -> dict[str, Any]:
@@ -176,13 +146,13 @@ def _unit(values: Tensor) -> Tensor:
     return values / largest if largest > 0 else values
 
 
-def _panel(name: str, values: Tensor | None) -> Panel:
+def _shown(name: str, values: Tensor | None) -> Derivative:
     title = NAMES[name] + (" (own scale)" if name in _NO_UNIT else "")
     if values is None:
-        return Panel(title, "not installed")
+        return Derivative(title, "not installed")
     if not bool(torch.count_nonzero(values)):
-        return Panel(title, "zero everywhere")
-    return Panel(title, np.asarray(values), own_scale=name in _NO_UNIT)
+        return Derivative(title, "zero everywhere")
+    return Derivative(title, values, own_scale=name in _NO_UNIT)
 
 
 def _of_sionna(values: Tensor | None) -> str:

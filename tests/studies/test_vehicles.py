@@ -6,8 +6,8 @@ import torch
 import trimesh
 
 from invertwin.errors import InputError
-from invertwin.scene import Car, Mesh, car_distance, car_mesh, sample_car
-from invertwin.scene.geometry.vehicles import KINDS
+from invertwin.scene import Mesh
+from invertwin_studies.vehicles import KINDS, Car, car_distance, car_mesh, sample_car
 
 
 def solid(mesh: Mesh) -> trimesh.Trimesh:

@@ -19,10 +19,10 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.channel.bridge import to_float, to_index, to_torch, tracer
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.peers.binning import binned
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene.scene import Scene
+from invertwin_studies.peers.binning import binned
 
 # Sionna's receiver beside its transmitter [m]: at one place a path would have no direction.
 _BESIDE = 1e-3

@@ -1,4 +1,4 @@
-"""Pictures of the studies as PNG bytes: ways to a derivative, losses along a line."""
+"""Figures of the studies: ways to a derivative, losses along a line."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,36 +7,45 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import find_peaks
+from torch import Tensor
 
-from invertwin.cli.pictures import PALETTE, U_LABEL, V_LABEL, Axes, Curve, png_bytes
+from invertwin.channel import Grid
+from invertwin.plotting import PALETTE, U_LABEL, V_LABEL
 
 _SHALLOW = 1e-3  # of a curve's span: less deep minima are noise of its samples
 
+Curve = tuple[NDArray, NDArray]
+"""Places and values."""
 
-@dataclass(frozen=True)
-class Panel:
+
+@dataclass(frozen=True, eq=False)
+class Derivative:
     """One derivative map.
 
     Attributes:
         title: Above it.
         values: Map [frame, range, u, v], or the text that stands where there is none.
-        own_scale: Its colours do not compare with those of the other panels.
+        own_scale: Its colours do not compare with those of the other maps.
     """
 
     title: str
-    values: NDArray | str
+    values: Tensor | str
     own_scale: bool = False
 
 
-def derivatives_picture(panels: Sequence[Panel], axes: Axes) -> bytes:
+def derivatives(panels: Sequence[Derivative], grid: Grid) -> Figure:
     """Projections of derivative maps of the first frame: summed over elevation, over range.
 
     Red: power grows with θ; blue: it falls. The rows of axes that a radar does not resolve are
     left out.
+
+    Args:
+        panels: Maps, one column or half a column each.
+        grid: Bins of all maps.
     """
-    views = [("range [m]", axes.ranges, 2), (V_LABEL, axes.v, 0)]
+    views = [("range [m]", grid.ranges.tolist(), 2), (V_LABEL, grid.v.tolist(), 0)]
     views = [view for view in views if len(view[1]) > 1]
-    columns = (len(panels) + 1) // 2
+    u, columns = grid.u.tolist(), (len(panels) + 1) // 2
     height = 2 * len(views)
     figure = Figure(figsize=(3.2 * columns, 2.6 * height), layout="constrained")
     cells = figure.subplots(height, columns, squeeze=False)
@@ -44,7 +53,7 @@ def derivatives_picture(panels: Sequence[Panel], axes: Axes) -> bytes:
         cell.set_axis_off()
     for row, (label, places, summed) in enumerate(views):
         flats = {
-            panel.title: panel.values[0].sum(axis=summed)
+            panel.title: panel.values[0].sum(dim=summed).numpy()
             for panel in panels
             if not isinstance(panel.values, str)
         }
@@ -64,7 +73,7 @@ def derivatives_picture(panels: Sequence[Panel], axes: Axes) -> bytes:
                 flat,
                 origin="lower",
                 aspect="auto",
-                extent=(axes.u[0], axes.u[-1], places[0], places[-1]),
+                extent=(u[0], u[-1], places[0], places[-1]),
                 vmin=-limit,
                 vmax=limit,
                 cmap="RdBu_r",
@@ -73,19 +82,19 @@ def derivatives_picture(panels: Sequence[Panel], axes: Axes) -> bytes:
             cell.set_xlabel(U_LABEL if row == len(views) - 1 else "", fontsize=7)
             cell.set_ylabel(label if k % columns == 0 else "", fontsize=7)
             cell.tick_params(labelsize=6)
-    return png_bytes(figure)
+    return figure
 
 
 def _limit(flat: NDArray) -> float:
     return float(np.quantile(np.abs(flat), 0.998)) or 1.0
 
 
-def scan_picture(near: Mapping[str, Curve], wide: Curve, along: str) -> bytes:
+def scan(near: Mapping[str, Curve], wide: Curve, along: str) -> Figure:
     """Losses against displacement, one panel a loss, and the last one over a longer line.
 
     Args:
         near: Offsets (m) and losses, by name.
-        wide: The same of the surrogate, farther.
+        wide: Offsets (m) and losses of the surrogate on a longer line.
         along: What is moved and in which direction.
     """
     figure = Figure(figsize=(3.1 * (len(near) + 1), 3.0), layout="constrained")
@@ -102,7 +111,7 @@ def scan_picture(near: Mapping[str, Curve], wide: Curve, along: str) -> bytes:
         cell.tick_params(labelsize=7)
         cell.grid(alpha=0.3)
     cells[0].set_ylabel("loss", fontsize=8)
-    return png_bytes(figure)
+    return figure
 
 
 def deep_minima(values: NDArray) -> int:

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from cli.small import GRADCHECK, RUN, call, read_metrics
-from invertwin.cli import run_methods
-from invertwin.cli.figures import deep_minima
-from invertwin.cli.run_methods import best_factor, scores
+from invertwin_studies import methods as all_methods
+from invertwin_studies.figures import deep_minima
+from invertwin_studies.methods import best_factor, scores
 
 METHODS = """
 [methods]
@@ -37,15 +37,16 @@ SCAN = (
 )
 
 
+@pytest.mark.slow
 def test_all_methods_in_one_table(run_file, monkeypatch, capsys):
     """Without Sionna RT its row says so, and all others are there."""
-    monkeypatch.setattr(run_methods, "sionna_version", lambda: None)
+    monkeypatch.setattr(all_methods, "sionna_version", lambda: None)
     run_file.write_text(re.sub(r"depth = \d", "depth = 1", CHECK))
     assert call(monkeypatch, "gradcheck", run_file) == 0
     out = run_file.parent / "out" / "small"
     metrics = read_metrics(out)
     methods = metrics["methods"]
-    assert set(methods) == set(run_methods.NAMES)
+    assert set(methods) == set(all_methods.NAMES)
     assert methods == metrics["scenes"]["small"]["methods"]
     assert methods["sionna_rt"]["relative_l1"] is None
     assert methods["sionna_rt"]["note"] == "not installed"
@@ -86,6 +87,7 @@ def test_minima_that_are_noise_do_not_count():
     assert deep_minima((1 - torch.cos(20 * torch.pi * x) + x**2).numpy()) == 19
 
 
+@pytest.mark.slow
 def test_losses_along_a_line(run_file, monkeypatch, capsys):
     run_file.write_text(SCAN)
     assert call(monkeypatch, "loss-scan", run_file) == 0

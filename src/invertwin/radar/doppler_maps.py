@@ -1,43 +1,32 @@
-"""Range, range rate and direction of chirp trains: the maps and pictures of a board's owner."""
+"""Maps of one frame of chirps over range, range rate and direction, and where they peak."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.cli.pictures import DYNAMIC_RANGE_DB, U_LABEL, V_LABEL, png_bytes
-from invertwin.radar import (
-    Chirps,
-    PointCloud,
-    Radar,
-    beamform,
-    capon,
-    cell_averaging_cfar,
+from invertwin.radar.detection import PointCloud, cell_averaging_cfar, point_cloud
+from invertwin.radar.direction import capon, music
+from invertwin.radar.doppler import (
     compensate_tdm,
-    music,
-    point_cloud,
     range_doppler,
     range_doppler_angle,
     velocity_axis,
 )
+from invertwin.radar.motion import Chirps
+from invertwin.radar.radar import Radar
+from invertwin.radar.spectrum import beamform
 
 # Bins of range rate on either side of zero that a window spreads what stands still over.
 _STILL_BINS = 2
 _BINS_AT_ONCE = 2e7  # of range rate, range, u, v
-_MOST_BINS = 1e8  # the same, of all that are searched for points
-
-DOPPLER_NOTE = (
-    "Range rates are modulo the unambiguous span; phases that transmitters in turn add to movers "
-    "are taken out for range rates within it. Directions show the strongest of the other axis."
-)
+_MOST_BINS = 1e8  # of range rate, range, u, v that are searched for points
 
 
 @dataclass(frozen=True)
@@ -69,7 +58,7 @@ class Peak:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DopplerMaps:
     """One frame of a chirp train.
 
@@ -78,16 +67,17 @@ class DopplerMaps:
         velocities: Range rates [m/s].
         range_doppler: Mean power of the channels [velocity, range].
         everything: Power over range and direction, all range rates summed [range, u, v].
-        movers: The same without what stands still; None = too few chirps.
+        movers: Power over range and direction without what stands still [range, u, v]; None = too
+            few chirps.
         strongest: The strongest cell of all.
         mover: The strongest cell that moves.
     """
 
     grid: Grid
-    velocities: NDArray
-    range_doppler: NDArray
-    everything: NDArray
-    movers: NDArray | None
+    velocities: Float64[Tensor, " velocity"]
+    range_doppler: Float[Tensor, "velocity range"]
+    everything: Float64[Tensor, "range u v"]
+    movers: Float64[Tensor, "range u v"] | None
     strongest: Peak
     mover: Peak | None
 
@@ -102,6 +92,13 @@ def doppler_maps(
     """Range-Doppler and range-direction maps of one frame, transmitters' turns compensated.
 
     Range rates are those of the unambiguous span.
+
+    Args:
+        beat: Chirps of every transmitter.
+        radar: With one pose per frame.
+        grid: Ranges and directions of the maps.
+        chirps: Timing.
+        frame: The frame that is shown.
 
     Raises:
         InputError: As ``range_doppler`` and ``beamform``.
@@ -134,10 +131,10 @@ def doppler_maps(
     moving = peaks[1] is not None
     return DopplerMaps(
         grid,
-        velocities.numpy(),
-        flat.numpy(),
-        sums[0].numpy(),
-        sums[1].numpy() if moving else None,
+        velocities,
+        flat,
+        sums[0],
+        sums[1] if moving else None,
         strongest,
         peaks[1],
     )
@@ -149,7 +146,7 @@ def sharp_map(
     grid: Grid,
     method: str,
     sources: int | None,
-) -> NDArray:
+) -> Float[Tensor, "range u v"]:
     """Capon or MUSIC over range and direction [range, u, v].
 
     Args:
@@ -168,7 +165,7 @@ def sharp_map(
         power = capon(snapshots, radar, grid)[0]
     else:
         power = music(snapshots, radar, grid, sources="mdl" if sources is None else sources)[0]
-    return (power * (grid.u[:, None].square() + grid.v.square() <= 1)).numpy()
+    return power * (grid.u[:, None].square() + grid.v.square() <= 1)
 
 
 def snapshots_of(
@@ -178,7 +175,15 @@ def snapshots_of(
     chirps: Chirps,
     frame: int,
 ) -> Complex[Tensor, "velocity tx rx range"]:
-    """Bins of range rate of one frame, transmitters' turns compensated."""
+    """Bins of range rate of one frame, transmitters' turns compensated, for `sharp_map`.
+
+    Args:
+        beat: Chirps of every transmitter.
+        radar: With one pose per frame.
+        grid: Its ranges are used.
+        chirps: Timing.
+        frame: The frame that is used.
+    """
     radar = radar.frames([frame])
     cube = range_doppler(beat[frame : frame + 1], radar, grid, chirps, window="rectangular")
     return compensate_tdm(cube, radar, chirps)[0]
@@ -191,7 +196,15 @@ def points_of(
     chirps: Chirps,
     frame: int,
 ) -> PointCloud | None:
-    """What a cell-averaging CFAR detects in one frame; None where the map is too large for it."""
+    """What a cell-averaging CFAR detects in one frame; None where the map is too large for it.
+
+    Args:
+        beat: Chirps of every transmitter.
+        radar: With one pose per frame.
+        grid: Ranges and directions that are searched.
+        chirps: Timing.
+        frame: The frame that is searched.
+    """
     if chirps.count * math.prod(grid.shape) > _MOST_BINS:
         return None
     radar, signal = radar.frames([frame]), beat[frame : frame + 1]
@@ -220,76 +233,3 @@ def still_peak(spectrum: Float[Tensor, "range u v"], grid: Grid) -> Peak:
 def _peak(power: float, velocity: float, cell: Sequence[Any], grid: Grid) -> Peak:
     r, u, v = (int(index) for index in cell)
     return Peak(float(grid.ranges[r]), velocity, float(grid.u[u]), float(grid.v[v]), power)
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A map for a picture: rows are ranges.
-
-    Attributes:
-        power: [range, across].
-        ranges: [m].
-        across: Places of the columns.
-        label: Of the columns.
-    """
-
-    power: NDArray
-    ranges: NDArray
-    across: NDArray
-    label: str
-
-
-def panels(maps: DopplerMaps) -> dict[str, Panel]:
-    """What `panels_picture` shows of the maps."""
-    ranges = maps.grid.ranges.numpy()
-    found = {
-        "range and range rate": Panel(
-            maps.range_doppler.T, ranges, maps.velocities, "range rate [m/s], away > 0"
-        )
-    }
-    found |= direction_panels("everything", maps.everything, maps.grid)
-    if maps.movers is not None:
-        found |= direction_panels("what moves", maps.movers, maps.grid)
-    return found
-
-
-def direction_panels(title: str, power: NDArray, grid: Grid) -> dict[str, Panel]:
-    """Range × azimuth and range × elevation, the strongest of the other direction."""
-    ranges, found = grid.ranges.numpy(), {}
-    if grid.u_count > 1:
-        found[title] = Panel(power.max(axis=2), ranges, grid.u.numpy(), U_LABEL)
-    if grid.v_count > 1:
-        name = f"{title}, elevation" if found else title
-        found[name] = Panel(power.max(axis=1), ranges, grid.v.numpy(), V_LABEL)
-    return found
-
-
-def panels_picture(panels: Mapping[str, Panel]) -> bytes:
-    """Maps side by side as PNG bytes, each in dB below its own peak."""
-    figure = Figure(figsize=(3.9 * len(panels), 3.6), layout="constrained")
-    cells = figure.subplots(1, len(panels), squeeze=False)[0]
-    image = None
-    for cell, (title, panel) in zip(cells, panels.items(), strict=True):
-        peak = panel.power.max()
-        level = 10 * np.log10(np.maximum(panel.power / (peak if peak > 0 else 1.0), 1e-12))
-        image = cell.imshow(
-            level,
-            origin="lower",
-            aspect="auto",
-            extent=(*_edges(panel.across), *_edges(panel.ranges)),
-            vmin=-DYNAMIC_RANGE_DB,
-            vmax=0,
-            cmap="viridis",
-        )
-        cell.set_title(title, fontsize=9)
-        cell.set_xlabel(panel.label, fontsize=8)
-        cell.tick_params(labelsize=7)
-    cells[0].set_ylabel("range [m]", fontsize=8)
-    assert image is not None
-    figure.colorbar(image, ax=cells, label="power [dB below peak]", shrink=0.9)
-    return png_bytes(figure)
-
-
-def _edges(places: NDArray) -> tuple[float, float]:
-    half = 0.5 * float(places[1] - places[0]) if len(places) > 1 else 0.5
-    return float(places[0]) - half, float(places[-1]) + half

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from invertwin.cli.pictures import PALETTE, png_bytes
 from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.runs import RunFolder
-from invertwin.inversion import Trained, Training, train_prior
+from invertwin.plotting import PALETTE, png_bytes
 from invertwin.scene import Mesh, ShapePrior, load_prior
+from invertwin_studies.prior_training import Trained, Training, train_prior
 
 _SHOWN = 4  # coordinates of the picture
 _STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations of the picture
@@ -71,10 +71,10 @@ def run_train_prior(
         "Errors are root mean squares of distances, weighted by closeness to the surface.",
     )
     pictures = [
-        Picture("Learning", _curve(trained)),
+        Picture("Learning", png_bytes(_curve(trained))),
         Picture(
             "What the coordinates do",
-            _gallery(prior),
+            png_bytes(_gallery(prior)),
             "From the side and from above: one coordinate a row, in standard deviations; the "
             "mean shape is in the middle.",
         ),
@@ -97,7 +97,7 @@ def _decoding_time(prior: ShapePrior) -> float:
     return time.perf_counter() - begun
 
 
-def _curve(trained: Trained) -> bytes:
+def _curve(trained: Trained) -> Figure:
     figure = Figure(figsize=(7, 3), layout="constrained")
     axes = figure.subplots()
     rows: list[dict[str, Any]] = trained.history
@@ -106,10 +106,10 @@ def _curve(trained: Trained) -> bytes:
     axes.set(xlabel="epoch", ylabel="error near the surface [m]")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    return png_bytes(figure)
+    return figure
 
 
-def _gallery(prior: ShapePrior) -> bytes:
+def _gallery(prior: ShapePrior) -> Figure:
     rows = min(_SHOWN, prior.latent_size)
     figure = Figure(figsize=(11, 1.9 * rows), layout="constrained")
     grid = figure.subplots(2 * rows, len(_STEPS), squeeze=False)
@@ -121,7 +121,7 @@ def _gallery(prior: ShapePrior) -> bytes:
             for axes, up in zip(grid[2 * row : 2 * row + 2, column], (2, 1), strict=True):
                 _view(axes, mesh, up)
             grid[2 * row, column].set_title(f"z{row + 1} = {step:+g}", fontsize=8)
-    return png_bytes(figure)
+    return figure
 
 
 def _view(axes, mesh: Mesh, up: int) -> None:

@@ -3,8 +3,8 @@
 import pytest
 
 from cli.small import call, read_metrics
-from invertwin.inversion import Training
 from invertwin.scene import load_prior
+from invertwin_studies.prior_training import Training
 
 
 @pytest.mark.slow
@@ -32,7 +32,7 @@ def test_a_small_prior_is_trained_and_loads(tmp_path, monkeypatch, capsys):
 
 
 def test_the_command_without_options_has_the_settings_of_the_packaged_prior(tmp_path, monkeypatch):
-    from invertwin.cli import run_train_prior
+    from invertwin_studies import train_prior
 
     asked: list[Training] = []
 
@@ -44,7 +44,7 @@ def test_the_command_without_options_has_the_settings_of_the_packaged_prior(tmp_
         raise StopError
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_train_prior, "run_train_prior", stop)
+    monkeypatch.setattr(train_prior, "run_train_prior", stop)
     with pytest.raises(StopError):
         call(monkeypatch, "train-prior")
     assert asked == [Training()]

@@ -1,4 +1,4 @@
-"""Measures of shape against closed forms."""
+"""Metrics of shape against closed forms."""
 
 import math
 
@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.inversion.measures import (
-    Likeness,
+from invertwin.inversion.metrics import (
+    ShapeMetrics,
     Topology,
     compare_shapes,
     is_watertight,
@@ -163,7 +163,7 @@ def test_a_far_side_that_nobody_sees_does_not_count():
 
 def test_same_seed_same_numbers():
     one, two = (compare_shapes(sphere(0.5), box(0.8), seed=3, count=500) for _ in range(2))
-    assert isinstance(one, Likeness)
+    assert isinstance(one, ShapeMetrics)
     assert one == two
 
 

@@ -6,16 +6,16 @@ import torch
 from invertwin.channel import Sampling, deposit_power, draw_speckle, trace_power
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Direction, gradcheck
-from invertwin.peers.binning import binned
-from invertwin.peers.edge_sampling import edge_sampling_derivative
-from invertwin.peers.music import MusicMap
-from invertwin.peers.sionna import sionna_derivative, sionna_version
 from invertwin.radar import FMCW, Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import AntennaArray, Isotropic, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import planar_array
 from invertwin.scene.pose import rigid, rotation_from_vector
 from invertwin.scene.shapes import plate
+from invertwin_studies.peers.binning import binned
+from invertwin_studies.peers.edge_sampling import edge_sampling_derivative
+from invertwin_studies.peers.music import MusicMap
+from invertwin_studies.peers.sionna import sionna_derivative, sionna_version
 
 SLIDE = Direction("translation", "plate", (1.0, 0.0, 0.0))
 SURROGATE = Surrogate(range_kernel="gaussian")
@@ -71,6 +71,7 @@ def distance(found, truth):
     return float((found - truth).abs().sum() / truth.abs().sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("turn", "least", "most"), [(0.0, 0.0, 0.02), (0.35, 0.2, 2.0)])
 def test_edge_sampling_lacks_the_delay_and_nothing_else(radar, grid, turn, least, most):
     """A plate that slides in its own plane keeps the delay of every ray; a tilted one does not."""

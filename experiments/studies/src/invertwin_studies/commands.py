@@ -1,0 +1,56 @@
+"""The commands of the studies. Heavy imports wait until a command is called."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from invertwin.cli.options import (
+    BackendOption,
+    FileArgument,
+    OutOption,
+    OverwriteOption,
+    SeedOption,
+)
+
+
+def loss_scan(
+    file: FileArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    seed: SeedOption = None,
+    backend: BackendOption = None,
+) -> None:
+    """Show the losses of signals and of the surrogate along a line."""
+    from invertwin.cli.run_file import about_file
+    from invertwin.cli.running import default_folder, load_runs, print_tables, run_folder
+
+    runs = load_runs([file], seed, "loss-scan", ("loss_scan", "radar", "grid", "data"))
+    with run_folder(out or default_folder(file), runs, overwrite, False) as folder:
+        from invertwin_studies.loss_scan import run_loss_scan
+
+        with about_file(file):
+            tables = run_loss_scan(runs[file.stem], folder)
+        print_tables(tables)
+
+
+def train_prior(
+    cars: Annotated[int, typer.Option(min=100, help="Cars that are drawn for it.")] = 3000,
+    latent: Annotated[int, typer.Option(min=1, max=64, help="Coordinates of a shape.")] = 24,
+    epochs: Annotated[int, typer.Option(min=1, help="Times that every car is seen.")] = 40,
+    wheels: Annotated[bool, typer.Option("--wheels", help="Cars with wheels.")] = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Train a shape prior on cars of the generator; the packaged one by default."""
+    from invertwin.cli.running import now_and_then, print_tables, run_folder
+    from invertwin_studies import train_prior as training
+    from invertwin_studies.prior_training import Training
+
+    settings = Training(cars=cars, latent=latent, epochs=epochs, wheels=wheels, seed=seed)
+    again = f"train-prior --cars {cars} --latent {latent} --epochs {epochs} --seed {seed}"
+    again += " --wheels" if wheels else ""
+    with run_folder(out or Path("out/train_prior"), {}, overwrite, False) as folder:
+        tables = training.run_train_prior(settings, folder, again, now_and_then())
+        print_tables(tables)

@@ -1,0 +1,106 @@
+"""What commands do before and after their work: run files in, folder, tables on the terminal."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from invertwin.cli.options import console
+from invertwin.cli.report import Table, is_number, shown
+from invertwin.cli.run_file import about_file, load_run, need
+from invertwin.cli.runs import RunFolder, open_run
+from invertwin.cli.schema import RunFile
+from invertwin.errors import InputError
+
+_LOG_SECONDS = 10.0  # between lines of progress in a log
+
+
+@contextmanager
+def run_folder(
+    path: Path, runs: dict[str, RunFile], overwrite: bool, resume: bool
+) -> Iterator[RunFolder]:
+    """The run's folder; says where the results are, or how to resume.
+
+    Args:
+        path: The folder.
+        runs: Run files as used, by file stem.
+        overwrite: Replace the results that are there.
+        resume: Go on with the interrupted run that is there.
+    """
+    folder = open_run(path, runs, overwrite=overwrite, resume=resume)
+    try:
+        with folder:
+            yield folder
+    except KeyboardInterrupt:
+        line = "invertwin: interrupted"
+        if folder.resumable:
+            line += f"; the same command with --resume goes on (results so far in {path})"
+        print(line, file=sys.stderr)
+        sys.exit(130)
+    done = "was complete already" if folder.complete and folder.resumed else "complete"
+    console.print(f"{done}: {path / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def load_runs(
+    files: list[Path], seed: int | None, command: str, sections: Sequence[str]
+) -> dict[str, RunFile]:
+    """Run files by stem, with the sections that the command cannot do without.
+
+    Args:
+        files: Where they are.
+        seed: Replaces those of the run files.
+        command: The command that is asked for; run files of other tasks are refused.
+        sections: What each run file must have.
+    """
+    runs: dict[str, RunFile] = {}
+    for file in files:
+        if file.stem in runs:
+            raise InputError(
+                f"expected run files of different names, got {file.stem} twice; rename one"
+            )
+        run = load_run(file)
+        other = "reconstruct" if run.task == "demo" else run.task
+        cure = "add it"
+        if other != command:
+            cure = f"its task is {run.task}: use `invertwin {other} {file}`"
+        with about_file(file):
+            for section in sections:
+                need(run, section, command, cure)
+        runs[file.stem] = run if seed is None else run.model_copy(update={"seed": seed})
+    return runs
+
+
+def now_and_then() -> Callable[[str], None]:
+    """A function that prints a line of progress, unless one was printed just now."""
+    last = -_LOG_SECONDS
+
+    def say(line: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _LOG_SECONDS:
+            last = time.monotonic()
+            console.print(line, markup=False, soft_wrap=True)
+
+    return say
+
+
+def default_folder(file: Path) -> Path:
+    """Where the results of a run file go unless the user says otherwise."""
+    return Path("out") / file.stem
+
+
+def print_tables(tables: Sequence[Table]) -> None:
+    """Prints tables with their notes."""
+    for table in tables:
+        grid = RichTable(title=Text(table.title), title_justify="left")
+        for i, column in enumerate(table.columns):
+            numbers = any(is_number(row[i]) for row in table.rows)
+            grid.add_column(Text(column), justify="right" if numbers else "left", no_wrap=i == 0)
+        for row in table.rows:
+            grid.add_row(*(Text(shown(cell)) for cell in row))
+        console.print(grid)
+        if table.note:
+            console.print(table.note, markup=False)

@@ -1,0 +1,96 @@
+"""Figures of curves: how fits converge, and losses along a line."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from invertwin.plotting.figures import color
+
+Curve = tuple[NDArray, NDArray]
+"""Places and values."""
+
+
+def convergence(
+    losses: Sequence[float] | Mapping[str, Sequence[Sequence[float]]],
+    errors: Mapping[str, Sequence[Sequence[Sequence[float]]]] | None = None,
+    *,
+    annealed: float | None = None,
+    before: float | None = None,
+    error_label: str = "Chamfer distance [m]",
+) -> Figure:
+    """Loss over the steps and, beside it, an error: one colour for each way to fit.
+
+    Args:
+        losses: Losses of one fit; or those of every fit, by the name of the way.
+        errors: Pairs of step and error of every fit, by name.
+        annealed: Step from which the surrogate has no extra width.
+        before: Loss of the start without extra width.
+        error_label: What the errors are, with the unit.
+    """
+    if not isinstance(losses, Mapping):
+        losses = {"loss": [losses]}
+    figure = Figure(figsize=(7 if errors is None else 10, 3.3), layout="constrained")
+    left, *others = figure.subplots(1, 1 if errors is None else 2, squeeze=False)[0]
+    for i, (name, fits) in enumerate(losses.items()):
+        for k, values in enumerate(fits):
+            label = "_" if k else f"{name} ({len(fits)})"
+            left.plot(values, label=label, color=color(i), linewidth=1.1, alpha=0.7)
+    positive = [value for fits in losses.values() for row in fits for value in row if value > 0]
+    positive += [before] if before else []
+    if positive and max(positive) > 5 * min(positive):
+        left.set_yscale("log")
+    if annealed is not None:
+        label = "extra width shrinks to 0: losses not comparable"
+        left.axvspan(0, annealed, color="black", alpha=0.07, linewidth=0, label=label)
+    if before is not None:
+        left.plot([0], [before], "k*", markersize=8, label="start, without extra width")
+    left.set(xlabel="step", ylabel="loss")
+    for right in others:
+        _draw_errors(right, losses, errors or {}, error_label)
+    for axes in (left, *others):
+        axes.grid(alpha=0.3)
+        if losses:
+            axes.legend(fontsize=8)
+    return figure
+
+
+def _draw_errors(axes, losses, errors, label: str) -> None:
+    for i, name in enumerate(losses):
+        for k, curve in enumerate(errors[name]):
+            steps, values = zip(*curve, strict=True) if curve else ((), ())
+            axes.plot(steps, values, color=color(i), marker=".", label="_" if k else name)
+    highest = max(value for fits in errors.values() for curve in fits for _, value in curve)
+    axes.set(xlabel="step", ylabel=label, ylim=(0, 1.05 * highest))
+
+
+def landscape(exact: Curve, surrogates: Mapping[str, Curve], along: str) -> Figure:
+    """The exact signal's loss beside the surrogate's, over the offset from the truth.
+
+    Args:
+        exact: Offsets [m] and losses of the exact signal.
+        surrogates: Offsets [m] and losses of the surrogate, by name.
+        along: What is moved and in which direction, such as ``letter along z``.
+    """
+    figure = Figure(figsize=(10, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot(exact[0] * 1e3, exact[1], color=color(0), linewidth=0.8)
+    left.set_title(f"exact signal: {count_minima(exact[1])} local minima", fontsize=9)
+    left.set_xlabel(f"offset of {along} from the truth, in millimetres [mm]", fontsize=9)
+    for i, (name, (offsets, losses)) in enumerate(surrogates.items()):
+        label = f"{name} ({count_minima(losses)})"
+        right.plot(offsets, losses, color=color(i + 1), label=label)
+    right.set_title("surrogate, and its number of local minima", fontsize=9)
+    right.set_xlabel(f"offset of {along} from the truth, in metres [m]", fontsize=9)
+    right.legend(fontsize=8)
+    for axes in (left, right):
+        axes.axvline(0, color="black", linewidth=0.6, linestyle=":")
+        axes.set_ylabel("loss")
+        axes.grid(alpha=0.3)
+    return figure
+
+
+def count_minima(values: NDArray) -> int:
+    """Points inside a curve that are lower than both neighbours."""
+    return int(np.sum((values[1:-1] < values[:-2]) & (values[1:-1] < values[2:])))

@@ -1,0 +1,237 @@
+"""Figures of maps over range and direction or range rate: power in dB, derivatives."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from invertwin.channel import Grid
+from invertwin.errors import InputError
+from invertwin.plotting.figures import numbers
+from invertwin.radar import DopplerMaps
+
+U_LABEL, V_LABEL = "direction cosine u (to the right)", "direction cosine v (up)"
+RATE_LABEL = "range rate [m/s], away > 0"
+_FAINTEST = 1e-30  # power that stands for none in dB
+
+Maps = Tensor | Mapping[str, Tensor]
+"""Spectra [frame, range, u, v] by title, or a single one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A map with its axes; rows are ranges.
+
+    Attributes:
+        values: Power or derivative [range, across].
+        ranges: Range of each row [m].
+        across: Place of each column.
+        label: Name of the axis across, with its unit.
+    """
+
+    values: Float[Tensor, "range across"]
+    ranges: Float[Tensor, " range"]
+    across: Tensor
+    label: str
+
+
+def spectrum(
+    spectra: Maps, grid: Grid, *, relative: bool = True, dynamic_range: float = 40.0
+) -> Figure:
+    """Power maps side by side in dB, summed over frames and over the direction not shown.
+
+    Range × azimuth is the upper row and range × elevation the lower one; a direction that the grid
+    does not resolve has no row. Without any, range × frame is shown.
+
+    Args:
+        spectra: Power [frame, range, u, v], by title.
+        grid: Bins of all maps.
+        relative: Show each map below its own peak. False shows received over transmitted power,
+            all maps on one scale.
+        dynamic_range: From the darkest to the brightest colour [dB].
+    """
+    columns = {title: _views(power, grid) for title, power in _titled(spectra).items()}
+    rows = len(next(iter(columns.values())))
+    figure = Figure(figsize=(1.2 + 3.4 * len(columns), 3.3 * rows), layout="constrained")
+    cells = figure.subplots(rows, len(columns), squeeze=False, sharey=True)
+    drawn = [
+        (cells[row, column], title if row == 0 else "", view)
+        for column, (title, views) in enumerate(columns.items())
+        for row, view in enumerate(views)
+    ]
+    _draw_decibels(figure, drawn, relative, dynamic_range)
+    for row in cells:
+        row[0].set_ylabel("range [m]", fontsize=8)
+    return figure
+
+
+def panels(shown: Mapping[str, Panel], *, dynamic_range: float = 40.0) -> Figure:
+    """Power maps of different axes side by side, each in dB below its own peak.
+
+    Args:
+        shown: The maps, by title.
+        dynamic_range: From the darkest to the brightest colour [dB].
+    """
+    figure = Figure(figsize=(3.9 * len(shown), 3.6), layout="constrained")
+    cells = figure.subplots(1, len(shown), squeeze=False)[0]
+    drawn = [(cell, *item) for cell, item in zip(cells, shown.items(), strict=True)]
+    _draw_decibels(figure, drawn, True, dynamic_range)
+    cells[0].set_ylabel("range [m]", fontsize=8)
+    return figure
+
+
+def range_doppler(maps: DopplerMaps) -> Figure:
+    """Range × range rate of one frame of chirps, and range × direction of all and of what moves."""
+    return panels(doppler_panels(maps))
+
+
+def doppler_panels(maps: DopplerMaps) -> dict[str, Panel]:
+    """The panels of `range_doppler`, to be shown beside others."""
+    rates = Panel(maps.range_doppler.T, maps.grid.ranges, maps.velocities, RATE_LABEL)
+    found = {"range and range rate": rates}
+    found |= direction_panels("everything", maps.everything, maps.grid)
+    if maps.movers is not None:
+        found |= direction_panels("what moves", maps.movers, maps.grid)
+    return found
+
+
+def direction_panels(title: str, power: Float[Tensor, "range u v"], grid: Grid) -> dict[str, Panel]:
+    """Range × azimuth and range × elevation, the strongest over the other direction.
+
+    Args:
+        title: Of the first panel.
+        power: Map.
+        grid: Its bins; directions that it does not resolve have no panel.
+    """
+    found = {}
+    if grid.u_count > 1:
+        found[title] = Panel(power.amax(2), grid.ranges, grid.u, U_LABEL)
+    if grid.v_count > 1:
+        name = f"{title}, elevation" if found else title
+        found[name] = Panel(power.amax(1), grid.ranges, grid.v, V_LABEL)
+    return found
+
+
+def gradient(
+    derivatives: Maps,
+    grid: Grid,
+    *,
+    label: str = "∂ power (received/sent) [1/m]",
+    power: Float[Tensor, "frame range u v"] | None = None,
+    own_scale: Mapping[str, Tensor] | None = None,
+) -> Figure:
+    """Derivatives of a map side by side; red: power grows with θ, blue: it falls.
+
+    Shown is the first frame, summed over the direction that is not shown; all frames, where the
+    grid resolves no direction.
+
+    Args:
+        derivatives: Derivatives [frame, range, u, v], by title, on one symmetric colour scale.
+        grid: Bins of all maps.
+        label: What the colours of derivatives mean, with the unit.
+        power: The map itself, shown first, in dB below its peak.
+        own_scale: Further maps of the same unit, such as an error, each on its own colour scale.
+    """
+    still = grid.u_count == grid.v_count == 1
+
+    def first(values: Tensor) -> Panel:
+        return _views(values if still else values[:1], grid)[0]
+
+    shared = {title: first(values) for title, values in _titled(derivatives).items()}
+    others = {title: first(values) for title, values in (own_scale or {}).items()}
+    count = len(shared) + len(others) + (power is not None)
+    figure = Figure(figsize=(1.2 + 2.9 * count, 3.3), layout="constrained")
+    cells = list(figure.subplots(1, count, squeeze=False, sharey=True)[0])
+    cells[0].set_ylabel("range [m]", fontsize=8)
+    if power is not None:
+        _draw_decibels(figure, [(cells.pop(0), "power", first(power))], True, 30.0)
+    limit = max(_limit(panel) for panel in shared.values())
+    images = [
+        _signed(cell, title, panel, limit)
+        for cell, (title, panel) in zip(cells, shared.items(), strict=False)
+    ]
+    _colorbar(figure, images[-1], cells[: len(shared)], label)
+    for cell, (title, panel) in zip(cells[len(shared) :], others.items(), strict=True):
+        image = _signed(cell, title, panel, _limit(panel))
+        _colorbar(figure, image, [cell], "own scale, same unit")
+    return figure
+
+
+def _titled(maps: Maps) -> Mapping[str, Tensor]:
+    titled = maps if isinstance(maps, Mapping) else {"": maps}
+    if not titled:
+        raise InputError("expected at least one map, got none; give a tensor or a dict of them")
+    return titled
+
+
+def _views(power: Tensor, grid: Grid) -> list[Panel]:
+    """Range × azimuth and range × elevation where they are resolved, else range × frame."""
+    if tuple(power.shape[1:]) != grid.shape:
+        raise InputError(
+            f"expected a map [frame, {', '.join(map(str, grid.shape))}] on the grid, got "
+            f"{list(power.shape)}; give the grid that the map was made on"
+        )
+    views = []
+    if grid.u_count > 1:
+        views.append(Panel(power.sum((0, 3)), grid.ranges, grid.u, U_LABEL))
+    if grid.v_count > 1:
+        views.append(Panel(power.sum((0, 2)), grid.ranges, grid.v, V_LABEL))
+    frames = torch.arange(len(power), dtype=torch.float64)
+    return views or [Panel(power.sum((2, 3)).T, grid.ranges, frames, "frame")]
+
+
+def _draw_decibels(
+    figure: Figure, drawn: list[tuple[Any, str, Panel]], relative: bool, dynamic_range: float
+) -> None:
+    """Power of all panels in dB, with one bar for their colours."""
+    powers = [numbers(panel.values) for _, _, panel in drawn]
+    top = 0.0 if relative else 10 * np.log10(max(max(p.max() for p in powers), _FAINTEST))
+    image = None
+    for (cell, title, panel), power in zip(drawn, powers, strict=True):
+        peak = power.max() if relative and power.max() > 0 else 1.0
+        level = 10 * np.log10(np.maximum(power / peak, _FAINTEST))
+        image = _image(cell, title, panel, level, vmin=top - dynamic_range, vmax=top)
+    assert image is not None
+    label = "power [dB below peak]" if relative else "received over transmitted power [dB]"
+    _colorbar(figure, image, [cell for cell, *_ in drawn], label)
+
+
+def _signed(cell: Any, title: str, panel: Panel, limit: float) -> Any:
+    return _image(cell, title, panel, numbers(panel.values), vmin=-limit, vmax=limit, cmap="RdBu_r")
+
+
+def _limit(panel: Panel) -> float:
+    """The largest colour: a few outliers may exceed it."""
+    return float(np.quantile(np.abs(numbers(panel.values)), 0.998)) or 1.0
+
+
+def _image(cell: Any, title: str, panel: Panel, values: NDArray, **style: Any) -> Any:
+    image = cell.imshow(
+        values,
+        origin="lower",
+        aspect="auto",
+        extent=(*_edges(panel.across), *_edges(panel.ranges)),
+        **style,
+    )
+    cell.set_title(title, fontsize=9)
+    cell.set_xlabel(panel.label, fontsize=8)
+    cell.tick_params(labelsize=7)
+    return image
+
+
+def _colorbar(figure: Figure, image: Any, cells: list[Any], label: str) -> None:
+    bar = figure.colorbar(image, ax=cells, shrink=0.85)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+
+
+def _edges(places: Tensor) -> tuple[float, float]:
+    """Outer edges of the first and the last bin."""
+    half = 0.5 * float(places[1] - places[0]) if len(places) > 1 else 0.5
+    return float(places[0]) - half, float(places[-1]) + half

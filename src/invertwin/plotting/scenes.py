@@ -1,0 +1,194 @@
+"""Figures of scenes: three views along world axes, with the radar's positions."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from invertwin.plotting.figures import color, numbers
+from invertwin.plotting.triangles import Shape, paint, sharp_edges
+from invertwin.radar import Radar
+from invertwin.scene import Scene
+
+_BACKGROUND = "#b9bec7"
+_OUTLINE = "#c0143c"
+_MARKED_SHARE = 0.015  # of a view: objects that look smaller get a mark
+_TRACK_COUNT = 24  # radar positions: more of them are drawn as dots
+# What runs across, up, and in depth: 0, 1, 2 = the radar's right, up, boresight.
+_VIEWS = {"from the radar": (0, 1, 2), "from above": (0, 2, 1), "from the side": (2, 1, 0)}
+
+
+def scene(
+    scenes: Scene | Mapping[str, Scene],
+    radar: Radar | Sequence[Radar] | None = None,
+    *,
+    highlight: Sequence[str] | None = None,
+    outline: Scene | None = None,
+) -> Figure:
+    """Three views of a scene in a row; several scenes are one column each.
+
+    Each view looks along the world axis nearest to the radar's boresight, up or right.
+
+    Args:
+        scenes: What is drawn, by title.
+        radar: Its positions are marked, and its mean axes are those of the views; of several
+            radars, those of the first. None takes the world's axes: right x, up y, ahead z.
+        highlight: Names of the objects that are drawn in colour, the others grey; None is all.
+        outline: Objects whose sharp edges are drawn on top in red, such as the truth.
+    """
+    titled = scenes if isinstance(scenes, Mapping) else {"scene": scenes}
+    drawn = {title: _shapes(shown) for title, shown in titled.items()}
+    edges = {} if outline is None else _shapes(outline)
+    radars = [] if radar is None else [radar] if isinstance(radar, Radar) else list(radar)
+    places = np.concatenate([numbers(r.positions) for r in radars]) if radars else None
+    views = _views(radars[0] if radars else None)
+    windows = [_window([*drawn.values(), edges], places, view) for view in views]
+    ratios = [min(max(h / w, 0.3), 1.3) for _, _, w, h in windows]
+    if len(drawn) == 1:
+        cells = [[(k, title) for k in range(len(views)) for title in drawn]]
+        ratios = [max(ratios)]
+    else:
+        cells = [[(k, title) for title in drawn] for k in range(len(views))]
+    width = 11.0
+    height = 0.5 + sum(ratio * width / len(cells[0]) + 0.35 for ratio in ratios)
+    figure = Figure(figsize=(width, height), layout="constrained")
+    grid = figure.subplots(
+        len(cells), len(cells[0]), squeeze=False, gridspec_kw={"height_ratios": ratios}
+    )
+    for axes, (k, title) in zip(grid.flat, (c for row in cells for c in row), strict=True):
+        colors = _colors(drawn[title], highlight)
+        _draw(axes, drawn[title], colors, edges, places, views[k], windows[k])
+        axes.set_title(f"{title}, {views[k].title}", fontsize=9)
+    names = {name: c for shapes in drawn.values() for name, c in _colors(shapes, highlight).items()}
+    _legend(figure, names, bool(edges), places)
+    return figure
+
+
+@dataclass(frozen=True)
+class _View:
+    """A look along a world axis.
+
+    Attributes:
+        title: Where from.
+        axes: World axes that run across, up and in depth.
+        signs: Whether the first two grow to the right and up, and the third towards the eye.
+    """
+
+    title: str
+    axes: tuple[int, int, int]
+    signs: tuple[int, int, int]
+
+    @property
+    def plane(self) -> list[int]:
+        return list(self.axes[:2])
+
+    @property
+    def hides_the_radar(self) -> bool:
+        """Seen from the radar, its own marks would only hide the scene."""
+        return self.title == "from the radar"
+
+
+def _views(radar: Radar | None) -> list[_View]:
+    """The views along the world axes nearest to the radar's right, up and boresight."""
+    turned = radar is not None and radar.rotations is not None
+    frame = numbers(radar.rotations.mean(0)) if turned else np.eye(3)  # type: ignore[union-attr]
+    orders = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
+    nearest = max(orders, key=lambda order: sum(abs(frame[k, c]) for c, k in enumerate(order)))
+    sign = [-1 if frame[k, c] < 0 else 1 for c, k in enumerate(nearest)]
+    views = []
+    for title, (across, up, depth) in _VIEWS.items():
+        # The eye is before the radar's boresight, above, or on the right.
+        towards = sign[depth] * (-1 if depth == 2 else 1)
+        axes = nearest[across], nearest[up], nearest[depth]
+        views.append(_View(title, axes, (sign[across], sign[up], towards)))
+    return views
+
+
+def _shapes(shown: Scene) -> dict[str, Shape]:
+    return {
+        name: (numbers(item.vertices), numbers(item.mesh.faces))
+        for name, item in shown.objects.items()
+    }
+
+
+def _colors(shapes: Mapping[str, Shape], highlight: Sequence[str] | None) -> dict[str, str]:
+    return {
+        name: color(i) if highlight is None or name in highlight else _BACKGROUND
+        for i, name in enumerate(shapes)
+    }
+
+
+def _window(
+    drawn: Sequence[Mapping[str, Shape]], places: NDArray | None, view: _View
+) -> tuple[float, float, float, float]:
+    """Centre and size of what a view shows, equal for all scenes."""
+    points = [vertices for shapes in drawn for vertices, _ in shapes.values()]
+    if places is not None and not view.hides_the_radar:
+        points.append(places)
+    flat = np.concatenate(points)[:, view.plane]
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    sides = (high - low) * 1.12
+    sides = np.maximum(sides, max(0.3 * sides.max(), 1e-3))
+    (x, y), (width, height) = (low + high) / 2, sides
+    return float(x), float(y), float(width), float(height)
+
+
+def _draw(
+    axes: Any,
+    shapes: Mapping[str, Shape],
+    colors: Mapping[str, str],
+    edges: Mapping[str, Shape],
+    places: NDArray | None,
+    view: _View,
+    window: tuple[float, float, float, float],
+) -> None:
+    plane = view.plane
+    eye = np.eye(3)[list(view.axes)]
+    eye[2] *= view.signs[2]
+    extent = np.ptp(np.concatenate([v for v, _ in shapes.values()]), axis=0).max()
+    paint(axes, [(shape, colors[name]) for name, shape in shapes.items()], eye, extent / 6)
+    for vertices, faces in edges.values():
+        segments = vertices[sharp_edges(vertices, faces)][:, :, plane]
+        axes.add_collection(LineCollection(list(segments), colors=_OUTLINE, linewidths=0.8))
+    smallest = _MARKED_SHARE * max(window[2:])
+    small_marks = [
+        (v, {"marker": "o", "color": colors[k], "ms": 6}) for k, (v, _) in shapes.items()
+    ]
+    small_marks += [(v, {"marker": "+", "color": _OUTLINE, "ms": 11}) for v, _ in edges.values()]
+    for vertices, mark in small_marks:
+        if np.ptp(vertices[:, plane], axis=0).max() < smallest:
+            axes.plot(*vertices[:, plane].mean(axis=0), linestyle="", **mark)
+    if places is not None and not view.hides_the_radar:
+        axes.plot(*places[:, plane].T, color="black", linestyle="", mew=0, **_mark(places))
+    for set_limits, c in ((axes.set_xlim, 0), (axes.set_ylim, 1)):
+        ends = window[c] + window[c + 2] / 2 * np.array([-1, 1])
+        set_limits(*ends[:: view.signs[c]])
+    axes.set_aspect("equal")
+    axes.set_xlabel(f"{'xyz'[plane[0]]} [m]", fontsize=8)
+    axes.set_ylabel(f"{'xyz'[plane[1]]} [m]", fontsize=8)
+    axes.tick_params(labelsize=7)
+
+
+def _mark(places: NDArray) -> dict[str, Any]:
+    many = len(places) > _TRACK_COUNT
+    return {"marker": ".", "markersize": 5} if many else {"marker": "v", "markersize": 4}
+
+
+def _legend(
+    figure: Figure, names: Mapping[str, str], outlined: bool, places: NDArray | None
+) -> None:
+    """Which colour is what, over all scenes."""
+    labels = {("other objects" if c == _BACKGROUND else name): c for name, c in names.items()}
+    handles: list[Patch | Line2D] = [Patch(color=c, label=name) for name, c in labels.items()]
+    if outlined:
+        handles.append(Line2D([], [], color=_OUTLINE, linewidth=1, label="truth"))
+    if places is not None:
+        label = f"radar, {len(places)} positions" if len(places) > 1 else "radar"
+        handles.append(Line2D([], [], color="black", ls="", label=label, **_mark(places)))
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
