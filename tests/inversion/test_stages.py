@@ -4,7 +4,6 @@ from functools import partial
 
 import pytest
 import torch
-from invertwin.inversion.stages import Stage, reconstruct_in_stages, stage_checkpoint
 
 import fits
 from invertwin.errors import InputError
