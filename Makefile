@@ -46,7 +46,7 @@ format: .venv/.dev
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
-bench: .venv/.bench .venv/.llvm
+bench: .venv/.bench .venv/.dev .venv/.llvm
 	@set -e; for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python "$$script"; done
 
 clean:

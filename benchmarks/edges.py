@@ -31,12 +31,15 @@ from report import verdict, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel import Grid, boundary_walk
-from invertwin.channel.bridge import backend, flatten, from_points, one_torch_thread, tracer
-from invertwin.channel.edges import InteriorEdgeSampler
-from invertwin.channel.kernel import Inputs
-from invertwin.channel.rays import Shot
-from invertwin.channel.walk import Walk
+from invertwin.channel import Grid, Sampling, backend
+from invertwin.channel.power import boundary
+from invertwin.channel.power.edges import InteriorEdgeSampler
+from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.power.walk import Walk
+from invertwin.channel.rays.arrays import from_points
+from invertwin.channel.rays.backend import mi, one_torch_thread
+from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene import RayScene
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array
@@ -121,8 +124,8 @@ class Estimator:
         owner = torch.zeros(len(geometry.vertices), dtype=torch.bool)
         owner[geometry.topology.object_vertices[list(names).index(task.moving)]] = True
         self.moving = owner
-        self.shot = Shot(geometry, link)
-        self.inputs = Inputs.of(geometry, link, self.shot, monostatic=False)
+        self.rays = RayScene(geometry, link)
+        self.inputs = Inputs.of(self.rays)
 
     def __call__(
         self, samples: int, seed: int, *, weighted: bool
@@ -130,32 +133,30 @@ class Estimator:
         """The derivative [1/m] of the power over all bins, and the seconds that it took."""
         import drjit as dr
 
-        vertices = tracer().Float(self.inputs.vertices)
+        vertices = mi.Float(self.inputs.vertices)
         dr.enable_grad(vertices)
         attached = replace(self.inputs, vertices=vertices)
         start = perf_counter()
         # The samplers of the first family find nothing, so that all samples are of the second.
         with (
-            patch.object(boundary_walk, "EdgeSampler", lambda *_: NOTHING),
+            patch.object(boundary, "EdgeSampler", lambda *_: NOTHING),
             patch.object(
-                boundary_walk,
+                boundary,
                 "InteriorEdgeSampler",
                 partial(InteriorEdgeSampler, weighted=weighted),
             ),
         ):
-            points = boundary_walk.BoundaryPoints(
-                self.shot,
+            points = boundary.BoundaryPoints(
+                self.rays,
                 self.inputs,
-                samples=FAMILIES * samples,
-                depth=DEPTH,
-                seed=seed,
-                interior=True,
-                chunks=lambda size: iter([dr.arange(tracer().UInt32, size)] if size else []),
+                Sampling(depth=DEPTH, boundary_samples=FAMILIES * samples),
+                seed,
+                chunks=lambda size: iter([dr.arange(mi.UInt32, size)] if size else []),
             )
-            walk = Walk(self.shot, self.inputs, seed)
-            for chains in boundary_walk.boundary_chains(self.shot, attached, walk, points):
-                total = chains.weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
-                dr.backward_from(chains.speed * total)
+            walk = Walk(self.rays, self.inputs, seed)
+            for paths in boundary.boundary_paths(self.rays, attached, walk, points):
+                total = paths.weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
+                dr.backward_from(paths.speed * total)
         gradient = from_points(dr.grad(vertices)).numpy()
         seconds = perf_counter() - start
         return gradient[self.moving.numpy()].sum(axis=0, dtype=np.float64), seconds

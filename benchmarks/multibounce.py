@@ -58,8 +58,9 @@ from report import MetricTable, write
 from rich.table import Table
 from throughput import WAVEFORM, sionna_version
 
-from invertwin.channel import Sampling, deposit_power
-from invertwin.channel.bridge import Topology, backend, tracer
+from invertwin.channel import Sampling, backend, deposit_power
+from invertwin.channel.rays.backend import mi
+from invertwin.channel.rays.topology import Topology
 from invertwin.radar import Radar
 from invertwin.scene import Object, RoughConductor, Scene
 from invertwin.scene.antenna import linear_array
@@ -119,7 +120,6 @@ class Theirs:
     """Steps of Sionna RT in its `box` scene; raises ModuleNotFoundError where not installed."""
 
     def __init__(self) -> None:
-        mi = tracer()
         rt = import_module("sionna.rt")
         self.scene = rt.load_scene(rt.scene.box)
         self.scene.frequency = WAVEFORM.center_frequency
@@ -138,7 +138,7 @@ class Theirs:
         """Seconds of forward and backward with a new seed, and the number of paths."""
         import drjit as dr
 
-        coefficient = tracer().Float(SCATTERING)
+        coefficient = mi.Float(SCATTERING)
         dr.enable_grad(coefficient)
         self.material.scattering_coefficient = coefficient
         start = perf_counter()

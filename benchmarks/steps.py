@@ -6,7 +6,7 @@ Prints a table and writes `metrics.json` into DIR (default `out/steps`). The fit
 `experiments/demo.toml` with its settings; its first steps compile kernels and are left out.
 Medians over the other steps [s]:
 
-- `step`: the whole step, from one call of `progress` to the next.
+- `step`: the whole step, from one report to the next.
 - `kernels`: execution of all Dr.Jit kernels, as Dr.Jit's kernel history tells.
 - `convolutions`: torch operations that shape the deposited power (`CONVOLUTIONS`), forward and
   backward, in their own time.
@@ -19,11 +19,16 @@ the two after them in a second, equal fit.
 """
 
 import argparse
+import os
 import statistics
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+
+# Torch's profiler announces its every start and stop.
+os.environ.setdefault("KINETO_LOG_LEVEL", "5")
 
 import drjit as dr
 import torch
@@ -31,9 +36,15 @@ from report import MetricTable, Required, write
 from rich.console import Console
 
 from invertwin.cli import build
-from invertwin.cli.fits.problem import Problem, problem_of
+from invertwin.cli.fits.problem import (
+    Problem,
+    observations_of,
+    problem_of,
+    stages_of,
+    unknowns_of,
+)
 from invertwin.cli.run_file import load_run
-from invertwin.inversion import reconstruct
+from invertwin.inversion import Report, reconstruct
 
 RUN = Path(__file__).parents[1] / "experiments" / "demo.toml"
 STEPS, SKIPPED = 30, 5
@@ -53,29 +64,17 @@ COUNTED = {
 
 def fit(problem: Problem, steps: int, after_step: Callable[[dict[str, Any]], None]) -> None:
     """The first steps of the demo's fit."""
-    run, scene = problem.run, problem.scene
-    settings = run.reconstruct
-    assert settings is not None
-    modules = [
-        make(scene) for make in build.builders(run.parameters, build.Start(scene, {})).values()
-    ]
+    run = problem.run
+    (stage,) = stages_of(run)
     reconstruct(
-        scene,
-        problem.radar,
-        problem.capture,
-        modules,
-        grid=problem.grid,
+        problem.scene,
+        observations_of(problem),
+        unknowns_of(run, build.Start(problem.scene, {})),
         loss=build.loss(run.loss),
         optimizer=build.optimizer(run.optimizer),
-        surrogate=build.surrogate(run.surrogate),
-        steps=steps,
-        depth=settings.depth,
-        samples=settings.samples,
-        boundary_samples=settings.boundary_samples,
-        frames_per_step=settings.frames_per_step,
-        annealing=settings.annealing,
+        schedule=replace(stage, steps=steps),
+        callbacks=[Report(after_step)],
         seed=run.seed,
-        progress=after_step,
     )
 
 

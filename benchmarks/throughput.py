@@ -26,9 +26,10 @@ from report import MetricTable, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel import Grid, Sampling, deposit_power, trace_power
-from invertwin.channel.bridge import backend, flatten, tracer
-from invertwin.channel.rays import Shot, visible
+from invertwin.channel import Grid, Sampling, backend, deposit_power, trace_power
+from invertwin.channel.rays.backend import mi
+from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene import RayScene, visible
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array
@@ -82,7 +83,7 @@ class Task:
         center = torch.stack(corners).mean(dim=0)
         normal = torch.linalg.cross(corners[1] - corners[0], corners[2] - corners[0])
         facing = center[(normal * (link.tx - center)).sum(dim=1) > 0]
-        seen = visible(Shot(geometry, link), link.tx.expand(len(facing), 3), facing)
+        seen = visible(RayScene(geometry, link), link.tx.expand(len(facing), 3), facing)
         return 1 - float(seen.double().mean())
 
     def step(self, number: int, samples: int, boundary_samples: int) -> tuple[float, float]:
@@ -205,7 +206,6 @@ def sionna_calls(target: Mesh, rays: int) -> Callable[[int], int] | None:
     The material scatters all power diffusely and every other interaction is off, so no ray that
     meets the target is spent on anything but a path to the receiver.
     """
-    mi = tracer()
     try:
         rt = import_module("sionna.rt")
     except ModuleNotFoundError:

@@ -94,3 +94,14 @@ def relative(found: Tensor, truth: Tensor) -> float:
     """‖found − truth‖₁ / ‖truth‖₁."""
     found, truth = found.detach(), truth.detach()
     return float((found - truth).abs().sum() / truth.abs().sum())
+
+
+def shift_error(gradients: Sequence[Tensor]) -> float:
+    """How far the derivatives with respect to all points [*, 3] are from summing to zero.
+
+    The points are those of a scene and its antennas: to move everything alike changes nothing. The
+    error is relative to the sum of magnitudes, and 0 where all derivatives are 0.
+    """
+    total = torch.stack([gradient.sum(0) for gradient in gradients]).sum(0).abs().max()
+    scale = torch.stack([gradient.abs().sum() for gradient in gradients]).sum()
+    return float(total / scale) if float(scale) != 0 else 0.0

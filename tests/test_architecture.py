@@ -8,27 +8,32 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors"}
+FOUNDATION = {"constants", "errors", "limits", "seeds"}
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "channel"}
 RADAR = CHANNEL - {"doctor"} | {"radar"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
-INVERSION = SIMULATION | CAPTURE | {"inversion"}
+MODELS = SIMULATION | CAPTURE | {"models"}
+INVERSION = MODELS | {"inversion"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
 ALLOWED = {
     "constants": set(),
     "errors": set(),
+    "limits": set(),
+    "seeds": set(),
     "doctor": FOUNDATION,
     "scene": SCENE,
     "channel": CHANNEL,
     "radar": RADAR,
     "simulation": SIMULATION,
     "capture": CAPTURE,
+    "models": MODELS,
     "inversion": INVERSION,
     "plotting": INVERSION | {"plotting"},
-    "cli": INVERSION | {"doctor", "plotting", "cli", "__init__"},
+    "datasets": CAPTURE | {"datasets", "cli"},
+    "cli": INVERSION | {"doctor", "plotting", "datasets", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from invertwin.capture import rail_sar
 from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
+from invertwin.datasets import rail_sar
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]

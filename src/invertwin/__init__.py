@@ -24,7 +24,7 @@ _MENU = {
     "Capture": "capture.capture",
     "ExactMap": "models",
     "FMCW": "radar.waveform",
-    "Grid": "channel.paths",
+    "Grid": "channel",
     "InputError": "errors",
     "Object": "scene.scene",
     "MotionMap": "models",

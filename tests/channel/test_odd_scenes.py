@@ -5,12 +5,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as functional
 
-from invertwin.capture import read
-from invertwin.channel import Sampling
-from invertwin.channel.bridge import backend, use_backend
-from invertwin.channel.deposit import deposit_power
-from invertwin.channel.tracer import trace_field, trace_power
+from invertwin.channel import (
+    Grid,
+    Sampling,
+    backend,
+    deposit_power,
+    trace_field,
+    trace_power,
+    use_backend,
+)
+from invertwin.datasets import rail_sar
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,
@@ -24,7 +30,7 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
-from scenes import GRID, float64, link, occluder, thing
+from scenes import GRID, float64, link, occluder, shift_error, thing
 
 COUNTS = Sampling(depth=1, samples=2_000, boundary_samples=500)
 BACK = rotation_from_vector(float64([0.0, math.pi, 0.0]))[None]
@@ -116,6 +122,7 @@ def test_small_balls_from_a_rail_have_finite_gradients(radius):
     """Most rays miss, and some shadows graze: neither may leave a NaN."""
     places = torch.zeros(60, 3, dtype=torch.float64)
     places[:, 0] = torch.linspace(-2, 2, 60)
+    grid = Grid(2.5, 0.075, 40, u_start=-0.8, u_step=0.1, u_count=17)
     scene = Scene(
         {
             "a": thing(sphere(radius, subdivisions=2), (0.0, 0.1, 3.0)),
@@ -128,17 +135,19 @@ def test_small_balls_from_a_rail_have_finite_gradients(radius):
         out = deposit_power(
             moved,
             link(track),
-            GRID,
+            grid,
             sampling=Sampling(depth=1, samples=6_000, boundary_samples=2_000),
             seed=seed,
         )
         gradients = torch.autograd.grad(out.sum(), [*leaves.values(), track])
-        assert all(torch.isfinite(g).all() for g in gradients), seed
+        assert out.any()
+        assert shift_error(gradients) < 1e-4, seed
 
 
-def test_measured_track_has_finite_gradients(data_folder):
-    """Seed 36 once gave NaN: a boundary ray in the plane of the triangle that it met."""
-    capture = read(data_folder / "rail_sar", "rail_sar", clock_offset=9.216, range_bias=0.46257)
+def test_measured_track_has_the_gradients_of_points(data_folder):
+    """Small balls are points: the power falls with R⁴. Seed 36 once gave NaN, from a boundary ray
+    in the plane of the triangle that it met."""
+    capture = rail_sar.read(data_folder / "rail_sar", clock_offset=9.216, range_bias=0.46257)
     survey, radar = capture.survey, capture.radar()
     assert survey is not None
     shift = float64([-0.6, -0.04, 0.0]).requires_grad_()
@@ -148,17 +157,23 @@ def test_measured_track_has_finite_gradients(data_folder):
     scene = Scene(
         {f"ball {i}": Object(ball, surface, rigid(eye, at)) for i, at in enumerate(places)}
     )
-    grid = radar.grid(6.8, 10.2, oversample=4)
+    grid, antennas = radar.grid(6.8, 10.2, oversample=4), radar.link()
+    alone = Scene({"ball": Object(ball, surface, rigid(eye, places[1].detach()))})
+    plenty = Sampling(depth=1, samples=200_000, boundary_samples=0)
+    power = deposit_power(alone, antennas, grid, sampling=plenty, seed=5)
+    # ∂(P R)/∂x = −3 P ∂R/∂x of every frame.
+    away = functional.normalize(places[1].detach() - antennas.tx, dim=1)
+    expected = -3 * (power.sum((1, 2, 3)).double()[:, None] * away).sum(0)
     for seed in (0, 36):
         out = deposit_power(
             scene,
-            radar.link(),
+            antennas,
             grid,
             sampling=Sampling(depth=1, samples=20_000, boundary_samples=2_000),
             seed=seed,
         )
         (gradient,) = torch.autograd.grad((out * grid.ranges[:, None, None]).sum(), shift)
-        assert torch.isfinite(gradient).all()
+        assert float((gradient - expected).norm() / expected.norm()) < 0.02
 
 
 def test_backend_by_argument_and_by_environment(monkeypatch):
@@ -176,7 +191,7 @@ def test_backend_by_argument_and_by_environment(monkeypatch):
 
 
 def test_cuda_where_there_is_none(monkeypatch):
-    monkeypatch.setattr("invertwin.channel.bridge._cuda_found", lambda: False)
+    monkeypatch.setattr("invertwin.channel.rays.backend._cuda_found", lambda: False)
     with (
         pytest.raises(InputError, match="expected an NVIDIA GPU for backend 'cuda'"),
         use_backend("cuda"),
@@ -191,5 +206,12 @@ def test_a_backward_pass_runs_where_its_forward_pass_ran(monkeypatch):
     with use_backend("cpu"):
         out = deposit_power(scene, link(), GRID, sampling=COUNTS, seed=0)
     monkeypatch.setenv("INVERTWIN_BACKEND", "nowhere")
-    gradients = torch.autograd.grad(out.sum(), list(leaves.values()))
-    assert all(torch.isfinite(g).all() for g in gradients)
+    found = torch.autograd.grad(out.sum(), list(leaves.values()))
+    monkeypatch.undo()
+    scene, leaves = movable(occluder())
+    with use_backend("cpu"):
+        out = deposit_power(scene, link(), GRID, sampling=COUNTS, seed=0)
+        expected = torch.autograd.grad(out.sum(), list(leaves.values()))
+    for mine, theirs in zip(found, expected, strict=True):
+        # Sums by atomic additions come in another order.
+        torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-5 * float(theirs.abs().max()))

@@ -48,6 +48,7 @@ v_max = 0.6
 
 [data]
 kind = "simulated"
+depth = 1
 density = 2e3
 snr_db = 20.0
 

@@ -5,15 +5,15 @@ from typing import Any
 
 import pytest
 import torch
-from invertwin.cli.gradient_shapes import shape_direction
 
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
+from invertwin.cli.gradients import theta_of
 from invertwin.cli.run_file import validate
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
+from invertwin.inversion.lines import line_of
 from invertwin.scene import Scene
-from scenes import radar
 
 STUFF = {"kind": "rough_dielectric", "permittivity": 4.0}
 LEFT = {"left_elbow": ["y"], "left_hip": ["x", "y", "z"]}
@@ -94,9 +94,10 @@ def checked(parameter: dict[str, Any], name: str = "person") -> tuple[Scene, Sce
     key = "step_deg" if given["kind"] == "joint" else "step"
     run = run_file(gradcheck={"parameter": given, key: 0.1})
     assert run.gradcheck is not None
-    scene, direction = shape_direction(run.gradcheck.parameter, run, build.scene(run))
-    theta = torch.tensor(0.01, dtype=torch.float64)
-    return scene, direction(scene, radar(), theta)[0]
+    scene = build.scene(run)
+    theta = theta_of(run.gradcheck.parameter, run, scene)
+    line = line_of(theta.module, theta.tangent, scene)
+    return line.at(torch.zeros((), dtype=torch.float64)), line.end(0.01)
 
 
 BUMP = {

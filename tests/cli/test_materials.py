@@ -111,7 +111,10 @@ def test_run_files_with_materials_are_written_and_read_again(tmp_path):
     ("table", "parts"),
     [
         ({"kind": "dielectric"}, ["scene.wall.material: ", "`permittivity`, or `itu`"]),
-        ({"kind": "dielectric", "itu": "concret"}, ["scene.wall: ", "did you mean concrete?"]),
+        (
+            {"kind": "dielectric", "itu": "concret"},
+            ["scene.wall.material: ", "did you mean concrete?"],
+        ),
         (
             {"kind": "slab", "permittivity": 2.0, "thickness": -0.01},
             ["scene.wall.material.thickness: ", "greater than or equal to 0", "got -0.01"],
@@ -135,7 +138,7 @@ def test_run_files_with_materials_are_written_and_read_again(tmp_path):
         ),
         (
             {"kind": "dielectric", "permittivity": {"image": "none.npy"}},
-            ["scene.wall: ", "expected permittivity from a NumPy file"],
+            ["scene.wall.material.permittivity: ", "from a NumPy file"],
         ),
         (
             {"kind": "dielectric", "permittivity": {"imgae": "none.npy"}},
@@ -200,7 +203,7 @@ def test_truth_may_be_of_another_material_and_the_error_is_told():
     errors = value_errors(run.parameters, scene, truth, 77e9)
     assert errors == pytest.approx({"permittivity_error": 0.27 / 2.73, "thickness_error": 0.2})
     assert value_errors(run.parameters, truth, truth, 77e9)["thickness_error"] == 0
-    with pytest.raises(InputError, match=r"truth\.wall: expected a material of ITU"):
+    with pytest.raises(InputError, match=r"truth\.wall\.material: expected a material of ITU"):
         build.true_scene(read(known, truth={"wall": {"material": real | {"itu": "woood"}}}))
 
 
@@ -230,7 +233,9 @@ def test_materials_of_a_scene_file_take_no_images(tmp_path):
         "material": {"kind": "dielectric", "permittivity": {"image": "x.npy"}},
     }
     run = validate({"task": "simulate", "scene_file": table}, tmp_path / "run.toml")
-    with pytest.raises(InputError, match="scene_file: expected permittivity as a number"):
+    with pytest.raises(
+        InputError, match=r"scene_file\.material\.permittivity: expected permittivity as a number"
+    ):
         build.scene(run)
 
 

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from cli.small import call, read_metrics
-from invertwin.capture import Capture, calibrate, locate, rail_sar
+from invertwin.capture import Capture, calibrate, locate
 from invertwin.capture.radar_fields import labelled
+from invertwin.datasets import rail_sar
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from rich.console import Console
 from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import is_shape_key, shape_label, shape_scores
-from invertwin.cli.fits.problem import FULL, annealed_until, problem_of, run_stages, varied_run
+from invertwin.cli.fits.problem import FULL, annealed_until, problem_of, stages_of, varied_run
 from invertwin.cli.fits.writing import tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
@@ -219,10 +219,11 @@ def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
     assert own.reconstruct is not None
     assert own.reconstruct.annealing == 0.25
     assert varied_run(run, FULL).optimizer.kind == "adam"
-    first, second = run_stages(varied_run(run, FULL))
-    assert "optimizer" not in first.options
-    assert second.options["optimizer"].kind == "sgd"
-    assert second.options["annealing"] == 0.5
+    first, second = stages_of(varied_run(run, FULL))
+    assert first.optimizer is None
+    assert second.optimizer is not None
+    assert second.optimizer.kind == "sgd"
+    assert second.annealing == 0.5
 
 
 def learned(shape: str) -> str:

@@ -15,7 +15,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power
-from invertwin.channel.bridge import tracer
+from invertwin.channel.rays.backend import mi as raytracer
 from invertwin.scene import (
     Cosine,
     Isotropic,
@@ -75,7 +75,7 @@ def quads(mi: Any, item: Object) -> Any:
 
 def mitsuba(seeds: int, size: int = 128) -> tuple[Tensor, Tensor, float]:
     """The same and its derivative by ``direct_projective``, and the noise of the latter."""
-    tracer()
+    raytracer.variant()  # loads it as we do
     import drjit as dr
     import mitsuba as mi
 

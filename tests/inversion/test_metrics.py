@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 
+from invertwin.channel import visible_points
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import (
     ShapeMetrics,
     Topology,
     compare_shapes,
     is_watertight,
-    seen_points,
     surface_points,
     topology,
     volume_iou,
@@ -134,10 +134,10 @@ def test_open_meshes_are_told_apart():
 
 def test_half_of_a_ball_is_seen_from_afar():
     points, _ = surface_points(sphere(0.5, 5), 5_000, seed=0)
-    seen = seen_points(points, sphere(0.5, 5), [[0, 0, -50.0]])
+    seen = visible_points(sphere(0.5, 5), points, [[0, 0, -50.0]])
     assert float(seen.double().mean()) == pytest.approx(0.5, abs=0.03)
     assert bool((points[seen][:, 2] < 0.02).all())
-    both = seen_points(points, sphere(0.5, 5), [[0, 0, -50.0], [0, 0, 50.0]])
+    both = visible_points(sphere(0.5, 5), points, [[0, 0, -50.0], [0, 0, 50.0]])
     assert float(both.double().mean()) > 0.97
 
 

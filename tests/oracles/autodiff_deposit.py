@@ -6,11 +6,14 @@ from typing import Any
 import drjit as dr
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, Sampling, replay
-from invertwin.channel.bins import Contribution
-from invertwin.channel.bridge import backend, flatten, to_float, tracer
-from invertwin.channel.kernel import DIFFERENTIABLE, from_table
-from invertwin.channel.trace import Settings, Trace
+from invertwin.channel import Grid, Link, Sampling
+from invertwin.channel.power import replay
+from invertwin.channel.power.bins import Contribution
+from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table
+from invertwin.channel.power.trace import Trace
+from invertwin.channel.rays.arrays import to_float
+from invertwin.channel.rays.backend import mi
+from invertwin.channel.rays.geometry import flatten
 from invertwin.scene import Scene
 
 
@@ -18,45 +21,34 @@ def gradients(
     scene: Scene, link: Link, grid: Grid, weights: Tensor, *, samples: int, edges: int, seed: int
 ) -> dict[str, Tensor]:
     """∂ Σ weights · map / ∂ every table of the kernel."""
-    mi = tracer()
-    settings = Settings(
-        geometry=flatten(scene, link.wavelength),
-        link=link,
-        grid=grid,
-        sampling=Sampling(depth=1, samples=samples, boundary_samples=edges, memory_budget=1e12),
-        seed=seed,
-        scheme="rays",
-        reference=None,
-        backend=backend(),
-    )
-    trace = Trace(settings)
-    tables = {name: mi.Float(getattr(trace.fixed, name)) for name in DIFFERENTIABLE}
+    sampling = Sampling(depth=1, samples=samples, boundary_samples=edges, memory_budget=1e12)
+    trace = Trace(flatten(scene, link.wavelength), link, sampling, seed)
+    tables = {name: mi.Float(trace.fixed.table(name)) for name in DIFFERENTIABLE}
     dr.enable_grad(list(tables.values()))
     inputs, out = trace.inputs(tables), mi.Float(0)
     for records in trace.records():
-        vertex = replay._vertex(trace.shot, inputs, records, mi.UInt32(0), records.depth)
+        vertex = replay._vertex(trace.rays, inputs, records, mi.UInt32(0), records.depth)
         path, arriving = vertex.path(), vertex.arriving
         power = dr.select(vertex.seen, path.power * (arriving / dr.detach(arriving)), 0)
-        length = 0.5 * (vertex.leg + vertex.connection.distance)
+        length = 0.5 * (vertex.segment + vertex.connection.distance)
         out += _weighted(grid, weights, replace(path, power=power, range=length))
-    for chains in trace.boundary(inputs):
+    for paths in trace.boundary(inputs):
 
-        def visit(_: Any, path: Contribution, exists: Any, speed: Any = chains.speed) -> None:
+        def visit(_: Any, path: Contribution, exists: Any, speed: Any = paths.speed) -> None:
             nonlocal out
             amount = dr.select(exists, path.power, 0) * speed
             zero = dr.zeros(mi.Float, dr.width(amount))
             boundary = replace(path, power=dr.replace_grad(zero, amount))
             out += _weighted(grid, weights, boundary)
 
-        chains.run(dict(chains.state), visit)
+        paths.run(dict(paths.state), visit)
     dr.backward(out)
-    by_name: dict[str, Tensor] = dict(zip(DIFFERENTIABLE, settings.tables, strict=True))
+    by_name: dict[str, Tensor] = dict(zip(DIFFERENTIABLE, trace.tables, strict=True))
     return {name: from_table(name, dr.grad(tables[name]), by_name[name]) for name in tables}
 
 
 def _weighted(grid: Grid, weights: Tensor, found: Contribution) -> Any:
     """Σ weights · map of these paths, with B-spline weights that carry derivatives."""
-    mi = tracer()
     flat, total = to_float(weights), mi.Float(0)
     axes = [
         _taps(position, *ends)
@@ -84,7 +76,6 @@ def _weighted(grid: Grid, weights: Tensor, found: Contribution) -> Any:
 
 
 def _taps(position: Any, start: float, step: float, count: int) -> list[tuple[Any, Any]]:
-    mi = tracer()
     if count == 1:
         return [(mi.Int32(0), mi.Float(1))]
     t = (position - start) / step

@@ -60,9 +60,9 @@ def test_a_landscape_counts_its_minima():
     ripples = 1 - np.cos(20 * np.pi * x)
     figure = plotting.landscape((x, ripples), {"wide": (x, x**2)}, "plate along z")
     left, right = figure.axes
-    np.testing.assert_allclose(left.lines[0].get_xdata(), 1e3 * x)
-    np.testing.assert_allclose(left.lines[0].get_ydata(), ripples)
-    np.testing.assert_allclose(right.lines[0].get_xydata(), np.stack([x, x**2], 1))
+    for axes, places, losses in ((left, 1e3 * x, ripples), (right, x, x**2)):
+        drawn = np.asarray(axes.lines[0].get_xydata())
+        np.testing.assert_allclose(drawn, np.stack([places, losses], 1))
     assert left.get_title() == "exact signal: 19 local minima"
     assert legend(right) == ["wide (1)"]
     assert "plate along z" in left.get_xlabel()

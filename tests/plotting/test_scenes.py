@@ -42,7 +42,7 @@ def radar(positions, turn=0.0):
 def painted(axes):
     """Corners of all triangles in the axes."""
     (faces,) = [c for c in axes.collections if isinstance(c, PolyCollection)]
-    return np.concatenate([path.vertices[:3] for path in faces.get_paths()]), faces
+    return np.concatenate([np.asarray(path.vertices)[:3] for path in faces.get_paths()]), faces
 
 
 def labels(figure):
@@ -116,7 +116,7 @@ def test_small_objects_get_a_mark():
     dot, cross = figure.axes[0].lines
     assert (dot.get_marker(), cross.get_marker()) == ("o", "+")
     for mark in (dot, cross):
-        np.testing.assert_allclose(mark.get_xydata(), [[1, 0]], atol=1e-9)
+        np.testing.assert_allclose(np.asarray(mark.get_xydata()), [[1, 0]], atol=1e-9)
 
 
 def test_only_edges_that_bend_are_outlined():
@@ -138,7 +138,7 @@ def test_a_turntable_turns_once():
     """An eye on the axis of symmetry sees a cube of four equal sides four times."""
     gif = plotting.turntable({"truth": box(1.0), "twin": box(1.0)}, up=[0.0, 1.0, 0.0])
     image = Image.open(io.BytesIO(gif))
-    assert image.n_frames == 24
+    assert getattr(image, "n_frames", 1) == 24
     frames = []
     for k in range(24):
         image.seek(k)

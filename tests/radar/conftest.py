@@ -1,24 +1,15 @@
 """Hand-built paths: the radar is tested without a ray tracer."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
-from jaxtyping import config
 from torch import Tensor
 
 from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar import FMCW, Radar
 from invertwin.scene.antenna import linear_array, planar_array
-
-
-@pytest.fixture
-def unchecked() -> Iterator[None]:
-    """Without the run-time shape checks of the tests, which would catch bad input first."""
-    config.update("jaxtyping_disable", True)
-    yield
-    config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

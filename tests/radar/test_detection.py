@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy.optimize import brentq
 from torch.autograd import forward_ad
 
 from invertwin.channel import Grid
@@ -22,7 +23,6 @@ from invertwin.radar import (
     velocity_axis,
     velocity_span,
 )
-from invertwin.radar.detection import _ordered_factor
 from invertwin.scene.antenna import linear_array, planar_array
 from invertwin.scene.pose import rotation_from_vector
 from oracles.moving_point import moving_point
@@ -52,13 +52,30 @@ def test_false_alarm_rate(cfar, looks, rate):
         assert abs(int(cells.sum()) - expected) < 5 * math.sqrt(expected)
 
 
-def test_factor_of_one_look_is_the_closed_form():
-    """Rohling: P = Π (N − i)/(N − i + α), i = 0 … k − 1."""
-    for cells, place in ((16, 12), (40, 30), (5, 5)):
-        for rate in (1e-2, 1e-6):
-            factor = _ordered_factor(cells, place, rate, 1)
-            product = math.prod((cells - i) / (cells - i + factor) for i in range(place))
-            assert product == pytest.approx(rate, rel=1e-3)
+@pytest.mark.parametrize(
+    ("training", "cell", "cells", "rank", "place"),
+    [
+        ((0, 8), (30, 40), 16, 0.75, 12),
+        ((0, 20), (30, 40), 40, 0.75, 30),
+        ((1, 2), (0, 0), 5, 1.0, 5),  # a corner, where some training cells are missing
+    ],
+)
+@pytest.mark.parametrize("rate", [1e-2, 1e-6])
+def test_factor_of_one_look_is_the_closed_form(training, cell, cells, rank, place, rate):
+    """Rohling: P = Π (N − i)/(N − i + α), i = 0 … k − 1.
+
+    In a level map, a cell is found where it exceeds α times the level.
+    """
+
+    def product(factor: float) -> float:
+        return math.prod((cells - i) / (cells - i + factor) for i in range(place)) - rate
+
+    factor = float(brentq(product, 0.0, 1e9))
+    options = {"guard": (0, 0), "training": training, "false_alarm": rate, "rank": rank}
+    for ratio, detected in ((0.999, False), (1.001, True)):
+        power = torch.ones(1, 60, 80, dtype=torch.float64)
+        power[(0, *cell)] = ratio * factor
+        assert bool(ordered_statistics_cfar(power, **options)[(0, *cell)]) == detected
 
 
 @BOTH

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -102,7 +103,7 @@ def test_coherent_sources_need_smoothing(linear):
     truth = [0.0, 1.2 * linear.beamwidth[0]]
     profile = waves(linear, [[u, 0.0] for u in truth], 1, 3, noise=1e-4, coherent=True)
     grid = line(count=1801)
-    options = {"smoothing": (10, 1), "forward_backward": True}
+    options: dict[str, Any] = {"smoothing": (10, 1), "forward_backward": True}
     for power in (
         music(profile, linear, grid, sources=2, **options),
         music(profile, linear, grid, **options),

@@ -30,7 +30,6 @@ from invertwin.radar import (
     range_profile,
     residual_phase,
 )
-from invertwin.radar.impairments import _streams
 from invertwin.radar.waveform import sample_window
 from invertwin.scene.antenna import linear_array
 
@@ -299,9 +298,10 @@ def test_a_train_with_everything(point_paths):
     none = point_paths(radar, torch.zeros(0, 3), torch.zeros(0))
     still = Impairments(leakage=leakage, gain_std_db=0.5, phase_std=0.1)
     direct = still.record(none, radar, seed=11, chirps=TRAIN)
-    factors = channel_errors(radar, 0.5, 0.1, seed=_streams(11)[1])
-    expected = leakage_signal(leakage, radar) * factors[..., None]
-    assert torch.allclose(direct, expected.expand_as(direct))
+    errors = replace(still, leakage=None)
+    expected = errors.apply(leakage_signal(leakage, radar).expand_as(direct), radar, seed=11)
+    assert torch.allclose(direct, expected)
+    assert not torch.allclose(direct, leakage_signal(leakage, radar).expand_as(direct), rtol=0.01)
 
 
 def test_impairments_of_a_finished_signal(point_paths):

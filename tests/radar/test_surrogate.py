@@ -98,7 +98,7 @@ def test_the_surrogate_follows_a_waveform_of_ones_own(linear, point_paths):
         bandwidth: float = 1e9
         center_frequency: float = 77e9
         noise_bandwidth: float = 1e6
-        residual_slope: float = -1e13
+        residual_slope: float = -1e13  # pyright: ignore[reportIncompatibleMethodOverride]
 
     radar = replace(linear, waveform=Falling())
     points, power = cloud(40)

@@ -1,6 +1,7 @@
 """Waveforms, radar geometry, grids, and the errors and warnings at their edge."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -90,7 +91,7 @@ def test_wrong_units(make, message):
 
 def small(**changes) -> Radar:
     one = linear_array(1, LAMBDA / 2)
-    arguments = {
+    arguments: dict[str, Any] = {
         "transmitters": one,
         "receivers": one,
         "waveform": FMCW(77e9, 1e9, 40e-6, 64),
@@ -123,7 +124,8 @@ def test_wrong_radar(unchecked, changes, message):
 
 def test_positions_from_lists_are_float64(unchecked):
     radar = small(positions=[[0, 0, 1], [0, 0, 2]])
-    assert radar.positions.dtype == torch.float64
+    expected = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]], dtype=torch.float64)
+    torch.testing.assert_close(radar.positions, expected, rtol=0, atol=0)
 
 
 def test_shared_visibility_follows_the_distance():

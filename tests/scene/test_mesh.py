@@ -15,10 +15,12 @@ FACE = torch.tensor([[0, 1, 2]])
 def test_converts_arrays_and_keeps_gradients():
     vertices = TRIANGLE.to(torch.float32).requires_grad_()
     mesh = Mesh(vertices, np.array([[0, 1, 2]], dtype=np.uint32))  # pyright: ignore[reportArgumentType]
-    assert mesh.vertices.dtype == torch.float64
-    assert mesh.faces.dtype == torch.int64
-    mesh.vertices.sum().backward()
+    torch.testing.assert_close(mesh.vertices.detach(), TRIANGLE, rtol=0, atol=0)
+    torch.testing.assert_close(mesh.faces, FACE, rtol=0, atol=0)
+    weights = torch.arange(9.0).reshape(3, 3)
+    (weights * mesh.vertices).sum().backward()
     assert vertices.grad is not None
+    assert torch.equal(vertices.grad, weights)
 
 
 def test_center_is_the_middle_of_the_bounding_box():
@@ -37,7 +39,9 @@ def test_center_is_the_middle_of_the_bounding_box():
 )
 def test_degenerate_meshes_are_accepted(faces):
     vertices = torch.cat([TRIANGLE, TRIANGLE[:2] + 1.0])
-    assert len(Mesh(vertices, torch.tensor(faces)).faces) == len(faces)
+    mesh = Mesh(vertices, torch.tensor(faces))
+    assert torch.equal(mesh.vertices, vertices)
+    assert mesh.faces.tolist() == faces
 
 
 @pytest.mark.usefixtures("unchecked")

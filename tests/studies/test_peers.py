@@ -5,19 +5,29 @@ import torch
 
 from invertwin.channel import Sampling, deposit_power, draw_speckle, trace_power
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Direction, gradcheck
+from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.models import SurrogateMap
 from invertwin.radar import FMCW, Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import AntennaArray, Isotropic, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import planar_array
-from invertwin.scene.pose import rigid, rotation_from_vector
+from invertwin.scene.parameters import Translation
+from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.shapes import plate
 from invertwin_studies.peers.binning import binned
 from invertwin_studies.peers.edge_sampling import edge_sampling_derivative
 from invertwin_studies.peers.music import MusicMap
 from invertwin_studies.peers.sionna import sionna_derivative, sionna_version
 
-SLIDE = Direction("translation", "plate", (1.0, 0.0, 0.0))
+ALONG = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+
+
+def slide(scene, radar, theta):
+    """The plate moved along x by θ."""
+    moved = compose(scene["plate"].transform, rigid(translation=ALONG * theta))
+    return scene.replace("plate", pose=moved), radar
+
+
 SURROGATE = Surrogate(range_kernel="gaussian")
 
 
@@ -76,28 +86,26 @@ def distance(found, truth):
 def test_edge_sampling_lacks_the_delay_and_nothing_else(radar, grid, turn, least, most):
     """A plate that slides in its own plane keeps the delay of every ray; a tilted one does not."""
     given = scene(turn)
+    sampling = Sampling(depth=1, samples=400_000, boundary_samples=200_000)
     report = gradcheck(
-        given,
-        radar,
-        grid,
-        SLIDE,
-        surrogate=SURROGATE,
-        depth=1,
-        samples=400_000,
-        boundary_samples=200_000,
-        repeats=1,
-        difference_samples=400_000,
-        max_pairs=4,
+        SurrogateMap(grid, SURROGATE, sampling),
+        Translation("plate"),
+        ALONG,
+        scene=given,
+        sensor=radar,
+        check=Check(repeats=1, difference_samples=400_000, max_pairs=4),
     )
     found = edge_sampling_derivative(
-        given, radar, grid, SLIDE, surrogate=SURROGATE, samples=50_000, edge_samples=100_000, seed=1
+        given, radar, grid, slide, surrogate=SURROGATE, samples=50_000, edge_samples=100_000, seed=1
     )
     assert least < distance(found, report.gradient) < most
     assert distance(report.gradient, report.difference) < 0.02
 
 
 def test_edge_sampling_refuses_what_it_cannot_do(radar, grid):
-    moved = Direction("radar_translation")
+    def moved(scene, radar, theta):
+        return scene, radar.moved(torch.eye(3, dtype=torch.float64), ALONG * theta)
+
     with pytest.raises(InputError, match="moves the radar"):
         edge_sampling_derivative(
             scene(), radar, grid, moved, surrogate=SURROGATE, samples=10, edge_samples=10, seed=1
@@ -109,17 +117,17 @@ def test_music_is_differentiated_through_the_whole_chain(radar, grid):
     drawn = Sampling(depth=1, points_per_m2=500.0)
     speckle = draw_speckle(given, radar.link(), drawn, 1)
     music = MusicMap(radar, grid, speckle, 3, (4, 3), 1)
-    found = music.derivative(given, SLIDE)
+    found = music.derivative(given, slide)
     # Steps far below a wavelength and so small that no point appears.
-    assert distance(found, music.difference(given, SLIDE, 1e-7)) < 1e-3
+    assert distance(found, music.difference(given, slide, 1e-7)) < 1e-3
     # Over a wavelength the spectrum is another one.
-    assert distance(found, music.difference(given, SLIDE, 4e-3)) > 0.3
+    assert distance(found, music.difference(given, slide, 4e-3)) > 0.3
 
 
 @pytest.mark.skipif(sionna_version() is None, reason="Sionna RT is not installed")
 def test_sionna_leaves_nothing_of_the_geometry(radar, grid):
     found = sionna_derivative(
-        scene(0.35), radar, grid, SLIDE, surrogate=SURROGATE, samples=20_000, seed=1
+        scene(0.35), radar, grid, slide, surrogate=SURROGATE, samples=20_000, seed=1
     )
     assert found.shape == (1, *grid.shape)
     assert not torch.count_nonzero(found)

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from invertwin.capture import described_arrays, openradar, rail_sar, ti
+from invertwin.capture import described_arrays, ti
 from invertwin.capture.backprojection import backproject, calibrate, locate
 from invertwin.capture.capture import Capture
 from invertwin.capture.channels import ChannelCalibration, estimate_channels
@@ -18,8 +18,6 @@ from invertwin.errors import InputError
 READERS: MappingProxyType[str, Callable[..., Capture]] = MappingProxyType(
     {
         "netcdf": Capture.load,
-        "rail_sar": rail_sar.read,
-        "openradar": openradar.read,
         "dca1000": ti.read,
         "arrays": described_arrays.read,
     }

@@ -92,7 +92,7 @@ def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
     interpolator = capture.interpolator()
 
     def focus(trial: Float64[Tensor, "trial 2"]) -> Float64[Tensor, " trial"]:
-        """Of rows of shifts of clock [s] and bias [m]."""
+        """Amplitude at the target for rows of shifts of clock [s] and bias [m]."""
         distances = [(capture.positions(clock) - target).norm(dim=1) for clock in trial[:, 0]]
         return interpolator(torch.stack(distances, dim=1) + trial[:, 1]).mean(0).abs()
 

@@ -177,7 +177,7 @@ class Capture:
 
     @property
     def times(self) -> Float64[Tensor, " frame"]:
-        """Of each frame, on the radar's clock [s].
+        """Time of each frame on the radar's clock [s].
 
         Raises:
             InputError: the capture has no times.
@@ -227,7 +227,11 @@ class Capture:
         return track.at(self.times + (self.clock_offset + clock_shift))
 
     def recalibrated(self, clock_offset: float, range_bias: float) -> "Capture":
-        """The same data with another clock offset [s] and range bias [m].
+        """A capture of the same data with another clock offset and range bias.
+
+        Args:
+            clock_offset: of the track's clock against the radar's [s].
+            range_bias: what is subtracted from the radar's own ranges [m].
 
         Raises:
             InputError: the capture has no track, or holds beat samples.
@@ -248,7 +252,7 @@ class Capture:
     def spectrum(self, grid: Grid) -> Float[Tensor, "frame range u v"]:
         """Measured power in the bins of a grid.
 
-        Beat samples go through the exact chain (window, range transform, beamforming); range
+        Beat samples are processed exactly (window, range transform, beamforming); range
         profiles are interpolated, band-limited, and squared.
 
         Raises:

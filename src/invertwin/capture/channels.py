@@ -109,7 +109,7 @@ class ChannelCalibration:
         return Capture(capture.dataset.assign(beat=variable))
 
     def apply_to_chirps(self, data: ChirpData) -> ChirpData:
-        """The same for every chirp. The samples are no whole counts any more.
+        """Calibrate every chirp of raw data. The samples are no longer whole counts.
 
         Raises:
             InputError: another number of channels, or real samples: a phase turns only complex

@@ -307,7 +307,12 @@ def adc_counts(
 
 
 def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], int]:
-    """A repeated order of transmitters as its shortest period, sent that many times more often."""
+    """A repeated order of transmitters as its shortest period, sent that many times more often.
+
+    Args:
+        order: transmitters in their order of sending.
+        loops: how often the order is sent.
+    """
     for length in range(1, len(order) + 1):
         repeats = len(order) // length
         if length * repeats == len(order) and tuple(order) == tuple(order[:length]) * repeats:

@@ -84,6 +84,14 @@ def described_elements(
 ) -> tuple[AntennaArray, AntennaArray]:
     """TX and RX elements of described samples, see `read`.
 
+    Args:
+        path: file of the samples, beside its description.
+        settings: chirp settings of the recording.
+        board: name of a preset; None = as described.
+        elevation: channels of the preset along y; None = as described.
+        azimuth: channels of the preset along x; None = as described.
+        arrays: (transmitters, receivers) instead of a preset.
+
     Raises:
         InputError: neither the arguments nor the description say which.
     """

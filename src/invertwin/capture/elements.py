@@ -17,6 +17,13 @@ def elements(
 
     Transmitters come in the order of sending.
 
+    Args:
+        settings: chirp settings, which name antennas.
+        board: name of a preset, or None.
+        elevation: as in `Board.arrays`.
+        azimuth: as in `Board.arrays`.
+        arrays: (transmitters, receivers) instead of a preset, or None.
+
     Raises:
         InputError: neither or both, or what the preset refuses.
     """

@@ -12,6 +12,10 @@ from invertwin.errors import InputError
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     """Writes to a file beside ``path`` and renames it; complex variables as two real ones.
 
+    Args:
+        dataset: what to write.
+        path: file; an old one is replaced.
+
     Raises:
         InputError: the folder does not exist.
     """

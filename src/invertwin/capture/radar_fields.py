@@ -97,6 +97,11 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
 def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
     """A copy of a tensor with named dimensions and a unit.
 
+    Args:
+        dims: name of each dimension.
+        value: the tensor.
+        unit: such as "m".
+
     Raises:
         InputError: another number of dimensions.
     """
@@ -111,6 +116,10 @@ def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
 def tensor(dataset: xr.Dataset, name: str) -> Tensor:
     """A copy of a variable as a tensor.
 
+    Args:
+        dataset: of a capture.
+        name: of the variable.
+
     Raises:
         InputError: the variable is missing.
     """
@@ -124,6 +133,10 @@ def tensor(dataset: xr.Dataset, name: str) -> Tensor:
 
 def attribute(attributes: Mapping[Hashable, Any], name: str) -> Any:
     """An attribute of a capture.
+
+    Args:
+        attributes: of a capture.
+        name: of the attribute.
 
     Raises:
         InputError: the attribute is missing.

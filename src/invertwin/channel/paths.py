@@ -168,3 +168,51 @@ class Paths:
             velocity = torch.cat(rows)
         kind = self.kind if self.kind == other.kind else "field"
         return Paths(**joined, kind=kind, velocity=velocity)
+
+
+def listed(
+    frame: Int64[Tensor, " path"],
+    length: Float64[Tensor, " path"],
+    position: Float64[Tensor, "path 3"],
+    kind: str,
+    *,
+    first: Float64[Tensor, "path 3"] | None = None,
+    power: Float64[Tensor, " path"] | None = None,
+    coefficient: Complex128[Tensor, " path"] | None = None,
+    boundary: bool = False,
+    velocity: Float64[Tensor, "path 3"] | None = None,
+) -> Paths:
+    """Paths of one kind; what is not given is zero.
+
+    Args:
+        frame: Radar pose.
+        length: From antenna to antenna [m].
+        position: Of the last point [m].
+        kind: See ``Paths``.
+        first: Position of the first point; None = the same as the last.
+        power: Received over transmitted.
+        coefficient: Of the field.
+        boundary: Whether all rows are boundary paths.
+        velocity: Of the points [m/s].
+    """
+    zero = torch.zeros(len(frame), dtype=torch.float64)
+    return Paths(
+        frame=frame,
+        delay=length / SPEED_OF_LIGHT,
+        coefficient=zero.to(torch.complex128) if coefficient is None else coefficient,
+        power=zero if power is None else power,
+        first=position if first is None else first,
+        last=position,
+        kind=kind,
+        boundary=torch.full((len(frame),), boundary),
+        velocity=velocity,
+    )
+
+
+def joined(parts: list[Paths]) -> Paths:
+    """All paths in order; added in pairs, so that no row is copied once for every part."""
+    while len(parts) > 1:
+        pairs = zip(parts[::2], parts[1::2], strict=False)
+        odd = parts[-1:] if len(parts) % 2 else []
+        parts = [first + second for first, second in pairs] + odd
+    return parts[0]

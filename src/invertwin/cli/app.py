@@ -1,5 +1,6 @@
 """The command line `invertwin`: from run files and recordings to folders of results."""
 
+import json
 import sys
 import warnings
 from collections.abc import Callable
@@ -10,7 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from invertwin import __version__
-from invertwin.cli.keys import key_tables
 from invertwin.cli.options import (
     BackendOption,
     FileArgument,
@@ -213,9 +213,17 @@ def keys(
         str | None,
         typer.Argument(help="Such as radar or radar.waveform; default: all.", show_default=False),
     ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json-schema", help="Print the JSON Schema, for editors.")
+    ] = False,
 ) -> None:
     """Print the keys of run files: what may be written where, units, defaults."""
-    print_tables(key_tables(section))
+    from invertwin.cli.keys import json_schema, key_tables
+
+    if as_json:
+        print(json.dumps(json_schema(), indent=2, ensure_ascii=False))
+    else:
+        print_tables(key_tables(section))
 
 
 @app.command()

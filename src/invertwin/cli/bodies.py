@@ -3,41 +3,63 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import MinLen
 from torch import Tensor
 
-from invertwin.cli import schema
-from invertwin.cli.run_file import about
+from invertwin.cli.section import Vector, about
 from invertwin.errors import InputError
+from invertwin.limits import RADIANS, Axes, Positive
 from invertwin.scene import Mesh, rotation_angle, rotation_from_vector
 from invertwin.scene.geometry import BodyTemplate, SkinnedBody, load_anny, load_smpl, person
 
+Angles = Annotated[dict[str, Vector], RADIANS]
+_AT_REST: dict[str, list[float]] = {}
 
-def template(table: schema.BodyShape) -> BodyTemplate:
-    """The template of a body, in its own size.
+
+def body(
+    model: Literal["person", "anny"] = "person",
+    file: Path | None = None,
+    height: Positive = 1.75,
+    spacing: Positive = 0.03,
+    angles: Angles = _AT_REST,
+) -> Mesh:
+    """A body with joints and one skin, y up, facing −z, in the frame of its model.
+
+    Args:
+        model: person = made of formulas, arms held out at rest; anny = of the extra `anny`.
+        file: SMPL's layout (.npz), from the run file's folder; in place of a model.
+        height: m, of `person`.
+        spacing: m, of the corners of its triangles.
+        angles: rotation vectors of joints by name, each in the frame of the joint before; others
+            at rest.
+
+    Raises:
+        InputError: A file is missing or broken, the extra `anny` is not installed, or no such
+            joint.
+    """
+    found = _template(model, file, height, spacing)
+    given = {name: torch.tensor(turn, dtype=torch.float64) for name, turn in angles.items()}
+    turns = torch.stack([rotation_from_vector(turn) for turn in found.rotations(given)])
+    return Mesh(found.posed(turns)[0], found.faces)
+
+
+def template(table: Any) -> BodyTemplate:
+    """The template of a table with shape = "body", in its own size.
 
     Raises:
         InputError: A file is missing or broken, or the extra `anny` is not installed.
     """
-    if table.file is not None:
-        return load_smpl(table.file)
-    return load_anny() if table.model == "anny" else person(table.height, table.spacing)
+    return _template(table.model, table.file, table.height, table.spacing)
 
 
-def posed(table: schema.BodyShape) -> Mesh:
-    """The mesh with turned joints, in the template's size.
-
-    Raises:
-        InputError: No such joint, or as for the template.
-    """
-    body = template(table)
-    angles = {
-        name: torch.tensor(turn, dtype=torch.float64).deg2rad()
-        for name, turn in table.angles_deg.items()
-    }
-    turns = torch.stack([rotation_from_vector(turn) for turn in body.rotations(angles)])
-    return Mesh(body.posed(turns)[0], body.faces)
+def _template(model: str, file: Any, height: float, spacing: float) -> BodyTemplate:
+    if file is not None:
+        return load_smpl(file)
+    return load_anny() if model == "anny" else person(height, spacing)
 
 
 @dataclass(frozen=True)
@@ -96,26 +118,47 @@ class SoughtBody:
         return torch.stack([rotation_from_vector(turn) for turn in chosen])
 
 
-def sought_bodies(run: schema.RunFile) -> dict[str, SoughtBody]:
+class Bodies(dict[str, SoughtBody]):
+    """The bodies whose joints are sought, by object."""
+
+
+def joints(
+    object: str,
+    joints: Annotated[Mapping[str, Axes], MinLen(1)],
+    mesh: Mesh,
+    bodies: Bodies,
+) -> SkinnedBody:
+    """Joint angles of an object with shape = "body", from those it has.
+
+    Args:
+        object: name in the scene.
+        joints: by name: the components of the rotation vector that are sought, such as ["y"].
+        mesh: of the object.
+        bodies: all that are sought.
+    """
+    return bodies[object].module(object, mesh)
+
+
+def sought_bodies(run: Any) -> Bodies:
     """The bodies of the `[[parameters]]` tables with kind = "body", by object.
 
     Raises:
         InputError: The object is no body, or has no such joint.
     """
-    found = {}
+    found = Bodies()
     for i, parameter in enumerate(run.parameters):
-        if not isinstance(parameter, schema.BodyParameter):
+        if parameter.kind != "body":
             continue
         table = run.scene.get(parameter.object)
         with about(f"parameters[{i}]"):
-            if not isinstance(table, schema.BodyShape):
+            if getattr(table, "shape", None) != "body":
                 raise InputError(
                     f'expected an object with shape = "body", got {parameter.object}; '
                     'give it this shape, or use kind = "pose"'
                 )
-            body = template(table).scaled(table.scale)
+            scaled = template(table).scaled(table.scale)
             for name in parameter.joints:
-                body.joint(name)
+                scaled.joint(name)
         axes = {name: "".join(axes) for name, axes in parameter.joints.items()}
-        found[parameter.object] = SoughtBody(body, axes)
+        found[parameter.object] = SoughtBody(scaled, axes)
     return found

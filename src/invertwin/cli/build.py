@@ -4,42 +4,28 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from invertwin.cli import schema
-from invertwin.cli.bodies import SoughtBody
-from invertwin.cli.materials import fitted, material
+from invertwin.channel import Grid
+from invertwin.cli.bodies import Bodies, SoughtBody
+from invertwin.cli.fit_tables import surrogate as surrogate
 from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import unknown_object
+from invertwin.cli.schema import RunFile, SceneFile, Starts
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
-from invertwin.cli.shape_tables import density_module, shape_mesh, shape_module, shape_terms
+from invertwin.cli.shape_tables import ObjectTable, Placement, given_for, joined, shape_terms
 from invertwin.errors import InputError
-from invertwin.inversion.loss import SpectrumLoss
-from invertwin.inversion.reconstruction import Optimizer
 from invertwin.inversion.regularization import Regularizer
-from invertwin.radar.parameters import RadarPose
 from invertwin.radar.surrogate import Surrogate
-from invertwin.scene import (
-    Mesh,
-    Object,
-    Scene,
-    rigid,
-    rotation_angle,
-    rotation_from_vector,
-    shapes,
-)
-from invertwin.scene.files import CONCRETE, load_mesh, load_scene_xml
-from invertwin.scene.parameters import (
-    Pose,
-    Scale,
-    Translation,
-)
+from invertwin.scene import Mesh, Object, Scene, rigid, rotation_angle, rotation_from_vector
+from invertwin.scene.files import CONCRETE, load_scene_xml
 
 
-def scene(run: schema.RunFile) -> Scene:
+def scene(run: RunFile) -> Scene:
     """The scene of the `[scene.<name>]` tables and of the `[scene_file]`.
 
     Raises:
@@ -57,103 +43,68 @@ def scene(run: schema.RunFile) -> Scene:
                     "expected a name that the scene file does not use, got one of its objects; "
                     "choose another"
                 )
-            built[name] = _object(table)
+            built[name] = table.build()
     for path, name in run.references():
         if name not in built:
             raise InputError(unknown_object(path, name, list(built)))
     return Scene(built)
 
 
-def true_scene(run: schema.RunFile) -> Scene:
+def true_scene(run: RunFile) -> Scene:
     """The scene with the placements and materials of the `[truth.<name>]` tables."""
     found = scene(run)
     for name, truth in run.truth.items():
         changes = {key: value for key, value in truth if value is not None}
         parts = changes.pop("parts", None)
         with about(f"truth.{name}"):
+            shape = {} if parts is None else {"mesh": joined([part.build() for part in parts])}
             if name in run.scene:
-                item = _object(run.scene[name].model_copy(update=changes), parts)
+                item = run.scene[name].model_copy(update=changes).build(**shape)
             else:
                 # Objects of a file stand where it puts them: they are scaled and placed from there.
                 made_of = changes.pop("material", None)
-                item, place = found[name], schema.Placement(**changes)
+                item, place = found[name], Placement(**changes)
                 mesh = Mesh(item.mesh.vertices * place.scale, item.mesh.faces)
-                if parts is not None:
-                    mesh = _joined(parts)
-                item = replace(item, mesh=mesh, pose=_pose(place))
+                item = replace(item, mesh=shape.get("mesh", mesh), pose=place.pose())
                 if made_of is not None:
-                    item = replace(item, material=material(made_of, mesh))
+                    with about("material"):
+                        item = replace(item, material=made_of.build({Mesh: item.mesh}))
         found = Scene({**found.objects, name: item})
     return found
 
 
-def _from_file(table: schema.SceneFile) -> Scene:
-    materials = {name: material(found, None) for name, found in table.materials.items()}
-    others = CONCRETE if table.material is None else material(table.material, None)
+def _from_file(table: SceneFile) -> Scene:
+    materials = {}
+    for name, found in table.materials.items():
+        with about(f"materials.{name}"):
+            materials[name] = found.build()
+    with about("material"):
+        others = CONCRETE if table.material is None else table.material.build()
     return load_scene_xml(table.file, materials, others)
 
 
-def _object(table: schema.SceneObject, parts: Sequence[schema.Part] | None = None) -> Object:
-    velocity = None if table.velocity is None else _float64(table.velocity)
-    mesh = _mesh(table) if parts is None else _joined(parts)
-    return Object(mesh, material(table.material, mesh), _pose(table), velocity)
-
-
-def _pose(table: schema.Placement) -> Tensor:
-    turn = rotation_from_vector(torch.deg2rad(_float64(table.rotation_deg)))
-    return rigid(turn, _float64(table.position))
-
-
-def _mesh(table: schema.Placement) -> Mesh:
-    """The mesh in the object's frame, scaled but not placed."""
-    match table:
-        case schema.Plate():
-            mesh = shapes.plate(table.width, table.height, table.divisions)
-        case schema.Box():
-            mesh = shapes.box(table.size, table.divisions)
-        case schema.Sphere():
-            mesh = shapes.sphere(table.radius, table.subdivisions)
-        case schema.Dihedral():
-            mesh = shapes.dihedral(table.edge)
-        case schema.Trihedral():
-            mesh = shapes.trihedral(table.edge)
-        case schema.Text():
-            mesh = shapes.text(table.text, table.size, table.depth, table.max_edge)
-        case schema.File():
-            mesh = load_mesh(table.file)
-        case schema.Parts():
-            mesh = _joined(table.parts)
-        case _:
-            mesh = shape_mesh(table)
-    return Mesh(mesh.vertices * table.scale, mesh.faces)
-
-
-def _joined(parts: Sequence[schema.Part]) -> Mesh:
-    vertices, faces, count = [], [], 0
-    for part in parts:
-        mesh, pose = _mesh(part), _pose(part)
-        vertices.append(mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
-        faces.append(mesh.faces + count)
-        count += len(mesh.vertices)
-    return Mesh(torch.cat(vertices), torch.cat(faces))
-
-
-def surrogate(table: schema.Surrogate) -> Surrogate:
-    """The smooth model of the `[surrogate]` table, at its starting widths.
-
-    Of the exact chain the response, its mean over phases.
-    """
-    return Surrogate(**table.model_dump(exclude={"exact"}))
-
-
-def loss(table: schema.Loss) -> SpectrumLoss:
+def loss(table: Any) -> Any:
     """How maps are compared, from the `[loss]` table."""
-    return SpectrumLoss(**table.model_dump(exclude_none=True))
+    with about("loss"):
+        return table.build()
 
 
-def optimizer(table: schema.Optimizer) -> Optimizer:
-    """The rates of the `[optimizer]` table."""
-    return Optimizer(**table.model_dump(exclude_none=True))
+def optimizer(table: Any) -> Any:
+    """How a gradient becomes a step, from the `[optimizer]` table."""
+    with about("optimizer"):
+        return table.build()
+
+
+def model(table: Any, grid: Grid, surrogate: Surrogate) -> Any:
+    """The forward model of a `model` table, which plugins add.
+
+    Args:
+        table: The table.
+        grid: Handed over where the model asks for a `Grid`.
+        surrogate: Handed over where the model asks for a `Surrogate`.
+    """
+    with about("model"):
+        return table.build({Grid: grid, Surrogate: surrogate})
 
 
 @dataclass(frozen=True)
@@ -170,9 +121,7 @@ class Start:
 
 
 def builders(
-    tables: Sequence[schema.Parameter],
-    start: Start,
-    objects: Mapping[str, schema.SceneObject] | None = None,
+    tables: Sequence[Any], start: Start, objects: Mapping[str, ObjectTable] | None = None
 ) -> dict[str, Callable[[Scene], nn.Module]]:
     """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order.
 
@@ -181,26 +130,25 @@ def builders(
         start: Where the fit starts.
         objects: The `[scene.<name>]` tables, whose coordinates learned shapes start from.
     """
-    objects = objects or {}
     return {
-        name: partial(_module, table, f"parameters[{i}]", start, objects)
+        name: partial(_module, table, f"parameters[{i}]", start, objects or {})
         for i, (name, table) in enumerate(named(tables).items())
     }
 
 
-def named(tables: Sequence[schema.Parameter]) -> dict[str, schema.Parameter]:
+def named(tables: Sequence[Any]) -> dict[str, Any]:
     """The `[[parameters]]` tables by what stages and variants call them."""
-    names = [getattr(table, "name", None) or table.kind for table in tables]
+    names = [table.name or table.kind for table in tables]
     # Twice the same kind without names is fine where nothing calls them by name.
     names = [f"{n}_{i}" if n in names[:i] else n for i, n in enumerate(names)]
     return dict(zip(names, tables, strict=True))
 
 
 def parameters(
-    tables: Sequence[schema.Parameter],
+    tables: Sequence[Any],
     scene: Scene,
     bodies: Mapping[str, SoughtBody] | None = None,
-    objects: Mapping[str, schema.SceneObject] | None = None,
+    objects: Mapping[str, ObjectTable] | None = None,
 ) -> list[nn.Module]:
     """The modules of the `[[parameters]]` tables; each starts as the object is, or as it says.
 
@@ -213,35 +161,18 @@ def parameters(
 
 
 def _module(
-    table: schema.Parameter,
-    path: str,
-    start: Start,
-    objects: Mapping[str, schema.SceneObject],
-    scene: Scene,
+    table: Any, path: str, start: Start, objects: Mapping[str, ObjectTable], scene: Scene
 ) -> nn.Module:
-    match table:
-        case schema.TranslationParameter():
-            return Translation(table.object, axes="".join(table.axes))
-        case schema.PoseParameter():
-            axes, turns = "".join(table.axes), "".join(table.rotation_axes)
-            return Pose(table.object, axes=axes, rotation_axes=turns)
-        case schema.ScaleParameter():
-            return Scale(table.object)
-        case schema.MaterialParameter():
-            with about(f"{path}.values, material of {table.object}"):
-                return fitted(table, scene[table.object].material)
-        case schema.RadarParameter():
-            return RadarPose()
-        case schema.DensityParameter():
-            with about(path):
-                return density_module(table, scene[table.object])
+    name = getattr(table, "object", None)
+    given: dict[type, object] = {Scene: scene}
+    if name is not None:
+        given = given_for(name, scene, Bodies(start.bodies), objects)
     with about(path):
-        item = objects.get(table.object)
-        return shape_module(table, scene[table.object].mesh, start.bodies, item)
+        return table.build(given)
 
 
 def regularizers(
-    tables: Mapping[str, schema.Parameter],
+    tables: Mapping[str, Any],
     modules: Mapping[str, nn.Module],
     scenes: Mapping[str, Scene],
 ) -> list[Regularizer]:
@@ -259,7 +190,7 @@ def regularizers(
 
 
 def starts(
-    table: schema.Starts,
+    table: Starts,
     scene: Scene,
     truth: Scene,
     seed: int,

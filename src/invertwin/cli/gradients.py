@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -97,7 +98,7 @@ def theta_of(table: schema.GradientParameter, run: schema.RunFile, scene: Scene)
         case "joint":
             return Theta(*_joint(table, item), shape=True)
         case "latent":
-            return Theta(*_latent(table, item, scene), shape=True)
+            return Theta(*_latent(table, item), shape=True)
     low, high, counts = _box(table)
     distance = partial(signed_distance, scene[name].mesh)
     if table.kind == "distance":
@@ -137,10 +138,8 @@ def _value(module: nn.Module, key: str, parameter: Tensor, scene: Scene, value: 
     return getattr(moved[module.object].material, value)  # type: ignore[attr-defined]
 
 
-def _joint(
-    table: schema.GradientParameter, item: schema.SceneObject | None
-) -> tuple[SkinnedBody, dict[str, Tensor]]:
-    if not isinstance(item, schema.BodyShape):
+def _joint(table: schema.GradientParameter, item: Any) -> tuple[SkinnedBody, dict[str, Tensor]]:
+    if _shape(item) != "body":
         raise InputError(f'expected an object with shape = "body", got {table.object}; choose one')
     body = template(item).scaled(item.scale)
     angles = {
@@ -155,15 +154,15 @@ def _joint(
 
 
 def _latent(
-    table: schema.GradientParameter, item: schema.SceneObject | None, scene: Scene
+    table: schema.GradientParameter, item: Any
 ) -> tuple[LinearShape | PriorShape, dict[str, Tensor]]:
     index, name = table.index or 0, table.object or ""
-    whole = isinstance(item, schema.Placement) and item.scale == 1
-    if isinstance(item, schema.Vehicle) and whole and item.max_edge is None:
+    whole = item is not None and item.scale == 1
+    if _shape(item) == "vehicle" and whole and item.max_edge is None:
         start = torch.zeros(max(index + 1, len(item.coefficients)), dtype=torch.float64)
         start[: len(item.coefficients)] = torch.tensor(item.coefficients, dtype=torch.float64)
         module = LinearShape(name, load_vehicle_space(item.folder, item.level), start)
-    elif isinstance(item, schema.Learned) and whole:
+    elif _shape(item) == "prior" and whole:
         prior = load_prior(item.prior)
         start = torch.zeros(prior.latent_size, dtype=torch.float64)
         if item.latent is not None:
@@ -196,3 +195,7 @@ def _bump(table: schema.GradientParameter, lattice: Lattice) -> Tensor:
     assert table.width is not None
     far = lattice.nodes - lattice.nodes.new_tensor(table.center)
     return torch.exp(-far.square().sum(-1) / (2 * table.width**2))
+
+
+def _shape(item: Any) -> str | None:
+    return getattr(item, "shape", None)

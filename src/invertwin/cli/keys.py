@@ -1,26 +1,26 @@
-"""What may be written in a run file, as tables made from the schema itself."""
+"""What may be written in a run file, as tables made from its JSON Schema."""
 
 import difflib
-import types
+import json
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
-
-from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
-from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
+from typing import Any
 
 from invertwin.cli.report import Table
-from invertwin.cli.run_file import inline
-from invertwin.cli.schema import RunFile, Section
+from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
 COLUMNS = ("key", "value", "default", "unit or meaning")
-_NAMED = {
-    **{name: f"{name}.<name>" for name in ("scene", "truth", "variants", "observations")},
-    **{name: f"[{name}]" for name in ("parameters", "stages")},
-}
-_WORDS = {float: "number", int: "integer", bool: "true or false", str: "text"}
-_SIGNS = {Gt: ("gt", ">"), Ge: ("ge", "≥"), Lt: ("lt", "<"), Le: ("le", "≤")}
+_WORDS = {"number": "number", "integer": "integer", "boolean": "true or false", "string": "text"}
+_SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+Schema = dict[str, Any]
+
+
+def json_schema() -> Schema:
+    """The JSON Schema of run files, for editors; kinds and sections of plugins are in it."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **RunFile.model_json_schema(),
+    }
 
 
 def key_tables(section: str | None = None) -> list[Table]:
@@ -32,11 +32,11 @@ def key_tables(section: str | None = None) -> list[Table]:
     Raises:
         InputError: There is no such section.
     """
-    found = dict(_tables())
+    found = dict(_Reader(json_schema()).tables())
     if section is None:
         return [table for tables in found.values() for table in tables]
     wanted = section.strip("[]")
-    names = [name for name in found if _under(_plain(name), wanted)]
+    names = [name for name in found if f"{_plain(name)}.".startswith(f"{wanted}.")]
     if not names:
         known = [_plain(name) for name in found if name]
         close = difflib.get_close_matches(wanted, known, n=1)
@@ -52,137 +52,125 @@ def _plain(name: str) -> str:
     return name.replace(".<name>", "").replace("[", "").replace("]", "")
 
 
-def _under(name: str, wanted: str) -> bool:
-    return name == wanted or name.startswith(wanted + ".")
+class _Reader:
+    """Walks the schema from the top; a table that comes again is referred to."""
 
+    def __init__(self, schema: Schema) -> None:
+        self._top = schema
+        self._models: dict[str, Schema] = schema.get("$defs", {})
+        self._seen: dict[object, str] = {}
 
-def _tables() -> Iterator[tuple[str, list[Table]]]:
-    """Path and tables of every section, the top level first (its path is empty)."""
-    seen: dict[type[Section], str] = {}
-    waiting: list[tuple[str, list[type[Section]]]] = [("", [RunFile])]
-    while waiting:
-        path, models = waiting.pop(0)
-        tables, inner = _section(path, models, seen)
-        yield path, tables
-        # A section comes right before those inside it.
-        waiting = inner + waiting
+    def tables(self) -> Iterator[tuple[str, list[Table]]]:
+        """Path and tables of every section, the top level first (its path is empty)."""
+        waiting: list[tuple[str, list[Schema]]] = [("", [self._top])]
+        while waiting:
+            path, models = waiting.pop(0)
+            inner: list[tuple[str, list[Schema]]] = []
+            yield path, list(self._section(path, models, inner))
+            # A section comes right before those inside it.
+            waiting = inner + waiting
 
+    def _section(
+        self, path: str, models: Sequence[Schema], inner: list[tuple[str, list[Schema]]]
+    ) -> Iterator[Table]:
+        title = f"[{path}]" if path else "top of the file, and its sections"
+        common = set.intersection(*map(_untagged, models)) if len(models) > 1 else set()
+        shared = [key for key in models[0]["properties"] if (key, _note(models[0], key)) in common]
+        if shared:
+            rows = self._rows(path, models[0], shared, inner)
+            yield Table(f"{title}, all kinds", COLUMNS, rows, "")
+        for model in models:
+            keys = [key for key in model.get("properties", {}) if key not in shared]
+            rows = self._rows(path, model, keys, inner)
+            tag = "".join(f" {key} = {value}" for key, value in _tags(model).items())
+            own = title if len(models) == 1 else f"{title}{tag or f' with {keys[0]}'}"
+            document = " ".join(model.get("description", "").split())
+            if rows or document:
+                yield Table(own, COLUMNS, rows, document)
 
-def _section(
-    path: str, models: Sequence[type[Section]], seen: dict[type[Section], str]
-) -> tuple[list[Table], list[tuple[str, list[type[Section]]]]]:
-    for model in models:
-        seen |= {base: path for base in model.__mro__ if issubclass(base, Section)}
-    common = {key for key, _ in set.intersection(*map(_untagged, models))}
-    groups = [(model, [k for k in model.model_fields if k not in common]) for model in models]
-    inner: list[tuple[str, list[type[Section]]]] = []
-    tables = []
-    if len(models) > 1 and common:
-        first = models[0]
-        keys = [key for key in first.model_fields if key in common]
-        groups = [(first, keys), *groups]
-    elif len(models) == 1:
-        groups = [(models[0], list(models[0].model_fields))]
-    for i, (model, keys) in enumerate(groups):
-        shared = len(models) > 1 and bool(common) and i == 0
+    def _rows(
+        self,
+        path: str,
+        model: Schema,
+        keys: Sequence[str],
+        inner: list[tuple[str, list[Schema]]],
+    ) -> list[list[Any]]:
         rows = []
         for key in keys:
-            field = model.model_fields[key]
-            below = _sections(field.annotation)
-            place = ".".join(filter(None, [path, _NAMED.get(key, key) if not path else key]))
-            note = field.description or ""
-            if below and below[0] in seen:
-                note += f"; keys as in [{seen[below[0]]}]"
+            value, note = model["properties"][key], _note(model, key)
+            below = self._below(value)
+            place = f"{path}.{key}" if path else key
+            if "additionalProperties" in value and below and not path:
+                place += ".<name>"
+            elif value.get("type") == "array" and below and not path:
+                place = f"[{key}]"
+            identity = frozenset(str(_tags(m) or m["title"]) for m in below)
+            if below and identity in self._seen:
+                note += f"; keys as in [{self._seen[identity]}]"
             elif below:
                 inner.append((place, below))
-                seen |= dict.fromkeys(below, place)
-            rows.append([key, _values(field), _default(field), note])
-        title = f"[{path}]" if path else "top of the file, and its sections"
-        if shared:
-            title += ", all kinds"
-        elif len(models) > 1:
-            tag = "".join(f" {key} = {value}" for key, value in _tags(model).items())
-            title += f"{tag or ' with ' + _first_key(model, common)}"
-        document = "" if shared or model.__doc__ == Section.__doc__ else model.__doc__ or ""
-        if rows or document:
-            tables.append(Table(title, COLUMNS, rows, " ".join(document.split())))
-    return tables, inner
+                self._seen[identity] = place
+            default = None if key in model.get("required", ()) else _default(value)
+            required = "required" if key in model.get("required", ()) else default
+            rows.append([key, self._described(value), required, note])
+        return rows
+
+    def _below(self, value: Schema) -> list[Schema]:
+        """The tables that a value may be, or hold."""
+        if "$ref" in value:
+            model = self._models[value["$ref"].rpartition("/")[2]]
+            return [model] if "properties" in model else []
+        parts = [*value.get("anyOf", ()), *value.get("oneOf", ())]
+        parts += [value[k] for k in ("items", "additionalProperties") if _is_schema(value.get(k))]
+        found = {id(model): model for part in parts for model in self._below(part)}
+        return list(found.values())
+
+    def _described(self, value: Schema) -> str:
+        parts = [*value.get("anyOf", ()), *value.get("oneOf", ())]
+        if parts:
+            words = [self._described(part) for part in parts if part.get("type") != "null"]
+            return " or ".join(dict.fromkeys(words))
+        if "const" in value or "enum" in value:
+            return ", ".join(map(_shown, value.get("enum", [value.get("const")])))
+        if value.get("type") == "array":
+            item, least = self._described(value.get("items", {})), value.get("minItems")
+            exact = least is not None and least == value.get("maxItems")
+            return f"{least} × {item}" if exact else f"list of {item}"
+        if "$ref" in value or value.get("type", "object") == "object":
+            return "table"
+        signs = [f"{sign} {value[name]:.10g}" for name, sign in _SIGNS.items() if name in value]
+        return " ".join([_WORDS[value["type"]], ", ".join(signs)]).strip()
 
 
-def _untagged(model: type[Section]) -> set[tuple[str, str | None]]:
+def _is_schema(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+def _note(model: Schema, key: str) -> str:
+    return model["properties"][key].get("description", "")
+
+
+def _tags(model: Schema) -> dict[str, str]:
+    """The key that tells a kind from the others, with its one value."""
+    values = model.get("properties", {}).items()
+    return {key: _shown(value["const"]) for key, value in values if "const" in value}
+
+
+def _untagged(model: Schema) -> set[tuple[str, str]]:
     """Keys and what they mean, without the one that names the kind."""
     tags = _tags(model)
-    return {(k, field.description) for k, field in model.model_fields.items() if k not in tags}
+    return {(key, _note(model, key)) for key in model.get("properties", {}) if key not in tags}
 
 
-def _tags(model: type[Section]) -> dict[str, str]:
-    """The key that tells a kind from the others, with its one value."""
-    return {
-        key: inline(get_args(field.annotation)[0])
-        for key, field in model.model_fields.items()
-        if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1
-    }
+def _shown(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
 
 
-def _first_key(model: type[Section], common: set[str]) -> str:
-    return next(key for key in model.model_fields if key not in common)
-
-
-def _sections(kind: Any) -> list[type[Section]]:
-    """The sections that a value may be."""
-    if isinstance(kind, type) and issubclass(kind, Section):
-        return [kind]
-    arguments = get_args(kind)
-    if get_origin(kind) is Annotated:
-        arguments = arguments[:1]
-    return list(dict.fromkeys(s for a in arguments for s in _sections(a)))
-
-
-def _values(field: FieldInfo) -> str:
-    return _described(field.annotation, field.metadata)
-
-
-def _described(kind: Any, limits: Sequence[Any] = ()) -> str:
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _described(arguments[0], [*_flat(arguments[1:]), *limits])
-    if origin is Literal:
-        return ", ".join(map(inline, arguments))
-    if origin in (Union, types.UnionType):
-        words = [_described(a) for a in arguments if a is not type(None)]
-        return " or ".join(dict.fromkeys(words))
-    if origin is list:
-        return _listed(_described(arguments[0]), limits)
-    if origin is dict or (isinstance(kind, type) and issubclass(kind, Section)):
-        return "table"
-    signs = [
-        f"{sign} {getattr(limit, name):.10g}"
-        for limit in limits
-        for mark, (name, sign) in _SIGNS.items()
-        if isinstance(limit, mark)
-    ]
-    return " ".join([_WORDS[kind], ", ".join(signs)]).strip()
-
-
-def _listed(item: str, limits: Sequence[Any]) -> str:
-    least = next((limit.min_length for limit in limits if isinstance(limit, MinLen)), 0)
-    most = next((limit.max_length for limit in limits if isinstance(limit, MaxLen)), None)
-    return f"{most} × {item}" if least == most else f"list of {item}"
-
-
-def _flat(metadata: Sequence[Any]) -> list[Any]:
-    found: list[Any] = []
-    for item in metadata:
-        found += item.metadata if isinstance(item, FieldInfo) else [item]
-    return found
-
-
-def _default(field: FieldInfo) -> str | None:
-    if field.default is PydanticUndefined:
-        return "required"
-    if field.default is None or field.default in ({}, []):
+def _default(value: Schema) -> str | None:
+    default = value.get("default")
+    if default is None or default in ({}, []):
         return None
-    if isinstance(field.default, Section):
-        values = field.default.model_dump(exclude_none=True)
-        return None if len(values) > 1 else inline(values)
-    return inline(field.default)
+    if not isinstance(default, dict):
+        return _shown(default)
+    (name, item), *others = default.items()
+    return None if others else f"{{{name} = {_shown(item)}}}"

@@ -1,24 +1,27 @@
-"""From the material tables of a run file to the library's materials."""
+"""Materials of run files: values as numbers, lists or images, and what is sought of them."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt, Le, MinLen
+from pydantic import GetCoreSchemaHandler, model_validator
 from torch import Tensor
 
-from invertwin.cli import schema
+from invertwin.cli.registry import Form, Group, Registry, Table, number_or_list
+from invertwin.cli.section import InputPath, Section, about, fail, key
 from invertwin.errors import InputError
 from invertwin.scene import (
     Dielectric,
     Itu,
-    Layer,
     Material,
     Mesh,
     Multilayer,
+    Object,
     PerfectConductor,
     RefractingBody,
     RoughConductor,
@@ -27,10 +30,12 @@ from invertwin.scene import (
     Slab,
     Texture,
 )
-from invertwin.scene.material import Value
+from invertwin.scene.material import RANGES, Value
+from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import evaluated
 from invertwin.scene.parameters import MaterialValues
 
+MaterialValue = Literal[tuple(RANGES)]  # type: ignore[valid-type]
 _KINDS: Mapping[str, type[Material]] = {
     "rough_dielectric": RoughDielectric,
     "perfect_conductor": PerfectConductor,
@@ -42,42 +47,107 @@ _KINDS: Mapping[str, type[Material]] = {
 }
 
 
-def material(table: schema.Material, mesh: Mesh | None) -> Material:
-    """The material of a table.
+class TextureFile(Section):
+    """Values from an image, laid over the object as seen along its own z axis."""
+
+    image: InputPath = key(
+        "NumPy file (.npy) of rows of pixels, top row first, read at the middle of each triangle"
+    )
+
+
+def _value_type(name: str, angle: bool) -> Any:
+    """One number, a list of one number per triangle, or a texture, in the range of its name."""
+    number: Any = float
+    if name in RANGES:
+        span = RANGES[name]
+        low, high = (math.degrees(end) if angle else end for end in (span.low, span.high))
+        number = Annotated[float, Gt(low) if span.open_low else Ge(low)]
+        number = number if math.isinf(high) else Annotated[number, Le(high)]
+    return number_or_list(number, Annotated[list[number], MinLen(1)], TextureFile)
+
+
+@dataclass(frozen=True)
+class _ValueOf:
+    """Annotates a key that holds a material value of this name."""
+
+    name: str
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(_value_type(self.name, False))
+
+
+class MediumTable(Table):
+    """A dielectric, by numbers or from the ITU table."""
+
+    itu: Annotated[str, MinLen(1)] | None = key("name in the table of ITU-R P.2040", None)
+    permittivity: Annotated[Any, _ValueOf("permittivity")] | None = key(
+        "relative, real part; needed without `itu`", None
+    )
+    conductivity: Annotated[Any, _ValueOf("conductivity")] | None = key(
+        "S/m; 0 without `itu`", None
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> "MediumTable":
+        if self.itu is None and self.permittivity is None:
+            fail("expected `permittivity`, or `itu` with a name of its table, got neither; add one")
+        return self
+
+    def library_values(self, given: Mapping[type, object]) -> dict[str, Any]:
+        """The arguments; numbers stand before those of the table."""
+        found = super().library_values(given)
+        if self.itu is None:
+            return found
+        return {"permittivity": Itu(self.itu), "conductivity": Itu(self.itu), **found}
+
+
+def register(registry: Registry) -> None:
+    """Adds the materials and what can be sought of them."""
+    registry.group(Group("material"))
+    registry.form(Texture, Form(_value_type, _value))
+    registry.base(Medium, MediumTable)
+    registry.give(Mesh)
+    for name, kind in _KINDS.items():
+        registry.add("material", name, kind)
+
+
+def sought_values(
+    object: str,
+    values: Annotated[Sequence[MaterialValue], MinLen(1)],
+    item: Object,
+    layer: Annotated[int, Ge(0)] | None = None,
+) -> MaterialValues:
+    """Material values that are sought, from the values of the scene table.
 
     Args:
-        table: its values.
-        mesh: the shape that textures are laid over; None if it is not known.
-
-    Raises:
-        InputError: an unknown name of the ITU table, an impossible value, or a broken image.
-    """
-    return _KINDS[table.kind](**_values(table, mesh))
-
-
-def fitted(table: schema.MaterialParameter, material: Any) -> MaterialValues:
-    """The module that fits the named values, from those of the material.
+        object: name in the scene.
+        values: which are sought.
+        item: the object.
+        layer: of a multilayer, from 0: the layer whose values they are.
 
     Raises:
         InputError: the material has no such value, it comes from the ITU table, or it starts at
             the end of its range.
     """
-    holder = _holder(material, table.layer)
-    missing = [name for name in table.values if name not in vars(holder)]
-    if missing:
-        raise InputError(f"expected values of {type(holder).__name__}, got {missing[0]}; remove it")
-    start: dict[str, Any] = {name: getattr(holder, name) for name in table.values}
-    for name, value in start.items():
-        if isinstance(value, Itu):
+    with about(f"values, material of {object}"):
+        holder = _holder(item.material, layer)
+        missing = [name for name in values if name not in vars(holder)]
+        if missing:
             raise InputError(
-                f"expected a number from which {name} starts, got that of the ITU table; "
-                f"give `{name}` beside `itu`"
+                f"expected values of {type(holder).__name__}, got {missing[0]}; remove it"
             )
-    return MaterialValues(table.object, layer=table.layer, **start)
+        start: dict[str, Any] = {name: getattr(holder, name) for name in values}
+        for name, value in start.items():
+            if isinstance(value, Itu):
+                raise InputError(
+                    f"expected a number from which {name} starts, got that of the ITU table; "
+                    f"give `{name}` beside `itu`"
+                )
+        return MaterialValues(object, layer=layer, **start)
 
 
 def value_errors(
-    parameters: Sequence[schema.Parameter], twin: Scene, truth: Scene, frequency: float
+    parameters: Sequence[Any], twin: Scene, truth: Scene, frequency: float
 ) -> dict[str, float]:
     """How far the sought material values are from the truth, relative to it.
 
@@ -89,7 +159,7 @@ def value_errors(
     """
     found: dict[str, float] = {}
     for table in parameters:
-        if not isinstance(table, schema.MaterialParameter):
+        if table.kind != "material":
             continue
         ends = [_holder(scene[table.object].material, table.layer) for scene in (twin, truth)]
         for name in table.values:
@@ -119,48 +189,24 @@ def _number(value: Value | Itu, name: str, frequency: float) -> Tensor:
     return evaluated(value).detach()
 
 
-def _values(table: schema.Section, mesh: Mesh | None) -> dict[str, Any]:
-    """Fields of the library's class by name."""
-    given = {name: getattr(table, name) for name in type(table).model_fields}
-    found: dict[str, Any] = {}
-    name = given.pop("itu", None)
-    if name is not None:
-        found = {"permittivity": Itu(name), "conductivity": Itu(name)}
-    for key, value in given.items():
-        if key == "kind" or value is None:
-            continue
-        if key == "layers":
-            found[key] = [Layer(**_values(layer, mesh)) for layer in value]
-        elif key == "lobe_width_deg":
-            found["lobe_width"] = _radians(_value(key, value, mesh))
-        else:
-            found[key] = _value(key, value, mesh)
-    return found
-
-
-def _value(
-    key: str, value: float | list[float] | schema.TextureFile, mesh: Mesh | None
-) -> float | Tensor | Texture:
+def _value(value: Any, name: str, angle: bool, given: Mapping[type, object]) -> Value:
     if isinstance(value, list):
-        return torch.tensor(value, dtype=torch.float64)
-    if not isinstance(value, schema.TextureFile):
-        return value
-    if mesh is None:
+        row = torch.tensor(value, dtype=torch.float64)
+        return torch.deg2rad(row) if angle else row
+    if not isinstance(value, TextureFile):
+        return math.radians(value) if angle else value
+    mesh = given.get(Mesh)
+    if not isinstance(mesh, Mesh):
         raise InputError(
-            f"expected {key} as a number for the materials of a scene file, got an image; "
+            f"expected {name} as a number for the materials of a scene file, got an image; "
             "give textures to objects of their own"
         )
     try:
         image = np.load(Path(value.image), allow_pickle=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"expected {key} from a NumPy file (.npy), got {value.image} ({error}); "
+            f"expected {name} from a NumPy file (.npy), got {value.image} ({error}); "
             "write it with numpy.save"
         ) from None
-    return Texture.over(image, mesh)
-
-
-def _radians(value: float | Tensor | Texture) -> float | Tensor | Texture:
-    if isinstance(value, Texture):
-        return replace(value, image=torch.deg2rad(value.image))
-    return torch.deg2rad(value) if isinstance(value, Tensor) else math.radians(value)
+    texture = Texture.over(image, mesh)
+    return replace(texture, image=torch.deg2rad(texture.image)) if angle else texture

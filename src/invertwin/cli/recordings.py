@@ -1,9 +1,11 @@
-"""Measured data of run files: captures, raw chirps with their elements and poses."""
+"""Data of run files: simulated, captures, and raw chirps with their elements and poses."""
 
-from pathlib import Path
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
-import torch
-from torch import Tensor
+from annotated_types import Ge
+from pydantic import model_validator
+from torch import Tensor, float64, zeros
 
 from invertwin.capture import (
     Capture,
@@ -11,133 +13,216 @@ from invertwin.capture import (
     ChirpCapture,
     ChirpData,
     described_arrays,
-    openradar,
-    rail_sar,
     ti,
 )
-from invertwin.cli import schema
-from invertwin.cli.run_file import about
-from invertwin.cli.sensors import board_elements, rotations_of, track
+from invertwin.cli.registry import Group, OneOf, Registry, Table
+from invertwin.cli.section import Depth, InputPath, Section, Seed, about, fail, key
+from invertwin.cli.sensors import (
+    BoardTable,
+    Elements,
+    Orientation,
+    Track,
+    board_elements,
+    rotations_of,
+    track,
+)
 from invertwin.errors import InputError
-from invertwin.scene import AntennaArray
+from invertwin.limits import Count, Positive
+from invertwin.radar.radar import Radar
 
-_OPENRADAR_ORIGINAL = "github.com/PreSenseRadar/OpenRadar"
-_RAIL_SAR_ORIGINAL = "github.com/jjimmykang/bwsi-backprojection, trial 6"
+_Board = Annotated[Any, OneOf("board")]
 
 
-def measured(data: schema.MeasuredData) -> Capture:
+class SimulatedData(Section):
+    """Exact signals of the true scene, with noise."""
+
+    kind: Literal["simulated"]
+    density: Positive = key("rough points per m²")
+    samples: Count = key("coherent paths", 200_000)
+    depth: Depth = key("most bounces of a path; with [chirps] it is one", 3)
+    chains: Count = key("paths of two bounces to draw, and of each number above", 200_000)
+    snr_db: float | None = key("signal to noise per sample; without it no noise", None)
+    noise_figure_db: float | None = key("thermal noise of a receiver instead of snr_db", None)
+    seed: Seed | None = key("without it the run's", None)
+
+    @model_validator(mode="after")
+    def _one_noise_level(self) -> "SimulatedData":
+        if self.snr_db is not None and self.noise_figure_db is not None:
+            fail("expected snr_db or noise_figure_db, got both; remove one")
+        return self
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Every chirp of a recording, and what recorded it. Readers return it, or a `Capture`.
+
+    Attributes:
+        chirps: The samples and their settings.
+        elements: Of TX in the order of sending, of RX.
+        positions: Of the radar in every frame [m]; None = the origin.
+        rotations: Of the radar in every frame; None = axes of the world.
+    """
+
+    chirps: ChirpData
+    elements: Elements
+    positions: Tensor | None = None
+    rotations: Tensor | None = None
+
+    def radar(self) -> Radar:
+        """What recorded it, one frame per position."""
+        return self.chirps.radar(*self.elements, self.positions, self.rotations)
+
+    def capture(self, chirp: int | None = None) -> Capture:
+        """One signal per frame and channel: of one chirp, counted from 0, or the mean."""
+        return self.chirps.capture(
+            *self.elements,
+            chirps="mean" if chirp is None else chirp,
+            positions=self.positions,
+            rotations=self.rotations,
+        )
+
+
+class DataTable(Table):
+    """Measured data."""
+
+    channels: InputPath | None = key(
+        "channel calibration that `invertwin look --reflector` wrote; divided out", None
+    )
+
+
+class ChirpTable(DataTable):
+    """Raw chirps of a board, made one signal per frame."""
+
+    chirp: Annotated[int, Ge(0)] | None = key(
+        "number from 0 of one; without it the mean of a frame's, in which movers fade", None
+    )
+    positions: Track | None = key(
+        "m, of the radar in every frame, or one for all; without it the origin", None
+    )
+    orientation: Orientation | None = key(
+        "look_at or rotation_deg; without it the axes of the world", None
+    )
+
+    def build(self, given: Any = None, /, **more: Any) -> Recording:
+        """The recording with its poses."""
+        found: Recording = super().build(given, **more)
+        if self.positions is None and self.orientation is None:
+            return found
+        with about("positions"):
+            positions = zeros(1, 3, dtype=float64)
+            positions = positions if self.positions is None else track(self.positions)
+            if len(positions) == 1:
+                positions = positions.expand(found.chirps.frame_count, 3).clone()
+            rotations = self.orientation and rotations_of(self.orientation, positions)
+        return replace(found, positions=positions, rotations=rotations)
+
+
+def register(registry: Registry) -> None:
+    """Adds the readers; what one returns says which keys it has beside its own."""
+    registry.group(Group("data"))
+    registry.base(Capture, DataTable)
+    registry.base(Recording, ChirpTable)
+    registry.add("data", "simulated", SimulatedData)
+    registry.add("data", "capture", saved)
+    registry.add("data", "dca1000", dca1000)
+    registry.add("data", "arrays", arrays)
+
+
+def saved(file: InputPath) -> Capture:
+    """A capture saved by the library (NetCDF).
+
+    Args:
+        file: path, from the run file's folder.
+    """
+    with about("file"):
+        return Capture.load(file)
+
+
+def dca1000(
+    file: InputPath,
+    board: _Board,
+    settings: InputPath | None = None,
+    lanes: Literal[2, 4] | None = None,
+) -> Recording:
+    """A recording of a TI board through the DCA1000.
+
+    Args:
+        file: .bin, or the .setup.json that names the files.
+        board: whose elements recorded; those in use are what the settings say.
+        settings: .cfg or .mmwave.json; without it what the .setup.json names.
+        lanes: of the LVDS link, where the settings do not say.
+    """
+    with about("file"):
+        chirps = ti.read_recording(file, settings, lanes)
+    return recorded(chirps, board)
+
+
+def arrays(file: InputPath, board: _Board | None = None) -> Recording:
+    """Samples in a NumPy, HDF5 or MATLAB file with a TOML description beside it.
+
+    Args:
+        file: the description.
+        board: whose elements recorded; without it what the description says.
+    """
+    with about("file"):
+        chirps = described_arrays.read_chirps(file)
+    if board is not None:
+        return recorded(chirps, board)
+    with about("board"):
+        return Recording(chirps, described_arrays.described_elements(file, chirps.settings))
+
+
+def recorded(chirps: ChirpData, board: BoardTable) -> Recording:
+    """Chirps and the elements of the board that were in use."""
+    settings = chirps.settings
+    with about("board"):
+        elements = board_elements(board, settings.transmit_order, settings.receivers)
+    return Recording(chirps, elements)
+
+
+def measured(data: Any, path: str = "data") -> Capture:
     """The capture of a `[data]` table that names a recording.
+
+    Args:
+        data: The table.
+        path: Of the table, for errors.
 
     Raises:
         InputError: Files that are missing, damaged or contradict each other.
     """
-    match data:
-        case schema.CaptureData():
-            with about("data.file"):
-                capture = Capture.load(data.file)
-            return _calibrated(capture, data.channels)
-        case schema.RailSarData():
-            with about("data.folder"):
-                return _rail_sar(Path(data.folder))
-    return _of_chirps(data)
+    found = _built(data, path)
+    with about(path):
+        capture = found.capture(data.chirp) if isinstance(found, Recording) else found
+        if data.channels is None:
+            return capture
+        with about("channels"):
+            return ChannelCalibration.load(data.channels).apply(capture)
 
 
-def chirp_capture(data: schema.Data) -> ChirpCapture:
+def chirp_capture(data: Any, path: str = "data") -> ChirpCapture:
     """The recording of a `[data]` table with every chirp of its frames.
+
+    Args:
+        data: The table.
+        path: Of the table, for errors.
 
     Raises:
         InputError: Data without chirps, or files that are missing or damaged.
     """
-    if isinstance(data, schema.OpenRadarData):
-        with about("data.folder"):
-            chirps = _openradar(Path(data.folder))
-        with about("data.board"):
-            device = chirps.radar(*board_elements(data.board))
-    elif isinstance(data, schema.Dca1000Data | schema.ArraysData):
-        with about("data.file"):
-            chirps = _chirps(data)
-        with about("data.board"):
-            elements = _elements(data, chirps)
-        with about("data.positions"):
-            device = chirps.radar(*elements, *_poses(data, chirps.frame_count))
-    else:
+    found = None if data.kind == "simulated" else _built(data, path)
+    if not isinstance(found, Recording):
         raise InputError(
-            f'data.kind: expected data with chirps, got "{data.kind}"; give dca1000, arrays, or '
+            f'{path}.kind: expected data with chirps, got "{data.kind}"; give dca1000, arrays, or '
             "simulated with [chirps]"
         )
-    return ChirpCapture(chirps.beat, device, chirps.settings.chirps)
+    with about(path):
+        radar, chirps = found.radar(), found.chirps
+        if data.channels is not None:
+            with about("channels"):
+                chirps = ChannelCalibration.load(data.channels).apply_to_chirps(chirps)
+    return ChirpCapture(chirps.beat, radar, chirps.settings.chirps)
 
 
-def _openradar(folder: Path) -> ChirpData:
-    if not (folder / openradar.FILE).is_file():
-        raise InputError(
-            f"expected {openradar.FILE} in {folder}, got no such file; it is made from the public "
-            f"recording of {_OPENRADAR_ORIGINAL}: set INVERTWIN_DATA to the folder that holds "
-            f"{folder.name}/"
-        )
-    return openradar.read_chirps(folder)
-
-
-def _rail_sar(folder: Path) -> Capture:
-    if not (folder / rail_sar.FILE).is_file():
-        raise InputError(
-            f"expected {rail_sar.FILE} in {folder}, got no such file; it is made from the public "
-            f"recording {_RAIL_SAR_ORIGINAL}: set INVERTWIN_DATA to the folder that holds "
-            f"{folder.name}/"
-        )
-    return rail_sar.read(folder)
-
-
-def _of_chirps(data: schema.Dca1000Data | schema.ArraysData) -> Capture:
-    with about("data.file"):
-        chirps = _chirps(data)
-    with about("data.board"):
-        transmitters, receivers = _elements(data, chirps)
-    with about("data.positions"):
-        positions, rotations = _poses(data, chirps.frame_count)
-    with about("data"):
-        capture = chirps.capture(
-            transmitters,
-            receivers,
-            chirps="mean" if data.chirp is None else data.chirp,
-            positions=positions,
-            rotations=rotations,
-        )
-    return _calibrated(capture, data.channels)
-
-
-def _calibrated(capture: Capture, file: str | None) -> Capture:
-    """The capture with a channel calibration divided out, where a file names one."""
-    if file is None:
-        return capture
-    with about("data.channels"):
-        return ChannelCalibration.load(file).apply(capture)
-
-
-def _chirps(data: schema.Dca1000Data | schema.ArraysData) -> ChirpData:
-    if isinstance(data, schema.ArraysData):
-        return described_arrays.read_chirps(data.file)
-    return ti.read_recording(data.file, data.settings, data.lanes)
-
-
-def _elements(
-    data: schema.Dca1000Data | schema.ArraysData, chirps: ChirpData
-) -> tuple[AntennaArray, AntennaArray]:
-    settings = chirps.settings
-    if data.board is None:
-        return described_arrays.described_elements(data.file, settings)
-    return board_elements(data.board, settings.transmit_order, settings.receivers)
-
-
-def _poses(data: schema.Recording, frames: int) -> tuple[Tensor | None, Tensor | None]:
-    """Positions and rotations of every frame; a single position is that of all frames."""
-    if data.positions is None and data.orientation is None:
-        return None, None
-    positions = torch.zeros(1, 3, dtype=torch.float64)
-    if data.positions is not None:
-        positions = track(data.positions)
-    if len(positions) == 1:
-        positions = positions.expand(frames, 3).clone()
-    if data.orientation is None:
-        return positions, None
-    return positions, rotations_of(data.orientation, positions)
+def _built(data: Any, path: str) -> Capture | Recording:
+    with about(path):
+        return data.build()

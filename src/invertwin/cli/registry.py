@@ -1,51 +1,546 @@
-"""Sections and commands that other packages add to the command line, by entry points.
+"""What a run file may name: constructors by group and kind, sections, commands; also of plugins.
 
-An entry point of the group `invertwin.plugins` is a function that is given the registry.
+A constructor is a class or a function. Its signature, its annotations and its docstring become a
+table of the run file: keys, defaults, limits and their meaning are stated there and nowhere else.
+Other packages add theirs by an entry point of the group ``invertwin.plugins``, a function that
+takes the `Registry` (docs/extending.md). Nothing here imports torch by itself.
 """
 
-from collections.abc import Callable
+import inspect
+import math
+import pkgutil
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
-from pydantic import BaseModel
+from annotated_types import Len, MinLen
+from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, model_validator
+
+from invertwin.cli.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
+from invertwin.errors import InputError
+from invertwin.limits import RADIANS, Letters
+
+BUILT_IN = (
+    "invertwin.cli.sensors",
+    "invertwin.cli.materials",
+    "invertwin.cli.shape_tables",
+    "invertwin.cli.recordings",
+    "invertwin.cli.fit_tables",
+    "invertwin.datasets.kinds",
+)
+PLUGINS = "invertwin.plugins"
+_PLAIN = (bool, int, float, str, list, tuple, dict)
+
+
+class Table(Section):
+    """A table that a constructor of the library makes something of."""
+
+    made_by: ClassVar[Callable[..., Any]]
+    made_from: ClassVar[Mapping[str, tuple[str | None, Any]]] = {}  # name → key, annotation
+
+    def build(self, given: Mapping[type, object] | None = None, /, **more: Any) -> Any:
+        """What the constructor makes of the table.
+
+        Args:
+            given: Values of its arguments that no run file can hold, by their type.
+            more: Further arguments.
+
+        Raises:
+            InputError: What the constructor refuses; the path begins at this table.
+        """
+        return type(self).made_by(**self.library_values(given or {}) | more)
+
+    def library_values(self, given: Mapping[type, object]) -> dict[str, Any]:
+        """The arguments of the constructor; what the table does not state keeps its default."""
+        found: dict[str, Any] = {}
+        for name, (place, hint) in self.made_from.items():
+            if place is None:
+                kind = next((kind for kind in _members(hint) if kind in given), None)
+                if kind is not None:
+                    found[name] = given[kind]
+            elif getattr(self, place) is not None:
+                with about(place):
+                    found[name] = registry.value(getattr(self, place), hint, name, given)
+        return found
+
+
+class _Checked(Table):
+    """A table whose constructor costs nothing, so that its own checks are made at once."""
+
+    @model_validator(mode="after")
+    def _accepted(self) -> "_Checked":
+        try:
+            self.build()
+        except InputError as error:
+            fail(str(error))
+        return self
+
+
+class _NoKind(Section):
+    """No kind is known; plugins may add some."""
+
+
+class Form(NamedTuple):
+    """How a type of the library is written in a run file.
+
+    Attributes:
+        table: Name of an argument, whether it is an angle → what pydantic checks.
+        value: What was read, the name, whether it is an angle, given values → the library's value.
+    """
+
+    table: Callable[[str, bool], Any]
+    value: Callable[[Any, str, bool, Mapping[type, object]], Any]
+
+
+@dataclass(frozen=True)
+class _Kind:
+    make: Any
+    without: tuple[str, ...]
+    untagged: bool
+    checked: bool | None
+
+
+@dataclass
+class Group:
+    """The kinds of one thing, such as materials.
+
+    Attributes:
+        name: Of the group.
+        tag: The key that names the kind.
+        base: Keys that all of its tables have.
+        product: The type that its constructors make; annotations with it mean the group.
+        default: The kind of a table without `tag`.
+        points: The type of a list that may stand in place of a table.
+        includes: Another group, whose kinds it has, too.
+    """
+
+    name: str
+    tag: str = "kind"
+    base: type[Table] = Table
+    product: Any = None
+    default: str | None = None
+    points: Any = None
+    includes: str | None = None
+    kinds: dict[str, _Kind] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Annotates a key whose value is a table of a group, with a base of its own if it has one."""
+
+    group: str
+    base: type[Table] | None = None
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(registry.union(self.group, self.base))
+
+
+@dataclass(frozen=True)
+class TableOf:
+    """Annotates a key whose value is the table of one constructor."""
+
+    make: Any
+    base: type[Table] = Table
+    without: tuple[str, ...] = ()
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(_table_of_class(self.make, self.base, self.without))
+
+
+@dataclass(frozen=True)
+class NameOf:
+    """Annotates a key whose value is the name of a kind of a group, or of a task."""
+
+    group: str
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(Literal[tuple(registry.names(self.group))])
 
 
 class Registry:
-    """What plugins have added.
-
-    Attributes:
-        sections: Tables of run files, by name.
-        commands: Functions with typer annotations, by name.
-    """
+    """All that a run file may name. `register` functions get it and add to it."""
 
     def __init__(self) -> None:
-        self.sections: dict[str, type[BaseModel]] = {}
+        self.sections: dict[str, Any] = {}
         self.commands: dict[str, Callable[..., Any]] = {}
+        self._groups: dict[str, Group] = {}
+        self._forms: dict[Any, Form] = {}
+        self._bases: dict[type, type[Table]] = {}
+        self._given: set[Any] = set()
+        self._waiting: list[tuple[str, str, _Kind]] | None = []
 
-    def section(self, name: str, model: type[BaseModel]) -> None:
-        """Adds the table `[name]` to run files.
+    def add(
+        self,
+        group: str,
+        kind: str,
+        make: Any,
+        *,
+        without: Sequence[str] = (),
+        untagged: bool = False,
+        checked: bool | None = None,
+    ) -> None:
+        """Adds a kind.
 
         Args:
-            name: Its key.
-            model: What it may hold.
+            group: Such as "material", "shape", "waveform", "pattern", "array", "board", "track",
+                "data", "parameter", "loss", "optimizer" or "model".
+            kind: Its name in run files.
+            make: Its class or function, or "module:name" of it, which is imported when needed.
+            without: Arguments that are no keys.
+            untagged: The key of this name chooses the kind, in place of `kind = "..."`.
+            checked: Whether a table is tried at once; by default if `make` is a plain dataclass.
+
+        Raises:
+            InputError: The group is not known, or has this kind already.
         """
+        entry = _Kind(make, tuple(without), untagged, checked)
+        if self._waiting is not None:
+            self._waiting.append((group, kind, entry))
+        else:
+            self._enter(group, kind, entry)
+
+    def section(self, name: str, model: Any) -> None:
+        """Adds a section to run files: a dataclass or a pydantic model."""
         self.sections[name] = model
 
     def command(self, name: str, function: Callable[..., Any]) -> None:
-        """Adds a command.
+        """Adds a command to the command line, as typer takes it, and a task of its name."""
+        self.commands[name] = function
+
+    def group(self, group: Group) -> None:
+        """Adds a group."""
+        self._groups[group.name] = group
+
+    def form(self, kind: Any, form: Form) -> None:
+        """States how values of a type of the library are written."""
+        self._forms[kind] = form
+
+    def base(self, kind: type, base: type[Table]) -> None:
+        """States a base of the tables of all constructors of a type or its subclasses."""
+        self._bases[kind] = base
+
+    def give(self, *kinds: Any) -> None:
+        """Arguments of these types are no keys: they are handed over when a table is built."""
+        self._given |= set(kinds)
+
+    def names(self, group: str) -> list[str]:
+        """The kinds of a group, or of "task"."""
+        if group == "task":
+            own = ["simulate", "reconstruct", "gradcheck", "loss-scan", "demo"]
+            return list(dict.fromkeys([*own, *self.commands]))
+        return list(self._kinds(group))
+
+    @cache  # noqa: B019 - the only registry lives as long as the program
+    def union(self, group: str, base: type[Table] | None = None) -> Any:
+        """The type of a value that is a table of a group."""
+        found, kinds = self._complete()[group], self._kinds(group)
+        if not kinds:
+            return _NoKind
+        keys = (found.tag, *(name for name, kind in kinds.items() if kind.untagged))
+        members = [Annotated[self.table(group, name, base), Tag(TAG_MARK + name)] for name in kinds]
+        if found.points is not None:
+            members.append(Annotated[found.points, Tag(f"{TAG_MARK}points")])
+        if all(kind.untagged for kind in kinds.values()):
+            keys = keys[1:]
+        return Annotated[_any_of(members), tag_by(keys, found.default)]
+
+    @cache  # noqa: B019 - as above
+    def table(self, group: str, name: str, base: type[Table] | None = None) -> Any:
+        """The table of a kind."""
+        found = self._complete()[group]
+        kind, base = self._kinds(group)[name], base or found.base
+        fields: dict[str, Any] = {}
+        if not kind.untagged:
+            default = name if name == found.default else ...
+            fields[found.tag] = (Literal[name], key("", default))
+        title = _title(name) + _title(base.__name__ if base is not Table else group)
+        return self.table_of(kind.make, title, base, fields, kind.without, checked=kind.checked)
+
+    def table_of(
+        self,
+        make: Any,
+        title: str,
+        base: type[Table] = Table,
+        fields: Mapping[str, Any] | None = None,
+        without: Sequence[str] = (),
+        *,
+        checked: bool | None = False,
+    ) -> Any:
+        """The table of a constructor, made from its signature and docstring.
 
         Args:
-            name: What users type.
-            function: What it does; its arguments have typer annotations.
+            make: Class, function, "module:name", or a model, which is taken as it is.
+            title: Name of the model.
+            base: Keys that it has beside those of the constructor.
+            fields: Further fields, as pydantic's `create_model` takes them.
+            without: Arguments that are no keys.
+            checked: Whether it is built as soon as it is read; None = if it is a dataclass.
         """
-        self.commands[name] = function
+        self._complete()
+        make = pkgutil.resolve_name(make) if isinstance(make, str) else make
+        if isinstance(make, type) and issubclass(make, Section):
+            return make
+        hints, documents = _hints(make), _documents(make)
+        made: dict[str, Any] = dict(fields or {})
+        arguments: dict[str, tuple[str | None, Any]] = {}
+        product = make if isinstance(make, type) else hints.get("return")
+        if isinstance(product, type):
+            own = next((b for kind, b in self._bases.items() if issubclass(product, kind)), base)
+            base = base if issubclass(base, own) else _joined(own, base)
+        for name, parameter in inspect.signature(make).parameters.items():
+            if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+                continue
+            if name in without:
+                continue
+            hint = hints[name]
+            if self._given & set(_members(hint)):
+                arguments[name] = (None, hint)
+                continue
+            place = f"{name}_deg" if _is_angle(hint) else name
+            arguments[name] = (place, hint)
+            if place not in base.model_fields and place not in made:
+                made[place] = self._field(hint, name, parameter.default, documents.get(name, ""))
+        checked = is_dataclass(make) if checked is None else checked
+        if checked and not self._forms.keys() & {m for h in hints.values() for m in _members(h)}:
+            base = _joined(_Checked, base)
+        words = (inspect.getdoc(make) or "").split("\n\n")[0]
+        # Fields of the constructor come first, those of the base after them, but for the tag.
+        model = create_model(title, __base__=base, __doc__=words, **made)
+        model.made_by = staticmethod(make) if inspect.isfunction(make) else make
+        model.made_from = arguments
+        return model
+
+    def _field(self, hint: Any, name: str, default: Any, words: str) -> Any:
+        kind = self.read_type(hint, name)
+        if default is inspect.Parameter.empty:
+            return kind, key(words)
+        if not isinstance(default, _PLAIN):
+            return _any_of([kind, None]), key(words, None)
+        if isinstance(default, float) and _is_angle(hint):
+            default = round(math.degrees(default), 9)
+        if isinstance(default, tuple) or _letters(hint):
+            default = list(default)
+        return kind, key(words, default, validate_default=isinstance(default, str))
+
+    def read_type(self, hint: Any, name: str) -> Any:
+        """What a run file may say for an argument with this annotation."""
+        origin, arguments, members = get_origin(hint), get_args(hint), _members(hint)
+        form = next((self._forms[member] for member in members if member in self._forms), None)
+        group = next((g for g in self._groups.values() if g.product in members), None)
+        if form is not None:
+            return form.table(name, _is_angle(hint))
+        if group is not None and group.product is not None:
+            return Annotated[Any, OneOf(group.name)]
+        if origin is Annotated:
+            letters = _letters(hint)
+            if letters:
+                return Annotated[list[Literal[tuple(letters)]], MinLen(1)]  # type: ignore[valid-type]
+            limits = [item for item in arguments[1:] if item != RADIANS]
+            if float in members and any(_is_array(member) for member in members):
+                number = Annotated[(float, *limits)] if limits else float
+                return number_or_list(number, list[number])  # type: ignore[valid-type]
+            kind = self.read_type(arguments[0], name)
+            return Annotated[(kind, *limits)] if limits else kind  # type: ignore[return-value]
+        if Path in members:
+            return InputPath
+        if hasattr(hint, "dim_str"):
+            return _nested(hint.dim_str.split())
+        if origin in (Union, UnionType):
+            allowed = [part for part in arguments if part is not NoneType]
+            kinds = [self.read_type(part, name) for part in allowed if not _is_array(part)]
+            lists = [list[float]] if any(_is_array(member) for member in members) else []
+            return number_or_list(*kinds, *lists) if len(kinds + lists) > 1 else (kinds + lists)[0]
+        if origin is tuple and arguments[-1] is not Ellipsis:
+            item = self.read_type(arguments[0], name)
+            return Annotated[list[item], Len(len(arguments), len(arguments))]
+        if isinstance(origin, type) and issubclass(origin, Sequence):
+            return list[self.read_type(arguments[0], name)]  # type: ignore[misc]
+        if isinstance(origin, type) and issubclass(origin, Mapping):
+            return dict[str, self.read_type(arguments[1], name)]  # type: ignore[misc]
+        if is_dataclass(hint) and isinstance(hint, type):
+            return _table_of_class(hint)
+        return hint
+
+    def value(self, value: Any, hint: Any, name: str, given: Mapping[type, object]) -> Any:
+        """What the constructor gets for a value of the run file."""
+        if isinstance(value, Table):
+            return value.build(given)
+        form = next((self._forms[m] for m in _members(hint) if m in self._forms), None)
+        if form is not None:
+            return form.value(value, name, _is_angle(hint), given)
+        if _letters(hint):
+            return "".join(value)
+        if _is_angle(hint):
+            value = _radians(value)
+        members = [member for member in _members(hint) if member is not NoneType]
+        hint = members[0] if len(members) == 1 else hint
+        arguments = get_args(hint)
+        if hasattr(hint, "dim_str"):
+            import torch  # what reads a run file up to here must not wait for it
+
+            return torch.tensor(value, dtype=torch.float64)
+        if isinstance(value, list) and arguments:
+            items = [self.value(item, arguments[0], name, given) for item in value]
+            return tuple(items) if get_origin(hint) is tuple else items
+        if isinstance(value, dict) and len(arguments) == 2:
+            return {k: self.value(v, arguments[1], name, given) for k, v in value.items()}
+        return value
+
+    def _kinds(self, group: str) -> dict[str, _Kind]:
+        """The kinds of a group, its own first where they are chosen by a key."""
+        groups = self._complete()
+        own = groups[group].kinds
+        if groups[group].includes is None:
+            return own
+        included = groups[groups[group].includes or ""].kinds
+        told = {name: kind for name, kind in included.items() if not kind.untagged}
+        return told | own | included
+
+    def _enter(self, group: str, kind: str, entry: _Kind) -> None:
+        if group not in self._groups:
+            known = ", ".join(self._groups)
+            raise InputError(f"expected a group among {known}, got {group}; choose one")
+        if kind in self._groups[group].kinds:
+            raise InputError(f"expected a new name of a {group}, got {kind}; choose another")
+        self._groups[group].kinds[kind] = entry
+
+    def _complete(self) -> dict[str, Group]:
+        """The groups, the library's own kinds before those of plugins."""
+        if self._waiting is not None:
+            waiting, self._waiting = self._waiting, None
+            for module in BUILT_IN:
+                pkgutil.resolve_name(f"{module}:register")(self)
+            for entry in waiting:
+                self._enter(*entry)
+        return self._groups
+
+
+registry = Registry()
 
 
 @cache
 def load_plugins() -> Registry:
-    """The registry, after all plugins have seen it."""
-    found = Registry()
-    for entry in entry_points(group="invertwin.plugins"):
-        entry.load()(found)
+    """The registry with what installed packages add; one that fails is a warning, no more."""
+    for entry in entry_points(group=PLUGINS):
+        try:
+            entry.load()(registry)
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            warnings.warn(f"plugin {entry.name} is left out: {reason}", stacklevel=2)
+    return registry
+
+
+def number_or_list(*kinds: Any) -> Any:
+    """A type that is told by its form, a list, a table or else, so that errors name no member."""
+
+    def form(value: Any) -> str:
+        kind = "list" if isinstance(value, list) else "table"
+        return TAG_MARK + (kind if isinstance(value, list | dict | Section) else "number")
+
+    def tag(kind: Any) -> str:
+        bare = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+        if get_origin(bare) is list:
+            return "list"
+        return "table" if isinstance(bare, type) and issubclass(bare, Section) else "number"
+
+    members = [Annotated[kind, Tag(TAG_MARK + tag(kind))] for kind in kinds]
+    return Annotated[_any_of(members), Discriminator(form)]
+
+
+def _any_of(kinds: Sequence[Any]) -> Any:
+    return Union.__getitem__(tuple(kinds))  # type: ignore[attr-defined]
+
+
+def _members(hint: Any) -> tuple[Any, ...]:
+    """The types that an annotation allows, without its limits."""
+    if get_origin(hint) is Annotated:
+        return _members(get_args(hint)[0])
+    if get_origin(hint) in (Union, UnionType):
+        return tuple(member for part in get_args(hint) for member in _members(part))
+    return (hint,)
+
+
+def _marks(hint: Any) -> tuple[Any, ...]:
+    found = hint.__metadata__ if get_origin(hint) is Annotated else ()
+    if get_origin(hint) in (Union, UnionType, Annotated):
+        found += tuple(mark for part in get_args(hint) for mark in _marks(part))
     return found
+
+
+def _is_angle(hint: Any) -> bool:
+    return RADIANS in [mark for mark in _marks(hint) if isinstance(mark, str)]
+
+
+def _letters(hint: Any) -> str:
+    return next((mark.allowed for mark in _marks(hint) if isinstance(mark, Letters)), "")
+
+
+def _is_array(kind: Any) -> bool:
+    """Whether it stands for rows of numbers, as `ArrayLike` has them."""
+    return kind is Sequence or getattr(kind, "__name__", "") in ("Tensor", "ndarray")
+
+
+def _nested(sizes: Sequence[str]) -> Any:
+    if not sizes:
+        return float
+    kind = list[_nested(sizes[1:])]  # type: ignore[misc]
+    return Annotated[kind, Len(int(sizes[0]), int(sizes[0]))] if sizes[0].isdigit() else kind
+
+
+def _radians(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _radians(item) for name, item in value.items()}
+    return [_radians(item) for item in value] if isinstance(value, list) else math.radians(value)
+
+
+def _hints(make: Any) -> dict[str, Any]:
+    plain = isinstance(make, type) and not is_dataclass(make)
+    return get_type_hints(make.__init__ if plain else make, include_extras=True)
+
+
+def _documents(make: Any) -> dict[str, str]:
+    """What `Attributes:` and `Args:` say of each name, bases first."""
+    found: dict[str, str] = {}
+    owners = reversed(make.__mro__[:-1]) if isinstance(make, type) else [make]
+    for owner in owners:
+        texts = [owner.__doc__, owner.__init__.__doc__ if isinstance(make, type) else None]
+        for text in map(inspect.cleandoc, filter(None, texts)):
+            for part in re.findall(r"^(?:Args|Attributes):\n((?:(?: {4}.*)?\n?)+)", text, re.M):
+                for names, words in re.findall(
+                    r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", part, re.M
+                ):
+                    for name in names.split(", "):
+                        found.setdefault(name, " ".join(words.split()).removesuffix("."))
+    return found
+
+
+def _title(name: str) -> str:
+    return "".join(part[:1].upper() + part[1:] for part in re.split(r"\W|_", name))
+
+
+@cache
+def _joined(first: type[Table], second: type[Table]) -> type[Table]:
+    if issubclass(first, second):
+        return first
+    return type(f"{first.__name__}{second.__name__}", (first, second), {"__module__": __name__})
+
+
+@cache
+def _table_of_class(kind: Any, base: type[Table] = Table, without: tuple[str, ...] = ()) -> Any:
+    return registry.table_of(kind, kind.__name__, base, without=without, checked=None)

@@ -1,18 +1,23 @@
-"""Run files in and out: TOML to the schema with errors that help, and back to TOML."""
+"""Run files in and out: TOML to the schema with errors that help, and back to TOML.
+
+The schema, and torch with it, is imported once a file is TOML.
+"""
 
 import difflib
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import tomli_w
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from invertwin.cli.schema import TAG_MARK, RunFile
+from invertwin.cli.section import TAG_MARK
+from invertwin.cli.section import about as about
 from invertwin.errors import InputError
 
 _MOST_ERRORS = 4  # in one line
@@ -26,8 +31,8 @@ _WORDS = {
 }
 
 
-def load_run(path: Path) -> RunFile:
-    """Reads and validates a run file.
+def load_run(path: Path) -> Any:
+    """Reads and validates a run file: a `RunFile` of the schema.
 
     Raises:
         InputError: The file is missing, is not TOML, or does not fit the schema; the message
@@ -51,13 +56,16 @@ def load_run(path: Path) -> RunFile:
     return validate(raw, path)
 
 
-def need(run: RunFile, section: str, command: str, otherwise: str = "add it") -> Any:
+def need(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
     """A section that a command cannot do without.
 
     Raises:
         InputError: The run file does not have it; the message ends with `otherwise`.
     """
     found = getattr(run, section)
+    observed = run.observations.values()
+    if observed and all(getattr(table, section, None) for table in observed):
+        return found
     if found in (None, []):
         raise InputError(
             f"expected a section [{section}] for {command}, got a run file without one; {otherwise}"
@@ -74,22 +82,15 @@ def about_file(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from None
 
 
-@contextmanager
-def about(path: str) -> Iterator[None]:
-    """Errors of the library with the key of the run file that they are about."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def validate(raw: dict[str, Any], source: Path) -> RunFile:
+def validate(raw: dict[str, Any], source: Path) -> Any:
     """The run file of parsed TOML; `source` names it in errors and anchors relative paths.
 
     Raises:
         InputError: It does not fit the schema.
     """
     try:
+        from invertwin.cli.schema import RunFile
+
         return RunFile.model_validate(raw, context={"folder": source.parent})
     except ValidationError as error:
         errors = error.errors(include_url=False)
@@ -97,21 +98,9 @@ def validate(raw: dict[str, Any], source: Path) -> RunFile:
         raise InputError(f"{source}: {' — also '.join([*lines][:_MOST_ERRORS])}") from None
 
 
-def to_toml(run: RunFile) -> str:
+def to_toml(run: Any) -> str:
     """The run file as used, defaults filled in; reading it back gives an equal run file."""
-    lines: list[str] = []
-    for key, value in run.model_dump(exclude_none=True).items():
-        if key in ("scene", "truth", "variants", "observations"):
-            for name, table in value.items():
-                lines += ["", f"[{key}.{_key(name)}]", *_lines(table)]
-        elif isinstance(value, dict):
-            lines += ["", f"[{key}]", *_lines(value)]
-        elif key in ("parameters", "stages"):
-            for table in value:
-                lines += ["", f"[[{key}]]", *_lines(table)]
-        else:
-            lines += _lines({key: value})
-    return "\n".join(lines) + "\n"
+    return tomli_w.dumps(run.model_dump(exclude_none=True))
 
 
 def unknown_object(path: str, name: str, known: Sequence[str]) -> str:
@@ -162,9 +151,9 @@ def _explain(error: ErrorDetails) -> str:
             advice = f"did you mean `{guesses[0]}`?" if guesses else f"add `{keys[0]}`"
             return f"{path}: expected a table with the key {' or '.join(keys)}, got {got}; {advice}"
         case "union_tag_invalid":
-            key = context["discriminator"].removesuffix("()").split(",")[0]
+            key, *others = context["discriminator"].removesuffix("()").split(",")
             tags = [t.strip(f" '{TAG_MARK}") for t in context["expected_tags"].split(",")]
-            allowed = [tag for tag in tags if tag not in ("parts", "file")]
+            allowed = [tag for tag in tags if tag not in (*others, "points")]
             tag = context["tag"].strip(TAG_MARK)
             return (
                 f"{path}.{key}: expected one of {', '.join(allowed)}, got {_shown(tag)}; "
@@ -203,24 +192,3 @@ def _shown(value: Any) -> str:
 def _nearest(given: str, allowed: Sequence[str], otherwise: str) -> str:
     close = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
     return f"did you mean `{close[0]}`?" if close else otherwise
-
-
-def _lines(table: Mapping[str, Any]) -> list[str]:
-    return [f"{_key(key)} = {inline(value)}" for key, value in table.items()]
-
-
-def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else inline(key)
-
-
-def inline(value: Any) -> str:
-    """A value as TOML writes it on one line."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(k)} = {inline(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(inline, value)) + "]"
-    return repr(value)

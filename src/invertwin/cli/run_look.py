@@ -13,14 +13,13 @@ from invertwin.capture import (
     ChirpData,
     described_arrays,
     estimate_channels,
-    openradar,
-    rail_sar,
     ti,
 )
 from invertwin.capture.elements import elements
 from invertwin.channel import Grid
 from invertwin.cli.report import DOPPLER_NOTE, Again, Picture, Table, report_html
 from invertwin.cli.runs import RunFolder
+from invertwin.datasets import openradar, rail_sar
 from invertwin.errors import InputError
 from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
 from invertwin.radar import (

@@ -35,7 +35,8 @@ from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table
 from invertwin.cli.run_file import need
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
-from invertwin.cli.schema import MoverParameter, RunFile, SimulatedData
+from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.shape_tables import Mover
 from invertwin.inversion import Reconstruction
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry import without_clouds
@@ -46,7 +47,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
 
     Starts that an interrupted run has finished are not fitted again.
     """
-    if isinstance(next(iter(run.parameters), None), MoverParameter):
+    if isinstance(next(iter(run.parameters), None), Mover):
         return run_mover(run, folder, console)
     begin = time.perf_counter()
     need(run, "reconstruct", "reconstruct")

@@ -16,9 +16,8 @@ from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw
 from invertwin.cli.report import DOPPLER_NOTE, Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import Chirps as ChirpsTable
-from invertwin.cli.schema import Impairments as ImpairmentsTable
 from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.sensors import ChirpsTable
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span
@@ -146,7 +145,7 @@ def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> tor
         chirps: Timing.
     """
     data = _simulated(run)
-    front = sensors.impairments(run.impairments or ImpairmentsTable(), data)
+    front = sensors.impairments(run.impairments, data)
     with about("chirps"), torch.no_grad():
         return simulate_chirps(
             scene,

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -13,7 +14,6 @@ from invertwin.cli.options import console
 from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.run_file import about_file, load_run, need
 from invertwin.cli.runs import RunFolder, open_run
-from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
 _LOG_SECONDS = 10.0  # between lines of progress in a log
@@ -21,7 +21,7 @@ _LOG_SECONDS = 10.0  # between lines of progress in a log
 
 @contextmanager
 def run_folder(
-    path: Path, runs: dict[str, RunFile], overwrite: bool, resume: bool
+    path: Path, runs: dict[str, Any], overwrite: bool, resume: bool
 ) -> Iterator[RunFolder]:
     """The run's folder; says where the results are, or how to resume.
 
@@ -47,7 +47,7 @@ def run_folder(
 
 def load_runs(
     files: list[Path], seed: int | None, command: str, sections: Sequence[str]
-) -> dict[str, RunFile]:
+) -> dict[str, Any]:
     """Run files by stem, with the sections that the command cannot do without.
 
     Args:
@@ -56,7 +56,7 @@ def load_runs(
         command: The command that is asked for; run files of other tasks are refused.
         sections: What each run file must have.
     """
-    runs: dict[str, RunFile] = {}
+    runs: dict[str, Any] = {}
     for file in files:
         if file.stem in runs:
             raise InputError(

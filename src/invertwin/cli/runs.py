@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from invertwin.cli.run_file import to_toml
-from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
@@ -134,7 +133,7 @@ class RunFolder:
 
 
 def open_run(
-    path: Path, runs: Mapping[str, RunFile], *, overwrite: bool = False, resume: bool = False
+    path: Path, runs: Mapping[str, Any], *, overwrite: bool = False, resume: bool = False
 ) -> RunFolder:
     """Takes a folder for a run and writes the run files as used into it.
 

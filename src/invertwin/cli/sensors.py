@@ -1,65 +1,310 @@
-"""From the tables of a run file to sensors: radars, boards, grids, chirp trains, front ends."""
+"""Radars of run files: waveforms, antennas, boards, tracks, grids, chirp trains, front ends."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Ge, Gt, Le, Len, MinLen
+from pydantic import Tag, model_validator
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.cli import schema
-from invertwin.cli.run_file import about
+from invertwin.cli.registry import Group, OneOf, Registry, Table
+from invertwin.cli.section import (
+    TAG_MARK,
+    Section,
+    Vector,
+    about,
+    check_presence,
+    key,
+    tag_by,
+)
 from invertwin.errors import InputError
-from invertwin.radar.boards import Board, board
-from invertwin.radar.impairments import ADC, Impairments, Leakage, PhaseNoise
-from invertwin.radar.motion import Chirps
+from invertwin.limits import RADIANS, Angle, Count, NonNegative, Positive
+from invertwin.radar import boards, motion
+from invertwin.radar.impairments import Impairments
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import (
     FMCW,
     OFDM,
+    WINDOWS,
     Impulse,
     SampledWaveform,
     SteppedFrequency,
-    Waveform,
 )
 from invertwin.scene import (
     AntennaArray,
     Cosine,
     Isotropic,
     Pattern,
-    Table,
     linear_array,
     look_at,
     planar_array,
     rotation_from_vector,
 )
+from invertwin.scene import Table as PatternTable
 
 _MOST_BINS = 1e9  # 4 GB a map
+Numbers = Annotated[list[Count], MinLen(1)]
+Window = Literal[tuple(WINDOWS)]  # type: ignore[valid-type]
+Elements = tuple[AntennaArray, AntennaArray]
 
 
-def radar(table: schema.Radar) -> Radar:
-    """The radar of the `[radar]` table, one frame per position.
+class ArrayTable(Table):
+    """Antenna elements in the radar frame (x right, y up, z boresight)."""
+
+    center: Vector = key("m, in the radar frame", [0.0, 0.0, 0.0])
+
+    def build(self, given: Any = None, /, **more: Any) -> AntennaArray:
+        """The elements about their centre."""
+        array = super().build(given, **more)
+        return replace(array, positions=array.positions + _float64(self.center))
+
+
+class BoardTable(Table):
+    """Elements on a board's grid of half wavelengths."""
+
+    elevation: Literal[-1, 1] | None = key(
+        "1 = rows grow upwards, -1 = downwards; required where there are several rows", None
+    )
+    azimuth: Literal[-1, 1] = key("1 = columns grow to the right, -1 = to the left", 1)
+    transmitters: Numbers | None = key(
+        "numbers from 1 in the order of sending; without it all, or those of the recording", None
+    )
+    receivers: Numbers | None = key(
+        "numbers from 1, ascending; without it all, or those of the recording", None
+    )
+    pattern: Annotated[Any, OneOf("pattern")] | None = key("of every element; else isotropic", None)
+
+    def board(self) -> boards.Board:
+        """The board."""
+        return super().build()
+
+    def build(self, given: Any = None, /, **more: Any) -> "BoardTable":
+        """Itself: which of its elements are in use may be up to a recording."""
+        return self
+
+
+class LookAt(Section):
+    look_at: Vector = key("m, the point that boresight is turned to")
+
+
+class Turned(Section):
+    rotation_deg: Vector = key("rotation vector, the same at every position")
+
+
+Track = Annotated[Any, OneOf("track")]
+Orientation = Annotated[
+    Annotated[LookAt, Tag(TAG_MARK + "look_at")]
+    | Annotated[Turned, Tag(TAG_MARK + "rotation_deg")],
+    tag_by(("look_at", "rotation_deg")),
+]
+
+
+class RadarTable(Section):
+    """Arrays, waveform and poses; one frame per position."""
+
+    waveform: Annotated[Any, OneOf("waveform")] = key("what is sent")
+    board: Annotated[Any, OneOf("board")] | None = key("antenna elements of a board, or:", None)
+    transmitters: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
+    receivers: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
+    window: Window = key("over the samples of a ramp", "hamming")
+    array_window: Window = key("over the elements", "hamming")
+    positions: Track = key("m, one frame each: a list of points or a track", [[0.0, 0.0, 0.0]])
+    orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
+    shared_visibility: bool | None = key(
+        "what the transmitter sees, the receiver sees; default: when both are within 0.1 m", None
+    )
+
+    @model_validator(mode="after")
+    def _elements(self) -> "RadarTable":
+        arrays = self.board is None
+        wanted = {"transmitters": arrays, "receivers": arrays}
+        check_presence(self, wanted, f"with{'out' if arrays else ''} `board`")
+        return self
+
+
+class GridTable(Section):
+    """The map that is compared: metres of range, direction cosines."""
+
+    range_min: NonNegative = key("m")
+    range_max: Positive = key("m")
+    u_max: Annotated[float, Gt(0), Le(1)] = key("direction cosine to the right", 1.0)
+    v_max: Annotated[float, Gt(0), Le(1)] = key("direction cosine up", 1.0)
+    oversample: Positive = key("bins per resolution cell", 2.0)
+
+
+class ChirpsTable(Table):
+    """Several ramps a frame: objects move between them, and range rates are resolved."""
+
+    count: Annotated[int, Ge(2)] = key("ramps of each transmitter in a frame (loops)")
+    retrace: bool = key(
+        "trace rays anew at every ramp, instead of moving what is seen at the start of the frame",
+        False,
+    )
+
+
+def register(registry: Registry) -> None:
+    """Adds waveforms, antennas, boards and tracks."""
+    registry.group(Group("pattern", product=Pattern))
+    registry.group(Group("waveform"))
+    registry.group(Group("array", base=ArrayTable))
+    registry.group(Group("board", base=BoardTable))
+    points = Annotated[list[Vector], MinLen(1)]
+    registry.group(Group("track", points=points))
+    for name, waveform in (
+        ("fmcw", FMCW),
+        ("stepped", SteppedFrequency),
+        ("ofdm", OFDM),
+        ("impulse", Impulse),
+    ):
+        registry.add("waveform", name, waveform)
+    registry.add("pattern", "isotropic", Isotropic)
+    registry.add("pattern", "cosine", Cosine)
+    registry.add("pattern", "table", measured_pattern, checked=True)
+    registry.add("array", "planar", planar)
+    registry.add("array", "linear", linear_array)
+    registry.add("array", "positions", AntennaArray)
+    registry.add("board", "name", preset, untagged=True)
+    registry.add("board", "tx_places", own_board, untagged=True)
+    for track_kind in (line, arc, grid_track):
+        registry.add("track", track_kind.__name__.removesuffix("_track"), track_kind)
+
+
+def measured_pattern(
+    theta: Annotated[Sequence[float], MinLen(2), RADIANS],
+    gain_db: Sequence[Sequence[float]],
+    phi: Annotated[Sequence[float], MinLen(1), RADIANS] = (0.0,),
+) -> PatternTable:
+    """A measured power pattern: one row per theta, from 0 at boresight, one column per phi.
+
+    Args:
+        theta: from 0 at boresight.
+        gain_db: one row per theta, one column per phi.
+        phi: one: symmetric about boresight.
+    """
+    rows, columns = len(theta), len(phi)
+    if len(gain_db) != rows or any(len(row) != columns for row in gain_db):
+        lengths = sorted({len(row) for row in gain_db})
+        raise InputError(
+            f"expected gain_db with {rows} rows of {columns}, got {len(gain_db)} rows of "
+            f"{' or '.join(map(str, lengths))}; give one row per theta and one column per phi"
+        )
+    return PatternTable(_float64(theta), _float64(phi), 10 ** (_float64(gain_db) / 10))
+
+
+def planar(
+    count: tuple[Count, Count], spacing: tuple[Positive, Positive], pattern: Pattern | None = None
+) -> AntennaArray:
+    """Elements on a grid, y runs fastest.
+
+    Args:
+        count: elements along x, y.
+        spacing: m, along x, y.
+        pattern: of every element, isotropic by default.
+    """
+    return planar_array(*count, *spacing, pattern=pattern)
+
+
+def preset(
+    name: Literal[tuple(boards.BOARDS)],  # type: ignore[valid-type]
+    design_frequency: Positive | None = None,
+) -> boards.Board:
+    """A board that the library knows.
+
+    Args:
+        name: of a preset; xWR serves AWR and IWR.
+        design_frequency: Hz, whose half wavelength is the unit; without it the preset's.
+    """
+    found = boards.board(name)
+    return found if design_frequency is None else replace(found, design_frequency=design_frequency)
+
+
+_Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
+
+
+def own_board(tx_places: _Places, rx_places: _Places, design_frequency: Positive) -> boards.Board:
+    """A board of one's own: a table of places.
+
+    Args:
+        tx_places: column, row of TX1, TX2, … in half wavelengths.
+        rx_places: column, row of RX1, RX2, … in half wavelengths.
+        design_frequency: Hz, whose half wavelength is the unit.
+    """
+    ends = (tuple((x, y) for x, y in places) for places in (tx_places, rx_places))
+    return boards.Board("the board", *ends, design_frequency)
+
+
+def line(start: Vector, stop: Vector, count: Count) -> Tensor:
+    """Positions at even distances on a line.
+
+    Args:
+        start: m.
+        stop: m.
+        count: positions.
+    """
+    first, last = _float64(start), _float64(stop)
+    return first + torch.linspace(0, 1, count, dtype=torch.float64)[:, None] * (last - first)
+
+
+def arc(center: Vector, radius: Positive, start: Angle, stop: Angle, count: Count) -> Tensor:
+    """A level arc about `center`; 0° is on its −z side, 90° on its +x side.
+
+    Args:
+        center: m.
+        radius: m.
+        start: 0 is on the −z side of the centre.
+        stop: 90 is on its +x side.
+        count: positions.
+    """
+    angle = torch.linspace(start, stop, count, dtype=torch.float64)
+    around = torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
+    return _float64(center) + radius * around
+
+
+def grid_track(
+    center: Vector, size: tuple[NonNegative, NonNegative], count: tuple[Count, Count]
+) -> Tensor:
+    """An upright rectangle of positions in the x-y plane through `center`.
+
+    Args:
+        center: m.
+        size: m along x, y.
+        count: positions along x, y.
+    """
+    x, y = (
+        (torch.linspace(-0.5, 0.5, n, dtype=torch.float64) if n > 1 else torch.zeros(1)) * length
+        for n, length in zip(count, size, strict=True)
+    )
+    across, up = torch.meshgrid(x.double(), y.double(), indexing="ij")
+    offsets = torch.stack([across, up, torch.zeros_like(up)], dim=-1)
+    return _float64(center) + offsets.reshape(-1, 3)
+
+
+def radar(table: RadarTable) -> Radar:
+    """The radar of a `[radar]` table, one frame per position.
 
     Raises:
         InputError: Values the radar refuses, or a target straight above a position.
     """
-    with about("radar.waveform"):
-        waveform = _waveform(table.waveform)
-    if table.board is not None:
-        with about("radar.board"):
-            transmitters, receivers = board_elements(table.board)
-    else:
-        assert table.transmitters is not None
-        assert table.receivers is not None
-        with about("radar.transmitters"):
-            transmitters = _array(table.transmitters)
-        with about("radar.receivers"):
-            receivers = _array(table.receivers)
-    positions = track(table.positions)
-    with about("radar.orientation.look_at"):
-        rotations = rotations_of(table.orientation, positions)
     with about("radar"):
+        with about("waveform"):
+            waveform = table.waveform.build()
+        if table.board is not None:
+            with about("board"):
+                transmitters, receivers = board_elements(table.board)
+        else:
+            assert table.transmitters is not None
+            assert table.receivers is not None
+            with about("transmitters"):
+                transmitters = table.transmitters.build()
+            with about("receivers"):
+                receivers = table.receivers.build()
+        positions = track(table.positions)
+        with about("orientation.look_at"):
+            rotations = rotations_of(table.orientation, positions)
         return Radar(
             transmitters,
             receivers,
@@ -72,22 +317,11 @@ def radar(table: schema.Radar) -> Radar:
         )
 
 
-def _waveform(table: schema.Waveform) -> Waveform:
-    match table:
-        case schema.Fmcw():
-            return FMCW(table.start_frequency, table.bandwidth, table.duration, table.samples)
-        case schema.SteppedFrequency():
-            return SteppedFrequency(table.start_frequency, table.step, table.samples, table.dwell)
-        case schema.Ofdm():
-            return OFDM(table.start_frequency, table.spacing, table.subcarriers)
-    return Impulse(table.center_frequency, table.bandwidth)
-
-
 def board_elements(
-    table: schema.Board,
+    table: BoardTable,
     transmitters: Sequence[int] | None = None,
     receivers: Sequence[int] | None = None,
-) -> tuple[AntennaArray, AntennaArray]:
+) -> Elements:
     """TX and RX elements of a `board` table.
 
     Args:
@@ -106,83 +340,34 @@ def board_elements(
                 f"expected no `{name}` with a recording, got {given}; remove the key: the "
                 f"recording's settings say {list(recorded)}"
             )
-    if isinstance(table, schema.PresetBoard):
-        chosen = board(table.name)
-    else:
-        places = [[(x, y) for x, y in end] for end in (table.tx_places, table.rx_places)]
-        chosen = Board("the board", tuple(places[0]), tuple(places[1]), table.design_frequency)
-    return chosen.arrays(
+    return table.board().arrays(
         elevation=table.elevation,
         azimuth=table.azimuth,
-        design_frequency=table.design_frequency,
         transmitters=transmitters or table.transmitters,
         receivers=receivers or table.receivers,
-        pattern=_pattern(table.pattern),
+        pattern=None if table.pattern is None else table.pattern.build(),
     )
 
 
-def _array(table: schema.Array) -> AntennaArray:
-    pattern = _pattern(table.pattern)
-    match table:
-        case schema.PlanarArray():
-            array = planar_array(*table.count, *table.spacing, pattern=pattern)
-        case schema.LinearArray():
-            array = linear_array(table.count, table.spacing, table.axis, pattern=pattern)
-        case _:
-            array = AntennaArray(_float64(table.positions), pattern)
-    return replace(array, positions=array.positions + _float64(table.center))
+def track(table: Any) -> Tensor:
+    """Positions [frame, 3] of a track or of a list of points."""
+    return _float64(table) if isinstance(table, list) else table.build()
 
 
-def _pattern(table: schema.Pattern) -> Pattern:
-    match table:
-        case schema.Cosine():
-            return Cosine(table.exponent)
-        case schema.TablePattern():
-            theta, phi = torch.deg2rad(_float64(table.theta_deg)), _float64(table.phi_deg)
-            return Table(theta, torch.deg2rad(phi), 10 ** (_float64(table.gain_db) / 10))
-    return Isotropic()
-
-
-def track(table: schema.Track) -> Tensor:
-    """Positions [frame, 3] of a track."""
-    match table:
-        case schema.LineTrack():
-            start, stop = _float64(table.start), _float64(table.stop)
-            return start + torch.linspace(0, 1, table.count, dtype=torch.float64)[:, None] * (
-                stop - start
-            )
-        case schema.ArcTrack():
-            angle = torch.deg2rad(
-                torch.linspace(table.start_deg, table.stop_deg, table.count, dtype=torch.float64)
-            )
-            around = torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
-            return _float64(table.center) + table.radius * around
-        case schema.GridTrack():
-            x, y = (
-                (torch.linspace(-0.5, 0.5, n, dtype=torch.float64) if n > 1 else torch.zeros(1))
-                * size
-                for n, size in zip(table.count, table.size, strict=True)
-            )
-            across, up = torch.meshgrid(x.double(), y.double(), indexing="ij")
-            offsets = torch.stack([across, up, torch.zeros_like(up)], dim=-1)
-            return _float64(table.center) + offsets.reshape(-1, 3)
-    return _float64(table)
-
-
-def rotations_of(table: schema.Orientation, positions: Tensor) -> Tensor:
+def rotations_of(table: Any, positions: Tensor) -> Tensor:
     """Columns are the radar's right, up and boresight axes in the world [frame, 3, 3].
 
     Raises:
         InputError: A target straight above a position.
     """
-    if isinstance(table, schema.Turned):
+    if isinstance(table, Turned):
         turn = rotation_from_vector(torch.deg2rad(_float64(table.rotation_deg)))
         return turn.expand(len(positions), 3, 3).clone()
     return look_at(positions, table.look_at)
 
 
-def grid(table: schema.Grid, radar: Radar) -> Grid:
-    """The bins of the `[grid]` table for a radar.
+def grid(table: GridTable, radar: Radar) -> Grid:
+    """The bins of a `[grid]` table for a radar.
 
     Raises:
         InputError: Limits that the radar refuses or does not reach, or a map of a size that only
@@ -207,29 +392,25 @@ def grid(table: schema.Grid, radar: Radar) -> Grid:
     return found
 
 
-def chirps(table: schema.Chirps) -> Chirps:
+def chirps(table: ChirpsTable) -> motion.Chirps:
     """Timing of the `[chirps]` table."""
-    return Chirps(table.count, table.interval, tdm=table.tdm)
+    return table.build()
 
 
-def impairments(table: schema.Impairments, data: schema.SimulatedData) -> Impairments:
+def impairments(table: Any, data: Any) -> Impairments:
     """The front end of the `[impairments]` table, with the noise of the `[data]` table.
+
+    Args:
+        table: None = nothing but that noise.
+        data: Of kind "simulated".
 
     Raises:
         InputError: Values that no front end has.
     """
-    noise, leak, adc = table.phase_noise, table.leakage, table.adc
+    if table is None:
+        return Impairments(snr_db=data.snr_db, noise_figure_db=data.noise_figure_db)
     with about("impairments"):
-        return Impairments(
-            None if noise is None else PhaseNoise(tuple(noise.offsets), tuple(noise.levels)),
-            None if leak is None else Leakage(leak.delay, leak.level_db),
-            gain_std_db=table.gain_std_db,
-            phase_std=math.radians(table.phase_std_deg),
-            snr_db=data.snr_db,
-            noise_figure_db=data.noise_figure_db,
-            transmit_power=table.transmit_power,
-            adc=None if adc is None else ADC(adc.bits, adc.full_scale),
-        )
+        return table.build(snr_db=data.snr_db, noise_figure_db=data.noise_figure_db)
 
 
 def _float64(values: object) -> Tensor:

@@ -1,18 +1,25 @@
-"""Learned and free shapes of a run file: their meshes, modules, and terms of the loss."""
+"""Shapes of run files: objects and their parts, and what is sought of them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import MinLen
 from torch import Tensor, nn
 
-from invertwin.cli import schema
-from invertwin.cli.bodies import SoughtBody, posed
+from invertwin.cli.bodies import Bodies, body, joints
+from invertwin.cli.materials import sought_values
+from invertwin.cli.registry import Group, OneOf, Registry, Table
+from invertwin.cli.section import Counts, InputPath, Vector, about, key
 from invertwin.errors import InputError
 from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
-from invertwin.scene import Mesh, Object, Scene
+from invertwin.limits import Count, NonNegative, Positive
+from invertwin.radar.parameters import RadarPose
+from invertwin.scene import Mesh, Object, Scene, rigid, rotation_from_vector, shapes
+from invertwin.scene.files import load_mesh
 from invertwin.scene.geometry import (
     DensityGrid,
     DistanceGrid,
@@ -24,113 +31,265 @@ from invertwin.scene.geometry import (
     load_prior,
     load_vehicle_space,
 )
-from invertwin.scene.parameters import Vertices
+from invertwin.scene.parameters import Pose, Scale, Translation, Vertices
 
 
-def shape_mesh(table: schema.Placement) -> Mesh:
-    """The mesh of a learned shape, in the object's frame.
+class Placement(Table):
+    """Where a shape stands: scaled, then rotated about its own origin, then moved."""
 
-    Raises:
-        InputError: Files are missing, or more coefficients than the space has.
+    position: Vector = key("m", [0.0, 0.0, 0.0])
+    rotation_deg: Vector = key("rotation vector", [0.0, 0.0, 0.0])
+    scale: Positive = key("factor", 1.0)
+
+    def mesh(self) -> Mesh:
+        """In its own frame, scaled but not placed."""
+        mesh = super().build()
+        return Mesh(mesh.vertices * self.scale, mesh.faces)
+
+    def pose(self) -> Tensor:
+        """Where it stands [4, 4]."""
+        turn = torch.tensor(self.rotation_deg, dtype=torch.float64).deg2rad()
+        return rigid(rotation_from_vector(turn), torch.tensor(self.position, dtype=torch.float64))
+
+    def build(self, given: Any = None, /, **more: Any) -> Any:
+        """The mesh as a part of an object, placed within it."""
+        mesh, pose = self.mesh(), self.pose()
+        return Mesh(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.faces)
+
+
+class _Body(Table):
+    material: Annotated[Any, OneOf("material")] = key("what it is made of")
+    velocity: Vector | None = key("m/s", None)
+
+
+class ObjectTable(Placement, _Body):
+    """A shape with what makes it an object of the scene."""
+
+    def build(self, given: Any = None, /, **more: Any) -> Object:
+        """The object; `mesh` stands in for its shape."""
+        mesh = more["mesh"] if more else self.mesh()
+        with about("material"):
+            material = self.material.build({Mesh: mesh})
+        velocity = self.velocity and torch.tensor(self.velocity, dtype=torch.float64)
+        return Object(mesh, material, self.pose(), velocity)
+
+
+class ParameterTable(Table):
+    """What every parameter may have."""
+
+    name: str | None = key("by which stages and variants call it; without it its kind", None)
+    rate: Positive | None = key("of its own; without it the optimizer's", None)
+
+
+class Mover(ParameterTable):
+    """Place, size, velocity, turn and diffuse share of a rough body in motion.
+
+    Starts at the strongest echo that moves, with the object's size; the data must have chirps.
     """
-    match table:
-        case schema.Vehicle():
-            space = load_vehicle_space(table.folder, table.level)
-            mesh = space.mesh(space.mean.new_tensor(table.coefficients))
-            return mesh if table.max_edge is None else remeshed(mesh, table.max_edge)
-        case schema.Learned():
-            prior = load_prior(table.prior)
-            latent = torch.zeros(prior.latent_size, dtype=torch.float64)
-            return prior.mesh(latent if table.latent is None else latent.new_tensor(table.latent))
-        case schema.BodyShape():
-            return posed(table)
-    raise InputError(f"expected a shape, got {type(table).__name__}; add `shape`")
+
+    kind: Literal["mover"]
+    object: str = key("name in the scene")
+    cells: Count = key("range and Doppler cells to either side of the echo that are fitted", 6)
 
 
-def shape_module(
-    table: schema.Parameter,
-    mesh: Mesh,
-    bodies: Mapping[str, SoughtBody],
-    item: schema.SceneObject | None = None,
-) -> nn.Module:
-    """The module of a shape that is sought, from the object's present mesh.
+def register(registry: Registry) -> None:
+    """Adds shapes, and the modules of what is sought of them."""
+    registry.group(Group("shape", tag="shape", base=Placement))
+    registry.group(Group("object", tag="shape", base=ObjectTable, includes="shape"))
+    registry.group(Group("parameter", base=ParameterTable))
+    registry.give(Scene, Mesh, Object, ObjectTable, Bodies)
+    for name in ("plate", "box", "sphere", "dihedral", "trihedral", "text"):
+        registry.add("shape", name, getattr(shapes, name))
+    registry.add("shape", "vehicle", vehicle)
+    registry.add("shape", "prior", learned)
+    registry.add("shape", "body", body)
+    registry.add("shape", "file", mesh_file, untagged=True)
+    registry.add("object", "parts", joined, untagged=True)
+    for name, make, without in (
+        ("translation", Translation, ("initial",)),
+        ("pose", Pose, ("translation", "rotation")),
+        ("scale", Scale, ("initial",)),
+        ("vertices", vertices, ()),
+        ("lattice", LatticeDeformation, ()),
+        ("distance_grid", distance_grid, ()),
+        ("neural_distance", NeuralDistance, ("seed",)),
+        ("density", density, ()),
+        ("prior", prior, ()),
+        ("shape_space", shape_space, ()),
+        ("body", joints, ()),
+        ("material", sought_values, ()),
+        ("radar_pose", RadarPose, ("translation", "rotation")),
+        ("mover", Mover, ()),
+    ):
+        registry.add("parameter", name, make, without=without)
+
+
+def mesh_file(file: InputPath) -> Mesh:
+    """A mesh file: OBJ, PLY, STL or glTF.
 
     Args:
-        table: The parameter.
-        mesh: Of its object.
-        bodies: Bodies whose joints are sought, by object.
-        item: The table of its object, whose coordinates are where those of its own space start.
-
-    Raises:
-        InputError: A box without volume, files are missing, too many coordinates, or fewer than
-            the object has.
+        file: path, from the run file's folder.
     """
-    match table:
-        case schema.VerticesParameter():
-            if table.smooth > 0:
-                return SmoothVertices(table.object, mesh, table.smooth)
-            return Vertices(table.object, len(mesh.vertices))
-        case schema.LatticeParameter():
-            return LatticeDeformation(table.object, table.low, table.high, table.counts)
-        case schema.DistanceGridParameter():
-            distance: Callable[[Tensor], Tensor] = partial(signed_distance, mesh)
-            return DistanceGrid.sampled(
-                table.object, table.low, table.high, table.counts, distance, table.smooth
-            )
-        case schema.NeuralDistanceParameter():
-            return NeuralDistance(
-                table.object,
-                table.low,
-                table.high,
-                table.counts,
-                radius=table.radius,
-                width=table.width,
-                depth=table.depth,
-                frequency=table.frequency,
-            )
-        case schema.ShapeSpaceParameter():
-            space = load_vehicle_space(table.folder, table.level)
-            return LinearShape(table.object, space, _coefficients(table, item))
-        case schema.BodyParameter():
-            return bodies[table.object].module(table.object, mesh)
-        case schema.PriorParameter():
-            latent = None
-            if isinstance(item, schema.Learned) and item.prior == table.file:
-                latent = item.latent
-            return PriorShape(table.object, load_prior(table.file), latent, table.counts)
-    raise InputError(f"expected a shape, got {table.kind}; choose another kind")
+    return load_mesh(file)
 
 
-def _coefficients(table: schema.ShapeSpaceParameter, item: schema.SceneObject | None) -> Tensor:
-    """Where the coordinates start: as the object's, where it is of the same space; else 0."""
-    found = torch.zeros(table.modes, dtype=torch.float64)
-    if isinstance(item, schema.Vehicle) and (item.folder, item.level) == (
-        table.folder,
-        table.level,
-    ):
-        count = len(item.coefficients)
-        if count > table.modes:
-            raise InputError(
-                f"expected at least as many modes as {table.object} has coefficients, {count}, got "
-                f"{table.modes}; raise modes"
-            )
-        found[:count] = found.new_tensor(item.coefficients)
-    return found
+def joined(parts: Annotated[list[Annotated[Any, OneOf("shape")]], MinLen(1)]) -> Mesh:
+    """Several shapes as one rigid object of one material.
+
+    Args:
+        parts: shapes, each placed within the object.
+    """
+    starts = torch.tensor([0, *(len(part.vertices) for part in parts)]).cumsum(0)
+    faces = [part.faces + int(start) for part, start in zip(parts, starts, strict=False)]
+    return Mesh(torch.cat([part.vertices for part in parts]), torch.cat(faces))
 
 
-def density_module(table: schema.DensityParameter, item: Object) -> DensityGrid:
-    """The module of a density: from the object's present cloud, else faint and even.
+def vehicle(
+    folder: InputPath = "vehicle_prior",
+    level: Literal["coarse", "fine"] = "fine",
+    coefficients: Sequence[float] = (),
+    max_edge: Positive | None = None,
+) -> Mesh:
+    """The body of a car of the public learned space: x ahead, y to the left, z up.
 
-    Raises:
-        InputError: A box without volume.
+    Args:
+        folder: path, from the run file's folder, then from INVERTWIN_DATA.
+        level: of detail.
+        coefficients: of the first modes, in standard deviations; the others are 0.
+        max_edge: m, longest edge of the mesh; without it as in the file.
+    """
+    space = load_vehicle_space(folder, level)
+    mesh = space.mesh(space.mean.new_tensor(coefficients))
+    return mesh if max_edge is None else remeshed(mesh, max_edge)
+
+
+def learned(latent: Sequence[float] | None = None, prior: InputPath | None = None) -> Mesh:
+    """A car of the learned prior: x ahead, y to the left, z up, on the ground z = 0.
+
+    Args:
+        latent: coordinates; without them the mean car.
+        prior: file that `invertwin train-prior` wrote; without it the prior of the package.
+    """
+    found = load_prior(prior)
+    mean = torch.zeros(found.latent_size, dtype=torch.float64)
+    return found.mesh(mean if latent is None else mean.new_tensor(latent))
+
+
+def vertices(
+    object: str, mesh: Mesh, laplacian: NonNegative = 0.0, smooth: NonNegative = 0.0
+) -> nn.Module:
+    """Free vertices, held together by a Laplacian term, or moved in smooth steps.
+
+    Args:
+        object: name in the scene.
+        mesh: of the object.
+        laplacian: weight of the term; 0 = none.
+        smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = none.
+    """
+    if smooth > 0:
+        return SmoothVertices(object, mesh, smooth)
+    return Vertices(object, len(mesh.vertices))
+
+
+def distance_grid(
+    object: str,
+    low: Vector,
+    high: Vector,
+    counts: Counts,
+    mesh: Mesh,
+    smooth: NonNegative = 0.0,
+) -> DistanceGrid:
+    """A signed distance on a grid, whose zero is the surface; starts as the object's mesh.
+
+    Args:
+        object: name in the scene.
+        low: corner of the box, in the object's frame [m].
+        high: the opposite corner [m].
+        counts: nodes along x, y and z.
+        mesh: of the object.
+        smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = none.
+    """
+    distance: Callable[[Tensor], Tensor] = partial(signed_distance, mesh)
+    return DistanceGrid.sampled(object, low, high, counts, distance, smooth)
+
+
+def density(object: str, low: Vector, high: Vector, counts: Counts, item: Object) -> DensityGrid:
+    """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else faint and
+    even. Rates of about 0.1 suit it; measures and pictures show the surface of its usual level.
+
+    Args:
+        object: name in the scene.
+        low: corner of the box, in the object's frame [m].
+        high: the opposite corner [m].
+        counts: nodes along x, y and z.
+        item: the object.
     """
     if item.cloud is not None:
         cloud = item.cloud
-        return DensityGrid(table.object, cloud.low, cloud.high, cloud.density.detach())
-    return DensityGrid.even(table.object, table.low, table.high, table.counts)
+        return DensityGrid(object, cloud.low, cloud.high, cloud.density.detach())
+    return DensityGrid.even(object, low, high, counts)
 
 
-def shape_terms(table: schema.Parameter, module: nn.Module, scene: Scene) -> list[Regularizer]:
+def shape_space(
+    object: str,
+    table: ObjectTable | None = None,
+    folder: InputPath = "vehicle_prior",
+    level: Literal["coarse", "fine"] = "fine",
+    modes: Count = 10,
+    weight: NonNegative = 0.0,
+) -> LinearShape:
+    """Coordinates of the public space of vehicles, from those of its object, else the mean.
+
+    Args:
+        object: name in the scene.
+        table: of the object; its coordinates count where they are of the same space.
+        folder: path, from the run file's folder, then from INVERTWIN_DATA.
+        level: of detail.
+        modes: coordinates that are sought.
+        weight: of ½ Σ z².
+
+    Raises:
+        InputError: files are missing, or fewer modes than the object has coefficients.
+    """
+    start = torch.zeros(modes, dtype=torch.float64)
+    known: Any = table
+    if _shape(known) == "vehicle" and (known.folder, known.level) == (folder, level):
+        count = len(known.coefficients)
+        if count > modes:
+            raise InputError(
+                f"expected at least as many modes as {object} has coefficients, {count}, got "
+                f"{modes}; raise modes"
+            )
+        start[:count] = start.new_tensor(known.coefficients)
+    return LinearShape(object, load_vehicle_space(folder, level), start)
+
+
+def prior(
+    object: str,
+    table: ObjectTable | None = None,
+    weight: NonNegative = 0.0,
+    file: InputPath | None = None,
+    counts: Counts | None = None,
+) -> PriorShape:
+    """Coordinates of the learned prior of vehicles, from those of its object, else the mean car.
+
+    Args:
+        object: name in the scene.
+        table: of the object; its coordinates count where they are of the same prior.
+        weight: of ½ Σ z².
+        file: that `invertwin train-prior` wrote; without it the prior of the package.
+        counts: nodes along x, y and z at which it is meshed; without it every 0.1 m or so.
+    """
+    known: Any = table
+    same = _shape(known) == "prior" and known.prior == file
+    return PriorShape(object, load_prior(file), known.latent if same else None, counts)
+
+
+def _shape(table: Any) -> str | None:
+    return getattr(table, "shape", None)
+
+
+def shape_terms(table: Any, module: nn.Module, scene: Scene) -> list[Regularizer]:
     """What keeps a shape that is sought plausible.
 
     Args:
@@ -138,9 +297,24 @@ def shape_terms(table: schema.Parameter, module: nn.Module, scene: Scene) -> lis
         module: Its module.
         scene: Where the fit starts.
     """
-    match table:
-        case schema.VerticesParameter() if table.laplacian > 0:
-            return [Laplacian(scene, table.object, table.laplacian)]
-        case schema.ShapeSpaceParameter() | schema.PriorParameter() if table.weight > 0:
-            return [LatentNorm(module, table.weight)]
+    if table.kind == "vertices" and table.laplacian > 0:
+        return [Laplacian(scene, table.object, table.laplacian)]
+    if table.kind in ("shape_space", "prior") and table.weight > 0:
+        return [LatentNorm(module, table.weight)]
     return []
+
+
+def given_for(
+    name: str, scene: Scene, bodies: Bodies, objects: Mapping[str, Any]
+) -> dict[type, object]:
+    """What a module may ask for beside its keys.
+
+    Args:
+        name: Of its object.
+        scene: Where the fit starts.
+        bodies: Whose joints are sought.
+        objects: The `[scene.<name>]` tables.
+    """
+    item, table = scene[name], objects.get(name)
+    found: dict[type, object] = {Scene: scene, Object: item, Mesh: item.mesh, Bodies: bodies}
+    return found if table is None else {**found, ObjectTable: table}

@@ -1,7 +1,7 @@
 """Gauss–Newton for few parameters: one derivative of the map in forward mode for each."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -207,7 +207,7 @@ class GaussNewton:
         return self.objective.curvature(fixed, [torch.stack(rows) for rows in tangents])
 
     @contextmanager
-    def _along(self, index: int) -> Iterator[None]:
+    def _along(self, index: int) -> Generator[None, None, None]:
         """Parameters as dual numbers whose tangent is one along a single coordinate."""
         sizes = [parameter.numel() for _, _, parameter in self._slots]
         slot = next(k for k in range(len(sizes)) if index < sum(sizes[: k + 1]))
@@ -269,7 +269,7 @@ def _penalty_curvature(
     slopes = torch.autograd.grad(value, parameters, create_graph=True, allow_unused=True)
     row = torch.cat(
         [
-            (torch.zeros_like(p) if v is None else v).flatten()
+            (torch.zeros_like(p) if v is None else v).flatten()  # pyright: ignore[reportUnnecessaryComparison]
             for v, p in zip(slopes, parameters, strict=True)
         ]
     )

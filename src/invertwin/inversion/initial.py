@@ -153,7 +153,7 @@ def image_points(
     step: float,
     share: float = 0.3,
 ) -> Float64[Tensor, "point 3"]:
-    """The nodes of a backprojected image that hold a share of its strongest echo.
+    """The nodes of a backprojected image that are nearly as bright as its strongest one.
 
     Args:
         capture: the data.
@@ -161,7 +161,7 @@ def image_points(
         low: corner of the image in the world [m].
         high: the opposite corner [m].
         step: of the image [m], about.
-        share: of the strongest node.
+        share: least brightness of a node, relative to the strongest.
 
     Raises:
         InputError: a box without volume or echoes, or a step that is not positive.
@@ -180,7 +180,12 @@ def image_points(
 
 
 def largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Tensor, "part 3"]:
-    """The largest set of points that are linked by steps of at most a gap [m]."""
+    """The largest set of points that are linked by steps of at most a gap [m].
+
+    Args:
+        points: [m].
+        gap: longest step between linked points [m].
+    """
     pairs = KDTree(points.numpy()).sparse_distance_matrix(KDTree(points.numpy()), gap)
     # Distances of zero are no entries: every point is linked to itself by being a node.
     _, label = connected_components(pairs, directed=False)
@@ -238,7 +243,12 @@ def fit_rectangle(
 def principal_rectangle(
     points: Float64[Tensor, "point 3"], *, ground: Ground | None = None
 ) -> Rectangle:
-    """The rectangle along the points' principal axes in the ground plane."""
+    """The rectangle along the points' principal axes in the ground plane.
+
+    Args:
+        points: [m].
+        ground: the plane; None = the default `Ground`.
+    """
     plane = ground or Ground()
     flat = points[:, plane.level]
     _, axes = torch.linalg.eigh(torch.cov(flat.T))
@@ -344,6 +354,11 @@ def guess_scale(item: Object, found: Rectangle, *, ground: Ground | None = None)
     """Length of a rectangle over that of an object, both along their longer side.
 
     The longer side is the one that is seen from most places; the other often hides its far end.
+
+    Args:
+        item: the object.
+        found: rectangle around its points.
+        ground: the plane; None = the default `Ground`.
     """
     plane = ground or Ground()
     extent = item.vertices.detach()[:, plane.level]

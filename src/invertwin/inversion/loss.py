@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
 
 _GAIN_STEPS = 8  # of the fixed point; from the second on the gain moves by parts in a thousand
 
@@ -50,10 +51,10 @@ class SpectrumLoss:
     """
 
     kind: Literal["mse", "likelihood"] = "mse"
-    levels: int = 3
+    levels: Count = 3
     gain: Literal["fitted", "one"] = "fitted"
     background: Literal["none", "level", "static"] = "none"
-    floor: float = 0.01
+    floor: Positive = 0.01
 
     def __post_init__(self) -> None:
         if self.kind not in ("mse", "likelihood"):
@@ -161,13 +162,17 @@ class SpectrumLoss:
                 mixed = torch.stack([(a * b).mean() / n for (a, b), n in both]).sum()
                 power = torch.stack([(a * a).mean() / n for (a, _), n in both]).sum()
                 return (mixed / power.clamp_min(1e-30)).clamp_min(0.0)
+            # The maps are large: what does not change is computed once, the rest in place.
+            lit = [a.clamp_min(0.0) for a, _ in pairs]
+            data = [
+                a * (b.clamp_min(0.0) + self.floor) for a, (_, b) in zip(lit, pairs, strict=True)
+            ]
             for _ in range(_GAIN_STEPS):
                 up, down = torch.zeros(()), torch.zeros(())
-                for a, b in pairs:
-                    lit = a.clamp_min(0.0)
-                    model = gain * lit + self.floor
-                    up = up + (lit * (b.clamp_min(0.0) + self.floor) / model.square()).mean()
-                    down = down + (lit / model).mean()
+                for a, b in zip(lit, data, strict=True):
+                    inverse = (a * gain).add_(self.floor).reciprocal_()
+                    down = down + (a * inverse).mean()
+                    up = up + inverse.square_().mul_(b).mean()
                 gain = gain * (up / down.clamp_min(1e-30))
         return gain
 

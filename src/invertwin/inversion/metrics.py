@@ -8,19 +8,14 @@ import igl
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from invertwin.channel import Link
-from invertwin.channel.bridge import flatten
-from invertwin.channel.rays import Shot, visible
+from invertwin.channel import visible_points
 from invertwin.errors import InputError
-from invertwin.scene.antenna import Isotropic
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
-from invertwin.scene.material import PerfectConductor
+from invertwin.scene.checks import ArrayLike, checked_count, checked_number
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.scene import Object, Scene
 
 POINTS = 20_000  # of each surface
 VOXEL = 0.02  # [m]
@@ -97,7 +92,7 @@ def compare_shapes(
     masks = [np.ones(count, dtype=bool)] * 2
     if seen_from is not None:
         masks = [
-            seen_points(points, mesh, seen_from).numpy()
+            visible_points(mesh, points, seen_from).numpy()
             for (points, _), mesh in zip(clouds, (found, truth), strict=True)
         ]
         for name, mask in zip(("found", "true"), masks, strict=True):
@@ -190,37 +185,9 @@ def surface_points(
     if not solid.area > 0:
         raise InputError("expected a surface with area, got none; check the mesh")
     number = checked_count(count, "points", 1)
-    points, rows = trimesh.sample.sample_surface(solid, number, seed=[seed, stream])
+    points, rows = trimesh.sample.sample_surface(solid, number, seed=[seed, stream])[:2]
     normals = solid.face_normals[rows]
     return torch.from_numpy(np.array(points)), torch.from_numpy(np.array(normals))
-
-
-def seen_points(
-    points: Float64[Tensor, "n 3"], mesh: Mesh, positions: ArrayLike
-) -> Bool[Tensor, " n"]:
-    """Which points of a surface are seen from at least one position, past the rest of the mesh.
-
-    Args:
-        points: on the surface [m].
-        mesh: the surface, in the frame of the points.
-        positions: [p, 3], metres.
-
-    Raises:
-        InputError: wrong shapes, or NaN.
-    """
-    places = checked_tensor(positions, (None, 3), "radar positions [m]", "give x, y, z of each")
-    scene = Scene({"surface": Object(Mesh(mesh.vertices.detach(), mesh.faces), PerfectConductor())})
-    turns = torch.eye(3, dtype=torch.float64).expand(len(places), 3, 3)
-    antenna = Isotropic()
-    # Visibility does not depend on the wavelength.
-    link = Link(places, places, turns, antenna, antenna, 1e-2, True)
-    shot = Shot(flatten(scene, link.wavelength), link)
-    seen = torch.zeros(len(points), dtype=torch.bool)
-    for place in places:
-        hidden = torch.nonzero(~seen)[:, 0]
-        clear = visible(shot, points[hidden], place.expand(len(hidden), 3))
-        seen[hidden[clear]] = True
-    return seen
 
 
 def _shared_volume(

@@ -3,14 +3,16 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Lt
 from torch import nn
 
 from invertwin.errors import InputError
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.loss import Objective
+from invertwin.limits import Count, NonNegative, Positive
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,11 @@ class Optimizer:
     """
 
     kind: Literal["adam", "sgd", "gauss_newton"] = "adam"
-    rate: float = 0.03
-    rotation_rate: float | None = None
-    final_rate: float | None = None
-    momentum: float = 0.9
-    curvature_every: int = 1
+    rate: Positive = 0.03
+    rotation_rate: Positive | None = None
+    final_rate: NonNegative | None = None
+    momentum: Annotated[float, Ge(0), Lt(1)] = 0.9
+    curvature_every: Count = 1
 
     def __post_init__(self) -> None:
         if self.kind not in ("adam", "sgd", "gauss_newton") or not self.rate > 0:

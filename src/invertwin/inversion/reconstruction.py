@@ -91,7 +91,7 @@ def reconstruct(
         {name: item.made(o.sensor) for name, item in found.items()}
         for o, found in zip(watched, own, strict=True)
     ]
-    begun, sought, fit = scene, unknowns, None
+    begun, sought, fit, status = scene, unknowns, None, "budget"
     history: list[dict[str, Any]] = []
     modules, terms = _made(begun, sought)
     free = _Free([modules, *sensor_modules])

@@ -25,7 +25,7 @@ _FLAT = 0.5  # least cosine between two triangles whose edge is flipped: corners
 
 
 def remeshed(mesh: Mesh, edge: float) -> Mesh:
-    """The same surface with edges of about one length; topology and borders stay.
+    """Remesh a surface with edges of about one length; topology and borders stay.
 
     Too long edges are split, too short ones collapsed, others flipped where vertices then have
     closer to six neighbours, and vertices moved along the surface to the middle of theirs.
@@ -67,8 +67,8 @@ def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tenso
     if not len(points):
         return torch.zeros(0, dtype=torch.float64)
     places, surface = points.detach().numpy(), _arrays(mesh)
-    square, _, _ = igl.point_mesh_squared_distance(places, *surface)
-    inside = igl.winding_number(*surface, places) > 0.5
+    square = igl.point_mesh_squared_distance(places, *surface)[0]
+    inside = np.asarray(igl.winding_number(*surface, places)) > 0.5
     return torch.from_numpy(np.where(inside, -1.0, 1.0) * np.sqrt(square))
 
 
@@ -79,7 +79,7 @@ def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:
         mesh: the surface.
         points: in the mesh's frame [p, 3], metres.
     """
-    return igl.point_mesh_squared_distance(points, *_arrays(mesh))[2]
+    return np.asarray(igl.point_mesh_squared_distance(points, *_arrays(mesh))[2])
 
 
 def _arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

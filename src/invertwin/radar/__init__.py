@@ -1,4 +1,4 @@
-"""Channel to radar data: the exact signal chain and its smooth surrogate, in plain torch."""
+"""Channel to radar data: exact signals and their smooth surrogate, in plain torch."""
 
 from invertwin.radar.backprojection import backproject_beat
 from invertwin.radar.boards import BOARDS, Board, board

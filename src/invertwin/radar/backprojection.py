@@ -78,7 +78,12 @@ def backproject_beat(
 def distances(
     places: Float64[Tensor, "place 3"], points: Float64[Tensor, "point 3"]
 ) -> Float64[Tensor, "place point"]:
-    """From every place to every point [m]."""
+    """Distances from every place to every point [m].
+
+    Args:
+        places: [m].
+        points: [m].
+    """
     # The matrix product that cdist takes by default cancels digits.
     return torch.cdist(places, points, compute_mode="donot_use_mm_for_euclid_dist")
 
@@ -86,7 +91,12 @@ def distances(
 def between_samples(
     samples: Complex128[Tensor, "row sample"], index: Float64[Tensor, "row point"]
 ) -> Complex128[Tensor, "row point"]:
-    """Linear interpolation along each row at an index that may have a fraction."""
+    """Linear interpolation along each row at an index that may have a fraction.
+
+    Args:
+        samples: Rows of samples.
+        index: Where in each row, in samples; fractions allowed.
+    """
     cell = index.detach().floor().clamp(0, samples.shape[1] - 2).long()
     before, after = samples.gather(1, cell), samples.gather(1, cell + 1)
     return before + (after - before) * (index - cell)

@@ -199,9 +199,9 @@ class _SignalProjector(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         values, vectors, chosen = ctx.saved_tensors
-        gradient = 0.5 * (grads[0] + grads[0].mH)
+        gradient = 0.5 * (grad_outputs[0] + grad_outputs[0].mH)
         return _projector_change(values, vectors, chosen, gradient), None
 
     @staticmethod

@@ -48,7 +48,12 @@ def velocity_axis(
 
 
 def velocity_span(radar: Radar, chirps: Chirps) -> float:
-    """Range rates that differ by this look the same, twice the maximum speed [m/s]."""
+    """Twice the maximum speed [m/s]; range rates that differ by it look alike.
+
+    Args:
+        radar: Its wavelength and transmitters.
+        chirps: Their interval and order.
+    """
     return 2 * chirps.max_speed(radar.waveform.wavelength, len(radar.transmitters.positions))
 
 
@@ -180,6 +185,15 @@ def range_doppler_angle(
     """Power over range rate, range and direction (Bartlett), transmitters' turns compensated.
 
     ``range_doppler``, ``compensate_tdm``, then ``beamform``; see there.
+
+    Args:
+        beat: Signals of trains of chirps.
+        radar: What recorded them.
+        grid: Bins of range and direction.
+        chirps: Their interval and order.
+        window: Taper along the chirps.
+        bins: Number of range rates; None = number of chirps.
+        fold: How often each range rate has wrapped around, see ``compensate_tdm``.
 
     Raises:
         InputError: As those.

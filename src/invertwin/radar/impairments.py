@@ -9,14 +9,17 @@ errors of the channels, thermal noise, then the converter.
 import math
 import warnings
 from dataclasses import dataclass, fields, replace
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le, Lt
 from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Paths
 from invertwin.errors import InputError
+from invertwin.limits import RADIANS, NonNegative, Positive
 from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
@@ -45,7 +48,7 @@ class PhaseNoise:
             levels of 0 dBc/Hz and more.
     """
 
-    offsets: tuple[float, ...]
+    offsets: tuple[Positive, ...]
     levels: tuple[float, ...]
 
     def __post_init__(self) -> None:
@@ -93,8 +96,8 @@ class Leakage:
         InputError: A delay that is not one of a board, or more received than sent.
     """
 
-    delay: float
-    level_db: float
+    delay: NonNegative
+    level_db: Annotated[float, Lt(0)]
 
     def __post_init__(self) -> None:
         if not 0 <= self.delay <= 1e-6:
@@ -122,8 +125,8 @@ class ADC:
         InputError: Impossible bits or full scale.
     """
 
-    bits: int
-    full_scale: float
+    bits: Annotated[int, Ge(2), Le(32)]
+    full_scale: Positive
 
     def __post_init__(self) -> None:
         if not 2 <= self.bits <= 32:
@@ -160,11 +163,11 @@ class Impairments:
 
     phase_noise: PhaseNoise | None = None
     leakage: Leakage | None = None
-    gain_std_db: float = 0.0
-    phase_std: float = 0.0
+    gain_std_db: NonNegative = 0.0
+    phase_std: Annotated[NonNegative, RADIANS] = 0.0
     snr_db: float | None = None
     noise_figure_db: float | None = None
-    transmit_power: float = 0.01
+    transmit_power: Positive = 0.01
     adc: ADC | None = None
 
     def __post_init__(self) -> None:
@@ -211,7 +214,7 @@ class Impairments:
     def apply(
         self, beat: Complex128[Tensor, "frame *chirp tx rx sample"], radar: Radar, *, seed: int
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-        """The same for a beat signal, of frames or of trains; all but phase noise.
+        """Impair a beat signal, of frames or of trains, with everything except phase noise.
 
         Args:
             beat: Without impairments.

@@ -11,6 +11,7 @@ from torch import Tensor
 from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
 from invertwin.radar.nonuniform import (
     beat_of_delays,
     instants_derivative,
@@ -44,8 +45,8 @@ class Chirps:
             every transmitter once, or one of transmitters that send at once.
     """
 
-    count: int
-    interval: float
+    count: Count
+    interval: Positive
     tdm: bool = True
     order: tuple[int, ...] | None = None
 
@@ -89,7 +90,12 @@ class Chirps:
         return times[:, torch.argsort(torch.tensor(self.order))]
 
     def max_speed(self, wavelength: float, transmitters: int) -> float:
-        """Range rate beyond which Doppler is ambiguous, λ/(4 T) [m/s]."""
+        """Range rate beyond which Doppler is ambiguous, λ/(4 T) [m/s].
+
+        Args:
+            wavelength: [m].
+            transmitters: Number that take turns.
+        """
         turns = transmitters if self.tdm else 1
         return wavelength / (4 * self.interval * turns)
 
@@ -146,7 +152,13 @@ def every_ramp(
     transmitters: int,
     ramp: Callable[[float, list[int]], Complex128[Tensor, "frame sender rx sample"]],
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
-    """The signals of all ramps: ``ramp`` is called with each start [s] and who sends then."""
+    """Signals of all ramps of a train.
+
+    Args:
+        chirps: When ramps start, and who sends.
+        transmitters: Number of transmitters.
+        ramp: Signals of one ramp, from its start [s] and the transmitters that send then.
+    """
     rows = []
     for starts in chirps.times(transmitters).tolist():
         signals = {}
@@ -205,16 +217,21 @@ class Train:
     def ramp(
         self, start: float, senders: Sequence[int]
     ) -> Complex128[Tensor, "frame sender rx sample"]:
-        """What all receivers record of one ramp of transmitters that send at once [s]."""
+        """Record one ramp with all receivers.
+
+        Args:
+            start: Of the ramp [s].
+            senders: Transmitters that send at once.
+        """
         paths, waveform = self.paths, sampled(self.radar)
         device = paths.delay.device
         centers = [centre.to(device) for centre in (self.radar.link().tx, self.radar.link().rx)]
-        chain = paths.last - paths.first
-        legs = _length(paths.first, chain, centers[0][paths.frame], centers[1][paths.frame])
-        inner = paths.delay - legs / SPEED_OF_LIGHT
+        span = paths.last - paths.first
+        segments = _length(paths.first, span, centers[0][paths.frame], centers[1][paths.frame])
+        inner = paths.delay - segments / SPEED_OF_LIGHT
         placed = self._placed(start, 1 if sample_interval(waveform) == 0 else 3)
         if len(placed) > 1 and len(paths):
-            length = _length(placed, chain, centers[0][paths.frame], centers[1][paths.frame])
+            length = _length(placed, span, centers[0][paths.frame], centers[1][paths.frame])
             cycles = phase_cycles((length / SPEED_OF_LIGHT).detach(), waveform)
             bend = math.pi * float((cycles[0] - 2 * cycles[1] + cycles[2]).abs().max())
             count = _instants(bend)
@@ -225,15 +242,18 @@ class Train:
             rows = torch.nonzero(paths.frame == frame)[:, 0]
             points = self._when_scattered(placed[:, rows], centers[1][frame])
             coefficient, rest = paths.coefficient[rows], inner[rows]
-            ends = points + chain[rows]
+            ends = points + span[rows]
             back = [(ends - place).norm(dim=-1) for place in receivers[frame]]
             for tx, found in zip(senders, signals, strict=True):
                 forth = (points - transmitters[frame, tx]).norm(dim=-1)
                 channels = [
                     beat_of_delays(
-                        coefficient, (forth + leg) / SPEED_OF_LIGHT + rest, waveform, self.tolerance
+                        coefficient,
+                        (forth + segment) / SPEED_OF_LIGHT + rest,
+                        waveform,
+                        self.tolerance,
                     )
-                    for leg in back
+                    for segment in back
                 ]
                 found.append(torch.stack(channels))
         return torch.stack([torch.stack(found) for found in signals], dim=1)
@@ -264,8 +284,8 @@ def _uniform(paths: Paths) -> Places:
     return lambda time: paths.first + velocity * time
 
 
-def _length(first: Tensor, chain: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
-    return (first - tx).norm(dim=-1) + (first + chain - rx).norm(dim=-1)
+def _length(first: Tensor, span: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
+    return (first - tx).norm(dim=-1) + (first + span - rx).norm(dim=-1)
 
 
 def _instants(bend: float) -> int:

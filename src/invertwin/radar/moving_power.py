@@ -1,4 +1,4 @@
-"""The smooth twin of range-Doppler-angle processing: what moving power looks like to a radar."""
+"""A smooth surrogate of range-Doppler-angle processing: moving power as a radar shows it."""
 
 import math
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def moving_power(
 ) -> Float64[Tensor, "frame velocity range u v"]:
     """Expected power over range rate, range and direction, as ``range_doppler_angle`` shows it.
 
-    Every path is spread by what the exact chain does to a point in motion: the power responses of
+    Every path is spread by what exact signals show of a point in motion: the power responses of
     the samples' window over range and of the chirps' window over range rate, and Bartlett
     beamforming of its plane wave. Transmitters in turn are compensated for the rate of the bin, not
     for that of the point, and a range rate shifts the range that a ramp shows. For independent

@@ -47,7 +47,12 @@ def _interpolation(samples: int, count: int) -> Float64[Tensor, "instant sample"
 
 
 def instants_derivative(samples: int, count: int) -> Float64[Tensor, "instant instant"]:
-    """Derivatives per sample at the instants, from values there."""
+    """Matrix of derivatives per sample at the instants, from values there.
+
+    Args:
+        samples: In a ramp.
+        count: Number of instants, as in ``ramp_instants``.
+    """
     places, weight = ramp_instants(samples, count), _weights(count)
     apart = places[:, None] - places
     matrix = (weight / weight[:, None]) / (apart + torch.eye(count, dtype=torch.float64))
@@ -98,7 +103,12 @@ def beat_of_delays(
 def phase_cycles(
     delay: Float64[Tensor, "instant path"], waveform: SampledWaveform
 ) -> Float64[Tensor, "instant path"]:
-    """Phase of paths at ``ramp_instants``, ``f τ − S τ²/2``."""
+    """Phase of paths at ``ramp_instants``, ``f τ − S τ²/2`` [cycles].
+
+    Args:
+        delay: At the instants [s].
+        waveform: Frequencies of the samples.
+    """
     instants = ramp_instants(waveform.samples, len(delay)).to(delay.device)
     frequency = waveform.start_frequency + waveform.step * instants
     return (frequency[:, None] - (0.5 * waveform.residual_slope) * delay) * delay
@@ -126,9 +136,9 @@ class NonUniformSum(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         coefficient, rest, turns = ctx.saved_tensors
-        grad, phasor = grads[0], _phasor(rest)
+        grad, phasor = grad_outputs[0], _phasor(rest)
         with_turns = ctx.needs_input_grad[2]
         if with_turns:
             grad = torch.cat([grad, grad * _places(ctx.samples, turns)])

@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from invertwin.limits import Axes
 from invertwin.radar.radar import Radar
 from invertwin.scene.checks import ArrayLike
 from invertwin.scene.parameters import ORIGIN, RigidMotion
@@ -23,8 +24,8 @@ class RadarPose(RigidMotion):
         self,
         translation: ArrayLike = ORIGIN,
         rotation: ArrayLike = ORIGIN,
-        axes: str = "xyz",
-        rotation_axes: str = "xyz",
+        axes: Axes = "xyz",
+        rotation_axes: Axes = "xyz",
     ) -> None:
         """Move the radar, from these values at the start.
 

@@ -39,6 +39,10 @@ def dirichlet(waveform: Waveform, distance: Float64[Tensor, " point"]) -> Float6
 
     It repeats after the unambiguous range, as the spectrum of samples does.
 
+    Args:
+        waveform: One with samples.
+        distance: From the target's range [m].
+
     Raises:
         InputError: A waveform without samples.
     """
@@ -57,7 +61,13 @@ def dirichlet(waveform: Waveform, distance: Float64[Tensor, " point"]) -> Float6
 def array_point_spread(
     array: Aperture, du: Float64[Tensor, " u"], dv: Float64[Tensor, " v"]
 ) -> Float64[Tensor, "u v"]:
-    """Power of a point target at offsets in u and v from its direction, peak 1."""
+    """Power of a point target at offsets in u and v from its direction, peak 1.
+
+    Args:
+        array: The virtual array.
+        du: Offsets in u.
+        dv: Offsets in v.
+    """
     weight = array.counts * array.x_taper[:, None] * array.y_taper[None]
     weight = (weight / weight.sum()).to(torch.complex128)
     response = array.steering(du, array.x) @ weight @ array.steering(dv, array.y).T
@@ -65,7 +75,12 @@ def array_point_spread(
 
 
 def airy_radii(radar: Radar, radius: float | None) -> tuple[float, float]:
-    """Half axes of the ellipse behind the Airy lobe [m]; by default it fills the aperture."""
+    """Half axes of the ellipse behind the Airy lobe [m].
+
+    Args:
+        radar: Its aperture.
+        radius: Of a disc instead [m]; None = the ellipse fills the aperture.
+    """
     if radius is not None:
         return radius, radius
     return 0.5 * radar.aperture[0], 0.5 * radar.aperture[1]
@@ -126,7 +141,7 @@ class _BesselJ1(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         z, value = ctx.saved_tensors
         ratio = torch.where(z == 0, 0.5 * torch.ones_like(z), value / z)
-        return grads[0] * (torch.special.bessel_j0(z) - ratio)
+        return grad_outputs[0] * (torch.special.bessel_j0(z) - ratio)

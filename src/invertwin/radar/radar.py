@@ -151,7 +151,7 @@ class Radar:
         )
 
     def frames(self, indices: Sequence[int] | Int64[Tensor, " chosen"]) -> "Radar":
-        """The same radar with only these poses, in this order."""
+        """The radar with only these poses."""
         chosen = torch.as_tensor(indices, dtype=torch.int64)
         return replace(self, positions=self.positions[chosen], rotations=self._rotations[chosen])
 

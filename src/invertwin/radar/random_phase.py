@@ -26,9 +26,9 @@ def random_phase_spectrum(
     """|Σ α e^{jφ} G(R) E(u, v)|² with Gaussian G, Airy E and independent uniform phases φ.
 
     Its mean over phases is the map of ``Surrogate("gaussian", "airy")``; one draw is speckled as
-    the exact chain's spectrum is, with other speckle. Its limits, which tests show:
+    an exact spectrum is, with other speckle. Its limits, which tests show:
 
-    - A boundary path b has α_b = 0, so that the derivative of |S|² by it is
+    - A boundary path b has α_b = 0, so that the derivative of |S|² with respect to it is
       ``2 Re(conj(S) e^{jφ_b}) ∂α_b``. φ_b is independent of S, and the mean of e^{jφ_b} is 0: on
       average the derivative knows nothing of silhouettes, however many samples there are.
     - Where the interior alone counts the derivative is right on average, under the noise of the

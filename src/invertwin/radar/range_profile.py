@@ -127,6 +127,11 @@ def range_profile(
 
     Source: eq:fmcw_fft of the paper.
 
+    Args:
+        beat: Beat signals.
+        radar: What recorded them.
+        grid: Bins, of which the ranges count.
+
     Raises:
         InputError: The signal does not fit the radar.
     """
@@ -152,7 +157,13 @@ def range_profile(
 
 
 def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
-    """Raise where the paths cannot be summed, warn where they appear at wrong ranges."""
+    """Raise where the paths cannot be summed, warn where they appear at wrong ranges.
+
+    Args:
+        paths: To be summed.
+        radar: Its poses and range bias.
+        waveform: Its unambiguous range.
+    """
     if paths.kind == "power":
         raise InputError(
             "expected field paths, got power paths, which have no phase; use trace_field, or "

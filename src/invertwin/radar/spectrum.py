@@ -69,7 +69,12 @@ class Aperture:
     def steering(
         self, cosines: Float64[Tensor, " node"], places: Float64[Tensor, " place"]
     ) -> Complex[Tensor, "node place"]:
-        """exp(+jk u x): undoes the beat phase of an element at x for a source at u."""
+        """Phasors exp(+jk u x), which undo the beat phase of an element at x for a source at u.
+
+        Args:
+            cosines: Direction cosines u.
+            places: Of the elements x [m].
+        """
         phase = 2 * math.pi / self.wavelength * cosines[:, None] * places[None]
         return torch.polar(torch.ones_like(phase), phase)
 
@@ -94,6 +99,11 @@ def beamform(
     Steering is exp(+jk(u x + v y)) on the beat signal, whose phase falls as the element moves
     towards the target. Normalised by the sum of the weights: a point target of |a|² peaks at
     |a|². Along an axis that the grid does not resolve, the power of the elements is averaged.
+
+    Args:
+        profile: From ``range_profile``.
+        radar: What recorded it.
+        grid: Bins of range and direction.
 
     Raises:
         InputError: The profile does not fit radar and grid, the array is not flat, or the grid
@@ -128,7 +138,13 @@ def beamform(
 def exact_spectrum(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar, grid: Grid
 ) -> Float[Tensor, "frame range u v"]:
-    """Power spectrum as a real radar forms it: ``range_profile``, then ``beamform``."""
+    """Power spectrum as a real radar forms it: ``range_profile``, then ``beamform``.
+
+    Args:
+        beat: Beat signals.
+        radar: What recorded them.
+        grid: Bins of range and direction.
+    """
     return beamform(range_profile(beat, radar, grid), radar, grid)
 
 

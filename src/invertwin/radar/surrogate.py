@@ -1,10 +1,10 @@
-"""The smooth twin of the exact chain: deposited power, shaped by the radar's point spread."""
+"""The smooth surrogate of exact signals: deposited power, shaped by the radar's point spread."""
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, Float64
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
 from invertwin.errors import InputError
+from invertwin.limits import NonNegative, Positive
 from invertwin.radar.point_spread import (
     airy,
     airy_radii,
@@ -32,7 +33,7 @@ _MIN_EXTENT = 64
 class Surrogate:
     """How the power of one path spreads over the bins of a spectrum.
 
-    "response" kernels are what the exact chain does to a point target: the power response of
+    "response" kernels are what exact signals show of a point target: the power response of
     its sample window in range, of its weighted virtual array in direction. For random phases
     the mean of the exact spectrum is therefore the surrogate's. The extra widths blur both the
     simulated and the measured map; annealing them to zero widens the basin of attraction.
@@ -60,20 +61,16 @@ class Surrogate:
             kernels than the paper's or an extra angular width.
     """
 
-    range_kernel: str = "response"
-    angle_kernel: str = "response"
-    range_width: float = 0.0
-    angle_width: float = 0.0
-    aperture_radius: float | None = None
-    phases: str = "mean"
+    range_kernel: Literal["response", "gaussian", "dirichlet"] = "response"
+    angle_kernel: Literal["response", "airy"] = "response"
+    range_width: NonNegative = 0.0
+    angle_width: NonNegative = 0.0
+    aperture_radius: Positive | None = None
+    phases: Literal["mean", "random"] = "mean"
 
     def __post_init__(self) -> None:
-        choices = {
-            "range_kernel": ("response", "gaussian", "dirichlet"),
-            "angle_kernel": ("response", "airy"),
-            "phases": ("mean", "random"),
-        }
-        for name, allowed in choices.items():
+        for name in ("range_kernel", "angle_kernel", "phases"):
+            allowed = get_args(type(self).__annotations__[name])
             if getattr(self, name) not in allowed:
                 raise InputError(
                     f"expected {name} to be one of {', '.join(allowed)}, "
@@ -131,7 +128,12 @@ class Surrogate:
     def blur(
         self, power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
     ) -> Float[Tensor, "frame range u v"]:
-        """Only the extra Gaussian widths, for measured spectra; no widths, no change.
+        """A measured spectrum with the extra Gaussian widths only; without widths it stays.
+
+        Args:
+            power: Measured spectrum.
+            radar: Its range and angle cells.
+            grid: Bins.
 
         Raises:
             InputError: The map does not have the grid's shape.
@@ -176,11 +178,11 @@ SURROGATES = MappingProxyType(
         "random_phase": Surrogate("gaussian", "airy", phases="random"),
     }
 )
-"""What a ``surrogate`` argument may name; "exact" is the exact chain, as None is."""
+"""What a ``surrogate`` argument may name; "exact" means exact signals, as None does."""
 
 
 def chosen_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
-    """The surrogate meant by a ``surrogate`` argument; None = the exact chain.
+    """The surrogate meant by a ``surrogate`` argument; None = exact signals.
 
     Raises:
         InputError: A name that is not in ``SURROGATES``.
@@ -190,7 +192,7 @@ def chosen_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
     if surrogate not in SURROGATES:
         raise InputError(
             f"expected a Surrogate or one of {', '.join(SURROGATES)}, got {surrogate!r}; "
-            'surrogate="exact" is the exact chain'
+            'surrogate="exact" means exact signals'
         )
     return SURROGATES[surrogate]
 
@@ -290,8 +292,9 @@ class _Kernel:
         taps = torch.fft.irfft(transfer, _padded(count))
         place = torch.arange(count)
         matrix = taps[(place[:, None] - place[None]) % len(taps)].to(power)
-        rows = power.movedim(dim, 0)
-        return (matrix @ rows.reshape(count, -1)).reshape(rows.shape).movedim(0, dim)
+        if dim == power.ndim - 1:
+            return power @ matrix.T
+        return (matrix @ power.flatten(dim + 1)).reshape(power.shape)
 
 
 @lru_cache(maxsize=16)

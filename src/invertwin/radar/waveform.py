@@ -1,5 +1,8 @@
 """Waveforms and the radar: what is transmitted, from where, and which bins it resolves."""
 
+# Fields of the base class may be properties of a waveform.
+# pyright: reportIncompatibleVariableOverride=false
+
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -10,6 +13,7 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
@@ -45,7 +49,12 @@ class Waveform(ABC):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """Power of a point target at a distance from its range [m], peak 1."""
+        """Power of a point target beside its range, peak 1.
+
+        Args:
+            distance: From the target's range [m].
+            window: Taper of the samples.
+        """
 
 
 class SampledWaveform(Waveform):
@@ -85,7 +94,12 @@ class SampledWaveform(Waveform):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """|Σ w_n exp(2πj n d/R_max) / Σ w_n|²."""
+        """Power |Σ w_n exp(2πj n d/R_max) / Σ w_n|² of a point target beside its range.
+
+        Args:
+            distance: d, from the target's range [m].
+            window: Taper w of the samples.
+        """
         weight = sample_window(self, window)
         cycles = distance[:, None] / self.max_range * torch.arange(self.samples)
         return (torch.exp(2j * math.pi * cycles) @ (weight / weight.sum() + 0j)).abs().square()
@@ -107,10 +121,10 @@ class FMCW(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    bandwidth: float
-    duration: float
-    samples: int
+    start_frequency: Positive
+    bandwidth: Positive
+    duration: Positive
+    samples: Count
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -171,10 +185,10 @@ class SteppedFrequency(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    step: float
-    samples: int
-    dwell: float
+    start_frequency: Positive
+    step: Positive
+    samples: Count
+    dwell: Positive
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -228,9 +242,9 @@ class OFDM(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: float
-    spacing: float
-    subcarriers: int
+    start_frequency: Positive
+    spacing: Positive
+    subcarriers: Count
 
     def __post_init__(self) -> None:
         _check_frequency("start_frequency", self.start_frequency)
@@ -325,8 +339,8 @@ class Impulse(Waveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    center_frequency: float
-    bandwidth: float
+    center_frequency: Positive
+    bandwidth: Positive
 
     def __post_init__(self) -> None:
         _check_frequency("center_frequency", self.center_frequency)
@@ -335,7 +349,12 @@ class Impulse(Waveform):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """The pulse; it has no samples that a window could taper."""
+        """Power of the pulse beside the target's range, peak 1.
+
+        Args:
+            distance: From the target's range [m].
+            window: Ignored: a pulse has no samples to taper.
+        """
         return gaussian_response(self, distance)
 
 
@@ -361,7 +380,12 @@ def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[T
 
 
 def sample_window(waveform: SampledWaveform, window: str) -> Float64[Tensor, " sample"]:
-    """Taper of the beat signal's samples."""
+    """Taper of the beat signal's samples.
+
+    Args:
+        waveform: Its number of samples.
+        window: Name of the taper.
+    """
     position = torch.linspace(0, 1, waveform.samples, dtype=torch.float64)
     return taper(window, position, waveform.samples)
 
@@ -369,7 +393,12 @@ def sample_window(waveform: SampledWaveform, window: str) -> Float64[Tensor, " s
 def gaussian_response(
     waveform: Waveform, distance: Float64[Tensor, " point"]
 ) -> Float64[Tensor, " point"]:
-    """Gaussian of one range cell full width at half maximum, peak 1."""
+    """Gaussian whose full width at half maximum is one range cell, peak 1.
+
+    Args:
+        waveform: Its range cell.
+        distance: From the peak [m].
+    """
     sigma = SIGMA_PER_FWHM * waveform.range_resolution
     return torch.exp(-0.5 * (distance / sigma).square())
 

@@ -15,6 +15,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.limits import Count, NonNegative, Positive
 from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 
 COSINE_COUNT = 2049
@@ -63,7 +64,7 @@ class Cosine(Pattern):
         InputError: a negative exponent.
     """
 
-    exponent: float
+    exponent: NonNegative
 
     def __post_init__(self) -> None:
         checked_number(self.exponent, "pattern exponent", 0.0)
@@ -185,7 +186,7 @@ class AntennaArray:
 
 
 def linear_array(
-    count: int, spacing: float, axis: Literal["x", "y"] = "x", pattern: Pattern | None = None
+    count: Count, spacing: Positive, axis: Literal["x", "y"] = "x", pattern: Pattern | None = None
 ) -> AntennaArray:
     """Elements in a row, centred at the origin of the radar frame.
 
@@ -259,7 +260,7 @@ def _resampled(theta: Tensor, phi: Tensor, gains: Tensor) -> Tensor:
         # A multiple of the given number, so that evenly spaced angles stay nodes.
         count = len(phi) * -(-360 // len(phi))
         around = -np.pi + 2 * np.pi * np.arange(count) / count
-        rows: Sequence = [
+        rows: Sequence[np.ndarray | Tensor] = [
             np.interp(around, phi.detach().numpy(), row, period=2 * np.pi) for row in given
         ]
         given = np.stack(rows)

@@ -2,14 +2,18 @@
 
 import math
 from collections.abc import Sequence
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Ge, Len
 from torch import Tensor
 
 from invertwin.errors import InputError
 
-ArrayLike = Tensor | np.ndarray | Sequence
+ArrayLike = Tensor | np.ndarray | Sequence[Any]
+Point = Annotated[ArrayLike, Len(3, 3)]
+Counts = Annotated[Sequence[Annotated[int, Ge(2)]], Len(3, 3)]
 
 
 def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: str) -> Tensor:
@@ -46,7 +50,14 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
 def checked_number(
     value: object, what: str, low: float, high: float = math.inf, *, open_low: bool = False
 ) -> float:
-    """The value of a finite number (or 0-d tensor) in [low, high], or (low, high] if `open_low`.
+    """`value` as a finite number in [low, high], or (low, high] if `open_low`.
+
+    Args:
+        value: a number, or a tensor of dimension 0.
+        what: its name and unit, for the error.
+        low: least value.
+        high: greatest value.
+        open_low: whether the least value itself is excluded.
 
     Raises:
         InputError: not a number, NaN, infinite or out of range.
@@ -68,7 +79,12 @@ def checked_number(
 
 
 def checked_count(value: object, what: str, low: int) -> int:
-    """An integer that is at least `low`.
+    """`value` as an integer that is at least `low`.
+
+    Args:
+        value: an integer.
+        what: its name, for the error.
+        low: least value.
 
     Raises:
         InputError: not an integer, or too small.

@@ -27,7 +27,7 @@ class Cloud:
     Attributes:
         low, high: corners of the box in the object's frame [m]; the outer nodes lie on its faces.
         density: extinction at the nodes [1/m], at least two along each axis; may carry gradients.
-        albedo: share of the extinction that is scattered, times a gain where it is above one; a
+        albedo: fraction of the extinction that is scattered, times a gain where it is above one; a
             number, or a tensor without dimensions.
 
     Raises:

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.limits import Axes
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.scene.material.values import RANGES, Texture, Value, checked_value, evaluated
 from invertwin.scene.mesh import Mesh
@@ -37,7 +38,7 @@ class Translation(nn.Module):
         translation: parameter [3], metres.
     """
 
-    def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: str = "xyz") -> None:
+    def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: Axes = "xyz") -> None:
         """Move `object`, by `initial` [m] at the start.
 
         Args:
@@ -69,6 +70,14 @@ class RigidMotion(nn.Module):
     def __init__(
         self, translation: ArrayLike, rotation: ArrayLike, axes: str, rotation_axes: str
     ) -> None:
+        """Move from these values at the start.
+
+        Args:
+            translation: [m].
+            rotation: rotation vector of any angle [3] (rad), or q itself [4].
+            axes: world axes along which the fit may move.
+            rotation_axes: components of the rotation vector that the fit may change.
+        """
         super().__init__()
         self.translation = nn.Parameter(_vector(translation, "initial translation [m]"))
         self.rotation = nn.Parameter(_rotation_numbers(rotation))
@@ -114,8 +123,8 @@ class Pose(RigidMotion):
         object: str,
         translation: ArrayLike = ORIGIN,
         rotation: ArrayLike = ORIGIN,
-        axes: str = "xyz",
-        rotation_axes: str = "xyz",
+        axes: Axes = "xyz",
+        rotation_axes: Axes = "xyz",
     ) -> None:
         """Move `object`, from these values at the start.
 
@@ -154,6 +163,10 @@ class Scale(nn.Module):
     def __init__(self, object: str, initial: float = 1.0) -> None:
         """Scale `object`, by the factor `initial` at the start.
 
+        Args:
+            object: name of the object.
+            initial: factor.
+
         Raises:
             InputError: `initial` is not positive.
         """
@@ -182,6 +195,10 @@ class Vertices(nn.Module):
 
     def __init__(self, object: str, count: int) -> None:
         """Move the `count` vertices of `object`, by zero at the start.
+
+        Args:
+            object: name of the object.
+            count: number of its vertices.
 
         Raises:
             InputError: no vertices.

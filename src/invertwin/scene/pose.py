@@ -73,6 +73,10 @@ def rigid(
 ) -> Float[Tensor, "4 4"]:
     """The transform x → rotation x + translation [m] as a matrix; no rotation where None.
 
+    Args:
+        rotation: matrix; None = no rotation.
+        translation: [m].
+
     Raises:
         InputError: wrong shapes, or NaN.
     """

@@ -136,7 +136,7 @@ class Scene:
                 )
         object.__setattr__(self, "objects", MappingProxyType(dict(self.objects)))
 
-    def __reduce__(self) -> tuple:
+    def __reduce__(self) -> tuple[Any, ...]:
         # The read-only view of the mapping can be neither copied nor pickled by itself.
         return type(self), (dict(self.objects),)
 

@@ -5,17 +5,20 @@ from collections.abc import Sequence
 from functools import reduce
 from itertools import pairwise
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 import trimesh
+from annotated_types import Ge, Le, MinLen
 
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
 from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh
 
 
-def plate(width: float, height: float, divisions: int = 1) -> Mesh:
+def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
     """A rectangle in the plane z = 0 that faces −z.
 
     Args:
@@ -34,7 +37,7 @@ def plate(width: float, height: float, divisions: int = 1) -> Mesh:
     return _mesh(np.column_stack([plane, np.zeros(len(plane))]), faces[:, ::-1])
 
 
-def box(size: float | Sequence[float], divisions: int = 1) -> Mesh:
+def box(size: Positive | Sequence[Positive], divisions: Count = 1) -> Mesh:
     """A closed box.
 
     Args:
@@ -65,7 +68,7 @@ def box(size: float | Sequence[float], divisions: int = 1) -> Mesh:
     return _mesh((unique / n - 0.5) * extent, index.ravel()[np.concatenate(triangles)])
 
 
-def sphere(radius: float, subdivisions: int = 4) -> Mesh:
+def sphere(radius: Positive, subdivisions: Annotated[int, Ge(0), Le(8)] = 4) -> Mesh:
     """An icosphere with 20·4^subdivisions triangles and its vertices on the sphere.
 
     Args:
@@ -82,7 +85,7 @@ def sphere(radius: float, subdivisions: int = 4) -> Mesh:
     return _mesh(unit * length, ball.faces)
 
 
-def dihedral(edge: float) -> Mesh:
+def dihedral(edge: Positive) -> Mesh:
     """Two square plates at a right angle that meet on the y axis and open to −z.
 
     Its boresight is −z, and every wave it returns has the range of the y axis.
@@ -99,7 +102,7 @@ def dihedral(edge: float) -> Mesh:
     return _mesh(np.array(vertices), np.array([(0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4)]))
 
 
-def trihedral(edge: float) -> Mesh:
+def trihedral(edge: Positive) -> Mesh:
     """A corner reflector: three right-angled triangles with the apex at the origin, open to −z.
 
     Its boresight is −z, one of the inner edges lies in the half plane x = 0, y > 0, and every wave
@@ -120,11 +123,16 @@ def trihedral(edge: float) -> Mesh:
     return _mesh(vertices, np.array([(0, 2, 1), (0, 3, 2), (0, 1, 3)]))
 
 
-def text(string: str, size: float = 0.6, depth: float = 0.12, max_edge: float = 0.06) -> Mesh:
+def text(
+    text: Annotated[str, MinLen(1)],
+    size: Positive = 0.6,
+    depth: Positive = 0.12,
+    max_edge: Positive = 0.06,
+) -> Mesh:
     """Extruded bold text, watertight, readable from −z with x to the right and y up.
 
     Args:
-        string: one line of text.
+        text: one line of text.
         size: height of its bounding box along y [m].
         depth: thickness along z [m].
         max_edge: longest edge of a triangle [m].
@@ -135,7 +143,7 @@ def text(string: str, size: float = 0.6, depth: float = 0.12, max_edge: float = 
     height = _length(size, "text size [m]")
     thickness = _length(depth, "text depth [m]")
     longest = _length(max_edge, "longest edge [m]")
-    plane, cap = _triangulated_outline(string, height, longest)
+    plane, cap = _triangulated_outline(text, height, longest)
     count = len(plane)
     front = np.column_stack([plane, np.full(count, -thickness / 2)])
     back = np.column_stack([plane, np.full(count, thickness / 2)])

@@ -103,4 +103,11 @@ def test_what_a_cloud_does_not_show_cannot_be_sought(order):
 def test_a_cloud_can_be_moved():
     scene = Scene({"ball": Object(sphere(0.1, 1), RoughDielectric(4.0))})
     scene = DensityGrid.even("ball", [-0.2] * 3, [0.2] * 3, (3, 3, 3))(scene)
-    assert Translation("ball", [0.1, 0, 0])(scene)["ball"].cloud is not None
+    moved = Translation("ball", [0.1, 0, 0])(scene)["ball"]
+    offset = moved.transform[:3, 3] - scene["ball"].transform[:3, 3]
+    torch.testing.assert_close(offset, torch.tensor([0.1, 0, 0], dtype=torch.float64))
+    before, after = scene["ball"].cloud, moved.cloud
+    assert before is not None
+    assert after is not None
+    for name in ("low", "high", "density"):
+        assert torch.equal(getattr(after, name), getattr(before, name))

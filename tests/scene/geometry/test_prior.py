@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from importlib import resources
+from typing import Any
 
 import numpy as np
 import pytest
@@ -168,7 +169,7 @@ def test_what_is_no_prior_is_refused(tmp_path):
     with np.load(good) as arrays:
         parts = {name: arrays[name] for name in arrays.files}
     spoilt = np.full_like(parts["enter.bias"], np.nan)
-    wrong = {
+    wrong: dict[str, dict[str, Any]] = {
         "other": {"values": np.zeros(3)},
         "old": {**parts, "format": "another"},
         "shape": {**parts, "leave.weight": parts["leave.weight"][:-1]},

@@ -52,11 +52,12 @@ def test_gradient_of_the_conductor_lobe():
     assert torch.autograd.gradcheck(lambda w: PerfectConductor(w).surface(FREQUENCY).lobes, width)
 
 
-def test_gradient_is_finite_in_vacuum():
+def test_gradient_is_zero_in_vacuum():
+    """The amplitude √R has a corner there, |ε − 1| at every angle: its mean slope is chosen."""
     permittivity = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
     RoughDielectric(permittivity).surface(FREQUENCY).amplitude.sum().backward()
     assert permittivity.grad is not None
-    assert torch.isfinite(permittivity.grad)
+    assert float(permittivity.grad) == 0.0
 
 
 @pytest.mark.parametrize(

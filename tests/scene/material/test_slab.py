@@ -238,16 +238,32 @@ def test_forward_derivatives_agree_with_reverse_ones():
     ("permittivity", "conductivity", "thickness"),
     [(1.0, 0.0, 0.0), (1.0, 0.0, 0.01), (4.0, 0.0, 0.0), (1.0, 1e7, 0.01), (4.0, 0.0, 1e3)],
 )
-def test_gradients_are_finite_at_the_ends(permittivity, conductivity, thickness):
+def test_power_is_kept_at_the_ends(permittivity, conductivity, thickness):
+    """Reflected and transmitted power without losses; as a half space where nothing passes."""
     values = [
         torch.tensor(v, dtype=torch.float64, requires_grad=True)
         for v in (permittivity, conductivity, thickness)
     ]
     surface = Slab(values[0], values[1], thickness=values[2]).surface(FREQUENCY)
     for table in (surface.amplitude, surface.transmittance, surface.excess):
-        assert torch.isfinite(table).all()
         gradients = torch.autograd.grad(table[1:].sum(), values, retain_graph=True)
         assert all(torch.isfinite(g) for g in gradients)
+    reflected = surface.amplitude.square()
+    if conductivity > 0:
+        half_space = RoughDielectric(permittivity, conductivity).surface(FREQUENCY)
+        torch.testing.assert_close(surface.amplitude, half_space.amplitude)
+        assert not surface.transmittance.any()
+        return
+    # Grazing waves, in the first row, pass only where there is nothing.
+    power = (reflected + surface.transmittance)[1:]
+    torch.testing.assert_close(power, torch.ones_like(power))
+    changes = torch.autograd.grad(power.sum(), values[::2], retain_graph=True)
+    scales = torch.autograd.grad(surface.transmittance[1:].sum(), values[::2], retain_graph=True)
+    for change, scale in zip(changes, scales, strict=True):
+        assert abs(float(change)) < 1e-6 * (1 + abs(float(scale)))
+    if permittivity == 1 or thickness == 0:
+        assert not reflected.any()
+        assert surface.excess[1:].abs().max() < 1e-12
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -73,7 +73,12 @@ def test_texture_laid_over_a_plate():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (4, 1)])
 def test_thin_images(shape):
-    assert torch.isfinite(Texture(image(*shape), corners()).values).all()
+    """As an image whose single row or column is there twice."""
+    pixels = image(*shape)
+    repeats = [2 if count == 1 else 1 for count in shape]
+    wide = pixels.repeat(*repeats)
+    thin, full = (Texture(one, corners()).values for one in (pixels, wide))
+    torch.testing.assert_close(thin, full)
 
 
 def test_texture_is_differentiable_in_its_image():
@@ -123,9 +128,11 @@ def test_gradients_per_triangle():
 
 def test_lists_become_tensors():
     material = RoughDielectric([2.0, 3.0])
-    assert isinstance(material.permittivity, torch.Tensor)
+    assert torch.equal(material.permittivity, torch.tensor([2.0, 3.0], dtype=torch.float64))
     scene = Scene({"wall": Object(WALL, material)})
-    assert scene["wall"].material.surface(FREQUENCY).amplitude.shape == (2, 256)
+    rows = [RoughDielectric(value).surface(FREQUENCY).amplitude for value in (2.0, 3.0)]
+    amplitude = scene["wall"].material.surface(FREQUENCY).amplitude
+    torch.testing.assert_close(amplitude, torch.stack(rows))
 
 
 @pytest.mark.usefixtures("unchecked")

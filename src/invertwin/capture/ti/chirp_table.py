@@ -14,12 +14,22 @@ _LANES = {"12": 4, "14": 4, "16": 2, "18": 2, "68": 2}
 
 
 def scaled(number: str | float | Decimal, exponent: int) -> float:
-    """number · 10^exponent, without the rounding of a float product."""
+    """number · 10^exponent, without the rounding of a float product.
+
+    Args:
+        number: a decimal number.
+        exponent: power of ten.
+    """
     return float(Decimal(str(number)).scaleb(exponent))
 
 
 def text(number: float, exponent: int = 0) -> str:
-    """number · 10^exponent as plain decimals; `scaled` gives the same float back."""
+    """number · 10^exponent as plain decimals; `scaled` gives the same float back.
+
+    Args:
+        number: a number in SI units.
+        exponent: power of ten.
+    """
     return f"{Decimal(repr(float(number))).scaleb(exponent).normalize():f}"
 
 
@@ -35,6 +45,10 @@ def mask(chosen: Sequence[int]) -> int:
 
 def read_text(path: Path, what: str) -> str:
     """The file as text.
+
+    Args:
+        path: the file.
+        what: what it should be, for the error.
 
     Raises:
         InputError: no such file, or one that is no text.
@@ -100,7 +114,15 @@ def transmit_order(
 def settings(
     order: tuple[int, ...], loops: int, frames: int, period_ms: Any, **values: Any
 ) -> ChirpSettings:
-    """Settings of a frame as files count: 0 frames are endless, repeated orders are loops."""
+    """Settings of a frame as files count: 0 frames are endless, repeated orders are loops.
+
+    Args:
+        order: transmitters in their order of sending.
+        loops: how often the order is sent in a frame.
+        frames: number of frames; 0 = endless.
+        period_ms: from frame to frame [ms].
+        values: further fields of `ChirpSettings`.
+    """
     order, loops = shortest_loop(order, loops)
     return ChirpSettings(
         transmit_order=order,

@@ -196,6 +196,10 @@ def _integer(value: Any) -> int:
 def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
     """Writes the `.mmwave.json` that `read_studio` reads.
 
+    Args:
+        path: file to write.
+        chirp_settings: what to write.
+
     Raises:
         InputError: the folder does not exist, or settings without a number of lanes.
     """

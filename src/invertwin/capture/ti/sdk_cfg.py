@@ -153,6 +153,10 @@ def _swapped(commands: Sequence[list[str]]) -> bool:
 def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
     """Writes what `read_cfg` reads. What the settings do not hold is written as the demos have it.
 
+    Args:
+        path: file to write.
+        chirp_settings: what to write.
+
     Raises:
         InputError: the folder does not exist.
     """

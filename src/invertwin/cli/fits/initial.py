@@ -11,7 +11,7 @@ from invertwin.cli.fits.likeness import is_shape_key, shape_label
 from invertwin.cli.fits.problem import Problem
 from invertwin.cli.report import Table
 from invertwin.cli.run_file import about
-from invertwin.cli.schema.initial import Initial
+from invertwin.cli.schema import Initial
 from invertwin.errors import InputError
 from invertwin.inversion.initial import (
     Ground,

@@ -20,7 +20,8 @@ from invertwin.cli.report import Again, Picture, Table, report_html
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.run_simulate import chirp_train
 from invertwin.cli.runs import RunFolder
-from invertwin.cli.schema import MoverParameter, RunFile, SimulatedData
+from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.shape_tables import Mover
 from invertwin.errors import InputError
 from invertwin.inversion import (
     CorrelationLoss,
@@ -179,9 +180,9 @@ def _recorded(run: RunFile) -> ChirpCapture:
     return recording
 
 
-def _mover(run: RunFile) -> MoverParameter:
+def _mover(run: RunFile) -> Mover:
     table = need(run, "parameters", "reconstruct")[0]
-    if len(run.parameters) > 1 or not isinstance(table, MoverParameter):
+    if len(run.parameters) > 1 or not isinstance(table, Mover):
         kinds = ", ".join(parameter.kind for parameter in run.parameters)
         raise InputError(f"parameters: expected a mover alone, got {kinds}; leave only the mover")
     return table
@@ -189,7 +190,7 @@ def _mover(run: RunFile) -> MoverParameter:
 
 def _fitted(
     run: RunFile,
-    table: MoverParameter,
+    table: Mover,
     scene: Scene,
     recording: ChirpCapture,
     grid: Grid,
@@ -222,7 +223,7 @@ def _fitted(
 
 def _heldout(
     run: RunFile,
-    table: MoverParameter,
+    table: Mover,
     scene: Scene,
     recording: ChirpCapture,
     grid: Grid,

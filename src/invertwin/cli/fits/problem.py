@@ -13,20 +13,17 @@ from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
+from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.schema import (
-    MoverParameter,
-    RadarParameter,
     RunFile,
     Settings,
     SimulatedData,
     Variant,
-    VerticesParameter,
 )
 from invertwin.cli.schema import Stage as StageTable
-from invertwin.cli.schema import Surrogate as SurrogateTable
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
@@ -110,7 +107,7 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     need(run, "parameters", "reconstruct")
     scene, truth = build.scene(run), build.true_scene(run)
     for i, parameter in enumerate(run.parameters):
-        if isinstance(parameter, MoverParameter):
+        if parameter.kind == "mover":
             raise InputError(
                 f"parameters[{i}].kind: expected a mover as the only parameter, got "
                 f"{len(run.parameters)} parameters; leave only that"
@@ -166,7 +163,7 @@ def _sight(run: RunFile, weight: float, truth: Scene, console: Console) -> Sight
 
 def sought_objects(run: RunFile) -> list[str]:
     """Objects that have parameters."""
-    return [p.object for p in run.parameters if not isinstance(p, RadarParameter)]
+    return [p.object for p in run.parameters if getattr(p, "object", None)]
 
 
 def varied(problem: Problem, mode: str) -> Problem:
@@ -216,7 +213,7 @@ def varied_run(run: RunFile, mode: str) -> RunFile:
     if wanted.smooth is not None:
         smooth = {"smooth": wanted.smooth}
         for name, table in kept.items():
-            if isinstance(table, VerticesParameter):
+            if table.kind == "vertices":
                 kept[name] = table.model_copy(update=smooth)
     changes["parameters"] = list(kept.values())
     # Stages seek what the fit has; one that has nothing left to seek falls out.
@@ -265,7 +262,7 @@ def _stage(run: RunFile, table: StageTable, common: dict[str, Any]) -> Stage:
         tables = build.named(run.parameters)
         sought = [tables[name] for name in table.parameters or tables]
         change = partial(remeshed, edge=table.remesh)
-        remesh = {t.object: change for t in sought if isinstance(t, VerticesParameter)}
+        remesh = {t.object: change for t in sought if t.kind == "vertices"}
     return Stage(
         steps=table.steps or need(run, "reconstruct", "reconstruct").steps,
         unknowns=tuple(table.parameters),
@@ -334,7 +331,7 @@ def observations_of(problem: Problem) -> list[Observation]:
     poses = {
         name: Unknown(lambda _: RadarPose(), getattr(table, "rate", None))
         for name, table in build.named(run.parameters).items()
-        if isinstance(table, RadarParameter)
+        if table.kind == "radar"
     }
     return [
         Observation(
@@ -367,5 +364,5 @@ def unknowns_of(run: RunFile, start: build.Start) -> dict[str, Unknown]:
     return {
         name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
         for name, table in tables.items()
-        if not isinstance(table, RadarParameter)
+        if table.kind != "radar"
     }

@@ -14,7 +14,7 @@ from invertwin.cli.fits.likeness import shape_scores
 from invertwin.cli.fits.problem import Problem, Sight, points_per_m2, sampling_of
 from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import need
-from invertwin.cli.schema import MaterialParameter, Parameter, SimulatedData
+from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
 from invertwin.models import SurrogateMap, surrogate_correlation
@@ -61,9 +61,9 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
     return rows | shapes | value_errors(sought, twin, problem.truth, frequency)
 
 
-def _made_known(problem: Problem, parameter: Parameter) -> bool:
+def _made_known(problem: Problem, parameter: Any) -> bool:
     """Whether the run file tells what the sought object is really made of."""
-    if not isinstance(parameter, MaterialParameter):
+    if parameter.kind != "material":
         return False
     table = problem.run.truth.get(parameter.object)
     stated = table is not None and table.material is not None

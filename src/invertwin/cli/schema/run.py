@@ -2,114 +2,136 @@
 
 import json
 import re
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, create_model, model_validator
+from annotated_types import MinLen
+from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from invertwin.cli.registry import load_plugins
-from invertwin.cli.schema.initial import Initial
-from invertwin.cli.schema.inversion import (
+from invertwin.cli.fit_tables import SurrogateTable
+from invertwin.cli.registry import NameOf, OneOf, TableOf, load_plugins, registry
+from invertwin.cli.schema.fits import (
     Calibration,
-    Data,
-    Gradcheck,
+    Initial,
     Landscape,
-    Loss,
-    Optimizer,
+    Measures,
     Reconstruct,
+    Stage,
     Starts,
-    Surrogate,
+    Variant,
 )
-from invertwin.cli.schema.objects import SceneFile, SceneObject, Truth
-from invertwin.cli.schema.parameters import (
-    Parameter,
-    PriorParameter,
-    RadarParameter,
-    ShapeSpaceParameter,
-)
-from invertwin.cli.schema.recording import Chirps, Impairments, Raw
-from invertwin.cli.schema.section import Positive, Section, Seed, fail
-from invertwin.cli.schema.sensor import Grid, Radar
-from invertwin.cli.schema.stages import Measures, Stage, Variant
+from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.section import InputPath, Section, Seed, Vector, fail, key
+from invertwin.cli.sensors import ChirpsTable, GridTable, RadarTable
+from invertwin.errors import InputError
+from invertwin.limits import NonNegative, Positive
+from invertwin.radar.impairments import Impairments
+from invertwin.radar.motion import Chirps
+from invertwin.radar.surrogate import Surrogate
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "interior_only", "whole", "seen", "count", "m", "number", "consistency")
 
+AnyMaterial = Annotated[Any, OneOf("material")]
+AnyModel = Annotated[Any, OneOf("model")]
+AnyData = Annotated[Any, OneOf("data")]
+AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
+AnyChirps = Annotated[Any, TableOf(Chirps, ChirpsTable, ("order",))]
+AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_figure_db"))]
 
-class Observed(Section):
-    """What one of several sensors recorded; without a key as at the top of the file."""
 
-    radar: Radar | None = None
-    """what measures"""
-    grid: Grid | None = None
-    """the map that is compared"""
-    chirps: Chirps | None = None
-    """several ramps a frame"""
-    data: Data | None = None
-    """what is fitted"""
-    surrogate: Surrogate | None = None
-    """kernels of the smooth model"""
-    weight: Positive = 1.0
-    """share in the loss"""
+class SceneFile(Section):
+    """Objects from the geometry of a Mitsuba or Sionna scene file (XML), named as in the file."""
+
+    file: InputPath = key("path, from the run file's folder")
+    materials: dict[str, AnyMaterial] = key("by the file's material ids", {})
+    material: AnyMaterial | None = key("of all other objects; without it concrete", None)
+
+
+class Truth(Section):
+    """What an object really is: replaces values of its scene table, key by key."""
+
+    position: Vector | None = key("m", None)
+    rotation_deg: Vector | None = key("rotation vector", None)
+    scale: Positive | None = key("factor", None)
+    material: AnyMaterial | None = key("what it is really made of", None)
+    velocity: Vector | None = key("m/s", None)
+    angles_deg: dict[str, Vector] | None = key(
+        "of a body, all of its joints that are not at rest", None
+    )
+    parts: Annotated[list[Annotated[Any, OneOf("shape")]], MinLen(1)] | None = key(
+        "its real shape, in place of the scene's and in the same frame", None
+    )
+
+
+class Raw(Section):
+    """Raw files as other tools read them: DCA1000 samples, SDK and mmWave Studio settings."""
+
+    lanes: Literal[2, 4] = key("of the LVDS link: 4 for xWR12xx and xWR14xx, 2 for later ones", 2)
+    real: bool = key("real samples instead of I and Q", False)
+    bits: Literal[12, 14, 16] = key("of the ADC", 16)
+    full_scale: Positive | None = key(
+        "√(received over sent power) of the largest count; without it 1.25 times the largest "
+        "sample",
+        None,
+    )
+    adc_start_time: NonNegative = key(
+        "s, from the start of the ramp to the first sample; the waveform is what is sampled", 0.0
+    )
+    frame_period: Positive | None = key("s, from frame to frame, as the settings say it", None)
+
+
+class ObservationTable(Section):
+    """What one of several sensors has measured; without a key the section of this name counts."""
+
+    radar: RadarTable | None = key("what measures; not with a capture", None)
+    grid: GridTable | None = key("the map that is compared", None)
+    data: AnyData | None = key("what is fitted", None)
+    surrogate: AnySurrogate | None = key("kernels of the smooth model", None)
+    chirps: AnyChirps | None = key("several ramps a frame", None)
+    model: AnyModel | None = key("a plugin's forward model, in place of the surrogate's", None)
+    weight: Positive = key("of its loss beside the others'", 1.0)
 
 
 class _RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
-    task: Literal["simulate", "reconstruct", "gradcheck", "loss-scan", "demo"]
-    """what the file is for"""
-    title: str = ""
-    """heading of the report"""
-    note: str = ""
-    """shown in the report"""
-    seed: Seed = 0
-    """of everything random"""
-    scene: dict[str, SceneObject] = {}
-    """[scene.<name>]: an object each"""
-    scene_file: SceneFile | None = None
-    """objects from a file"""
-    truth: dict[str, Truth] = {}
-    """[truth.<name>]: where an object really is"""
-    radar: Radar | None = None
-    """what measures; not with a capture"""
-    grid: Grid | None = None
-    """the map that is compared"""
-    chirps: Chirps | None = None
-    """several ramps a frame, for simulate"""
-    impairments: Impairments | None = None
-    """what the front end of simulated data adds"""
-    raw: Raw | None = None
-    """raw files that simulate writes beside the capture"""
-    data: Data | None = None
-    """what is fitted"""
-    observations: dict[str, Observed] = {}
-    """[observations.<name>]: what each of several sensors recorded"""
-    parameters: list[Parameter] = []
-    """[[parameters]]: what is sought"""
-    starts: Starts | None = None
-    """where fits start; without it where the scene says"""
-    initial: Initial | None = None
-    """where the fit starts by conventional processing, not with [starts]"""
-    surrogate: Surrogate = Surrogate()
-    """kernels of the smooth model"""
-    loss: Loss = Loss()
-    """how maps are compared"""
-    optimizer: Optimizer = Optimizer()
-    """how a gradient becomes a step"""
-    reconstruct: Reconstruct | None = None
-    """the fit"""
-    stages: list[Stage] = []
-    """[[stages]]: parts of the fit, one after another; without them one"""
-    variants: dict[str, Variant] = {}
-    """[variants.<name>]: other ways to fit, to compare"""
-    measures: Measures | None = None
-    """of the found shape"""
-    calibration: Calibration | None = None
-    """before the fit"""
-    landscape: Landscape | None = None
-    """losses along a line"""
-    gradcheck: Gradcheck | None = None
-    """the gradient check"""
+    task: Annotated[str, NameOf("task")] = key("what the file is for")
+    title: str = key("heading of the report", "")
+    note: str = key("shown in the report", "")
+    seed: Seed = key("of everything random", 0)
+    scene: dict[str, Annotated[Any, OneOf("object")]] = key("[scene.<name>]: an object each", {})
+    scene_file: SceneFile | None = key("objects from a file", None)
+    truth: dict[str, Truth] = key("[truth.<name>]: where an object really is", {})
+    radar: RadarTable | None = key("what measures; not with a capture", None)
+    grid: GridTable | None = key("the map that is compared", None)
+    chirps: AnyChirps | None = key("several ramps a frame", None)
+    impairments: AnyImpairments | None = key("what the front end of simulated data adds", None)
+    raw: Raw | None = key("raw files that simulate writes beside the capture", None)
+    data: AnyData | None = key("what is fitted", None)
+    observations: dict[str, ObservationTable] = key(
+        "[observations.<name>]: several sensors, each with its own data", {}
+    )
+    parameters: list[Annotated[Any, OneOf("parameter")]] = key("[[parameters]]: what is sought", [])
+    starts: Starts | None = key("where fits start; without it where the scene says", None)
+    initial: Initial | None = key(
+        "where the fit starts by conventional processing, not with [starts]", None
+    )
+    surrogate: AnySurrogate = key("kernels of the smooth model", {}, validate_default=True)
+    model: AnyModel | None = key("a plugin's forward model, in place of the surrogate's", None)
+    loss: Annotated[Any, OneOf("loss")] = key("how maps are compared", {}, validate_default=True)
+    optimizer: Annotated[Any, OneOf("optimizer")] = key(
+        "how a gradient becomes a step", {}, validate_default=True
+    )
+    reconstruct: Reconstruct | None = key("the fit", None)
+    stages: list[Stage] = key(
+        "[[stages]]: parts of the fit, one after another; without them one", []
+    )
+    variants: dict[str, Variant] = key("[variants.<name>]: other ways to fit, to compare", {})
+    measures: Measures | None = key("of the found shape", None)
+    calibration: Calibration | None = key("before the fit", None)
+    landscape: Landscape | None = key("losses along a line", None)
+    gradcheck: Gradcheck | None = key("the gradient check", None)
 
     @model_validator(mode="after")
     def _names_exist(self) -> "_RunFile":
@@ -189,7 +211,7 @@ class _RunFile(Section):
     @model_validator(mode="after")
     def _learned_shapes_have_their_own_size(self) -> "_RunFile":
         for parameter in self.parameters:
-            if not isinstance(parameter, ShapeSpaceParameter | PriorParameter):
+            if parameter.kind not in ("shape_space", "prior"):
                 continue
             name, why = parameter.object, f'an object sought with kind = "{parameter.kind}"'
             scale = self.scene[name].scale if name in self.scene else 1.0
@@ -202,13 +224,13 @@ class _RunFile(Section):
     @property
     def parameter_names(self) -> list[str]:
         """What stages and variants call the parameters."""
-        return [getattr(p, "name", None) or p.kind for p in self.parameters]
+        return [p.name or p.kind for p in self.parameters]
 
     def references(self) -> list[tuple[str, str]]:
         """Where the run file names an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
         for i, parameter in enumerate(self.parameters):
-            if not isinstance(parameter, RadarParameter):
+            if getattr(parameter, "object", None) is not None:
                 used.append((f"parameters[{i}].object", parameter.object))
         for section in type(self).model_fields:
             name = getattr(getattr(self, section), "object", None)
@@ -228,11 +250,18 @@ def _named(used: list[str], known: list[str], path: str) -> None:
 
 def _with_plugins() -> type[_RunFile]:
     """The run file with the sections of installed plugins."""
-    added: Any = {
-        name: (model | None, Field(None, description=(model.__doc__ or "").split(".")[0]))
+    tables = {
+        name: registry.table_of(model, name.title().replace("_", ""), checked=None)
         for name, model in load_plugins().sections.items()
     }
-    return create_model("RunFile", __base__=_RunFile, __doc__=_RunFile.__doc__, **added)
+    taken = sorted(set(tables) & set(_RunFile.model_fields))
+    if taken:
+        raise InputError(f"expected new names of sections, got {taken[0]}; rename that plugin's")
+    fields: dict[str, Any] = {
+        name: (table | None, key((table.__doc__ or "").split(".")[0], None))
+        for name, table in tables.items()
+    }
+    return create_model("RunFile", __base__=_RunFile, __doc__=_RunFile.__doc__, **fields)
 
 
 if TYPE_CHECKING:

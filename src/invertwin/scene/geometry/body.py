@@ -139,7 +139,7 @@ class BodyTemplate:
         return found
 
     def scaled(self, factor: float) -> "BodyTemplate":
-        """The same body in another size."""
+        """The body in another size."""
         given = ("vertices", "joints", "shape_directions", "joint_directions", "pose_directions")
         values = {name: getattr(self, name) for name in given}
         return replace(self, **{n: v if v is None else v * factor for n, v in values.items()})
@@ -171,7 +171,7 @@ class BodyTemplate:
         return turns
 
     def _rigid_turns(self, given: Tensor) -> Tensor:
-        """The same about, from the vertices that one joint moves nearly alone."""
+        """Rotation vectors, roughly, from the vertices that one joint moves nearly alone."""
         frames: list[Tensor] = []
         for joint, parent in enumerate(self.parents):
             frames.append(frames[parent] if joint else torch.eye(3, dtype=torch.float64))

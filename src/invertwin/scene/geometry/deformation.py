@@ -1,13 +1,11 @@
 """Smooth deformations: a few control points move many vertices."""
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike
+from invertwin.scene.checks import Counts, Point
 from invertwin.scene.geometry.lattice import Lattice, tensor_product
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
@@ -24,9 +22,7 @@ class LatticeDeformation(nn.Module):
             lattice's nodes and of one more on every side.
     """
 
-    def __init__(
-        self, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int] = (4, 4, 4)
-    ) -> None:
+    def __init__(self, object: str, low: Point, high: Point, counts: Counts = (4, 4, 4)) -> None:
         """Deform `object`, by zero at the start.
 
         Args:

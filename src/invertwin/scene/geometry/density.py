@@ -76,7 +76,7 @@ class DensityGrid(nn.Module):
         counts: Sequence[int],
         depth: float = 0.5,
     ) -> "DensityGrid":
-        """The same density everywhere: a way through the box along its longest side has ∫σ ds.
+        """A grid of one density σ; a way through the box along its longest side has ∫σ ds.
 
         Args:
             object: name of the object.

@@ -10,7 +10,15 @@ from jaxtyping import Float64
 from scipy.fft import dctn, idctn
 from torch import Tensor, nn
 
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.limits import Count, Positive
+from invertwin.scene.checks import (
+    ArrayLike,
+    Counts,
+    Point,
+    checked_count,
+    checked_number,
+    checked_tensor,
+)
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice, cubic
 from invertwin.scene.geometry.smooth_vertices import smoothed
@@ -90,7 +98,15 @@ class DistanceGrid(_Distance):
         distance: Callable[[Tensor], Tensor],
         smoothing: float = 0.0,
     ) -> "DistanceGrid":
-        """The grid that holds a signed distance, a function of points [p, 3], at its nodes.
+        """A grid that holds a signed distance at its nodes.
+
+        Args:
+            object: name of the object.
+            low: corner of the box in the object's frame [m].
+            high: the opposite corner [m].
+            counts: nodes along x, y and z.
+            distance: signed distance [m] of points [p, 3], negative inside.
+            smoothing: λ, as above.
 
         Raises:
             InputError: as above.
@@ -116,6 +132,12 @@ class GridSmoother:
     """I + λL of a grid, L its graph Laplacian, by cosine transforms, which diagonalise it."""
 
     def __init__(self, shape: tuple[int, ...], amount: float) -> None:
+        """Prepare I + λL.
+
+        Args:
+            shape: nodes along each axis.
+            amount: λ.
+        """
         self.amount = amount
         squares = np.zeros(shape)
         for axis, count in enumerate(shape):
@@ -152,14 +174,14 @@ class NeuralDistance(_Distance):
     def __init__(
         self,
         object: str,
-        low: ArrayLike,
-        high: ArrayLike,
-        counts: Sequence[int],
+        low: Point,
+        high: Point,
+        counts: Counts,
         *,
-        radius: float,
-        width: int = 32,
-        depth: int = 2,
-        frequency: float = 8.0,
+        radius: Positive,
+        width: Count = 32,
+        depth: Count = 2,
+        frequency: Positive = 8.0,
         seed: int = 0,
     ) -> None:
         """Shape `object` by a network, from a ball in the middle of the box at the start.

@@ -77,7 +77,12 @@ def surface_of(
 
 
 def slope_of(field: Field, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p 3"]:
-    """The field's gradient in space at points, without derivatives."""
+    """The field's gradient in space at points, without derivatives.
+
+    Args:
+        field: a function of points.
+        points: [m].
+    """
     return _value_and_slope(field, points)[1]
 
 

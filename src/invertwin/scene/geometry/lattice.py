@@ -33,6 +33,11 @@ class Lattice:
     def between(cls, low: ArrayLike, high: ArrayLike, counts: Sequence[int]) -> "Lattice":
         """The lattice between two corners, given as any numbers.
 
+        Args:
+            low: corner of the box [m].
+            high: the opposite corner [m].
+            counts: nodes along x, y and z.
+
         Raises:
             InputError: as above, wrong shapes, or NaN.
         """
@@ -81,7 +86,12 @@ class Lattice:
         return index, place - index
 
     def along(self, axis: int, places: Float64[Tensor, " n"]) -> tuple[Tensor, Tensor]:
-        """The same along one axis: cell and place in it of coordinates [m]."""
+        """Cells along one axis that hold coordinates, and the places in them.
+
+        Args:
+            axis: 0, 1 or 2.
+            places: coordinates along the axis [m].
+        """
         place = (places - self.low[axis]) / self.spacing[axis]
         index = place.floor().long().clamp(0, self.counts[axis] - 2)
         return index, place - index
@@ -92,7 +102,13 @@ def tensor_product(
     index: Int64[Tensor, "p 3"],
     weights: Float64[Tensor, "p 3 4"],
 ) -> Float64[Tensor, "p *rest"]:
-    """Σ weights of the 4 × 4 × 4 nodes that begin at `index`, times their values."""
+    """Σ weights of the 4 × 4 × 4 nodes that begin at `index`, times their values.
+
+    Args:
+        values: at the nodes.
+        index: first node of each point along every axis.
+        weights: of four nodes along every axis.
+    """
     steps = torch.arange(4)
     x, y, z = (index[:, k, None] + steps for k in range(3))
     near = values[x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]]
@@ -102,7 +118,13 @@ def tensor_product(
 def cubic(
     values: Float64[Tensor, "x y z"], lattice: Lattice, points: Float64[Tensor, "p 3"]
 ) -> Float64[Tensor, " p"]:
-    """Cubic convolution (Catmull–Rom) of values at a lattice's nodes, continued outside."""
+    """Values at points by cubic convolution (Catmull–Rom), continued outside the lattice.
+
+    Args:
+        values: at the nodes.
+        lattice: the nodes.
+        points: [m].
+    """
     index, t = lattice.cell(points)
     return tensor_product(_extended(values), index, _cubic_convolution(t))
 
@@ -110,9 +132,14 @@ def cubic(
 def cubic_slices(
     values: Float64[Tensor, "x y z"], lattice: Lattice, wanted: Lattice
 ) -> Iterator[Float64[Tensor, "y z"]]:
-    """The same at the nodes of another lattice, one plane of constant x after another.
+    """Values at the nodes of another lattice by cubic convolution, one plane of x after another.
 
     No more than a plane is held; weights along the axes are applied one axis after the other.
+
+    Args:
+        values: at the nodes.
+        lattice: the nodes.
+        wanted: nodes of the result.
     """
     extended, places = _extended(values), wanted.axes
     index, t = zip(*(lattice.along(k, place) for k, place in enumerate(places)), strict=True)

@@ -33,6 +33,14 @@ class Decoder(nn.Module):
     """
 
     def __init__(self, latent: int, width: int, features: int, nodes: int) -> None:
+        """A network with random weights.
+
+        Args:
+            latent: number of coordinates.
+            width: of the hidden layer.
+            features: number of learned fields.
+            nodes: of half a grid.
+        """
         super().__init__()
         self.enter = nn.Linear(latent, width)
         self.leave = nn.Linear(width, features)
@@ -49,8 +57,8 @@ class ShapePrior:
     """A kind of shapes with mirror symmetry in y, as a decoder of latents with unit variance.
 
     Latents of the shapes it was trained on have zero mean and unit variance along each coordinate,
-    so ½ |z|² is the negative logarithm of their density, and z = 0 is the mean shape. Coordinates
-    come in order of how much they change.
+    so ½ |z|² is the negative logarithm of their probability density, and z = 0 is the mean shape.
+    Coordinates come in order of how much they change.
 
     Attributes:
         decoder: the network, float64, without gradients.
@@ -61,6 +69,10 @@ class ShapePrior:
 
     def __init__(self, decoder: Decoder, lattice: Lattice) -> None:
         """A prior from its network and the nodes that it decodes to.
+
+        Args:
+            decoder: the network.
+            lattice: its nodes, both halves.
 
         Raises:
             InputError: a network for another number of nodes, or nodes that do not mirror in y.
@@ -112,6 +124,10 @@ class ShapePrior:
     ) -> Float64[Tensor, " p"]:
         """The field at points in the shape's frame [m], negative inside.
 
+        Args:
+            points: [m].
+            latent: coordinates in standard deviations.
+
         Raises:
             InputError: as above.
         """
@@ -124,6 +140,10 @@ class ShapePrior:
 
         Only one plane is held at a time.
 
+        Args:
+            latent: coordinates in standard deviations.
+            counts: nodes along x, y and z.
+
         Raises:
             InputError: as above, or fewer than two nodes along an axis.
         """
@@ -134,6 +154,10 @@ class ShapePrior:
         self, latent: Float64[Tensor, " k"], counts: Sequence[int]
     ) -> Float64[Tensor, "x y z"]:
         """The whole field at the nodes of a lattice in the box [m].
+
+        Args:
+            latent: coordinates in standard deviations.
+            counts: nodes along x, y and z.
 
         Raises:
             InputError: as above.

@@ -77,12 +77,19 @@ class Smoother:
     """The factorised matrix I + λL, symmetric and positive definite; copies factorise anew."""
 
     def __init__(self, faces: Tensor, count: int, amount: float) -> None:
+        """Factorise I + λL.
+
+        Args:
+            faces: triangles [f, 3].
+            count: number of vertices.
+            amount: λ.
+        """
         self._given = faces, count, amount
         self._factors: SuperLU = splu(
             csc_array(eye_array(count) + amount * laplacian(faces, count))
         )
 
-    def __reduce__(self) -> tuple:
+    def __reduce__(self) -> tuple[Any, ...]:
         return type(self), self._given
 
     def solve(self, values: Tensor) -> Tensor:
@@ -91,7 +98,12 @@ class Smoother:
 
 
 def laplacian(faces: Tensor, count: int) -> csc_array:
-    """The graph Laplacian: degrees on the diagonal, −1 for every edge."""
+    """The graph Laplacian: degrees on the diagonal, −1 for every edge.
+
+    Args:
+        faces: triangles [f, 3].
+        count: number of vertices.
+    """
     pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = pairs.sort(dim=1).values.unique(dim=0).numpy()
     edges = edges[edges[:, 0] != edges[:, 1]]  # triangles that are a line
@@ -112,7 +124,12 @@ class Solver(Protocol):
 
 
 def smoothed(latent: Tensor, solver: Solver) -> Tensor:
-    """(I + λL)⁻¹ u, with derivatives of any order in both modes."""
+    """(I + λL)⁻¹ u, with derivatives of any order in both modes.
+
+    Args:
+        latent: u.
+        solver: of the matrix I + λL.
+    """
     return _Smoothed.apply(latent, solver)  # type: ignore[return-value]
 
 

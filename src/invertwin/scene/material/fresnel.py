@@ -130,5 +130,10 @@ def refractive_index(permittivity: Shaped[Tensor, "*row"]) -> Float64[Tensor, "*
 
 
 def attenuation(permittivity: Shaped[Tensor, "*row"], frequency: float) -> Float64[Tensor, "*row"]:
-    """Power lost per metre [1/m] inside a medium: −2 (ω/c₀) Im √ε."""
+    """Power lost per metre [1/m] inside a medium: −2 (ω/c₀) Im √ε.
+
+    Args:
+        permittivity: complex, relative.
+        frequency: [Hz].
+    """
     return -4 * math.pi * frequency / SPEED_OF_LIGHT * torch.sqrt(permittivity).imag

@@ -6,13 +6,15 @@ gradients; permittivity and conductivity may also follow the ITU table (`Itu`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import ClassVar, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 import torch
+from annotated_types import MinLen
 from jaxtyping import Float64, Shaped
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.limits import RADIANS
 from invertwin.scene.checks import checked_number
 from invertwin.scene.material.fresnel import (
     attenuation,
@@ -117,7 +119,7 @@ class PerfectConductor(_Values, Material):
         InputError: a width outside its range.
     """
 
-    lobe_width: Value = MIRROR_LOBE_WIDTH
+    lobe_width: Annotated[Value, RADIANS] = MIRROR_LOBE_WIDTH
     coherent: ClassVar[bool] = True
 
     def surface(self, frequency: float) -> Surface:
@@ -161,7 +163,7 @@ class RoughDielectric(Medium, Material):
     """
 
     diffuse: Value = 1.0
-    lobe_width: Value = ROUGH_LOBE_WIDTH
+    lobe_width: Annotated[Value, RADIANS] = ROUGH_LOBE_WIDTH
     coherent: ClassVar[bool] = False
 
     def surface(self, frequency: float) -> Surface:
@@ -279,7 +281,7 @@ class Multilayer(_Values, EffectiveRoughness, Material):
         InputError: no layers, or a value outside its range.
     """
 
-    layers: Sequence[Layer]
+    layers: Annotated[Sequence[Layer], MinLen(1)]
     coherent: ClassVar[bool] = False
 
     def __post_init__(self) -> None:

@@ -71,7 +71,12 @@ def lobe_integral(exponent: Float64[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
 def specular_weights(
     diffuse: Float64[Tensor, "*#row"], exponent: Float64[Tensor, "*#row"]
 ) -> Weights:
-    """A Lambertian part, and the rest in the specular lobe."""
+    """A Lambertian part, and the rest in the specular lobe.
+
+    Args:
+        diffuse: Lambertian part, 0 to 1.
+        exponent: of the specular lobe.
+    """
     diffuse, exponent = torch.broadcast_tensors(diffuse, exponent)
     none = diffuse.new_zeros((*diffuse.shape, LOBE_COUNT - 1))
     weight = (1 - diffuse) / lobe_integral(exponent)

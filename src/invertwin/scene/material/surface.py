@@ -72,7 +72,14 @@ class Surface:
         lobes: Float64[Tensor, "*row 3"] | None = None,
         exponents: Float64[Tensor, "*row 3"] | None = None,
     ) -> "Surface":
-        """A surface that lets nothing through; without lobes it is Lambertian."""
+        """A surface that lets nothing through; without lobes it is Lambertian.
+
+        Args:
+            amplitude: of reflection, tabulated.
+            diffuse: weight of the Lambertian part.
+            lobes: weights of the lobes.
+            exponents: of the lobes.
+        """
         row = diffuse.shape
         none, dark = diffuse.new_zeros((*row, LOBE_COUNT)), torch.zeros_like(amplitude)
         return cls(

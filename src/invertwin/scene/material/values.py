@@ -66,6 +66,10 @@ class Texture:
         The left and right borders are at the least and largest x of the mesh, bottom and top at
         the least and largest y, in the object's own frame.
 
+        Args:
+            image: values of the pixels [row, column].
+            mesh: what it is laid over.
+
         Raises:
             InputError: a mesh without width or height, or a bad image.
         """
@@ -135,6 +139,10 @@ RANGES: Mapping[str, Range] = {
 
 def checked_value(value: object, name: str) -> Value:
     """The value of the field `name`, lists and arrays as tensors.
+
+    Args:
+        value: a number, one per triangle, or a `Texture`.
+        name: a field of `RANGES`.
 
     Raises:
         InputError: not a number, a row of numbers or a texture; NaN, or out of the field's range.

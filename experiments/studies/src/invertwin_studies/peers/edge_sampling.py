@@ -16,10 +16,12 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link
-from invertwin.channel.bridge import Geometry, differentiated, flatten, to_float, to_torch, tracer
-from invertwin.channel.rays import Shot, visible
-from invertwin.channel.tracer import view
+from invertwin.channel import Grid, Link, differentiated
+from invertwin.channel.rays.arrays import to_float, to_torch
+from invertwin.channel.rays.backend import mi
+from invertwin.channel.rays.geometry import Geometry, flatten
+from invertwin.channel.rays.scene import RayScene, visible
+from invertwin.channel.reference.radar_equation import Place, radar_equation
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
@@ -73,13 +75,13 @@ def edge_sampling_derivative(
                 "leave edge_sampling out"
             )
         geometry = flatten(moved, link.wavelength)
-        shot = Shot(geometry, link)
+        rays = RayScene(geometry, link)
         total = torch.zeros(link.frame_count, *grid.shape, dtype=torch.float64)
         generator = torch.Generator().manual_seed(seed)
         for count in _chunks(samples):
-            total += _interior(geometry, link, shot, grid, count, samples, generator)
+            total += _interior(geometry, link, rays, grid, count, samples, generator)
         for count in _chunks(edge_samples):
-            total += _edges(geometry, link, shot, grid, count, edge_samples, generator)
+            total += _edges(geometry, link, rays, grid, count, edge_samples, generator)
     return surrogate.shape(total, radar, grid)
 
 
@@ -112,7 +114,9 @@ def _echo(
     origin = link.tx[frame]
     slope = (normal * ray).sum(1)
     reach = (normal * (p0 - origin)).sum(1) / slope
-    found = view(geometry, link, frame, face, origin + ray * reach[:, None], normal)
+    ones = torch.ones_like(reach)
+    met = Place(origin + ray * reach[:, None], normal, ones, geometry.face_surface[face])
+    found = radar_equation(geometry, link, frame, [met])
     local = torch.einsum("nij,ni->nj", link.rotations[frame], ray)
     strength = found.power * reach.square() / slope.abs().clamp_min(1e-6)
     return _Echo(strength, 0.5 * found.length, local[:, 0], local[:, 1])
@@ -121,7 +125,7 @@ def _echo(
 def _interior(
     geometry: Geometry,
     link: Link,
-    shot: Shot,
+    rays: RayScene,
     grid: Grid,
     count: int,
     samples: int,
@@ -141,7 +145,7 @@ def _interior(
     forward = (1 - u.square() - v.square()).clamp_min(0).sqrt()
     local = torch.stack([u, v, forward], dim=1)
     ray = torch.einsum("nij,nj->ni", link.rotations[frame], local)
-    face = _hit(shot, link.tx[frame], ray)
+    face = _hit(rays, link.tx[frame], ray)
     lit = (face >= 0) & (forward > 1e-3)
     frame, face, ray = frame[lit], face[lit], ray[lit]
     # Solid angle of a piece of (u, v), over the density of samples.
@@ -154,7 +158,7 @@ def _interior(
 def _edges(
     geometry: Geometry,
     link: Link,
-    shot: Shot,
+    rays: RayScene,
     grid: Grid,
     count: int,
     samples: int,
@@ -174,7 +178,7 @@ def _edges(
     frame = torch.randint(link.frame_count, (count,), generator=generator)
     y0, y1 = ends[chosen, 0], ends[chosen, 1]
     point = y0 + (y1 - y0) * along
-    seen = visible(shot, link.tx[frame], _value(point))
+    seen = visible(rays, link.tx[frame], _value(point))
     frame, chosen, point = frame[seen], chosen[seen], point[seen]
     origin = link.tx[frame]
     away = point - origin
@@ -190,7 +194,7 @@ def _edges(
     weight = swept * length.sum() * link.frame_count / samples
     for side in (-1.0, 1.0):
         probe = torch.nn.functional.normalize(still + side * _ASIDE * across, dim=1)
-        face = _hit(shot, origin, probe)
+        face = _hit(rays, origin, probe)
         hit = face >= 0
         echo = _echo(geometry, link, frame[hit], face[hit], still[hit])
         # The side that the edge leaves behind grows.
@@ -201,13 +205,10 @@ def _edges(
     return total
 
 
-def _hit(shot: Shot, origin: Tensor, ray: Tensor) -> Tensor:
+def _hit(rays: RayScene, origin: Tensor, ray: Tensor) -> Tensor:
     """The triangle that each ray meets first; −1 = none."""
-    mi = tracer()
-    local = (origin - shot.origin).float()
-    start = mi.Point3f(*(to_float(local[:, k]) for k in range(3)))
     aim = mi.Vector3f(*(to_float(ray[:, k]) for k in range(3)))
-    found = shot.scene.ray_intersect_preliminary(mi.Ray3f(start, aim), coherent=True)
+    found = rays.scene.ray_intersect_preliminary(mi.Ray3f(rays.located(origin), aim), coherent=True)
     face = to_torch(found.prim_index).long()
     return torch.where(to_torch(found.is_valid()).bool(), face, -1)
 

@@ -17,7 +17,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.channel.bridge import to_float, to_index, to_torch, tracer
+from invertwin.channel.rays.arrays import to_float, to_index, to_torch
+from invertwin.channel.rays.backend import mi
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
@@ -79,7 +80,6 @@ def _paths(
     scene: Scene, vertices: dict[str, Any], radar: Radar, frame: int, samples: int, seed: int
 ) -> list[tuple[Tensor, Tensor]]:
     """Power, delay, polar and azimuth angle of departure of all paths, with tangents."""
-    mi = tracer()
     rt = import_module("sionna.rt")
     import drjit as dr
 

@@ -1,0 +1,1 @@
+"""Fields: conductors, rough points, rough paths of several bounces."""

@@ -1,0 +1,240 @@
+"""Rough paths: the fixed paths of several bounces that rough surfaces scatter along.
+
+The power of a path is its radar equation; as a field it is the square root of that, with a phase
+of its own (derivations §4). Nothing draws anew what is drawn here: a realisation stays while radar
+and scene move.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invertwin.channel.paths import Link
+from invertwin.channel.power import integrand, walk
+from invertwin.channel.rays.arrays import (
+    opaque,
+    scrambled,
+    to_float,
+    to_index,
+    to_torch,
+    uniform_pair,
+)
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.geometry import Geometry, flatten
+from invertwin.channel.rays.scene import RayScene, face_areas
+from invertwin.channel.reference.radar_equation import SurfacePaths, passed, scattered
+from invertwin.scene.scene import Scene
+
+_LANES = 1 << 18  # walked at a time
+_KEPT = 0.25  # of the paths that are drawn; the others carry little
+_REFERENCES = 8  # frames that say how much a path carries
+_ALIKE = 0.5  # share of the draws that goes to all sequences of objects alike
+_BLIND = 0.1  # share that goes to paths whatever the reference frames see of them
+_AWAY = 0.125  # share of the first points that are lit from the side the antennas do not see
+
+
+@dataclass(frozen=True)
+class RoughPaths:
+    """The fixed paths of rough multiple scattering, from two points up.
+
+    Attributes:
+        by_length: Paths of two points, of three points, and so on.
+    """
+
+    by_length: tuple[SurfacePaths, ...]
+
+
+def draw_rough_paths(scene: Scene, link: Link, *, count: int, depth: int, seed: int) -> RoughPaths:
+    """Draw the paths that rough surfaces scatter along, once for all frames.
+
+    The first point is spread over the surfaces, every object alike; the next ones follow the
+    lobes and aim at other objects. After every point, paths that bring much to their last
+    point go on several times and others by chance; of whole paths, the strong ones are kept.
+    Every sequence of objects gets its share, so that a weak echo that takes a narrow way, by a
+    wall to a hidden object and back, is made of many paths, too. One over the chance goes into
+    the weight: the expected power is that of all paths. The antennas only suggest what is worth
+    while: nothing is lost that another pose could see.
+
+    Args:
+        scene: Surfaces.
+        link: Antennas, of which a few frames say what a path is worth.
+        count: Paths to draw, of each length; at most a quarter of them are kept.
+        depth: Most points of a path.
+        seed: Of places and phases.
+
+    Source: derivations §4 (one independent phase per ordered path).
+    """
+    if depth < 2:
+        return RoughPaths(())
+    with torch.no_grad():
+        drawer = _Drawer(flatten(scene, link.wavelength, motion="fixed"), link, seed)
+        rounds = -(-count // _LANES)
+        parts = [drawer.draw(turn, count // rounds, depth) for turn in range(rounds)]
+        return RoughPaths(tuple(map(drawer.joined, zip(*parts, strict=True))))
+
+
+class _Drawer:
+    """Walks paths, and draws again from them where they carry power (splitting and roulette)."""
+
+    def __init__(self, geometry: Geometry, link: Link, seed: int) -> None:
+        self.geometry, self.link = geometry, link
+        self.rays = RayScene(geometry, link)
+        self.inputs = integrand.Inputs.of(self.rays)
+        self.walk = walk.Walk(self.rays, self.inputs, seed)
+        self.seeds = scrambled(seed, 12), scrambled(seed, 13)
+        self.generator = torch.Generator().manual_seed(seed)
+        areas = face_areas(geometry)
+        owners = torch.zeros(len(geometry.coherent), dtype=torch.float64)
+        owners = owners.index_add(0, geometry.face_object, areas)
+        share = areas / owners[geometry.face_object] / len(owners)
+        self.areas = to_float(areas)
+        self.faces = mi.DiscreteDistribution(to_float(share))
+        frames = torch.linspace(0, link.frame_count - 1, min(link.frame_count, _REFERENCES))
+        self.frames = frames.round().long()
+
+    def draw(self, turn: int, lanes: int, depth: int) -> list[SurfacePaths]:
+        """Paths of two points and more, without phases, of one of the rounds."""
+        state = self._started(turn * lanes, lanes)
+        places: list[Tensor] = []
+        found = []
+        for number in range(1, depth + 1):
+            if number > 1:
+                state = self.walk.step(state)
+            places, alive, paths = self._walked(state, places)
+            if number > 1:
+                chance = self._shares(paths, received=True) * (lanes * _KEPT)
+                chance = chance.clamp_max(1.0)
+                found.append(
+                    replace(paths, weight=paths.weight / chance).keep(
+                        self._random(len(chance)) < chance
+                    )
+                )
+            if number < depth and len(alive):
+                shares = self._shares(paths, received=False)
+                drawn = (torch.arange(lanes) + self._random(1)) / lanes
+                row = torch.searchsorted(shares.cumsum(0), drawn).clamp_max(len(alive) - 1)
+                weight = paths.weight[row] / (shares[row] * lanes)
+                places = [column[row] for column in (paths.face, paths.b1, paths.b2)]
+                state = self._again(state, alive[row], weight)
+        return found
+
+    def joined(self, parts: tuple[SurfacePaths, ...]) -> SurfacePaths:
+        """Paths of one length from all rounds, each with a phase."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        face, b1, b2, weight, _ = (torch.cat(column) for column in columns)
+        phase = 2 * torch.pi * self._random(len(weight))
+        return SurfacePaths(face, b1, b2, weight / len(parts), phase)
+
+    def _random(self, count: int) -> Tensor:
+        return torch.rand(count, generator=self.generator, dtype=torch.float64)
+
+    def _started(self, start: int, lanes: int) -> walk.State:
+        """First points, and for each a reference frame that lights it, or its mirror image."""
+        lane = dr.arange(mi.UInt32, lanes)
+        index = lane + opaque(start)
+        place, side = uniform_pair(index, self.seeds[0])
+        face, pmf = self.faces.sample_pmf((mi.Float(lane) + place) / lanes)
+        b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
+        point = integrand.place(self.inputs, face, b.x, b.y)
+        frame = dr.gather(mi.UInt32, to_index(self.frames), index % opaque(len(self.frames)))
+        back, distance = integrand.segment(point.position, self.inputs.antenna(frame, False))
+        turned = back - 2 * dr.dot(back, point.normal) * point.normal
+        back = dr.select(side < _AWAY, turned, back)
+        state = walk.start(index, frame, face, b.x, b.y, back, dr.ones(mi.Float, lanes), distance)
+        area = dr.gather(mi.Float, self.areas, face)
+        state["weight"] = area / (pmf * lanes * dr.select(side < _AWAY, _AWAY, 1 - _AWAY))
+        return state
+
+    def _walked(
+        self, state: walk.State, before: list[Tensor]
+    ) -> tuple[list[Tensor], Tensor, SurfacePaths]:
+        """Places of all lanes' points, the lanes that are alive, and their paths."""
+        names = ("face", "b1", "b2", "weight", "active")
+        dr.eval(*(state[name] for name in names))
+        *latest, weight, active = (to_torch(state[name]) for name in names)
+        places = [latest[0].long()[:, None], *(b.double()[:, None] for b in latest[1:])]
+        if before:
+            places = [torch.cat(pair, dim=1) for pair in zip(before, places, strict=True)]
+        alive = active.bool().nonzero()[:, 0]
+        face, b1, b2 = (column[alive] for column in places)
+        weight = weight.double()[alive]
+        return places, alive, SurfacePaths(face, b1, b2, weight, torch.zeros_like(weight))
+
+    def _again(self, state: walk.State, parent: Tensor, weight: Tensor) -> walk.State:
+        """Lanes that go on from others; each has its own number, and so its own way."""
+        at = to_index(parent)
+        columns = {
+            name: dr.gather(type(column), column, at)
+            if name != "back"
+            else mi.Vector3f(*(dr.gather(mi.Float, column[k], at) for k in range(3)))
+            for name, column in state.items()
+            if name in ("face", "b1", "b2", "back", "number")
+        }
+        return {
+            **state,
+            **columns,
+            "weight": to_float(weight),
+            "active": dr.full(mi.Bool, True, len(parent)),
+        }
+
+    def _shares(self, paths: SurfacePaths, *, received: bool) -> Tensor:
+        """How the draws are shared among paths: by their power, and by sequences of objects."""
+        if not len(paths.weight):
+            return paths.weight
+        power = paths.weight * self._power(paths, received=received)
+        blind = paths.weight / paths.weight.sum()
+        total = power.sum()
+        if not total > 0:
+            return blind
+        objects = self.geometry.face_object[paths.face]
+        base = len(self.geometry.coherent) ** torch.arange(objects.shape[1])
+        _, family = (objects * base).sum(1).unique(return_inverse=True)
+        sums = torch.zeros(int(family.max()) + 1, dtype=torch.float64).index_add(0, family, power)
+        seen = int((sums > 0).sum())
+        alike = power / sums.clamp_min(1e-300)[family] / seen
+        return _BLIND * blind + (1 - _BLIND) * (_ALIKE * alike + (1 - _ALIKE) * power / total)
+
+    def _power(self, paths: SurfacePaths, *, received: bool) -> Tensor:
+        """Power at the receiver or the last point, the mean of the reference frames.
+
+        What lies between points is left out: it only makes the draw less good.
+        """
+        places = paths.places(self.geometry)
+        points = [place.position for place in places]
+        segments = [end - start for start, end in pairwise(points)]
+        middle = torch.ones_like(paths.weight)
+        for segment in segments:
+            middle = middle / segment.square().sum(1)
+        ways = [normalize(segment, dim=1) for segment in segments]
+        for k in range(1, len(points) - 1):
+            middle = middle * scattered(self.geometry, places[k], -ways[k - 1], ways[k])
+        if segments and not received:
+            middle = middle * (places[-1].normal * ways[-1]).sum(1).abs()
+        total = torch.zeros_like(middle)
+        link = self.link
+        for number in self.frames.tolist():
+            value = middle
+            tx, rx = link.tx[number].detach(), link.rx[number].detach()
+            to_tx = normalize(tx - points[0], dim=1)
+            if segments:
+                value = value * scattered(self.geometry, places[0], to_tx, ways[0])
+            else:
+                value = value * (places[0].normal * to_tx).sum(1).abs()
+            ends = [(tx, points[0], link.tx_pattern)]
+            if received:
+                to_rx = normalize(rx - points[-1], dim=1)
+                value = value * scattered(self.geometry, places[-1], -ways[-1], to_rx)
+                ends.append((rx, points[-1], link.rx_pattern))
+            for antenna, point, pattern in ends:
+                offset = point - antenna
+                distance = offset.norm(dim=1)
+                gain = pattern.gain(offset / distance[:, None] @ link.rotations[number].detach())
+                value = value * gain / distance**2
+                lit = value > 0
+                transmittance, _ = passed(self.rays, antenna.expand(int(lit.sum()), 3), point[lit])
+                value = value.masked_scatter(lit, value[lit] * transmittance)
+            total = total + value
+        return total / len(self.frames)

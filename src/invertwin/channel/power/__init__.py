@@ -1,0 +1,1 @@
+"""Scattered power: where paths start, how they go on, what they add to a map."""

@@ -1,0 +1,303 @@
+"""Power that clouds of soft scatterers send back, into the bins of a map: rays that fade.
+
+Geometry and transmittance are torch in float64, so that automatic differentiation in both modes
+does their derivatives; only the deposit is a integrand. A cloud has no silhouette: its power is
+continuous in all that moves, so no boundary terms are due.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float32, Float64, Int64
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from invertwin.channel.paths import Grid, Link
+from invertwin.channel.power import bins
+from invertwin.channel.rays.arrays import to_float, to_index, to_torch
+from invertwin.channel.rays.backend import backend, mi, use_backend
+from invertwin.channel.sampling import Sampling
+from invertwin.errors import InputError
+from invertwin.scene.cloud import Cloud
+from invertwin.scene.scene import Object
+
+_CHUNK = 262_144  # points at a time
+_FLAT = 1e-12  # least component of a direction: a ray along a face of the box
+
+
+def deposit_density(
+    item: Object,
+    link: Link,
+    grid: Grid,
+    *,
+    sampling: Sampling,
+    seed: int,
+) -> Float32[Tensor, "frame range u v"]:
+    """Expected received over transmitted power of an object's cloud in every bin, per frame.
+
+        ∫ (λ/4π)² G_t G_r / (R_t R_r)² · (albedo/4π) σ exp(−∫_t σ ds − ∫_r σ ds) dV
+
+    with the ways from both antennas to the point through the cloud; one way serves both where
+    the link shares its visibility. Rays start at the transmitter through points spread evenly over
+    the box; along a ray every segment holds back 1 − exp(−σΔ) of what reaches it, so that
+    nothing is lost in cells that are opaque.
+    Differentiable in both modes with respect to densities, albedo, the object's pose and the
+    radar's poses and patterns. Meshes neither hide the cloud nor are hidden by it.
+
+    Source: the radiative transfer of single scattering; units of ``deposit_power``.
+    Differs from the source: the paper has no densities.
+
+    Args:
+        item: An object with a cloud.
+        link: Antennas, per frame.
+        grid: Bins.
+        sampling: How many points on rays, over all frames, and where they are traced.
+        seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
+
+    Raises:
+        InputError: An object without a cloud or in motion, an antenna
+            inside of the box.
+    """
+    if item.cloud is None:
+        raise InputError(
+            "expected an object with a cloud, got one without; use deposit_power for meshes"
+        )
+    if item.velocity is not None and bool(item.velocity.any()):
+        raise InputError(
+            "expected a cloud at rest, got a velocity; a frame is one instant: use scene.at(time)"
+        )
+    with use_backend(sampling.backend):
+        rays = _Rays.of(item, link, sampling.samples, seed)
+        parts = [_Splat.apply(grid, link.frame_count, *part) for part in rays.contributions()]
+    return torch.stack(parts).sum(0)
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays through a box: one row per ray, in the object's frame.
+
+    Attributes:
+        cloud: The density.
+        link: Antennas.
+        origins: Of the transmitter and the receiver of every frame.
+        turn: Rotation of the object.
+        frame: Of every ray.
+        through: Point of the box that the ray meets.
+        shift: Place of the points within their segments, in [0, 1).
+        steps: Segments of a ray.
+    """
+
+    cloud: Cloud
+    link: Link
+    origins: tuple[Float64[Tensor, "frame 3"], Float64[Tensor, "frame 3"]]
+    turn: Float64[Tensor, "3 3"]
+    frame: Int64[Tensor, " ray"]
+    through: Float64[Tensor, "ray 3"]
+    shift: Float64[Tensor, " ray"]
+    steps: int
+
+    @staticmethod
+    def of(item: Object, link: Link, samples: int, seed: int) -> "_Rays":
+        cloud = item.cloud
+        assert cloud is not None
+        pose = item.transform
+        turn = pose[:3, :3]
+        origins = tuple((places - pose[:3, 3]) @ turn for places in (link.tx, link.rx))
+        for places in origins:
+            inside = ((places > cloud.low) & (places < cloud.high)).all(1)
+            if bool(inside.any()):
+                raise InputError(
+                    "expected the antennas outside of the cloud's box, got one inside of it in "
+                    f"frame {int(inside.int().argmax())}; choose a smaller box"
+                )
+        # About one point per cell on the longest way through the box.
+        steps = math.ceil(math.hypot(*(count - 1 for count in cloud.density.shape)))
+        count = max(1, round(samples / (link.frame_count * steps)))
+        # Consecutive rows of a Sobol sequence are well spread: every frame gets its own.
+        engine = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed)
+        numbers = engine.draw(link.frame_count * count, dtype=torch.float64)
+        return _Rays(
+            cloud=cloud,
+            link=link,
+            origins=(origins[0], origins[1]),
+            turn=turn,
+            frame=torch.arange(link.frame_count).repeat_interleave(count),
+            through=cloud.low + numbers[:, :3] * (cloud.high - cloud.low),
+            shift=numbers[:, 3],
+            steps=steps,
+        )
+
+    def contributions(self) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+        """Frame, power, range, u and v of the points, so many at a time."""
+        per_frame = len(self.frame) // self.link.frame_count
+        ways = 1 if self.link.shared_visibility else self.steps
+        width = max(1, _CHUNK // (self.steps * ways))
+        for start in range(0, len(self.frame), width):
+            part = slice(start, start + width)
+            yield replace(
+                self, frame=self.frame[part], through=self.through[part], shift=self.shift[part]
+            )._seen(per_frame)
+
+    def _seen(self, per_frame: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        tx = self.origins[0][self.frame]
+        offset = self.through - tx
+        way = offset / offset.norm(dim=1, keepdim=True)
+        near, far = self._chord(tx, way)
+        # Density of rays per steradian that even points in the box make: chord's share of it.
+        volume = (self.cloud.high - self.cloud.low).prod()
+        weight = 3 * volume / ((far**3 - near**3) * per_frame)
+        length = (far - near)[:, None] / self.steps
+        place = torch.arange(self.steps) + self.shift[:, None]
+        distance = near[:, None] + place * length  # from the transmitter
+        points = tx[:, None] + distance[..., None] * way[:, None]
+        thickness = self._density(points) * length
+        before = thickness.cumsum(1) - thickness
+        link, frame = self.link, self.frame[:, None].expand_as(distance)
+        if link.shared_visibility:
+            ways = 2 * before
+        else:
+            # Back to the start of the segment, as far as the way to it is as dense: without this
+            # an opaque cell would count as if all came back from the point's depth in it.
+            ways = before + self._way_back(points, frame) - self.shift[:, None] * thickness
+        held = -0.5 * torch.exp(-ways) * torch.expm1(-2 * thickness)
+        back = points - self.origins[1][self.frame][:, None]
+        return_way = back.norm(dim=2)
+        rotation = link.rotations[self.frame]
+        towards = [
+            torch.einsum("rij,rkj->rki", rotation.mT @ self.turn, direction)
+            for direction in (way[:, None], back / return_way[..., None])
+        ]
+        gain = link.tx_pattern.gain(towards[0]) * link.rx_pattern.gain(towards[1])
+        scale = (link.wavelength / (4 * math.pi)) ** 2 * self.cloud.albedo / (4 * math.pi)
+        power = scale * weight[:, None] * gain * held / return_way.square()
+        total = 0.5 * (distance + return_way)
+        columns = [power, total, towards[1][..., 0], towards[1][..., 1]]
+        return frame.reshape(-1), *(column.reshape(-1) for column in columns)  # type: ignore[return-value]
+
+    def _chord(self, origin: Tensor, way: Tensor) -> tuple[Tensor, Tensor]:
+        """Distances at which rays that meet the box enter and leave it."""
+        slope = torch.where(way.abs() < _FLAT, _FLAT, way)
+        first, second = (self.cloud.low - origin) / slope, (self.cloud.high - origin) / slope
+        near = torch.minimum(first, second).amax(1).clamp_min(0.0)
+        return near, torch.maximum(first, second).amin(1)
+
+    def _way_back(self, points: Tensor, frame: Tensor) -> Tensor:
+        """∫σ ds from points to the receiver."""
+        flat = points.reshape(-1, 3)
+        rx = self.origins[1][frame.reshape(-1)]
+        offset = flat - rx
+        distance = offset.norm(dim=1)
+        way = offset / distance[:, None]
+        near, _ = self._chord(rx, way)
+        length = (distance - near)[:, None] / self.steps
+        shift = self.shift[:, None].expand(points.shape[:2]).reshape(-1, 1)
+        depth = near[:, None] + (torch.arange(self.steps) + shift) * length
+        between = rx[:, None] + depth[..., None] * way[:, None]
+        return (self._density(between) * length).sum(1).reshape(points.shape[:2])
+
+    def _density(self, points: Float64[Tensor, "ray step 3"]) -> Float64[Tensor, "ray step"]:
+        place = (points - self.cloud.low) / self.cloud.spacing
+        found = _Trilinear.apply(self.cloud.density, place.reshape(-1, 3))
+        return found.reshape(points.shape[:2])
+
+
+class _Trilinear(torch.autograd.Function):
+    """Values between the nodes of a grid, at places counted in cells; outside the nearest cell.
+
+    Written out, since the corners of every point would else be kept for the derivative.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, place: Tensor) -> Tensor:
+        ctx.shape = values.shape
+        ctx.first, ctx.inside = _cell(place.detach(), values.shape)
+        ctx.values = values.detach()
+        flat, total = ctx.values.reshape(-1), torch.zeros_like(ctx.inside[:, 0])
+        for index, weight, _ in _corners(values.shape, ctx.first, ctx.inside):
+            total += weight * flat[index]
+        return total
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:  # type: ignore[override]
+        flat = ctx.values.reshape(-1)
+        to_values = torch.zeros_like(flat) if ctx.needs_input_grad[0] else None
+        to_place = torch.zeros_like(ctx.inside) if ctx.needs_input_grad[1] else None
+        for index, weight, slopes in _corners(ctx.shape, ctx.first, ctx.inside):
+            if to_values is not None:
+                to_values.index_add_(0, index, grad * weight)
+            if to_place is not None:
+                to_place += (grad * flat[index])[:, None] * slopes()
+        return None if to_values is None else to_values.reshape(ctx.shape), to_place
+
+    @staticmethod
+    def jvp(ctx: Any, values: Tensor | None, place: Tensor | None) -> Tensor:  # type: ignore[override]
+        flat = ctx.values.reshape(-1)
+        total = torch.zeros_like(ctx.inside[:, 0])
+        for index, weight, slopes in _corners(ctx.shape, ctx.first, ctx.inside):
+            if values is not None:
+                total += weight * values.reshape(-1)[index]
+            if place is not None:
+                total += flat[index] * (slopes() * place).sum(1)
+        return total
+
+
+def _cell(place: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor]:
+    """The lowest corner of a place's cell, and the place within the cell."""
+    last = torch.tensor(shape, device=place.device) - 2
+    first = place.floor().long().clamp_min(0).minimum(last)
+    return first, (place - first).clamp(0.0, 1.0)
+
+
+def _corners(shape: torch.Size, first: Tensor, inside: Tensor) -> Iterator[tuple[Tensor, Any, Any]]:
+    """Flat index, weight, and a function that gives the weight's slopes, of the eight corners."""
+    strides = (shape[1] * shape[2], shape[2], 1)
+    x, y, z = (torch.stack([1 - part, part]) for part in inside.unbind(1))
+    base = (first * torch.tensor(strides, device=first.device)).sum(1)
+    for i in (0, 1):
+        for j in (0, 1):
+            for k in (0, 1):
+                index = base + i * strides[0] + j * strides[1] + k * strides[2]
+
+                def slopes(i: int = i, j: int = j, k: int = k) -> Tensor:
+                    columns = [
+                        (2 * i - 1) * y[j] * z[k],
+                        x[i] * (2 * j - 1) * z[k],
+                        x[i] * y[j] * (2 * k - 1),
+                    ]
+                    return torch.stack(columns, dim=1)
+
+                yield index, x[i] * y[j] * z[k], slopes
+
+
+class _Splat(torch.autograd.Function):
+    """Points into the bins of a map, with the derivatives of ``bins`` in both modes."""
+
+    @staticmethod
+    def forward(ctx: Any, grid: Grid, frames: int, frame: Tensor, *columns: Tensor) -> Tensor:
+        places = [to_float(column) for column in columns]
+        ctx.found = bins.Contribution(mi.Int32(to_index(frame)), *places)
+        ctx.grid, ctx.frames, ctx.backend = grid, frames, backend()
+        out = bins.Bins(grid, frames)
+        out.add(ctx.found, True)
+        return out.map()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        with use_backend(ctx.backend):
+            bars = bins.gather(to_float(grad), ctx.grid, ctx.found, True)
+            return None, None, None, *(to_torch(bar).double() for bar in bars)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
+        with use_backend(ctx.backend):
+            dots = tuple(
+                mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[3:]
+            )
+            out = bins.Bins(ctx.grid, ctx.frames)
+            out.add_derivative(ctx.found, dots, True)
+            return out.map()

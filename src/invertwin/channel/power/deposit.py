@@ -1,0 +1,182 @@
+"""Power paths straight into the bins of a map, with derivatives in both modes.
+
+No path is ever stored for torch: paths are walked, deposited and forgotten, or kept as records
+while these fit the memory budget, and replayed for the derivative.
+"""
+
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from invertwin.channel.paths import Grid, Link
+from invertwin.channel.power import bins, replay
+from invertwin.channel.power.clouds import deposit_density
+from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
+from invertwin.channel.power.trace import Trace
+from invertwin.channel.rays.arrays import to_float
+from invertwin.channel.rays.backend import backend, dr, mi, one_torch_thread, use_backend
+from invertwin.channel.rays.geometry import differentiated, flatten, require_edges
+from invertwin.channel.sampling import Sampling
+from invertwin.errors import InputError
+from invertwin.scene.scene import Object, Scene
+
+
+def deposit_power(
+    scene: Scene,
+    link: Link,
+    grid: Grid,
+    *,
+    sampling: Sampling,
+    seed: int,
+    scheme: Literal["rays", "area"] = "rays",
+    reference: tuple[Scene, Link] | None = None,
+) -> Float32[Tensor, "frame range u v"]:
+    """Expected received over transmitted power in every bin of a map, per frame.
+
+    ``∫ f dA₁ … dAₙ`` over all paths of up to ``depth`` surface points that see each other in
+    turn, with ``f`` the radar equation of the path: 1/R² for every segment, the scattering
+    distribution of the material and both cosines for every point.
+    Differentiable in both modes with respect to vertices, material values and radar poses;
+    moving silhouettes included unless ``boundary`` is off. Objects that are clouds add the power
+    of ``deposit_density``, each with all ``samples``.
+
+    Args:
+        scene: What is seen.
+        link: Antennas, per frame.
+        grid: Bins.
+        sampling: How many paths are drawn.
+        seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
+        scheme: ``rays`` from the antenna into the caps around the objects, or ``area``.
+        reference: The scene and link that fix the density (caps around objects, enlarged by a
+            tenth, or triangle areas), so that differences in θ have common random numbers.
+
+    Source: Eq. 7–8 of the paper in material form, derivations §2–3 and §5; interior segments
+    §3.3.3.
+    Differs from the source: the boundary term carries a plain line integral over silhouettes,
+    not the divergence of Eq. 14.
+
+    Raises:
+        InputError: No silhouette samples where a derivative needs them, an
+            antenna pattern that carries derivatives, objects in motion, an unknown backend.
+    """
+    if scheme not in ("rays", "area"):
+        raise InputError(f"expected scheme 'rays' or 'area', got {scheme!r}; choose one")
+    surfaces, clouds = _sorted(scene)
+    soft = [deposit_density(item, link, grid, sampling=sampling, seed=seed) for item in clouds]
+    if surfaces is None:
+        return torch.stack(soft).sum(0)
+    with use_backend(sampling.backend), one_torch_thread():
+        geometry = flatten(surfaces, link.wavelength)
+        fixed = None
+        if reference is not None and (hard := _sorted(reference[0])[0]) is not None:
+            fixed = flatten(hard, link.wavelength), reference[1]
+        if sampling.boundary:
+            require_edges(geometry, link, sampling.boundary_samples)
+        if any(differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
+            raise InputError(
+                "expected an antenna pattern without derivatives, got one that carries them; "
+                "power paths do not differentiate patterns: detach its values"
+            )
+        trace = Trace(geometry, link, sampling, seed, scheme=scheme, reference=fixed)
+        found = _Deposit.apply(trace, grid, *trace.tables)
+    return found + torch.stack(soft).sum(0) if soft else found  # type: ignore[no-any-return]
+
+
+def _sorted(scene: Scene) -> tuple[Scene | None, list[Object]]:
+    """The surfaces of a scene, if any, and its clouds."""
+    clouds = [item for item in scene.objects.values() if item.cloud is not None]
+    surfaces = {name: item for name, item in scene.objects.items() if item.cloud is None}
+    return (Scene(surfaces) if surfaces else None), clouds
+
+
+class _Deposit(torch.autograd.Function):
+    """∂map/∂(vertices, poses, materials), forward and backward.
+
+    The derivative of the deposit itself is written out, and that of a path replayed from its
+    records; Dr.Jit differentiates the smooth geometry at one vertex.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, trace: Trace, grid: Grid, *tables: Tensor) -> Tensor:
+        out = bins.Bins(grid, trace.rays.link.frame_count)
+        derivative = any(ctx.needs_input_grad)
+        ctx.records = trace.deposit(out, record=derivative)
+        if derivative:
+            _ = trace.boundary_points  # prepared while the paths are walked
+        ctx.trace, ctx.grid, ctx.backend = trace, grid, backend()
+        return out.map()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        trace: Trace = ctx.trace
+        with use_backend(ctx.backend), one_torch_thread():
+            wanted = [n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[2:], strict=True) if w]
+            tables = _attached(trace, wanted)
+            inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
+            seed = to_float(grad)
+
+            def gather(*path: Any) -> tuple[Any, Any, Any, Any]:
+                return bins.gather(seed, ctx.grid, *path)
+
+            boundary = trace.boundary(inputs)
+            for records in [ctx.records] if ctx.records else trace.records():
+                replay.pull(trace.rays, inputs, records, gather)
+                dr.eval([dr.grad(table) for table in tables.values()])
+                del records  # before the next ones are made
+            for paths in boundary:
+                total = paths.weighted(lambda *path: gather(*path)[0])
+                if dr.grad_enabled(paths.speed):
+                    dr.backward_from(paths.speed * total)
+                dr.eval([dr.grad(table) for table in tables.values()])
+            results: list[Tensor | None] = [None, None]
+            for name, source in zip(DIFFERENTIABLE, trace.tables, strict=True):
+                results.append(
+                    from_table(name, dr.grad(tables[name]), source) if name in tables else None
+                )
+            return tuple(results)
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
+        trace: Trace = ctx.trace
+        with use_backend(ctx.backend), one_torch_thread():
+            given = {
+                name: tangent
+                for name, tangent in zip(DIFFERENTIABLE, tangents, strict=True)
+                if tangent is not None
+            }
+            tables = _attached(trace, list(given))
+            inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
+            out = bins.Bins(ctx.grid, trace.rays.link.frame_count)
+
+            def point_tangents() -> None:
+                for name, table in tables.items():
+                    dr.set_grad(table, to_table(name, given[name]))
+
+            boundary = trace.boundary(inputs)
+            for records in [ctx.records] if ctx.records else trace.records():
+                point_tangents()
+                replay.push(trace.rays, inputs, records, out.add_derivative)
+                dr.eval(out.values)
+                del records
+            for paths in boundary:
+                point_tangents()
+                paths.deposit(dr.forward_to(paths.speed), out.add)
+                dr.eval(out.values)
+            return out.map()
+
+
+def _attached(trace: Trace, names: list[str]) -> dict[str, Any]:
+    """Copies of some of the kernel's tables that carry derivatives."""
+    tables = {name: mi.Float(trace.fixed.table(name)) for name in names}
+    dr.enable_grad(list(tables.values()))
+    return tables
+
+
+def _equal(first: Tensor | None, second: Tensor | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    return torch.equal(first, second)

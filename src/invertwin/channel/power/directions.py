@@ -1,0 +1,169 @@
+"""Where a path goes on from a surface: towards other objects, or along the lobes of the surface.
+
+Both ways are drawn from, and the density is that of their mixture, so that small bright objects
+and narrow lobes are both found. Detached.
+"""
+
+from typing import Any
+
+import torch
+
+from invertwin.channel.power.integrand import Place
+from invertwin.channel.power.surface import Surfaces, gaussian
+from invertwin.channel.rays.arrays import to_float
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import RayScene
+from invertwin.scene.material import Surface
+
+_TOWARDS = 0.5  # share of the directions that aim at other objects, where there are some
+
+
+class Directions:
+    """Draws directions on the side of a surface from which it is lit."""
+
+    def __init__(self, rays: RayScene, surfaces: Surfaces) -> None:
+        centres, radii = rays.spheres
+        self.objects = len(radii)
+        self.centres = to_float(centres - rays.origin)
+        self.radii = to_float(1.001 * radii)
+        self.surfaces = surfaces
+        shares = _shares(rays.geometry.surfaces)
+        self.shares = to_float(shares)
+        self.width = shares.shape[1]
+
+    def draw(self, point: Place, back: Any, numbers: list[Any]) -> tuple[Any, Any]:
+        """A unit direction from four uniform numbers, and its density per solid angle.
+
+        Where total reflection leaves no direction, the density is infinite.
+        """
+        caps, outside = self._caps(point)
+        count: Any = mi.Float(0)
+        for away in outside:
+            count += dr.select(away, 1, 0)
+        towards: Any = dr.select(count > 0, _TOWARDS, 0.0)
+        facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, back)))
+        aimed, rest = numbers[0] < towards, numbers[0]
+        # The object, counted among those that the point is outside of.
+        wanted = dr.minimum(dr.floor(rest / dr.maximum(towards, 1e-6) * count), count - 1)
+        axis, height, passed = mi.Vector3f(0, 0, 1), mi.Float(2.0), mi.Float(0)
+        for (direction, cap), away in zip(caps, outside, strict=True):
+            chosen = away & (passed == wanted)
+            axis, height = dr.select(chosen, direction, axis), dr.select(chosen, cap, height)
+            passed += dr.select(away, 1, 0)
+        omega = dr.select(
+            aimed, _in_cap(axis, height, numbers[2:]), self._scattered(point, back, facing, numbers)
+        )
+        density = (1 - towards) * self._density(point, back, facing, omega)
+        share = towards / dr.maximum(count, 1)
+        for (direction, cap), away in zip(caps, outside, strict=True):
+            inside = away & (dr.squared_norm(omega - direction) <= 2 * cap)
+            density += dr.select(inside, share / (2 * dr.pi * cap), 0.0)
+        if self.surfaces.bodies:
+            lost = dr.squared_norm(omega) < 0.5
+            omega = dr.select(lost, mi.Vector3f(facing), omega)
+            density = dr.select(lost, dr.inf, density)
+        return omega, density
+
+    def _caps(self, point: Place) -> tuple[list[tuple[Any, Any]], list[Any]]:
+        """Axis and height of every object's cap, and whether the point is outside its sphere."""
+        caps, outside = [], []
+        for number in range(self.objects):
+            index = mi.UInt32(number)
+            offset = dr.gather(mi.Point3f, self.centres, index) - point.position
+            radius = dr.gather(mi.Float, self.radii, index)
+            distance = dr.norm(offset)
+            sine2 = dr.minimum(dr.square(radius / distance), 1.0)
+            caps.append((mi.Vector3f(offset / distance), sine2 / (1 + dr.sqrt(1 - sine2))))
+            outside.append(distance > radius)
+        return caps, outside
+
+    def _scattered(self, point: Place, back: Any, facing: Any, numbers: list[Any]) -> Any:
+        omega = mi.Frame3f(facing).to_world(
+            mi.warp.square_to_cosine_hemisphere(mi.Point2f(numbers[2], numbers[3]))
+        )
+        mirror = 2 * dr.dot(back, facing) * facing - back
+        limit = self._share(point, 0)
+        for number, present in enumerate(self.surfaces.lobed):
+            if not present:
+                continue
+            axis = mi.Vector3f(back if number == 2 else mirror)
+            exponent = dr.gather(mi.Float, self.surfaces.exponents, point.surface * 3 + number)
+            # Height of the cap that a lobe ((1 + cosψ)/2)^p fills to the share of the number.
+            height = 2 * (1 - dr.exp(dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)))
+            lobe = _in_cap(axis, height, [mi.Float(1.0), numbers[3]])
+            share = self._share(point, number + 1)
+            chosen = (numbers[1] >= limit) & (numbers[1] < limit + share)
+            omega = dr.select(chosen, lobe, omega)
+            limit += share
+        if self.surfaces.bodies:
+            omega = dr.select(numbers[1] >= limit, self._refracted(point, back, numbers), omega)
+        return mi.Vector3f(omega)
+
+    def _sides(self, point: Place, back: Any) -> tuple[Any, Any, Any]:
+        """Refractive index here and beyond, and variance of the refracted lobe."""
+        body = self.surfaces.value("index", point.surface)
+        outside = dr.dot(point.normal, back) > 0
+        variance = self.surfaces.refraction_variance(point.surface)
+        return dr.select(outside, 1.0, body), dr.select(outside, body, 1.0), variance
+
+    def _refracted(self, point: Place, back: Any, numbers: list[Any]) -> Any:
+        """A direction beyond the surface about Snell's; zero if there is none."""
+        here, beyond, variance = self._sides(point, back)
+        spread = dr.sqrt(variance)
+        gauss = mi.warp.square_to_std_normal(mi.Point2f(numbers[2], numbers[3])) * spread
+        frame = mi.Frame3f(mi.Vector3f(point.normal))
+        local = frame.to_local(mi.Vector3f(back))
+        x, y = ((gauss[k] - here * local[k]) / beyond for k in range(2))
+        rest = 1 - x * x - y * y
+        z = -dr.mulsign(dr.sqrt(dr.maximum(rest, 0.0)), local.z)
+        return dr.select(rest > 1e-6, frame.to_world(mi.Vector3f(x, y, z)), mi.Vector3f(0.0))
+
+    def _refraction_density(self, point: Place, back: Any, omega: Any) -> Any:
+        here, beyond, variance = self._sides(point, back)
+        first, second = dr.dot(point.normal, back), dr.dot(point.normal, omega)
+        mismatch = here * (back - point.normal * first) + beyond * (omega - point.normal * second)
+        lobe = gaussian(mismatch, variance)
+        return dr.select(first * second < 0, lobe * dr.square(beyond) * dr.abs(second), 0.0)
+
+    def _density(self, point: Place, back: Any, facing: Any, omega: Any) -> Any:
+        cosine, between = dr.dot(facing, omega), dr.dot(back, omega)
+        density = self._share(point, 0) * dr.maximum(cosine, 0.0) * dr.inv_pi
+        product = cosine * dr.dot(facing, back)
+        for number, present in enumerate(self.surfaces.lobed):
+            if present:
+                row = point.surface
+                lobe, exponent = self.surfaces.lobe(number, row, product, between)
+                lobe = (exponent + 1) / (4 * dr.pi) * lobe
+                density += self._share(point, number + 1) * lobe
+        if self.surfaces.bodies:
+            share = self._share(point, self.width - 1)
+            density += share * self._refraction_density(point, back, omega)
+        return density
+
+    def _share(self, point: Place, number: int) -> Any:
+        return dr.gather(mi.Float, self.shares, point.surface * self.width + number)
+
+
+def _in_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
+    """Uniform on the spherical cap of a height 1 − cos about an axis."""
+    depth = numbers[0] * height
+    sine = dr.sqrt(dr.maximum(depth * (2 - depth), 0.0))
+    s, c = dr.sincos(2 * dr.pi * numbers[1])
+    return dr.normalize(mi.Frame3f(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
+
+
+def _shares(surfaces: Surface) -> torch.Tensor:
+    """Share of each part of a surface in what it scatters; Lambertian if it scatters nothing."""
+    exponents = surfaces.exponents.detach()
+    wide = 4 * torch.pi * (exponents + torch.exp2(-(exponents + 1)))
+    integrals = wide / ((exponents + 1) * (exponents + 2))
+    lobes = surfaces.lobes.detach() * integrals
+    diffuse = surfaces.diffuse.detach()[:, None]
+    total = diffuse + lobes.sum(1, keepdim=True)
+    # Something of the cosine stays in, so that the density never vanishes where f does not.
+    parts = torch.cat([diffuse + 0.05 * (total + (total == 0)), lobes], dim=1)
+    # What is reflected at normal incidence against what is refracted there.
+    reflected = surfaces.amplitude.detach()[:, -1:].square()
+    parts = parts * torch.where(surfaces.refraction.any(1, keepdim=True), reflected, 1.0)
+    parts = torch.cat([parts, surfaces.refraction.detach()[:, -1:]], dim=1)
+    return parts / parts.sum(1, keepdim=True)

@@ -1,0 +1,467 @@
+"""Where shadows end: points on edges, what falls behind them, and how fast it moves.
+
+Family 1 looks from an antenna past its silhouettes; family 2 starts at an edge and looks both
+ways along a direction that is tangential there, so that no silhouette is ever searched per vertex
+(derivations §3). Places are detached, ``shadow_speed`` is attached.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from invertwin.channel.power import integrand
+from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.power.passage import land, passage
+from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import NEAR, RayScene
+
+_GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
+_RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's place within it
+# Boundary rays pass beside the edge, by this much of its distance from the origin (fifteen
+# roundings): a fine mesh's own triangles, nearly edge-on, would else lie in their way.
+_BESIDE = 1e-6
+_LAST_BELOW_ONE = 1 - 2.0**-24
+_FLAT = 1e-6  # least opening [rad] of an edge that can hide something
+
+
+@dataclass(frozen=True)
+class EdgePoints:
+    """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
+
+    ``receiver`` says of silhouettes of two antennas whether it is the receiver's (else False).
+    ``weight`` is one over (samples × density along the edge parameter). ``transmittance`` and
+    ``extra`` length are those of the sheets on the way, the edge's own triangles left out; what
+    these let through on the side of ``opposite`` is ``covered``, on the other side ``open`` (1
+    where there is nothing, 0 where it is opaque), both with an extra length.
+    """
+
+    index: Any
+    receiver: Any
+    frame: Any
+    first: Any
+    second: Any
+    opposite: Any
+    along: Any
+    face: Any
+    weight: Any
+    transmittance: Any
+    extra: Any
+    open: Any
+    open_extra: Any
+    covered: Any
+    covered_extra: Any
+
+    def sides(self, inputs: Inputs) -> list[tuple[float, Any, Any]]:
+        """Sign, transmittance and extra length of either side of the shadow's edge."""
+        lit = (1.0, self.transmittance * self.open, self.extra + self.open_extra)
+        if not inputs.sheets:
+            return [lit]
+        return [lit, (-1.0, self.transmittance * self.covered, self.extra + self.covered_extra)]
+
+
+@dataclass(frozen=True)
+class Behind:
+    """A point from which a shadow is cast: triangle and barycentric coordinates."""
+
+    face: Any
+    b1: Any
+    b2: Any
+
+
+@dataclass(frozen=True)
+class TwoSided:
+    """Points on edges with what lies on both sides of a tangential direction.
+
+    ``edge.face`` is where the shadow's edge runs, ``behind`` where it is cast from. The weight
+    holds the change of measure from directions to area there.
+    """
+
+    edge: EdgePoints
+    behind: Behind
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """A point on a shadow's edge: place, detached; area newly lit per unit of θ, attached."""
+
+    b1: Any
+    b2: Any
+    speed: Any
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Edge points of which some are void: recorded, and executed when asked for.
+
+    ``groups`` are dataclasses of arrays, of which ``kind`` makes the points.
+    """
+
+    valid: Any
+    groups: tuple[Any, ...]
+    kind: Callable[..., Any]
+
+    def launch(self) -> None:
+        """Start the execution, without waiting for it."""
+        dr.eval(self.valid, *self.groups)
+
+    def kept(self) -> Any:
+        """The points that are not void."""
+        self.launch()
+        lanes: Any = dr.compress(self.valid)
+        return self.kind(
+            *(
+                type(group)(
+                    *(
+                        c if c is False else dr.gather(type(c), c, lanes)
+                        for c in vars(group).values()
+                    )
+                )
+                for group in self.groups
+            )
+        )
+
+
+class _Proportional:
+    """Draws entries in proportion to weights, without reading any back."""
+
+    def __init__(self, weights: Any) -> None:
+        self.weights, self.sums = weights, dr.cumsum(weights)
+        self.entries = dr.width(weights)
+        self.total = dr.gather(mi.Float, self.sums, self.entries - 1)
+
+    def draw(self, spread: Any) -> tuple[Any, Any, Any]:
+        """Entry, the rest of the number within it, and probability: zero if there is no entry."""
+        target = spread * self.total
+
+        def below(at: Any) -> Any:
+            return dr.gather(mi.Float, self.sums, at) <= target
+
+        place: Any = dr.binary_search(0, self.entries - 1, below)
+        weight = dr.gather(mi.Float, self.weights, place)
+        last = dr.gather(mi.Float, self.sums, place) - weight
+        rest = dr.clip((target - last) / weight, 0.0, _LAST_BELOW_ONE)
+        return place, rest, dr.select(weight > 0, weight / self.total, 0.0)
+
+
+class EdgeSampler:
+    """Points on the silhouettes seen from one antenna or both, and where their shadows fall.
+
+    An edge is a silhouette if all its triangles lie, as seen from the antenna, on one side of
+    it: one triangle for an open edge, two for a fold, any number for a non-manifold edge. The
+    rule needs no consistent winding. Of sheets, every edge counts at which they let through
+    more on one side than on the other.
+    """
+
+    def __init__(
+        self, rays: RayScene, inputs: Inputs, centres: Sequence[str], samples: int, seed: int
+    ) -> None:
+        topology = rays.topology
+        self.rays, self.inputs, self.centres = rays, inputs, centres
+        entries = len(centres) * rays.link.frame_count * len(topology.edges)
+        edge, _, receiver, origin = self._seen(dr.arange(mi.UInt32, entries))
+        y0, y1 = (
+            point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
+            for ends in topology.device_edges
+        )
+        sides = _sides(rays, inputs, edge, y0, y1, 0.5 * (y0 + y1) - origin)
+        self.size = samples if entries else 0
+        if self.size:
+            # Both antennas get the same number of samples.
+            length = dr.norm(y1 - y0) / dr.norm(0.5 * (y0 + y1) - origin)
+            of, totals = dr.select(receiver, mi.UInt32(1), 0), dr.zeros(mi.Float, 2)
+            dr.scatter_add(totals, length, of, sides.unlike)
+            share = length / dr.gather(mi.Float, totals, of)
+            self.choice = _Proportional(dr.select(sides.unlike, share, 0.0))
+        self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
+
+    def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
+        """Edge, frame, whether the antenna is the receiver of two, and its place."""
+        rays, edges = self.rays, len(self.rays.topology.edges)
+        frame, edge = entry // edges, entry % edges
+        if len(self.centres) == 1:
+            origin = point_at(getattr(rays, self.centres[0]), frame)
+            return edge, frame, False, origin
+        receiver = frame >= rays.link.frame_count
+        frame = dr.select(receiver, frame - rays.link.frame_count, frame)
+        origin = dr.select(receiver, point_at(rays.rx, frame), point_at(rays.tx, frame))
+        return edge, frame, receiver, origin
+
+    def draw(self, index: Any) -> Drawn:
+        """The samples of the given indices below ``size``; void are those without a shadow."""
+        rays, topology = self.rays, self.rays.topology
+        place, along, pmf = _along(self.choice, index, self.size, self.seed)
+        edge, frame, receiver, origin = self._seen(place)
+        first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
+        y0 = point_at(rays.vertices, first)
+        y1 = point_at(rays.vertices, second)
+        y = y0 + (y1 - y0) * along
+        away = y - origin
+        sides = _sides(rays, self.inputs, edge, y0, y1, away)
+        beside = y + sides.outwards * (_BESIDE * dr.norm(y))
+        before = passage(rays, self.inputs, origin, beside, pmf > 0)
+        valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
+        ray = mi.Ray3f(beside + away * NEAR, dr.normalize(away))
+        hit = land(rays, self.inputs, ray, valid, (index, self.dice), coherent=True)
+        valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
+        found = EdgePoints(
+            index, receiver, frame, first, second, sides.opposite, along, hit.face,
+            weight=1 / (pmf * self.size * hit.chance),
+            transmittance=before.transmittance * hit.transmittance,
+            extra=before.extra + hit.extra,
+            open=sides.open, open_extra=sides.open_extra,
+            covered=sides.covered, covered_extra=sides.covered_extra,
+        )  # fmt: skip
+        return Drawn(valid, (found,), lambda points: points)
+
+
+class InteriorEdgeSampler:
+    """Points and tangential directions on all edges that can hide one surface from another.
+
+    Edges are weighted by their length, by the angle under which they hide (the opening between
+    their triangles' planes) and by how near they are to both antennas; directions are uniform
+    over those that are tangential. ``weighted=False`` takes edges by length alone and directions
+    from the whole sphere: what the benchmark compares with.
+    """
+
+    def __init__(
+        self, rays: RayScene, inputs: Inputs, samples: int, seed: int, *, weighted: bool = True
+    ) -> None:
+        topology = rays.topology
+        self.rays, self.inputs, self.weighted = rays, inputs, weighted
+        self.frames = rays.link.frame_count
+        edge = dr.arange(mi.UInt32, len(topology.edges))
+        y0, y1 = (
+            point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
+            for ends in topology.device_edges
+        )
+        length = dr.norm(y1 - y0)
+        _, span = self._opening(edge, y0, y1)
+        weight = dr.select(span > _FLAT, length, 0.0)
+        if weighted:
+            middle = 0.5 * (y0 + y1)
+            near = mi.Float(0.0)
+            for frame in range(min(self.frames, 8)):
+                at = mi.UInt32(frame * self.frames // min(self.frames, 8))
+                legs = [dr.norm(middle - point_at(t, at)) + length for t in (rays.tx, rays.rx)]
+                near += 1 / (legs[0] * legs[1])
+            weight *= span * near
+        self.per_frame = max(1, samples // self.frames)
+        self.size = self.per_frame * self.frames if len(topology.edges) else 0
+        if self.size:
+            self.choice = _Proportional(weight)
+        self.seeds = scrambled(seed, 4), scrambled(seed, 5)
+        self.dice = scrambled(seed, 10), scrambled(seed, 11)
+
+    def _opening(self, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
+        """Start and span of the tangential directions' azimuth about the edge, up to sign.
+
+        Azimuths count from the first triangle of the edge. Two triangles at azimuths 0 and α
+        leave (α, π); one triangle leaves all; more are left to the test of sides.
+        """
+        topology = self.rays.topology
+        along = dr.normalize(y1 - y0)
+        start, span = mi.Float(0.0), mi.Float(dr.pi)
+        if len(topology.device_opposite) < 2:
+            return start, span
+        x, y = self._azimuth_axes(edge, y0, along)
+        apex = dr.gather(mi.Int32, topology.device_opposite[1], edge)
+        offset = point_at(self.rays.vertices, mi.UInt32(dr.maximum(apex, 0))) - y0
+        angle = dr.atan2(dr.dot(offset, y), dr.dot(offset, x))
+        turn = dr.abs(angle)
+        # Behind a fold the free azimuths are those beyond the second triangle, up to π.
+        start = dr.select(apex >= 0, dr.select(angle > 0, turn, 0.0), start)
+        span = dr.select(apex >= 0, dr.pi - turn, span)
+        unsure = mi.Bool(False)
+        for column in topology.device_opposite[2:]:
+            unsure |= dr.gather(mi.Int32, column, edge) >= 0
+        if self.inputs.sheets:
+            unsure |= self._sheet(edge) & (span > _FLAT)
+        return dr.select(unsure, 0.0, start), dr.select(unsure, dr.pi, span)
+
+    def _sheet(self, edge: Any) -> Any:
+        """Whether any triangle of an edge lets something through."""
+        inputs, found = self.inputs, mi.Bool(False)
+        for column in self.rays.topology.device_beside:
+            face = dr.gather(mi.UInt32, column, edge)
+            row = dr.gather(mi.UInt32, inputs.face_surface, face)
+            found |= inputs.surfaces.tabulated("transmittance", row, mi.Float(1.0)) > 0
+        return found
+
+    def _azimuth_axes(self, edge: Any, y0: Any, along: Any) -> tuple[Any, Any]:
+        topology = self.rays.topology
+        apex = mi.UInt32(dr.maximum(dr.gather(mi.Int32, topology.device_opposite[0], edge), 0))
+        offset = point_at(self.rays.vertices, apex) - y0
+        x = dr.normalize(offset - along * dr.dot(along, offset))
+        return x, dr.cross(along, x)
+
+    def draw(self, index: Any) -> Drawn:
+        """The samples of the given indices below ``size``; void are those that hide nothing."""
+        rays, topology = self.rays, self.rays.topology
+        frame, within = index // self.per_frame, index % self.per_frame
+        edge, along, pmf = _along(self.choice, within, self.per_frame, self.seeds[0], index)
+        first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
+        y0, y1 = (point_at(rays.vertices, end) for end in (first, second))
+        y = y0 + (y1 - y0) * along
+        omega, density = self._direction(index, edge, y0, y1)
+        sides = _sides(rays, self.inputs, edge, y0, y1, omega)
+        valid = (pmf > 0) & sides.unlike
+        beside = mi.Point3f(y + sides.outwards * (_BESIDE * dr.norm(y)))
+        hits = []
+        for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
+            ray = mi.Ray3f(beside + omega * (sign * NEAR * dr.norm(y)), omega * sign)
+            hit = land(rays, self.inputs, ray, valid, (index, dice), coherent=False)
+            valid &= hit.valid & _not_grazing(rays, hit.face, omega, hit.valid)
+            hits.append(hit)
+        behind, ahead = hits
+        triangle = p0, p1, p2 = rays.corners(behind.face, valid)
+        b1, b2 = behind.b1, behind.b2
+        point = between(triangle, b1, b2)
+        cosine = dr.abs(dr.dot(dr.normalize(dr.cross(p1 - p0, p2 - p0)), omega))
+        measure = dr.squared_norm(point - y) / cosine
+        chance = behind.chance * ahead.chance
+        points = EdgePoints(
+            index, False, frame, first, second, sides.opposite, along, ahead.face,
+            weight=measure / (pmf * density * self.per_frame * chance),
+            transmittance=behind.transmittance * ahead.transmittance,
+            extra=behind.extra + ahead.extra,
+            open=sides.open, open_extra=sides.open_extra,
+            covered=sides.covered, covered_extra=sides.covered_extra,
+        )  # fmt: skip
+        return Drawn(valid, (points, Behind(behind.face, b1, b2)), TwoSided)
+
+    def _direction(self, index: Any, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
+        """A tangential direction and its density per solid angle."""
+        first, second = uniform_pair(index, self.seeds[1])
+        if not self.weighted:
+            sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(first, second))
+            return sphere, mi.Float(1 / (4 * dr.pi))
+        along = dr.normalize(y1 - y0)
+        x, y = self._azimuth_axes(edge, y0, along)
+        start, span = self._opening(edge, y0, y1)
+        sign = dr.select(second < 0.5, 1.0, -1.0)
+        azimuth = start + span * (2 * second - dr.select(second < 0.5, 0.0, 1.0))
+        s, c = dr.sincos(azimuth)
+        height = 2 * first - 1
+        across = sign * dr.sqrt(dr.maximum(1 - height * height, 0.0))
+        omega = along * height + (x * c + y * s) * across
+        return mi.Vector3f(dr.normalize(omega)), 1 / (4 * span)
+
+
+def _along(
+    choice: _Proportional, index: Any, count: int, seed: Any, key: Any = None
+) -> tuple[Any, Any, Any]:
+    """Entry of the choice, place along its edge and probability, stratified over count."""
+    jitter, along = uniform_pair(index if key is None else key, seed)
+    place, rest, chance = choice.draw((mi.Float(index) + jitter) / count)
+    return place, dr.select(chance > _RESOLVED, rest, along), chance
+
+
+@dataclass(frozen=True)
+class _Sides:
+    """What an edge's triangles let through on either side of a direction; see ``EdgePoints``."""
+
+    opposite: Any
+    open: Any
+    open_extra: Any
+    covered: Any
+    covered_extra: Any
+    outwards: Any  # unit direction off the covered side; zero where there is something on both
+
+    @property
+    def unlike(self) -> Any:
+        """Whether the sides differ by more than rounding."""
+        same_length = dr.abs(self.open_extra - self.covered_extra) <= 1e-7
+        return ~((dr.abs(self.open - self.covered) <= 1e-6) & same_length)
+
+
+def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, direction: Any) -> _Sides:
+    """Sort an edge's triangles by the side of the plane through edge and direction they lie on.
+
+    An opaque edge is a silhouette if nothing is on one side. The covered side is that of the
+    triangle that leaves the plane most.
+    """
+    topology = rays.topology
+    plane = dr.cross(direction, y1 - y0)
+    offsets, heights = [], []
+    opposite, most = mi.UInt32(0), mi.Float(0.0)
+    for column in topology.device_opposite:
+        apex = dr.gather(mi.Int32, column, edge)
+        place = mi.UInt32(dr.maximum(apex, 0))
+        offset = point_at(rays.vertices, place) - y0
+        height = dr.select(apex >= 0, dr.dot(plane, offset), 0.0)
+        # Squares, since Dr.Jit 1.5 drops the abs of a select on an abs.
+        further = dr.square(height) > dr.square(most)
+        opposite, most = dr.select(further, place, opposite), dr.select(further, height, most)
+        offsets.append(offset)
+        heights.append(height)
+    transmittances, lengths = [mi.Float(1.0), mi.Float(1.0)], [mi.Float(0.0), mi.Float(0.0)]
+    for number, (offset, height) in enumerate(zip(offsets, heights, strict=True)):
+        transmittance, extra = mi.Float(0.0), mi.Float(0.0)
+        if inputs.sheets:
+            face = dr.gather(mi.UInt32, topology.device_beside[number], edge)
+            row = dr.gather(mi.UInt32, inputs.face_surface, face)
+            normal = dr.cross(y1 - y0, offset)
+            cosine = dr.abs(dr.dot(normal, direction)) / (dr.norm(normal) * dr.norm(direction))
+            transmittance, extra = inputs.surfaces.through(row, cosine, height != 0)
+        for index, on in enumerate((height * most < 0, height * most > 0)):
+            transmittances[index] = dr.select(
+                on, transmittances[index] * transmittance, transmittances[index]
+            )
+            lengths[index] = dr.select(on, lengths[index] + extra, lengths[index])
+    free = (transmittances[0] == 1) & (lengths[0] == 0)
+    outwards = dr.select(free, -dr.mulsign(dr.normalize(plane), most), 0.0)
+    return _Sides(
+        opposite,
+        transmittances[0],
+        lengths[0],
+        transmittances[1],
+        lengths[1],
+        mi.Vector3f(outwards),
+    )
+
+
+def _not_grazing(rays: RayScene, face: Any, direction: Any, active: Any) -> Any:
+    """A ray in the plane of the triangle it meets has no shadow point there."""
+    p0, p1, p2 = rays.corners(face, active)
+    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    return active & (dr.abs(dr.dot(normal, direction)) > _GRAZING * dr.norm(direction))
+
+
+def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
+    """How fast the shadow that an edge casts from an attached centre sweeps a surface.
+
+    ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
+    x_m the material point under it; T is the edge's image turned to the shadowed side.
+    Source: derivations §3.
+    """
+    c, fixed = centre, inputs.detached()
+    y0, y1 = integrand.edge_ends(inputs, points.first, points.second)
+    y = y0 + (y1 - y0) * points.along
+    triangle = p0, p1, p2 = integrand.corners(inputs, points.face)
+    plane = dr.cross(p1 - p0, p2 - p0)
+    moving = c + (y - c) * (dr.dot(plane, p0 - c) / dr.dot(plane, y - c))
+
+    f0, f1, f2 = integrand.corners(fixed, points.face)
+    shadow, normal = dr.detach(moving), dr.normalize(dr.cross(f1 - f0, f2 - f0))
+    b1, b2 = _barycentric(shadow, f0, f1, f2)
+    material = between(triangle, b1, b2)
+
+    ray, edge = dr.detach(y - c), dr.detach(y1 - y0)
+    stretch = dr.norm(shadow - dr.detach(c)) / dr.norm(ray)
+    slope = 1 / dr.dot(normal, ray)
+
+    def projected(vector: Any) -> Any:
+        return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
+
+    apex, _ = integrand.edge_ends(fixed, points.opposite, points.opposite)
+    tangent = dr.cross(normal, projected(edge))
+    tangent = dr.mulsign(tangent, dr.dot(tangent, projected(apex - dr.detach(y))))
+    return Shadow(b1, b2, dr.dot(tangent, moving - material) * points.weight)
+
+
+def _barycentric(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
+    a, b, r = p1 - p0, p2 - p0, point - p0
+    aa, ab, bb, ra, rb = dr.dot(a, a), dr.dot(a, b), dr.dot(b, b), dr.dot(r, a), dr.dot(r, b)
+    determinant = dr.fma(aa, bb, -ab * ab)
+    return (bb * ra - ab * rb) / determinant, (aa * rb - ab * ra) / determinant

@@ -1,0 +1,268 @@
+"""What one vertex of a path contributes, in Dr.Jit: the integrand of the path integral.
+
+Everything here is differentiable or not, as its ``Inputs`` are. The torch form of these formulas,
+in float64, is ``channel/reference/radar_equation.py``; tests hold the two equal.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from invertwin.channel.paths import Pattern
+from invertwin.channel.power.surface import SURFACE, Surfaces
+from invertwin.channel.rays import arrays
+from invertwin.channel.rays.arrays import (
+    between,
+    from_points,
+    point_at,
+    to_float,
+    to_index,
+    to_points,
+    to_torch,
+)
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import RayScene
+
+#: The differentiable inputs of the kernel, in the order in which torch passes them.
+DIFFERENTIABLE = ("vertices", "tx", "rx", "rotations", *SURFACE)
+POINTS = DIFFERENTIABLE[:3]
+
+
+def to_table(name: str, values: Tensor) -> Any:
+    """A torch table as the kernel reads it."""
+    return to_points(values) if name in POINTS else to_float(values)
+
+
+def from_table(name: str, values: Any, like: Tensor) -> Tensor:
+    """The torch form of an array that is laid out as one of the tables."""
+    flat = from_points(values) if name in POINTS else to_torch(values)
+    return flat.reshape(like.shape).to(like)
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Flat Dr.Jit arrays; those named in ``DIFFERENTIABLE`` may carry derivatives."""
+
+    vertices: Any
+    tx: Any
+    rx: Any
+    rotations: Any
+    surfaces: Surfaces
+    faces: Any
+    face_surface: Any
+    monostatic: bool
+    tx_pattern: "PatternTable"
+    rx_pattern: "PatternTable"
+    scale: float
+
+    @staticmethod
+    def of(rays: RayScene, *, monostatic: bool = False) -> "Inputs":
+        """Upload a scene and its antennas; positions are taken about the local origin.
+
+        Args:
+            rays: Scene and antennas.
+            monostatic: Spare one segment where both antennas are one, derivatives included: what
+                is due to ``rx`` is then due to ``tx``.
+        """
+        link = rays.link
+        return Inputs(
+            vertices=rays.vertices,
+            tx=rays.tx,
+            rx=rays.rx,
+            rotations=to_float(link.rotations),
+            surfaces=Surfaces.of(rays.geometry),
+            faces=rays.topology.device_faces,
+            face_surface=to_index(rays.geometry.face_surface),
+            monostatic=monostatic,
+            tx_pattern=PatternTable.of(link.tx_pattern),
+            rx_pattern=PatternTable.of(link.rx_pattern),
+            scale=(link.wavelength / (4 * np.pi)) ** 2,
+        )
+
+    @property
+    def sheets(self) -> bool:
+        """Whether something passes straight through any surface."""
+        return self.surfaces.sheets
+
+    @property
+    def bodies(self) -> bool:
+        """Whether any surface is the skin of a refracting body."""
+        return self.surfaces.bodies
+
+    def table(self, name: str) -> Any:
+        """One of the differentiable inputs."""
+        return getattr(self.surfaces if name in SURFACE else self, name)
+
+    def replaced(self, tables: dict[str, Any]) -> "Inputs":
+        """With some of the differentiable inputs replaced."""
+        rows = {name: table for name, table in tables.items() if name in SURFACE}
+        others = {name: table for name, table in tables.items() if name not in SURFACE}
+        return replace(self, surfaces=replace(self.surfaces, **rows), **others)
+
+    def detached(self) -> "Inputs":
+        """The same values without derivatives."""
+        return self.replaced({name: dr.detach(self.table(name)) for name in DIFFERENTIABLE})
+
+    def antenna(self, frame: Any, receiver: Any, active: Any = True) -> Any:
+        """Position of the receiver or the transmitter (a Python bool, or one per lane)."""
+        if receiver is True or receiver is False:
+            table = self.rx if receiver and not self.monostatic else self.tx
+            return point_at(table, frame, active)
+        return dr.select(
+            receiver, self.antenna(frame, True, active), self.antenna(frame, False, active)
+        )
+
+    def gain(self, frame: Any, receiver: Any, seen: Any) -> Any:
+        """Linear power gain of the receiver or the transmitter towards a radar-frame direction."""
+        if receiver is True or receiver is False:
+            return (self.rx_pattern if receiver else self.tx_pattern).gain(seen)
+        return dr.select(receiver, self.rx_pattern.gain(seen), self.tx_pattern.gain(seen))
+
+
+@dataclass(frozen=True)
+class PatternTable:
+    """An antenna pattern as the kernel reads it: bilinear in cosθ and φ."""
+
+    values: Any
+    shape: tuple[int, int]
+    constant: float | None
+
+    @staticmethod
+    def of(pattern: Pattern) -> "PatternTable":
+        table = pattern.table()
+        rows, columns = int(table.shape[0]), int(table.shape[1])
+        constant = float(table.reshape(-1)[0]) if rows * columns == 1 else None
+        return PatternTable(to_float(table), (rows, columns), constant)
+
+    def gain(self, direction: Any) -> Any:
+        """Linear power gain for a unit direction in the radar frame."""
+        if self.constant is not None:
+            return mi.Float(self.constant)
+        rows, columns = self.shape
+        t = (dr.clip(direction.z, -1.0, 1.0) + 1) * (0.5 * (rows - 1))
+        row = dr.minimum(mi.UInt32(dr.detach(t)), rows - 2)
+        along = t - mi.Float(row)
+        if columns == 1:
+            low, high = (dr.gather(mi.Float, self.values, line) for line in (row, row + 1))
+            return low + (high - low) * along
+        s = (dr.atan2(direction.y, direction.x) / (2 * dr.pi) + 0.5) * columns
+        column = dr.minimum(mi.UInt32(dr.detach(s)), columns - 1)
+        across = s - mi.Float(column)
+        nearby = (column + 1) % columns
+        rows_of_gain = []
+        for line in (row, row + 1):
+            low = dr.gather(mi.Float, self.values, line * columns + column)
+            high = dr.gather(mi.Float, self.values, line * columns + nearby)
+            rows_of_gain.append(low + (high - low) * across)
+        return rows_of_gain[0] + (rows_of_gain[1] - rows_of_gain[0]) * along
+
+
+def corners(inputs: Inputs, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    """Corners of triangles, attached."""
+    return arrays.corners(inputs.vertices, inputs.faces, face, active)
+
+
+def edge_ends(inputs: Inputs, first: Any, second: Any) -> tuple[Any, Any]:
+    """Ends of edges, attached."""
+    return point_at(inputs.vertices, first), point_at(inputs.vertices, second)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A material point: position and unit normal, attached, and the row of its surface.
+
+    ``jacobian`` is the area of its triangle over that area detached: one in value.
+    """
+
+    position: Any
+    normal: Any
+    jacobian: Any
+    surface: Any
+
+
+def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Place:
+    """Where a pair of barycentric coordinates lies now."""
+    triangle = p0, p1, p2 = corners(inputs, face, active)
+    normal = dr.cross(p1 - p0, p2 - p0)
+    double_area = dr.norm(normal)
+    return Place(
+        position=between(triangle, b1, b2),
+        normal=normal / double_area,
+        jacobian=double_area / dr.detach(double_area),
+        surface=dr.gather(mi.UInt32, inputs.face_surface, face, active),
+    )
+
+
+def segment(start: Any, end: Any) -> tuple[Any, Any]:
+    """Unit direction and distance from one point to another."""
+    offset = end - start
+    distance = dr.norm(offset)
+    return offset / distance, distance
+
+
+def to_radar(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> Any:
+    """World direction in the radar frame (the rotation's columns are the radar's axes)."""
+    rows = [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k, active) for k in range(3)]
+    return mi.Vector3f(*(sum(rows[k][axis] * direction[k] for k in range(3)) for axis in range(3)))
+
+
+@dataclass(frozen=True)
+class Medium:
+    """What a segment runs through: refractive index, and power attenuation [1/m]."""
+
+    index: Any
+    attenuation: Any
+
+
+def medium(inputs: Inputs, start: Place, end: Place | None, towards: Any, active: Any) -> Medium:
+    """The body inside of which a segment runs, if any: that of a skin it leaves or meets inside.
+
+    Args:
+        inputs: Tables.
+        start: Where it starts.
+        end: Where it ends; None for an antenna.
+        towards: Unit direction from start to end.
+        active: Lanes.
+    """
+    index, attenuation = mi.Float(1.0), mi.Float(0.0)
+    ends = ((start, 1.0),) if end is None else ((start, 1.0), (end, -1.0))
+    for place, sign in ends if inputs.bodies else ():
+        inside = active & (dr.detach(dr.dot(place.normal, towards)) * sign < 0)
+        inside &= inputs.surfaces.is_skin(place.surface)
+        values = (inputs.surfaces.value(n, place.surface, inside) for n in ("index", "attenuation"))
+        index, attenuation = (
+            dr.select(inside, value, so_far)
+            for value, so_far in zip(values, (index, attenuation), strict=True)
+        )
+    return Medium(index, attenuation)
+
+
+@dataclass(frozen=True)
+class Connection:
+    """The last segment of a path, from a surface point to an antenna."""
+
+    factor: Any  # f |cosθ| |cosθ'| G / R²
+    distance: Any
+    seen: Any  # direction of the point in the radar frame
+
+
+def connection(
+    inputs: Inputs,
+    frame: Any,
+    point: Place,
+    back: Any,
+    receiver: Any = True,
+    active: Any = True,
+    *,
+    same: bool = False,
+) -> Connection:
+    """Scatter what comes from ``back`` towards an antenna; ``same`` if it lies there."""
+    antenna = inputs.antenna(frame, receiver, active)
+    to_antenna, distance = segment(point.position, antenna)
+    seen = to_radar(inputs, frame, -to_antenna, active)
+    on = None if same else to_antenna
+    value = inputs.surfaces.scattered(point.surface, point.normal, back, on, active)
+    gain = inputs.gain(frame, receiver, seen)
+    return Connection(value * gain / dr.square(distance), distance, seen)

@@ -1,0 +1,215 @@
+"""What a segment passes through: nothing, sheets that let part of the power through, or a wall.
+
+A sheet (a slab meshed as one surface) is passed straight on: power times its transmittance, length
+plus its extra (``scene.material.Surface``), any number of sheets one after another.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from invertwin.channel.power import integrand
+from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.rays.arrays import opaque
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import NEAR, RayScene
+
+_MOST = 32  # surfaces that a segment may pass
+# Probability of passing a sheet on which the ray may end. Not that of the power: a probability that
+# follows the material would throw the dice anew under differences.
+_CHANCE = 0.5
+
+
+@dataclass(frozen=True)
+class Passage:
+    """Share of the power that gets through (0 if blocked), and the length it adds."""
+
+    transmittance: Any
+    extra: Any
+
+
+def passage(rays: RayScene, inputs: Inputs, start: Any, end: Any, active: Any) -> Passage:
+    """What gets from one point to another (their own surfaces excluded). Detached."""
+    if not inputs.sheets:
+        return Passage(dr.select(rays.clear(start, end, active), 1.0, 0.0), mi.Float(0.0))
+    lanes = dr.width(active)
+    state = {
+        "active": mi.Bool(active),
+        "transmittance": dr.ones(mi.Float, lanes),
+        "extra": dr.zeros(mi.Float, lanes),
+    }
+
+    def meet(state: dict[str, Any], face: Any, hit: Any) -> None:
+        transmittance, extra = _through(inputs, face, start, end, hit)
+        state["transmittance"] = dr.select(
+            hit, state["transmittance"] * transmittance, state["transmittance"]
+        )
+        state["extra"] = state["extra"] + dr.select(hit, extra, 0.0)
+        state["active"] = hit & (state["transmittance"] > 0)
+
+    state = _along(rays, start, end, state, meet)
+    return Passage(
+        dr.select(active & ~state["active"], state["transmittance"], 0.0), state["extra"]
+    )
+
+
+def crossed(
+    rays: RayScene,
+    inputs: Inputs,
+    start: Callable[[], Any],
+    end: Callable[[], Any],
+    active: Any,
+    carry: dict[str, Any],
+    act: Callable[[dict[str, Any], Any, Any], None],
+) -> dict[str, Any]:
+    """Show every sheet between two attached points: ``act(carry, transmittance, extra)``, attached.
+
+    The ends are functions, so that the loop over sheets gathers them anew: no derivative has to
+    cross the loop's border.
+    """
+    fixed_start, fixed_end = dr.detach(start()), dr.detach(end())
+    state = {"active": mi.Bool(active), **carry}
+
+    def meet(state: dict[str, Any], face: Any, hit: Any) -> None:
+        with dr.resume_grad():
+            transmittance, extra = _through(inputs, face, start(), end(), hit)
+            act(state, dr.select(hit, transmittance, 1.0), dr.select(hit, extra, 0.0))
+        state["active"] = hit & (dr.detach(transmittance) > 0)
+
+    return _along(rays, fixed_start, fixed_end, state, meet)
+
+
+def _through(inputs: Inputs, face: Any, start: Any, end: Any, active: Any) -> tuple[Any, Any]:
+    p0, p1, p2 = integrand.corners(inputs, face, active)
+    normal = dr.cross(p1 - p0, p2 - p0)
+    offset = end - start
+    cosine = dr.abs(dr.dot(normal, offset)) / (dr.norm(normal) * dr.norm(offset))
+    row = dr.gather(mi.UInt32, inputs.face_surface, face, active)
+    return inputs.surfaces.through(row, cosine, active)
+
+
+def _along(
+    rays: RayScene,
+    start: Any,
+    end: Any,
+    state: dict[str, Any],
+    meet: Callable[[dict[str, Any], Any, Any], None],
+) -> dict[str, Any]:
+    """Walk a segment from surface to surface until ``meet`` ends it or nothing is left."""
+    lanes = dr.width(state["active"])
+    state = {**state, "at": dr.full(mi.Float, NEAR, lanes), "count": dr.zeros(mi.UInt32, lanes)}
+    most = opaque(_MOST)
+
+    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
+        state = dict(state)
+        offset = end - start
+        at, active = state["at"], state["active"]
+        hit = rays.scene.ray_intersect_preliminary(
+            mi.Ray3f(mi.Point3f(start + offset * at), mi.Vector3f(offset), 1 - NEAR - at, 0.0, []),
+            active=active,
+        )
+        found = active & hit.is_valid()
+        face = dr.select(found, hit.prim_index, rays.sound_face)
+        state["active"] = found
+        meet(state, face, found)
+        state["at"] = dr.select(found, at + hit.t + NEAR, at)
+        state["count"] = state["count"] + 1
+        return (state,)
+
+    (state,) = dr.while_loop(
+        (state,),
+        lambda state: state["active"] & (state["count"] < most),
+        body,
+        labels=("state",),
+        mode="symbolic",
+    )
+    return state
+
+
+@dataclass(frozen=True)
+class Hit:
+    """Where a ray ends.
+
+    Attributes:
+        valid: Whether it meets a surface to end on.
+        face, b1, b2: Where.
+        transmittance, extra: Of the sheets that it passed.
+        chance: Probability of having passed those and ended on this one.
+    """
+
+    valid: Any
+    face: Any
+    b1: Any
+    b2: Any
+    transmittance: Any
+    extra: Any
+    chance: Any
+
+
+def land(
+    rays: RayScene, inputs: Inputs, ray: Any, active: Any, key: tuple[Any, Any], *, coherent: bool
+) -> Hit:
+    """Follow a ray to a surface; every sheet on the way is passed or not by a throw of dice.
+
+    Args:
+        rays: Rays.
+        inputs: Detached.
+        ray: Origin and unit direction.
+        active: Lanes.
+        key: Index and seed of the dice.
+        coherent: Whether neighbouring rays are alike.
+    """
+    one = mi.Float(1.0)
+    hit = rays.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+    if not inputs.sheets:
+        valid = active & hit.is_valid()
+        face = dr.select(valid, hit.prim_index, rays.sound_face)
+        b1, b2 = (dr.select(valid, b, 0.25) for b in (hit.prim_uv.x, hit.prim_uv.y))
+        return Hit(valid, face, b1, b2, one, mi.Float(0.0), one)
+    lanes = max(dr.width(active), dr.width(ray.d))
+    state = {
+        "going": active & hit.is_valid(),
+        "valid": dr.zeros(mi.Bool, lanes),
+        "face": dr.zeros(mi.UInt32, lanes) + rays.sound_face,
+        "b1": dr.full(mi.Float, 0.25, lanes),
+        "b2": dr.full(mi.Float, 0.25, lanes),
+        "transmittance": dr.ones(mi.Float, lanes),
+        "extra": dr.zeros(mi.Float, lanes),
+        "chance": dr.ones(mi.Float, lanes),
+        "origin": mi.Point3f(ray.o) + dr.zeros(mi.Point3f, lanes),
+        "count": dr.zeros(mi.UInt32, lanes),
+    }
+    index, seed = key
+
+    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
+        state = dict(state)
+        going, origin = state["going"], state["origin"]
+        hit = rays.scene.ray_intersect_preliminary(mi.Ray3f(origin, ray.d), active=going)
+        found = going & hit.is_valid()
+        face = dr.select(found, hit.prim_index, rays.sound_face)
+        point = origin + ray.d * dr.select(found, hit.t, 0.0)
+        transmittance, extra = _through(inputs, face, origin, origin + ray.d, found)
+        chance = dr.select(transmittance > 0, _CHANCE, 0.0)
+        first, _ = mi.sample_tea_32(index, seed + state["count"] * 0x85EBCA6B)
+        passes = found & (mi.Float(first >> 8) * 2.0**-24 < chance)
+        ends = found & ~passes
+        for name, value in (("face", face), ("b1", hit.prim_uv.x), ("b2", hit.prim_uv.y)):
+            state[name] = dr.select(ends, value, state[name])
+        state["valid"] = state["valid"] | ends
+        state["transmittance"] = dr.select(
+            passes, state["transmittance"] * transmittance, state["transmittance"]
+        )
+        state["extra"] = dr.select(passes, state["extra"] + extra, state["extra"])
+        odds = dr.select(passes, chance, dr.select(ends, 1 - chance, 1.0))
+        state["chance"] = state["chance"] * odds
+        step = NEAR * (hit.t + dr.norm(point))
+        state["origin"] = dr.select(passes, point + ray.d * step, origin)
+        state["count"] = state["count"] + 1
+        state["going"] = passes & (state["count"] < _MOST)
+        return (state,)
+
+    (state,) = dr.while_loop(
+        (state,), lambda state: state["going"], body, labels=("state",), mode="symbolic"
+    )
+    names = ("valid", "face", "b1", "b2", "transmittance", "extra", "chance")
+    return Hit(*(state[name] for name in names))

@@ -1,0 +1,155 @@
+"""Where paths start: rays from the transmitter into the caps around objects, or points by area.
+
+Everything here is detached: a sample is a place on the reference surface (triangle and
+barycentric coordinates), a frame, and one over its density. What depends on the scene's
+parameters is evaluated later, in material form (derivations §2).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.channel.paths import Link
+from invertwin.channel.power import integrand
+from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.power.passage import land, passage
+from invertwin.channel.rays.arrays import between, point_at, scrambled, to_float, uniform_pair
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.scene import RayScene, bounding_spheres, face_areas
+from invertwin.errors import InputError
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points on surfaces (Dr.Jit arrays). ``weight`` is one over (samples × area density).
+
+    ``transmittance`` and ``extra`` length are those of the sheets between transmitter and point.
+    """
+
+    frame: Any
+    face: Any
+    b1: Any
+    b2: Any
+    weight: Any
+    transmittance: Any
+    extra: Any
+
+
+def _caps(
+    spheres: tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]],
+    link: Link,
+    margin: float,
+) -> tuple[Float64[Tensor, "frame object 3"], Float64[Tensor, "frame object"]]:
+    """Axis and height 1 − cos of the spherical cap that holds each object, seen from TX."""
+    centres, radii = spheres
+    offset = centres - link.tx.detach()[:, None]
+    distance = offset.norm(dim=2).clamp_min(1e-30)
+    sine = (margin * radii / distance).clamp_max(1.0)
+    height = sine**2 / (1 + (1 - sine**2).sqrt())
+    return offset / distance[:, :, None], torch.where(distance > margin * radii, height, 2.0)
+
+
+class RaySampler:
+    """Rays from TX, the same number into the cap around each object, jittered on a grid."""
+
+    def __init__(
+        self,
+        rays: RayScene,
+        samples: int,
+        seed: int,
+        reference: tuple[Geometry, Link] | None = None,
+    ) -> None:
+        if reference:
+            axes, heights = _caps(bounding_spheres(reference[0]), reference[1], margin=1.1)
+        else:
+            axes, heights = _caps(rays.spheres, rays.link, margin=1.001)
+        self.rays = rays
+        self.objects = axes.shape[1]
+        blocks = rays.link.frame_count * self.objects
+        self.rows = max(1, int(np.sqrt(samples / blocks)))
+        self.columns = max(1, samples // blocks // self.rows)
+        self.size = blocks * self.rows * self.columns
+        self.axes, self.heights = to_float(axes), to_float(heights)
+        self.seed, self.dice = scrambled(seed, 0), scrambled(seed, 8)
+
+    def draw(self, index: Any, inputs: Inputs) -> Samples:
+        """The samples of the given indices below ``size``."""
+        rays, per_block = self.rays, self.rows * self.columns
+        block, place = index // per_block, index % per_block
+        frame = block // self.objects
+        jitter = uniform_pair(index, self.seed)
+        disk = mi.warp.square_to_uniform_disk_concentric(
+            mi.Point2f(
+                (mi.Float(place % self.columns) + jitter[0]) / self.columns,
+                (mi.Float(place // self.columns) + jitter[1]) / self.rows,
+            )
+        )
+        height = dr.gather(mi.Float, self.heights, block)
+        axis = dr.gather(mi.Vector3f, self.axes, block)
+        depth = dr.squared_norm(disk) * height
+        spread = dr.sqrt(height * (2 - depth))
+        local = mi.Vector3f(disk.x * spread, disk.y * spread, 1 - depth)
+        direction = dr.normalize(mi.Frame3f(axis).to_world(local))
+        density = mi.Float(0.0)
+        for other in range(self.objects):
+            entry = frame * self.objects + other
+            cap = dr.gather(mi.Float, self.heights, entry)
+            away = direction - dr.gather(mi.Vector3f, self.axes, entry)
+            inside = (dr.squared_norm(away) <= 2 * cap) | (block == entry)
+            density += dr.select(inside, per_block / (2 * dr.pi * cap), 0.0)
+        centre = point_at(rays.tx, frame)
+        ray = mi.Ray3f(centre, direction)
+        hit = land(rays, inputs, ray, mi.Bool(True), (index, self.dice), coherent=True)
+        point = integrand.place(inputs, hit.face, hit.b1, hit.b2)
+        cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
+        distance = dr.squared_norm(point.position - centre)
+        weight = dr.select(hit.valid, distance / (cosine * density * hit.chance), 0.0)
+        return Samples(frame, hit.face, hit.b1, hit.b2, weight, hit.transmittance, hit.extra)
+
+
+class AreaSampler:
+    """Points spread over all surfaces; the density per triangle is that of a reference scene.
+
+    A reference that does not follow the parameters keeps the point set under differences
+    (common random numbers) also when areas change.
+    """
+
+    def __init__(
+        self,
+        rays: RayScene,
+        samples: int,
+        seed: int,
+        reference: tuple[Geometry, Link] | None = None,
+    ) -> None:
+        geometry = reference[0] if reference else rays.geometry
+        if len(geometry.faces) != len(rays.geometry.faces):
+            raise InputError(
+                f"expected a reference scene of {len(rays.geometry.faces)} triangles, got "
+                f"{len(geometry.faces)}; use the scene the differences start from"
+            )
+        areas = face_areas(geometry)
+        self.rays = rays
+        self.per_frame = max(1, samples // rays.link.frame_count)
+        self.size = self.per_frame * rays.link.frame_count
+        self.distribution = mi.DiscreteDistribution(to_float(areas / areas.mean()))
+        self.seeds = scrambled(seed, 1), scrambled(seed, 2)
+
+    def draw(self, index: Any, inputs: Inputs) -> Samples:
+        """The samples of the given indices below ``size``."""
+        rays = self.rays
+        frame, place = index // self.per_frame, index % self.per_frame
+        jitter, _ = uniform_pair(index, self.seeds[0])
+        uniform = (mi.Float(place) + jitter) / self.per_frame
+        face, pmf = self.distribution.sample_pmf(uniform)
+        b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
+        triangle = p0, p1, p2 = rays.corners(face)
+        area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
+        position = between(triangle, b.x, b.y)
+        passed = passage(rays, inputs, point_at(rays.tx, frame), position, mi.Bool(True))
+        weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
+        return Samples(frame, face, b.x, b.y, weight, passed.transmittance, passed.extra)

@@ -1,0 +1,173 @@
+"""What a surface does to a path, in Dr.Jit: tables of ``scene.material.Surface`` and their law.
+
+Everything here is differentiable or not, as the tables are. The same law in torch, float64, is
+``channel/reference/radar_equation.py``; tests hold the two equal.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from invertwin.channel.rays.arrays import to_float
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.geometry import Geometry
+from invertwin.scene.material import Surface
+
+#: Names of a surface's tables.
+SURFACE = tuple(field.name for field in fields(Surface))
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Rows of ``scene.material.Surface`` as flat Dr.Jit arrays, and what is known of all rows."""
+
+    amplitude: Any
+    diffuse: Any
+    lobes: Any
+    exponents: Any
+    transmittance: Any
+    excess: Any
+    refraction: Any
+    index: Any
+    attenuation: Any
+    cosines: int
+    lobed: tuple[bool, bool, bool]
+    sheets: bool
+    bodies: bool
+
+    @staticmethod
+    def of(geometry: Geometry) -> "Surfaces":
+        """Upload the surfaces of a scene."""
+        return Surfaces(
+            **{name: to_float(getattr(geometry.surfaces, name)) for name in SURFACE},
+            cosines=geometry.surfaces.amplitude.shape[1],
+            lobed=geometry.lobed,
+            sheets=geometry.sheets,
+            bodies=geometry.bodies,
+        )
+
+    def value(self, name: str, row: Any, active: Any = True) -> Any:
+        """A number of each row: ``diffuse``, ``index`` or ``attenuation``."""
+        return dr.gather(mi.Float, getattr(self, name), row, active)
+
+    def tabulated(self, name: str, row: Any, cosine: Any, active: Any = True) -> Any:
+        """A table over cosθ, linear between its entries.
+
+        Args:
+            name: Of the table.
+            row: Of the surface.
+            cosine: Of the angle of incidence, at least 0.
+            active: Lanes.
+        """
+        table = getattr(self, name)
+        t = dr.minimum(cosine, 1.0) * (self.cosines - 1)
+        low = dr.minimum(mi.UInt32(dr.detach(t)), self.cosines - 2)
+        first = dr.gather(mi.Float, table, row * self.cosines + low, active)
+        second = dr.gather(mi.Float, table, row * self.cosines + low + 1, active)
+        return first + (second - first) * (t - mi.Float(low))
+
+    def through(self, row: Any, cosine: Any, active: Any = True) -> tuple[Any, Any]:
+        """Transmittance of a sheet, and the length [m] that it adds."""
+        return tuple(  # type: ignore[return-value]
+            self.tabulated(name, row, cosine, active) for name in ("transmittance", "excess")
+        )
+
+    def lobe(
+        self, number: int, row: Any, product: Any, between: Any, active: Any = True
+    ) -> tuple[Any, Any]:
+        """``((1 + cosψ)/2)^p`` of one lobe, and its exponent p.
+
+        Args:
+            number: 0 specular, 1 directive, 2 backscattering.
+            row: Of the surface.
+            product: Of the cosines of both directions with the normal.
+            between: Cosine between both directions.
+            active: Lanes.
+        """
+        cosine = between if number == 2 else 2 * product - between
+        exponent = dr.gather(mi.Float, self.exponents, row * 3 + number, active)
+        return dr.exp(exponent * dr.log(dr.maximum(0.5 * (1 + cosine), 1e-7))), exponent
+
+    def scattered(self, row: Any, normal: Any, back: Any, on: Any, active: Any = True) -> Any:
+        """``f |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
+
+        On one side, ``f`` is the distribution of ``scene.material``; through the skin of a
+        refracting body, ``refracted``.
+
+        Args:
+            row: Of the surface.
+            normal: Unit normal.
+            back: Where the path comes from.
+            on: Where it goes on; None where both directions are one.
+            active: Lanes.
+        """
+        first = dr.dot(normal, back)
+        low = self._amplitude(row, first, active)
+        if on is None:
+            product, between, reflectance = dr.square(first), mi.Float(1.0), dr.square(low)
+        else:
+            second = dr.dot(normal, on)
+            product, between = first * second, dr.dot(back, on)
+            reflectance = low * self._amplitude(row, second, active)
+        shape = self.value("diffuse", row, active) * dr.inv_pi
+        for number, present in enumerate(self.lobed):
+            if present:
+                lobe, _ = self.lobe(number, row, product, between, active)
+                shape += dr.gather(mi.Float, self.lobes, row * 3 + number, active) * lobe
+        value = dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
+        if self.bodies and on is not None:
+            through = self.refracted(row, normal, back, on, active)
+            value = dr.select(dr.detach(product) < 0, through, value)
+        return value
+
+    def _amplitude(self, row: Any, cosine: Any, active: Any) -> Any:
+        """Square root of the reflectance; from inside a body, that of the refracted angle."""
+        if not self.bodies:
+            return self.tabulated("amplitude", row, dr.abs(cosine), active)
+        outer, total = self._outside(row, cosine, active)
+        return dr.select(total, 1.0, self.tabulated("amplitude", row, outer, active))
+
+    def _outside(self, row: Any, cosine: Any, active: Any) -> tuple[Any, Any]:
+        """Cosine on the outer side of a skin (Snell), and whether there is none."""
+        inside = dr.detach(cosine) < 0
+        index = self.value("index", row, active)
+        square = 1 - dr.square(index) * (1 - dr.square(cosine))
+        total = inside & (dr.detach(square) <= 1e-6)
+        refracted = dr.sqrt(dr.select(inside & ~total, square, 1.0))
+        return dr.select(inside, refracted, cosine), total
+
+    def refracted(self, row: Any, normal: Any, back: Any, on: Any, active: Any) -> Any:
+        """``f |cosθ| |cosθ'|`` through the skin of a body, in a lobe about Snell's direction.
+
+        ``f = n'² sqrt(T(θ) T(θ')) g(m)`` with the mismatch ``m = n d + n' d'`` of the directions'
+        tangential parts and a Gaussian ``g`` of the variance of the specular lobe: ``f / n'²`` is
+        reciprocal, and a lobe within the propagating directions passes T.
+        """
+        first, second = dr.dot(normal, back), dr.dot(normal, on)
+        inner = self.value("index", row, active)
+        variance = self.refraction_variance(row, active)
+        roots, mismatch, index = [], mi.Vector3f(0.0), mi.Float(1.0)
+        for direction, cosine in ((back, first), (on, second)):
+            outer, total = self._outside(row, cosine, active)
+            passing = self.tabulated("refraction", row, outer, active)
+            # A root of zero has no derivative: opaque surfaces take part as well.
+            open_ = ~total & (dr.detach(passing) > 0)
+            roots.append(dr.select(open_, dr.sqrt(dr.select(open_, passing, 1.0)), 0.0))
+            index = dr.select(dr.detach(cosine) < 0, inner, 1.0)
+            mismatch = mismatch + index * (direction - normal * cosine)
+        lobe = gaussian(mismatch, variance)
+        return roots[0] * roots[1] * dr.square(index) * lobe * dr.abs(first * second)
+
+    def refraction_variance(self, row: Any, active: Any = True) -> Any:
+        """Variance of the refracted direction's tangential part: that of the specular lobe."""
+        exponent = dr.gather(mi.Float, self.exponents, row * 3, active)
+        return 2 / dr.maximum(exponent, 1.0)
+
+    def is_skin(self, row: Any) -> Any:
+        """Whether a surface is the skin of a refracting body."""
+        last = (row + 1) * self.cosines - 1
+        return dr.detach(dr.gather(mi.Float, self.refraction, last)) > 0
+
+
+def gaussian(mismatch: Any, variance: Any) -> Any:
+    """Density of a plane Gaussian at an offset from its centre."""
+    return dr.exp(-dr.squared_norm(mismatch) / (2 * variance)) / (2 * dr.pi * variance)

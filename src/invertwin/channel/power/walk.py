@@ -1,0 +1,263 @@
+"""Paths over surface points, drawn vertex by vertex in one symbolic loop.
+
+The loop is compiled once for any depth, and keeps no vertex unless asked to: then it writes one
+`Records` row a vertex, from which derivatives are replayed (``channel/power/replay.py``). Detached.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from invertwin.channel.power import integrand
+from invertwin.channel.power.bins import Contribution
+from invertwin.channel.power.directions import Directions
+from invertwin.channel.power.integrand import Inputs, Place
+from invertwin.channel.power.passage import Passage, land, passage
+from invertwin.channel.rays.arrays import opaque, scrambled
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import NEAR, RayScene
+
+_LEAST_SURVIVAL = 0.1  # of Russian roulette
+_ROULETTE_FROM = 3  # vertices after which it begins; shorter paths have less noise without
+_STREAM = 0x9E3779B9  # seeds of successive vertices
+
+#: A path at its latest vertex, one lane each: what the loop carries.
+State = dict[str, Any]
+
+
+def start(
+    index: Any,
+    frame: Any,
+    face: Any,
+    b1: Any,
+    b2: Any,
+    back: Any,
+    throughput: Any,
+    length: Any,
+    passed: Passage | None = None,
+) -> State:
+    """The state at the first vertex.
+
+    ``back`` points to where the path comes from; ``throughput`` is everything up to arriving
+    here, one over the density of the samples included; ``length`` is that of the path so far.
+    ``passed`` is what lies on the first segment, for antennas that share what they see. A state
+    with a ``weight`` also follows one over the density of its points per area.
+    """
+    count = dr.width(index)
+    return {
+        "index": index,
+        "number": dr.full(mi.UInt32, 1, count),
+        "active": throughput != 0,
+        "frame": frame,
+        "face": face,
+        "b1": b1,
+        "b2": b2,
+        "back": mi.Vector3f(back),
+        "throughput": throughput,
+        "length": length,
+        **(
+            {} if passed is None else {"transmittance": passed.transmittance, "extra": passed.extra}
+        ),
+    }
+
+
+class Walk:
+    """Continues paths, and shows every vertex to a visitor."""
+
+    def __init__(self, rays: RayScene, inputs: Inputs, seed: int) -> None:
+        self.rays = rays
+        self.inputs = inputs
+        self.seed = scrambled(seed, 7)
+
+    @cached_property
+    def directions(self) -> Directions:
+        """How paths go on; those of one bounce never ask."""
+        return Directions(self.rays, self.inputs.surfaces)
+
+    def run(self, state: State, depth: Any, visit: Callable[[State, Place], None]) -> State:
+        """Walk up to ``depth`` vertices (a number, or one per lane); returns the last state.
+
+        ``visit`` may change what it put into the state itself.
+        """
+        if isinstance(depth, int) and depth == 1:
+            visit(state, self._place(state))
+            return state
+        directions = self.directions  # uploaded before the loop is recorded
+        last = opaque(depth) if isinstance(depth, int) else depth
+        lanes = dr.width(state["index"])
+        state = {**state, "last": mi.UInt32(last) + dr.zeros(mi.UInt32, lanes)}
+
+        def body(state: State) -> tuple[State]:
+            state = dict(state)
+            point = self._place(state)
+            visit(state, point)
+            self._extend(state, point, directions)
+            return (state,)
+
+        # Without a second recording of the body, which would gain the kernel nothing.
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+            (state,) = dr.while_loop(
+                (state,), lambda state: state["active"], body, labels=("state",), mode="symbolic"
+            )
+        return state
+
+    def step(self, state: State) -> State:
+        """One more vertex, outside any loop."""
+        state = {**state, "last": state["number"] + 1}
+        self._extend(state, self._place(state), self.directions)
+        return state
+
+    def _place(self, state: State) -> Place:
+        return integrand.place(
+            self.inputs, state["face"], state["b1"], state["b2"], state["active"]
+        )
+
+    def _extend(self, state: State, point: Place, directions: Directions) -> None:
+        """Draw the next vertex into the state; paths that miss or are too long end."""
+        active = state["active"] & (state["number"] < state["last"])
+        back = state["back"]
+        omega, density = directions.draw(point, back, self._numbers(state))
+        scattered = self.inputs.surfaces.scattered(
+            point.surface, point.normal, back, mi.Vector3f(omega), active
+        )
+        ratio: Any = scattered / (density * dr.abs(dr.dot(point.normal, back)))
+        survival = dr.select(
+            state["number"] >= _ROULETTE_FROM,
+            dr.minimum(dr.maximum(ratio, _LEAST_SURVIVAL), 1.0),
+            1.0,
+        )
+        active &= (scattered > 0) & (self._numbers(state, 2)[0] < survival)
+        side = dr.mulsign(point.normal, dr.dot(point.normal, omega))
+        origin = point.position + side * (NEAR * dr.norm(point.position))
+        ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
+        key = state["index"], self.seed + (state["number"] * 4 + 3) * _STREAM
+        hit = land(self.rays, self.inputs, ray, active, key, coherent=False)
+        active &= hit.valid
+        found = integrand.place(self.inputs, hit.face, hit.b1, hit.b2, active)
+        to_point, distance = integrand.segment(found.position, point.position)
+        cosine: Any = dr.abs(dr.dot(found.normal, to_point))
+        active &= (cosine > 1e-6) & (distance > 0)
+        inside = integrand.medium(self.inputs, point, found, -to_point, active)
+        odds = density * survival * cosine * hit.chance
+        weight = scattered * hit.transmittance * dr.exp(-inside.attenuation * distance) / odds
+        state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
+        if "weight" in state:
+            state["weight"] = state["weight"] * dr.square(distance) / odds
+        state["face"], state["b1"], state["b2"] = hit.face, hit.b1, hit.b2
+        state["back"] = mi.Vector3f(to_point)
+        state["length"] = state["length"] + inside.index * distance + hit.extra
+        state["number"] = state["number"] + 1
+        state["active"] = active
+
+    def _numbers(self, state: State, pairs: int = 0) -> list[Any]:
+        """Uniform numbers of this vertex: four, or the two of a later stream."""
+        streams = (pairs,) if pairs else (0, 1)
+        numbers = []
+        for stream in streams:
+            seed = self.seed + (state["number"] * 4 + stream) * _STREAM
+            first, second = mi.sample_tea_32(state["index"], seed)
+            numbers += [mi.Float(first >> 8) * 2.0**-24, mi.Float(second >> 8) * 2.0**-24]
+        return numbers
+
+
+def connect(
+    rays: RayScene,
+    inputs: Inputs,
+    state: State,
+    point: Place,
+    receiver: Any,
+    *,
+    least: Any = 1,
+    shared: bool = False,
+    one_place: bool = False,
+) -> tuple[Contribution, Any]:
+    """The path that ends at the latest vertex, and whether it exists.
+
+    Args:
+        rays: Rays.
+        inputs: Detached.
+        state: The path so far.
+        point: Its latest vertex.
+        receiver: Whether the path ends at the receiver (a bool, or one per lane). Where it ends at
+            the transmitter, the state knows the receiver's direction ``u``, ``v``.
+        least: Fewest vertices of a path (a number, or one per lane).
+        shared: What the antenna at the start sees, the one at the end sees too.
+        one_place: Both are one.
+    """
+    found = integrand.connection(
+        inputs, state["frame"], point, state["back"], receiver, state["active"], same=one_place
+    )
+    u, v = found.seen.x, found.seen.y
+    if receiver is not True:
+        u, v = dr.select(receiver, u, state["u"]), dr.select(receiver, v, state["v"])
+    power = state["throughput"] * found.factor
+    exists = state["active"] & (power != 0) & (state["number"] >= least)
+    one, none = mi.Float(1.0), mi.Float(0.0)
+    transmittance, extra = state.get("transmittance", one), state.get("extra", none)
+    if not (shared and "last" not in state):
+        first = exists & (state["number"] == 1) if shared else mi.Bool(False)
+        antenna = inputs.antenna(state["frame"], receiver, exists)
+        passed = passage(rays, inputs, point.position, antenna, exists & ~first)
+        transmittance = dr.select(first, transmittance, passed.transmittance)
+        extra = dr.select(first, extra, passed.extra)
+    length = 0.5 * (state["length"] + found.distance + extra)
+    return Contribution(state["frame"], power * transmittance, length, u, v), exists & (
+        transmittance > 0
+    )
+
+
+@dataclass(frozen=True)
+class Records:
+    """Vertices of paths as flat arrays, vertex after vertex: ``[vertex × lane]``.
+
+    ``throughput`` is zero where a path has ended; ``seen`` says that the vertex is connected to
+    the receiver.
+    """
+
+    lanes: int
+    depth: int
+    frame: Any
+    face: Any
+    b1: Any
+    b2: Any
+    throughput: Any
+    length: Any
+    seen: Any
+
+    @staticmethod
+    def single(state: State, seen: Any) -> "Records":
+        """Records of paths of one vertex."""
+        names = ("frame", "face", "b1", "b2", "throughput", "length")
+        columns = {name: state[name] for name in names}
+        return Records(lanes=dr.width(state["index"]), depth=1, **columns, seen=seen)
+
+    @staticmethod
+    def empty(state: State, depth: int, sound_face: Any) -> "Records":
+        """Room for paths that start in this state."""
+        lanes = dr.width(state["index"])
+        size = lanes * depth
+        face = dr.zeros(mi.UInt32, size)
+        return Records(
+            lanes=lanes,
+            depth=depth,
+            frame=state["frame"],
+            face=face + sound_face if size else face,
+            b1=dr.zeros(mi.Float, size),
+            b2=dr.zeros(mi.Float, size),
+            throughput=dr.zeros(mi.Float, size),
+            length=dr.zeros(mi.Float, size),
+            seen=dr.zeros(mi.Bool, size),
+        )
+
+    @property
+    def columns(self) -> list[Any]:
+        """All arrays."""
+        return [column for column in vars(self).values() if not isinstance(column, int)]
+
+    def write(self, state: State, seen: Any) -> None:
+        """Store the latest vertex."""
+        at = (state["number"] - 1) * self.lanes + state["lane"]
+        values = {**state, "seen": seen}
+        for name in ("face", "b1", "b2", "throughput", "length", "seen"):
+            dr.scatter(getattr(self, name), values[name], at, state["active"])

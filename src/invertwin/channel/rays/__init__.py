@@ -1,0 +1,1 @@
+"""The scene as rays see it: tables, topology, visibility."""

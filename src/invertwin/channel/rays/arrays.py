@@ -1,0 +1,76 @@
+"""The one crossing between torch tensors and Dr.Jit arrays, and random numbers on the latter."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+from torch import Tensor
+
+from invertwin.channel.rays.backend import dr, mi
+
+
+def to_float(values: Tensor) -> Any:
+    """A flat Dr.Jit float array of a torch tensor (detached, float32)."""
+    return mi.Float(values.detach().to(torch.float32).contiguous().ravel().cpu())
+
+
+def to_index(values: Tensor) -> Any:
+    """A flat Dr.Jit index array of a torch tensor of non-negative integers."""
+    return mi.UInt32(values.detach().to(torch.int32).contiguous().ravel().cpu().numpy())
+
+
+def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> Any:
+    """A flat Dr.Jit array of four numbers a point, the last one zero: each is read as a whole."""
+    return to_float(torch.nn.functional.pad(values.detach().to(torch.float32), (0, 1)))
+
+
+def point_at(table: Any, index: Any, active: Any = True) -> Any:
+    """Points of such an array.
+
+    Args:
+        table: From ``to_points``.
+        index: Rows.
+        active: Lanes.
+    """
+    found = dr.gather(mi.Vector4f, table, index, active)
+    return mi.Point3f(found.x, found.y, found.z)
+
+
+def from_points(values: Any) -> Float32[Tensor, "n 3"]:
+    """Points, or derivatives by them, of such an array."""
+    return to_torch(values).reshape(-1, 4)[:, :3]
+
+
+def to_torch(values: Any) -> Tensor:
+    """A torch tensor on the CPU of a flat Dr.Jit array."""
+    return torch.from_numpy(np.array(values))
+
+
+def opaque(value: float | int, kind: str = "UInt32") -> Any:
+    """A Dr.Jit scalar that the kernel reads from memory, so that a new value does not recompile."""
+    return dr.opaque(getattr(mi, kind), value)
+
+
+def scrambled(seed: int, stream: int) -> Any:
+    """An opaque 32-bit seed; neighbouring seeds and streams are unrelated."""
+    state = np.random.SeedSequence([seed, stream]).generate_state(1)[0]
+    return opaque(int(state))
+
+
+def uniform_pair(index: Any, seed: Any) -> tuple[Any, Any]:
+    """Two uniform numbers in [0, 1) for each index."""
+    first, second = mi.sample_tea_32(index, seed)
+    return mi.Float(first >> 8) * 2.0**-24, mi.Float(second >> 8) * 2.0**-24
+
+
+def corners(vertices: Any, faces: Any, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    """Corners of triangles, from tables of points and of vertex indices."""
+    index = dr.gather(mi.Vector3u, faces, face, active)
+    return tuple(point_at(vertices, i, active) for i in index)  # type: ignore[return-value]
+
+
+def between(triangle: tuple[Any, Any, Any], b1: Any, b2: Any) -> Any:
+    """The point of a triangle with these barycentric coordinates."""
+    p0, p1, p2 = triangle
+    return p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2

@@ -1,0 +1,235 @@
+"""A scene as flat tables: what all paths are computed from, still torch and differentiable."""
+
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Literal
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.paths import Link
+from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.scene.material import Material, Surface
+from invertwin.scene.scene import Object, Scene
+
+
+def mixed(corners: tuple[Tensor, Tensor, Tensor], b1: Tensor, b2: Tensor) -> Tensor:
+    """Values at barycentric coordinates of triangles, from those at the corners.
+
+    Args:
+        corners: Values at the three corners.
+        b1: Weight of the second corner.
+        b2: Weight of the third corner.
+    """
+    c0, c1, c2 = corners
+    b1, b2 = b1[:, None], b2[:, None]
+    return c0 * (1 - b1 - b2) + c1 * b1 + c2 * b2
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A scene as flat tables, still torch and differentiable.
+
+    Attributes:
+        vertices: World positions of all objects, concatenated [m].
+        faces: Vertex indices of all triangles.
+        face_object: Index of the object of each triangle.
+        face_surface: Row of each triangle in the tables of surfaces.
+        surfaces: What surfaces do, one row per object or per triangle.
+        lobed: Which lobes have weight, or a derivative that could give them some.
+        sheets: Whether something passes straight through any surface.
+        bodies: Whether any surface is the skin of a refracting body.
+        coherent: Per object, whether its field paths have a deterministic phase.
+        topology: What depends on the connectivity only.
+        velocities: World velocities of the vertices [m/s]; None = all at rest.
+    """
+
+    vertices: Float64[Tensor, "v 3"]
+    faces: Int64[Tensor, "f 3"]
+    face_object: Int64[Tensor, " f"]
+    face_surface: Int64[Tensor, " f"]
+    surfaces: Surface
+    lobed: tuple[bool, bool, bool]
+    sheets: bool
+    bodies: bool
+    coherent: tuple[bool, ...]
+    topology: Topology
+    velocities: Float64[Tensor, "v 3"] | None = None
+
+    def corners(self, faces: Int64[Tensor, " n"]) -> tuple[Tensor, Tensor, Tensor]:
+        """The three corners of the given triangles, ``[n, 3]`` each."""
+        triangles = self.faces[faces]
+        return tuple(self.vertices[triangles[:, k]] for k in range(3))  # type: ignore[return-value]
+
+    def velocity(
+        self, face: Int64[Tensor, " n"], b1: Float64[Tensor, " n"], b2: Float64[Tensor, " n"]
+    ) -> Float64[Tensor, "n 3"] | None:
+        """World velocity of material points [m/s]; None if all objects are at rest.
+
+        Args:
+            face: Triangles.
+            b1: Weight of the second corner.
+            b2: Weight of the third corner.
+        """
+        if self.velocities is None:
+            return None
+        v0, v1, v2 = (self.velocities[self.faces[face, k]] for k in range(3))
+        return mixed((v0, v1, v2), b1, b2)
+
+    def require_rest(self, depth: int) -> None:
+        """Refuse paths of several bounces of objects in motion.
+
+        Raises:
+            InputError: An object moves.
+        """
+        if self.velocities is not None:
+            raise InputError(
+                f"expected depth 1 for objects in motion, got {depth}; the range rate of longer "
+                "paths is not modelled"
+            )
+
+
+def differentiated(value: Tensor | None) -> bool:
+    """Whether derivatives flow through a tensor, in reverse or in forward mode."""
+    if value is None:
+        return False
+    return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None
+
+
+def silhouettes_move(geometry: Geometry, link: Link) -> bool:
+    """Whether a derivative flows through anything that decides what is visible."""
+    return any(differentiated(value) for value in (geometry.vertices, link.tx, link.rx))
+
+
+def require_edges(geometry: Geometry, link: Link, samples: int) -> None:
+    """Refuse a derivative that would silently leave moving silhouettes out.
+
+    Raises:
+        InputError: Silhouettes move and there are no samples of them.
+    """
+    if samples < 1 and silhouettes_move(geometry, link):
+        raise InputError(
+            "expected boundary_samples >= 1 for a derivative in which silhouettes move, got "
+            f"{samples}; give some, or boundary=False for fixed visibility"
+        )
+
+
+def flatten(
+    scene: Scene, wavelength: float, *, motion: Literal["refused", "fixed", "free"] = "refused"
+) -> Geometry:
+    """All objects of a scene in one set of tables.
+
+    Args:
+        scene: Its objects.
+        wavelength: [m].
+        motion: Whether objects may move, and whether derivatives flow through their velocities.
+
+    Raises:
+        InputError: An object in motion where a frame is one instant, a derivative with respect
+            to a velocity, or an object that is a cloud.
+    """
+    objects = list(scene.objects.values())
+    clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
+    if clouds:
+        raise InputError(
+            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; only power "
+            "(deposit_power, the surrogate) is computed of clouds: mesh them for exact signals"
+        )
+    fitted = [n for n, o in scene.objects.items() if differentiated(o.velocity)]
+    moving = fitted or [n for n, o in scene.objects.items() if _moves(o)]
+    if (fitted and motion != "free") or (moving and motion == "refused"):
+        names = ", ".join(moving)
+        what = "no derivatives by velocities, got" if fitted else "objects at rest, got"
+        raise InputError(
+            f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time) "
+            "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
+        )
+    vertices = torch.cat([item.vertices for item in objects])
+    topology = topology_of([item.mesh for item in objects])
+    surfaces, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength)
+    skins = surfaces.refraction.any(1)
+    for number, name in enumerate(scene.objects) if bool(skins.any()) else ():
+        own = topology.face_object == number
+        if bool(skins[face_surface[own]].any()):
+            _require_solid(
+                name, vertices.detach()[topology.faces[own]], topology.open_objects[number]
+            )
+    weights, free = surfaces.lobes, differentiated(surfaces.lobes)
+    return Geometry(
+        vertices=vertices,
+        faces=topology.faces,
+        face_object=topology.face_object,
+        face_surface=face_surface,
+        surfaces=surfaces,
+        lobed=(
+            free or bool(weights[:, 0].any()),
+            free or bool(weights[:, 1].any()),
+            free or bool(weights[:, 2].any()),
+        ),
+        sheets=bool(surfaces.transmittance.any()),
+        bodies=bool(skins.any()),
+        coherent=tuple(item.material.coherent for item in objects),
+        topology=topology,
+        velocities=torch.cat([_velocities(item) for item in objects]) if moving else None,
+    )
+
+
+def _require_solid(name: str, triangles: Tensor, is_open: bool) -> None:
+    """Refuse a refracting body without an inside."""
+    volume = (triangles[:, 0] * torch.linalg.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
+    if is_open or not volume > 0:
+        found = "an open one" if is_open else "one wound inwards"
+        raise InputError(
+            f"expected a closed mesh with outward triangles for the refracting body {name}, got "
+            f"{found}; close or turn it, or use a Slab for a sheet"
+        )
+
+
+def _surface(material: Material, frequency: float) -> Surface:
+    """What a material does; remembered where it is frozen and of plain numbers."""
+    frozen = getattr(type(material), "__dataclass_params__", None)
+    plain = all(isinstance(value, int | float | str) for value in vars(material).values())
+    if plain and frozen is not None and frozen.frozen:
+        return _remembered(material, frequency)
+    return material.surface(frequency)
+
+
+@lru_cache(maxsize=64)
+def _remembered(material: Material, frequency: float) -> Surface:
+    return material.surface(frequency)
+
+
+def _surfaces(objects: list[Object], frequency: float) -> tuple[Surface, Tensor]:
+    """The rows of all surfaces, and the row of every triangle."""
+    columns: dict[str, list[Tensor]] = {field.name: [] for field in fields(Surface)}
+    face_surface, offset = [], 0
+    for item in objects:
+        surface, count = _surface(item.material, frequency), len(item.mesh.faces)
+        per_face = surface.diffuse.ndim == 1
+        if per_face and len(surface.diffuse) != count:
+            raise InputError(
+                f"expected one value of a material per triangle ({count}), got "
+                f"{len(surface.diffuse)}; give as many, or a single one"
+            )
+        for name, column in columns.items():
+            value = getattr(surface, name)
+            column.append(value if per_face else value[None])
+        numbers = torch.arange(count) if per_face else torch.zeros(count, dtype=torch.int64)
+        face_surface.append(numbers + offset)
+        offset += count if per_face else 1
+    rows = Surface(**{name: torch.cat(column) for name, column in columns.items()})
+    return rows, torch.cat(face_surface)
+
+
+def _moves(item: Object) -> bool:
+    return item.velocity is not None and bool(item.velocity.any())
+
+
+def _velocities(item: Object) -> Tensor:
+    """World velocity of every vertex [m/s]."""
+    still = torch.zeros(len(item.mesh.vertices), 3, dtype=torch.float64)
+    return still if item.velocity is None else still + item.velocity

@@ -1,0 +1,154 @@
+"""What rays need: the ray scene and the antennas, in float32 about a local origin."""
+
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.paths import Link
+from invertwin.channel.rays import arrays
+from invertwin.channel.rays.arrays import opaque, to_float, to_points, to_torch
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_tensor
+from invertwin.scene.mesh import Mesh
+
+# Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and small
+# enough that the dark side of a 0.3 m ball stays dark from a kilometre away.
+NEAR = 3e-6
+_SLIVER = 1e-3  # a triangle's area over its squared sides, below which it is one
+
+
+class Occluders:
+    """Triangles that block rays, in float32 about a local origin."""
+
+    def __init__(
+        self, vertices: Float64[Tensor, "v 3"], topology: Topology, origin: Float64[Tensor, "3"]
+    ) -> None:
+        self.topology = topology
+        self.origin = origin
+        self.local_vertices = (vertices.detach() - origin).to(torch.float32)
+
+    @property
+    def scene(self) -> Any:
+        """Mitsuba's scene. Asked for anew: other rays on the same objects may have moved them."""
+        return self.topology.ray_scene(self.local_vertices)
+
+    def clear(self, start: Any, end: Any, active: Any = True) -> Any:
+        """Whether nothing lies between two points (their own surfaces excluded)."""
+        return active & ~self.scene.ray_test(
+            mi.Ray3f(start + (end - start) * NEAR, end - start, 1 - 2 * NEAR, 0.0, []), active
+        )
+
+    def located(self, place: Float64[Tensor, "n 3"]) -> Any:
+        """World points as Dr.Jit points about the origin."""
+        local = (place.detach() - self.origin).to(torch.float32)
+        return mi.Point3f(*(to_float(local[:, k]) for k in range(3)))
+
+
+class RayScene(Occluders):
+    """The triangles of a scene and the antennas that look at them."""
+
+    def __init__(self, geometry: Geometry, link: Link) -> None:
+        origin = link.tx.detach().mean(dim=0)
+        super().__init__(geometry.vertices, geometry.topology, origin)
+        self.geometry = geometry
+        self.link = link
+        self.vertices = to_points(self.local_vertices)
+        self.tx = to_points(link.tx - origin)
+        self.rx = to_points(link.rx - origin)
+        # Lanes without a hit are evaluated on a sound triangle, then masked: no NaN can leak.
+        self.sound_face = opaque(_sound_face(geometry))
+
+    @cached_property
+    def spheres(self) -> tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]]:
+        """Centre and radius of a sphere around each object [m]."""
+        return bounding_spheres(self.geometry)
+
+    def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """Corners of triangles, detached."""
+        return arrays.corners(self.vertices, self.topology.device_faces, face, active)
+
+
+def _sound_face(geometry: Geometry) -> int:
+    """A triangle that is no sliver; the last answer while it stays one, which is quicker."""
+    topology = geometry.topology
+    if topology.sound_face is not None:
+        p0, p1, p2 = geometry.vertices.detach()[geometry.faces[topology.sound_face]]
+        sides = torch.stack([p1 - p0, p2 - p0])
+        area = torch.linalg.cross(sides[0], sides[1]).norm()
+        if area > _SLIVER * sides.square().sum():
+            return topology.sound_face
+    topology.sound_face = int(face_areas(geometry).argmax())
+    return topology.sound_face
+
+
+def bounding_spheres(
+    geometry: Geometry,
+) -> tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]]:
+    """Centre and radius of a sphere around each object, detached [m]."""
+    centres, radii = [], []
+    positions = geometry.vertices.detach()
+    for used in geometry.topology.object_vertices:
+        corners = positions[used]
+        low, high = torch.aminmax(corners, dim=0)
+        centre = 0.5 * (low + high)
+        centres.append(centre)
+        radii.append((corners - centre).norm(dim=1).max())
+    return torch.stack(centres), torch.stack(radii)
+
+
+def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
+    """Areas of all triangles [m²], detached."""
+    p0, p1, p2 = (geometry.vertices.detach()[geometry.faces[:, k]] for k in range(3))
+    areas = 0.5 * torch.linalg.cross(p1 - p0, p2 - p0).norm(dim=1)
+    if not bool((areas > 0).any()):
+        raise InputError("expected a triangle of positive area, got none; check the mesh's scale")
+    return areas
+
+
+def visible(rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]) -> Tensor:
+    """Whether nothing lies between pairs of world points (torch in, torch out)."""
+    if not len(start):
+        return torch.zeros(0, dtype=torch.bool)
+    return to_torch(rays.clear(rays.located(start), rays.located(end))).bool()
+
+
+def next_surface(
+    rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
+) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
+    """First triangle between pairs of world points (−1: none), and how far along it lies."""
+    origin = rays.located(start)
+    offset = rays.located(end) - origin
+    ray = mi.Ray3f(origin + offset * NEAR, mi.Vector3f(offset), 1 - 2 * NEAR, 0.0, [])
+    hit = rays.scene.ray_intersect_preliminary(ray)
+    face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
+    along = dr.select(hit.is_valid(), hit.t + NEAR, 1.0)
+    return to_torch(face).long(), to_torch(along).double()
+
+
+def visible_points(
+    mesh: Mesh, points: Float64[Tensor, "n 3"], positions: ArrayLike
+) -> Bool[Tensor, " n"]:
+    """Which points of a surface at least one position sees past the rest of the same mesh.
+
+    Args:
+        mesh: The surface; its triangles hide what is behind them.
+        points: On the surface [m], in the frame of the mesh.
+        positions: From where it is seen, [p, 3] in metres.
+
+    Raises:
+        InputError: Positions of another shape, or that are not finite.
+    """
+    places = checked_tensor(positions, (None, 3), "radar positions [m]", "give x, y, z of each")
+    rays = Occluders(mesh.vertices, topology_of([mesh]), places.detach().mean(dim=0))
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for place in places:
+        hidden = torch.nonzero(~seen)[:, 0]
+        clear = visible(rays, points[hidden], place.expand(len(hidden), 3))
+        seen[hidden[clear]] = True
+    return seen

@@ -1,0 +1,1 @@
+"""Slow, readable statements of the same laws: the oracles of the kernels' tests."""

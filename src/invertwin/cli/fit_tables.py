@@ -1,0 +1,54 @@
+"""How maps are compared and how a gradient becomes a step, in run files."""
+
+from typing import Any
+
+from pydantic import model_validator
+
+from invertwin.channel import Grid
+from invertwin.cli.registry import Group, Registry, Table
+from invertwin.cli.section import fail, key
+from invertwin.errors import InputError
+from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.optimizer import Optimizer
+from invertwin.radar.surrogate import Surrogate, chosen_surrogate
+
+
+class SurrogateTable(Table):
+    """Kernels of the smooth model; the extra widths anneal to zero, in cells.
+
+    A name may stand for the table: surrogate = "exact", "response", "annealed", "gaussian",
+    "dirichlet" or "random_phase", before the first table.
+    """
+
+    exact: bool = key("fit the exact chain instead; rough surfaces need boundary = false", False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, data: Any) -> Any:
+        if not isinstance(data, str):
+            return data
+        try:
+            chosen = chosen_surrogate(data)
+        except InputError as error:
+            fail(str(error))
+        return {"exact": True} if chosen is None else dict(vars(chosen))
+
+
+def register(registry: Registry) -> None:
+    """Adds losses and optimizers; forward models of one's own come from plugins."""
+    registry.group(Group("loss", default="mse"))
+    registry.group(Group("optimizer", default="adam"))
+    registry.group(Group("model"))
+    registry.give(Grid, Surrogate)
+    registry.add("loss", "mse", SpectrumLoss, without=("floor",))
+    registry.add("loss", "likelihood", SpectrumLoss)
+    for name in ("adam", "sgd", "gauss_newton"):
+        registry.add("optimizer", name, Optimizer, without=("module_rates",))
+
+
+def surrogate(table: Any) -> Surrogate:
+    """The smooth model of the `[surrogate]` table, at its starting widths.
+
+    For the exact chain it is the "response", which is its mean over phases.
+    """
+    return table.build()

@@ -1,0 +1,121 @@
+"""What every table of a run file is made of: numbers, paths, and tables with known keys only.
+
+Nothing here imports torch, so that the command line can say what it offers without it.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn
+
+from annotated_types import Ge, Le, Len, Lt, MinLen
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from invertwin.errors import InputError
+from invertwin.limits import NonNegative
+
+Depth = Annotated[int, Ge(1), Le(16)]
+Seed = Annotated[int, Ge(0), Lt(2**31)]
+Vector = Annotated[list[float], Len(3, 3)]
+Counts = Annotated[list[Annotated[int, Ge(2)]], Len(3, 3)]
+Interval = Annotated[list[NonNegative], Len(2, 2)]
+WorldAxes = Annotated[list[Literal["x", "y", "z"]], MinLen(1)]
+
+# Pydantic puts the tag of a union into an error's location; the mark tells it from a key.
+TAG_MARK = "→"
+
+# Beside the checkout; for an installed package this is a folder that does not exist.
+_DATA_BESIDE_CHECKOUT = Path(__file__).resolve().parents[4] / "shared" / "data"
+
+
+def _beside_run_file(name: str, info: Any) -> str:
+    """Relative paths start at the run file's folder, then at the data folder."""
+    folders = [
+        (info.context or {}).get("folder", Path()),
+        os.environ.get("INVERTWIN_DATA", _DATA_BESIDE_CHECKOUT),
+    ]
+    paths = [Path(folder, name).absolute() for folder in folders]
+    return str(next((path for path in paths if path.exists()), paths[0]))
+
+
+InputPath = Annotated[str, MinLen(1), AfterValidator(_beside_run_file)]
+"""Path of a file or folder, from the run file's folder, then from INVERTWIN_DATA."""
+
+
+class KeyInputError(InputError):
+    """Bad input at a key of the run file."""
+
+    def __init__(self, path: str, text: str) -> None:
+        super().__init__(f"{path}: {text}")
+        self.path, self.text = path, text
+
+
+@contextmanager
+def about(path: str) -> Iterator[None]:
+    """Errors of the library with the key of the run file that they are about."""
+    try:
+        yield
+    except KeyInputError as error:
+        raise KeyInputError(f"{path}.{error.path}", error.text) from None
+    except InputError as error:
+        raise KeyInputError(path, str(error)) from None
+
+
+def key(description: str, default: Any = ..., **limits: Any) -> Any:
+    """A key of a table: what it means and its default; without one it is required."""
+    return Field(default, description=description, **limits)
+
+
+class Section(BaseModel):
+    """A table of the run file; keys it does not know are errors that name the nearest match."""
+
+    # Which kinds there are is known once all modules are imported, so validators are built late.
+    model_config = ConfigDict(
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, defer_build=True
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys_only(cls, data: Any) -> Any:
+        # Pydantic's own error for an extra key does not carry the keys that are allowed.
+        for name in data if isinstance(data, dict) else ():
+            if name not in cls.model_fields:
+                allowed = {"key": name, "allowed": list(cls.model_fields)}
+                raise PydanticCustomError("unknown_key", "unknown key", allowed)
+        return data
+
+
+def tag_by(keys: tuple[str, ...], default: str | None = None) -> Discriminator:
+    """A union's member by the first of `keys` that is present.
+
+    Args:
+        keys: `kind` or `shape` tell the member by their value, others by their presence.
+        default: The member without any of them.
+    """
+
+    def tag(value: Any) -> str | None:
+        if isinstance(value, list):
+            return TAG_MARK + "points"
+        for name in keys:
+            found = value.get(name) if isinstance(value, dict) else getattr(value, name, None)
+            if found is not None:
+                return TAG_MARK + (str(found) if name in ("kind", "shape") else name)
+        return TAG_MARK + default if default and isinstance(value, dict) else None
+
+    tag.__name__ = ",".join(keys)  # pydantic quotes it in its errors, and run_file reads it
+    return Discriminator(tag)
+
+
+def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None:
+    """Keys that one kind needs and the others must not have."""
+    for name, needed in wanted.items():
+        if needed != (getattr(section, name) is not None):
+            verb, do = ("", "add it") if needed else ("no ", "remove it")
+            fail(f"expected {verb}`{name}` {when}; {do}")
+
+
+def fail(text: str, path: str = "") -> NoReturn:
+    """An error of a whole section, or of the key `path` of the run file."""
+    raise PydanticCustomError("section", "{text}", {"text": text, "path": path})

@@ -1,0 +1,55 @@
+"""The recordings as `[data]` kinds of run files."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from invertwin.capture import Capture
+from invertwin.cli.recordings import Recording, recorded
+from invertwin.cli.registry import OneOf, Registry, registry
+from invertwin.cli.section import InputPath, about
+from invertwin.datasets import openradar, rail_sar
+from invertwin.errors import InputError
+
+_ORIGINALS = {
+    rail_sar.FILE: "github.com/jjimmykang/bwsi-backprojection, trial 6",
+    openradar.FILE: "of github.com/PreSenseRadar/OpenRadar",
+}
+
+
+def register(kinds: Registry) -> None:
+    """Adds the readers."""
+    kinds.add("data", "rail_sar", rail_sar_data)
+    kinds.add("data", "openradar", openradar_data)
+
+
+def rail_sar_data(folder: InputPath) -> Capture:
+    """The public recording of an ultra-wideband radar on a rail.
+
+    Args:
+        folder: path, from the run file's folder, then from INVERTWIN_DATA.
+    """
+    with about("folder"):
+        return rail_sar.read(_holding(rail_sar.FILE, Path(folder)))
+
+
+def openradar_data(
+    folder: InputPath, board: Annotated[Any, OneOf("board")] | None = None
+) -> Recording:
+    """The public 77 GHz recording of movers, with every chirp.
+
+    Args:
+        folder: path, from the run file's folder, then from INVERTWIN_DATA.
+        board: whose elements recorded; the file does not say; without it xWR1642.
+    """
+    with about("folder"):
+        chirps = openradar.read_chirps(_holding(openradar.FILE, Path(folder)))
+    return recorded(chirps, board or registry.table("board", "name")(name="xWR1642"))
+
+
+def _holding(file: str, folder: Path) -> Path:
+    if not (folder / file).is_file():
+        raise InputError(
+            f"expected {file} in {folder}, got no such file; it is made from the public recording "
+            f"{_ORIGINALS[file]}: set INVERTWIN_DATA to the folder that holds {folder.name}/"
+        )
+    return folder

@@ -1,0 +1,314 @@
+"""The fused deposit against its slow twins, its own adjoint, and itself."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.autograd.forward_ad as forward_ad
+from torch import Tensor
+
+from invertwin.channel import Grid, Link, Sampling, deposit_power
+from invertwin.channel.rays.geometry import flatten
+from invertwin.errors import InputError
+from invertwin.scene import (
+    Cosine,
+    Isotropic,
+    Mesh,
+    Object,
+    RoughDielectric,
+    Scene,
+    Table,
+    plate,
+    rotation_from_vector,
+    sphere,
+)
+from oracles import autodiff_deposit
+from oracles.twin import deposit_by_paths
+from scenes import GRID, float64, link, occluder, relative, thing
+
+COUNTS = Sampling(depth=1, samples=20_000, boundary_samples=4_000)
+BOX = Grid(
+    0.4, 0.075, 34, u_start=-0.6, u_step=0.1, u_count=13, v_start=-0.6, v_step=0.2, v_count=7
+)
+
+
+def lopsided() -> Table:
+    """A pattern that depends on both angles."""
+    theta, phi = torch.linspace(0, 2.0, 9).double(), torch.linspace(-3, 3, 7).double()
+    return Table(theta, phi, 2 + torch.cos(theta)[:, None] * torch.cos(phi - 0.4)[None])
+
+
+def leaves(bistatic: bool) -> dict[str, Tensor]:
+    """Everything that a map can be differentiated by, in two frames."""
+    turns = [rotation_from_vector(float64(v)) for v in ([0.05, 0.1, 0.0], [0.0, -0.1, 0.2])]
+    values = {
+        "wall": occluder()["wall"].vertices,
+        "occluder": occluder()["occluder"].vertices,
+        "tx": float64([[0.0, 0.0, 0.0], [0.2, 0.1, -0.1]]),
+        "rotations": torch.stack(turns),
+        "permittivity": float64(4.0),
+        "conductivity": float64(0.5),
+        "diffuse": float64(0.6),
+        "lobe_width": float64(0.5),
+    }
+    if bistatic:
+        values["rx"] = values["tx"] + float64([0.3, 0.0, 0.05])
+    return {name: value.clone().requires_grad_() for name, value in values.items()}
+
+
+def built(values: dict[str, Tensor]) -> tuple[Scene, Link]:
+    """The scene and the link of the leaves."""
+    material = RoughDielectric(
+        values["permittivity"], values["conductivity"], values["diffuse"], values["lobe_width"]
+    )
+    scene = Scene(
+        {
+            name: Object(Mesh(values[name], occluder()[name].mesh.faces), material)
+            for name in ("wall", "occluder")
+        }
+    )
+    return scene, link(values["tx"], values.get("rx"), values["rotations"], lopsided())
+
+
+def random_map(shape: tuple[int, ...]) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("grid", [GRID, BOX], ids=["range-u", "range-u-v"])
+@pytest.mark.parametrize("bistatic", [False, True], ids=["monostatic", "bistatic"])
+def test_value_and_gradients_are_those_of_the_torch_twin(bistatic, grid):
+    values = leaves(bistatic)
+    scene, antennas = built(values)
+    fused = deposit_power(scene, antennas, grid, sampling=COUNTS, seed=3)
+    slow = deposit_by_paths(scene, antennas, grid, sampling=COUNTS, seed=3)
+    assert relative(fused, slow) < 1e-5
+    weights = random_map(slow.shape)
+    found, truth = (
+        torch.autograd.grad((weights * out).sum(), list(values.values())) for out in (fused, slow)
+    )
+    for name, a, b in zip(values, found, truth, strict=True):
+        assert relative(a, b) < 1e-3, name
+
+
+@pytest.mark.parametrize("bistatic", [False, True], ids=["monostatic", "bistatic"])
+def test_hand_written_adjoint_is_that_of_autodiff(bistatic):
+    values = leaves(bistatic)
+    scene, antennas = built({k: v.detach() for k, v in values.items()})
+    weights = random_map((2, *BOX.shape))
+    truth = autodiff_deposit.gradients(
+        scene, antennas, BOX, weights, samples=20_000, edges=4_000, seed=3
+    )
+    geometry = flatten(scene, antennas.wavelength)
+    vertices = geometry.vertices.clone().requires_grad_()
+    split = len(scene["wall"].mesh.vertices)
+    moved = scene
+    for name, part in (("wall", vertices[:split]), ("occluder", vertices[split:])):
+        moved = moved.replace(name, mesh=Mesh(part, scene[name].mesh.faces))
+    poses = {
+        name: getattr(antennas, name).clone().requires_grad_() for name in ("tx", "rx", "rotations")
+    }
+    if not bistatic:
+        poses["rx"] = poses["tx"]
+    fused = deposit_power(moved, replace(antennas, **poses), BOX, sampling=COUNTS, seed=3)
+    wanted = {"vertices": vertices, **poses}
+    found = torch.autograd.grad((weights * fused).sum(), list(wanted.values()))
+    for name, gradient in zip(wanted, found, strict=True):
+        own = "tx" if name == "rx" and not bistatic else name
+        assert relative(gradient, truth[own].double()) < 1e-4, name
+
+
+@pytest.mark.parametrize("bistatic", [False, True], ids=["monostatic", "bistatic"])
+def test_forward_and_reverse_mode_agree(bistatic):
+    values = leaves(bistatic)
+    scene, antennas = built(values)
+    out = deposit_power(scene, antennas, GRID, sampling=COUNTS, seed=3)
+    weights = random_map(out.shape)
+    pulled = torch.autograd.grad((weights * out).sum(), list(values.values()))
+    generator = torch.Generator().manual_seed(1)
+    for (name, value), bar in zip(values.items(), pulled, strict=True):
+        tangent = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+        with forward_ad.dual_level():
+            dual = {k: v.detach() for k, v in values.items()}
+            dual[name] = forward_ad.make_dual(dual[name], tangent)
+            pushed = forward_ad.unpack_dual(
+                deposit_power(*built(dual), GRID, sampling=COUNTS, seed=3)
+            ).tangent
+        assert pushed is not None
+        there, back = (weights * pushed).sum(), (bar * tangent).sum()
+        size = (weights * pushed.abs()).sum()
+        assert float((there - back).abs() / size) < 1e-5, name
+
+
+def test_coinciding_antennas_may_move_apart():
+    """Equal positions, but a derivative with respect to one of them alone."""
+    place, found = float64([[0.0, 0.0, 0.0]]), []
+    weights = random_map((1, *GRID.shape))
+    for which in ("tx", "rx"):
+        own = place.clone().requires_grad_()
+        antennas = replace(link(place), **{which: own})
+        maps = [
+            deposit(occluder(), antennas, GRID, sampling=COUNTS, seed=3)
+            for deposit in (deposit_power, deposit_by_paths)
+        ]
+        fused, slow = (torch.autograd.grad((weights * out).sum(), own)[0] for out in maps)
+        assert relative(fused, slow) < 1e-3
+        found.append(fused)
+    assert relative(*found) > 0.1
+
+
+@pytest.mark.parametrize("sampling", ["rays", "area"])
+def test_chunks_change_nothing(sampling):
+    values = leaves(bistatic=True)
+    results = []
+    for budget in (1e9, 40_000):
+        out = deposit_power(
+            *built(values),
+            GRID,
+            sampling=replace(COUNTS, memory_budget=budget),
+            seed=3,
+            scheme=sampling,
+        )
+        gradients = torch.autograd.grad(out.square().sum(), list(values.values()))
+        results.append([out, *gradients])
+    for whole, pieces in zip(*results, strict=True):
+        assert relative(pieces, whole) < 1e-5
+
+
+def test_a_seed_repeats_and_another_differs():
+    first, again, other = (
+        deposit_power(
+            occluder(),
+            link(),
+            GRID,
+            sampling=Sampling(depth=1, samples=20_000, boundary_samples=0),
+            seed=seed,
+        )
+        for seed in (0, 0, 1)
+    )
+    assert relative(again, first) < 1e-6
+    assert relative(other, first) > 1e-4
+
+
+@pytest.mark.parametrize("rx", [None, ((0.5, 0.0, 0.0),)], ids=["monostatic", "bistatic"])
+def test_area_sampling_is_ray_sampling(rx):
+    rays, area = (
+        torch.stack(
+            [
+                deposit_power(
+                    occluder(),
+                    link(rx=rx),
+                    GRID,
+                    sampling=Sampling(depth=1, samples=200_000, boundary_samples=0),
+                    seed=seed,
+                    scheme=sampling,
+                )
+                for seed in range(4)
+            ]
+        )
+        for sampling in ("rays", "area")
+    )
+    error = (rays.var(0) + area.var(0)).div(4).sqrt().sum() / rays.mean(0).sum()
+    assert error < 0.03
+    assert relative(area.mean(0), rays.mean(0)) < 2 * error
+
+
+def test_boundary_samples_leave_the_value_alone():
+    plain, full, off = (
+        deposit_power(
+            occluder(),
+            link(),
+            GRID,
+            sampling=Sampling(depth=1, samples=10_000, boundary_samples=n, boundary=on),
+            seed=0,
+        )
+        for n, on in ((0, True), (5_000, True), (5_000, False))
+    )
+    assert relative(full, plain) < 1e-6
+    assert relative(off, plain) < 1e-6
+
+
+def test_one_frame_at_a_time_is_all_frames():
+    positions = float64([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    both = deposit_power(
+        occluder(),
+        link(positions),
+        GRID,
+        sampling=Sampling(depth=1, samples=400_000, boundary_samples=0),
+        seed=0,
+    )
+    for frame in range(2):
+        alone = deposit_power(
+            occluder(),
+            link(positions[frame : frame + 1]),
+            GRID,
+            sampling=Sampling(depth=1, samples=200_000, boundary_samples=0),
+            seed=0,
+        )
+        assert relative(alone[0], both[frame]) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"samples": 0}, "samples >= 1"),
+        ({"boundary_samples": -1}, "boundary_samples >= 0"),
+        ({"depth": 0}, "expected a depth from 1 to 16, got 0"),
+        ({"points_per_m2": 0.0}, "expected points_per_m2 > 0"),
+        ({"backend": "tpu"}, "expected backend 'cpu', 'cuda' or 'auto', got 'tpu'"),
+    ],
+)
+def test_bad_options_are_named(options, message, unchecked):
+    with pytest.raises(InputError, match=message):
+        deposit_power(occluder(), link(), GRID, sampling=replace(COUNTS, **options), seed=3)
+
+
+def test_a_bad_scheme_is_named(unchecked):
+    with pytest.raises(InputError, match="expected scheme 'rays' or 'area', got 'photons'"):
+        deposit_power(occluder(), link(), GRID, sampling=COUNTS, seed=3, scheme="photons")  # type: ignore[arg-type]
+
+
+def test_a_reference_of_another_mesh_is_refused():
+    other = (Scene({"ball": thing(sphere(0.1))}), link())
+    with pytest.raises(InputError, match="expected a reference scene of"):
+        deposit_power(
+            occluder(), link(), GRID, sampling=COUNTS, seed=3, scheme="area", reference=other
+        )
+
+
+@pytest.mark.parametrize(
+    ("tx", "rotations"), [(((0.0, 0.0),), None), (((float("nan"), 0.0, 0.0),), None)]
+)
+def test_bad_links_are_named(tx, rotations, unchecked):
+    with pytest.raises(InputError, match="expected finite tx of shape"):
+        link(tx, rotations=rotations)
+
+
+@pytest.mark.parametrize("bad", [{"range_count": 0}, {"range_step": 0.0}, {"u_step": -1.0}])
+def test_bad_grids_are_named(bad):
+    with pytest.raises(InputError, match="expected a positive"):
+        Grid(**{"range_start": 0.0, "range_step": 0.1, "range_count": 4, **bad})
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("bistatic", [False, True], ids=["monostatic", "bistatic"])
+def test_cuda_is_cpu(bistatic):
+    values = leaves(bistatic)
+    results = []
+    for backend in ("cpu", "cuda"):
+        out = deposit_power(*built(values), GRID, sampling=replace(COUNTS, backend=backend), seed=3)
+        results.append([out, *torch.autograd.grad(out.square().sum(), list(values.values()))])
+    for cpu, cuda in zip(*results, strict=True):
+        assert relative(cuda, cpu) < 1e-3
+
+
+def test_a_plate_seen_through_a_cosine_pattern():
+    """A pattern only weighs: two antennas of gain g give g² where the direction is one."""
+    far = Scene({"plate": thing(plate(0.02, 0.02), (0.6, 0.0, 1.5))})
+    sampling = Sampling(depth=1, samples=2_000, boundary_samples=0)
+    grid = Grid(0.0, 4.0, 1)
+    plain, weighted = (
+        deposit_power(far, link(pattern=pattern), grid, sampling=sampling, seed=0)
+        for pattern in (Isotropic(), Cosine(3.0))
+    )
+    cosine = 1.5 / (0.6**2 + 1.5**2) ** 0.5
+    assert float(weighted / plain) == pytest.approx((8 * cosine**3) ** 2, rel=1e-3)

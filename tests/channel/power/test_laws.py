@@ -1,0 +1,132 @@
+"""What holds for any right answer: reciprocity, energy, spreading, sheets and refraction."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.scene import (
+    Dielectric,
+    Material,
+    RefractingBody,
+    RoughConductor,
+    RoughDielectric,
+    Scene,
+    Slab,
+    box,
+    plate,
+    sphere,
+)
+from scenes import WAVELENGTH, link, thing
+
+# Many bins: one alone, in single precision, would lose the small paths among the large ones.
+BINS = Grid(-0.1, 0.1, 160, u_start=-1.1, u_step=0.1, u_count=23)
+WHITE = RoughConductor(scattering=1.0)
+FREQUENCY = SPEED_OF_LIGHT / WAVELENGTH
+
+
+def orders(scene: Scene, antennas: Link, depth: int, samples: int, seeds: int) -> Tensor:
+    """Power of exactly 1 … depth points, one row a seed."""
+    rows = []
+    for seed in range(seeds):
+        totals = [
+            deposit_power(
+                scene,
+                antennas,
+                BINS,
+                sampling=Sampling(depth=d, samples=samples, boundary_samples=0),
+                seed=seed,
+            )
+            .double()
+            .sum()
+            for d in range(1, depth + 1)
+        ]
+        rows.append(torch.stack(totals).diff(prepend=torch.zeros(1, dtype=torch.float64)))
+    return torch.stack(rows)
+
+
+MATERIALS: dict[str, Material] = {
+    "diffuse": RoughDielectric(4.0),
+    "glossy": RoughDielectric(4.0, 0.0, 0.3, 0.5),
+    "lobes": Dielectric(4.0, 0.1, scattering=0.8, lambertian=0.3, directive=0.5, rms_slope=0.2),
+    "sheet": Slab(2.7, 0.05, thickness=0.01, scattering=0.5, rms_slope=0.3),
+    "body": RefractingBody(2.5, 0.02, scattering=0.5, rms_slope=0.3),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n == "sheet" else pytest.mark.slow) for n in MATERIALS]
+)
+def test_power_of_three_bounces_is_reciprocal(name):
+    """Order by order within four standard errors; each error is below 6 %."""
+    mesh = box((0.5, 0.5, 0.15)) if name == "body" else plate(0.5, 0.4)
+    scene = Scene(
+        {
+            "wall": thing(plate(1.4, 1.2), (0.0, 0.1, 1.8), (0.0, 0.15, 0.0), MATERIALS["glossy"]),
+            "floor": thing(plate(1.2, 1.2), (0.0, -0.7, 1.0), (1.5, 0.0, 0.0)),
+            "front": thing(mesh, (0.1, 0.0, 1.0), (0.1, 0.3, 0.0), MATERIALS[name]),
+        }
+    )
+    there, back = ((-0.3, 0.1, 0.0),), ((0.35, -0.1, 0.1),)
+    first, second = (
+        orders(scene, link(tx, rx), 3, 200_000, 6) for tx, rx in ((there, back), (back, there))
+    )
+    error = (first.var(0) + second.var(0)).div(6).sqrt()
+    mean = 0.5 * (first + second).mean(0)
+    assert (error < 0.06 * mean).all()
+    assert ((first - second).mean(0).abs() < 4 * error).all()
+
+
+@pytest.mark.parametrize(
+    ("tx", "rx"),
+    [((0.0, 0.0, 0.0), None), ((0.5, -0.2, 0.1), (-0.3, 0.4, 0.2))],
+    ids=["at the centre", "anywhere"],
+)
+def test_a_white_sphere_conserves_power(tx, rx):
+    """P_n = λ²/(4π²r²) for every order n.
+
+    A white Lambertian sphere is lit evenly by what it scatters: E = Pt/(4πr²) for every order
+    (for the first, from the centre only). An isotropic antenna anywhere inside takes in
+    ∫ E/π · λ²/(4π) dω = λ²E/π. The mesh itself, inside the sphere, adds 0.1 %.
+    """
+    radius = 2.0
+    room = Scene({"room": thing(sphere(radius, subdivisions=4), material=WHITE)})
+    antennas = link((tx,), None if rx is None else (rx,))
+    truth = WAVELENGTH**2 / (4 * math.pi**2 * radius**2)
+    found = orders(room, antennas, 5, 100_000, 3) / truth
+    if rx is not None:
+        found = found[:, 1:]  # the first order is even from the centre only
+    assert (found.std(0) / 3**0.5 < 3e-3).all()
+    assert (found.mean(0) - 1.001).abs().max() < 8e-3
+
+
+@pytest.mark.slow
+def test_two_bounces_fall_with_the_square_of_each_leg():
+    """Small plates that face each other at 45°: P = (λ/4π)² (A/2π)² / (r₁ r₁₂ r₂)²."""
+    size = 0.02
+
+    def power(first: float, between: float, last: float) -> float:
+        tilt = math.pi / 4
+        scene = Scene(
+            {
+                "a": thing(plate(size, size), (0.0, 0.0, 0.0), (0.0, tilt, 0.0), WHITE),
+                "b": thing(plate(size, size), (-between, 0.0, 0.0), (0.0, -tilt, 0.0), WHITE),
+            }
+        )
+        antennas = link(((0.0, 0.0, -first),), ((-between, 0.0, -last),))
+        paths = trace_power(
+            scene,
+            antennas,
+            sampling=Sampling(depth=2, samples=1_000_000, boundary_samples=0, boundary=False),
+            seed=0,
+        )
+        a_then_b = (paths.first[:, 0].abs() < size) & ((paths.last[:, 0] + between).abs() < size)
+        return float(paths.power[a_then_b].sum())
+
+    one = (WAVELENGTH / (4 * math.pi)) ** 2 * (size**2 / (2 * math.pi)) ** 2
+    for legs in ((1.0, 1.0, 1.0), (2.0, 1.0, 1.0), (1.0, 2.0, 1.0), (1.0, 1.0, 2.0)):
+        found = power(*legs) * math.prod(legs) ** 2 / one
+        assert found == pytest.approx(1, abs=0.03), legs
