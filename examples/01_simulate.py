@@ -35,11 +35,12 @@ grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6)
 
 # The exact chain: fields of fixed scatterers, beat signals, window, FFT, beamforming. The
 # speckle is that of one rough surface; another seed is another surface.
-recorded = iw.simulate(scene, radar, grid, seed=1, depth=1, snr_db=20.0)
+once = iw.Sampling(depth=1)  # paths of one bounce
+recorded = iw.simulate(scene, radar, grid, seed=1, sampling=once, snr_db=20.0)
 # The surrogate: the mean over all such surfaces, smooth in everything that may move.
-expected = iw.simulate(scene, radar, grid, seed=1, depth=1, surrogate=iw.Surrogate())
+expected = iw.SurrogateMap(grid, sampling=once).predict(scene, radar, seed=1)
 
-maps = {"one recording (exact)": recorded.spectrum, "on average (surrogate)": expected.spectrum}
+maps = {"one recording (exact)": recorded.spectrum, "on average (surrogate)": expected}
 figure = iw.plotting.spectrum(maps, grid, relative=False)  # one scale for both
 figure.savefig(folder / "simulate.png", dpi=100)
 

@@ -38,22 +38,22 @@ wall = iw.Object(plate(3.0, 2.4), paint, rigid(translation=[0.0, 0.0, 3.3]))
 start = iw.Scene({"letter": letter, "wall": wall})
 hidden = OnTheFloor(x=0.25, z=-0.15, yaw=0.3)
 
-# Two transmitters and sixteen receivers, at eight places.
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=128)
 row, half = iw.scene.linear_array, chirp.wavelength / 2
 looks = [[x, y, 0.0] for x in (-0.6, -0.2, 0.2, 0.6) for y in (-0.4, 0.4)]
-radar = iw.Radar(row(2, 16 * half), row(16, half), chirp, looks)
+radar = iw.Radar(row(2, 16 * half), row(16, half), chirp, looks)  # 2 × 16 at eight places
 grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6, oversample=1)
 with torch.no_grad():
-    recorded = iw.simulate(hidden(start), radar, grid, seed=1, depth=1, density=3e3, snr_db=20.0)
+    sparse = iw.Sampling(depth=1, points_per_m2=3e3)
+    recorded = iw.simulate(hidden(start), radar, grid, seed=1, sampling=sparse, snr_db=20.0)
 
-sought, capture = OnTheFloor(0.0, 0.0, 0.0), iw.Capture.from_beat(recorded.beat, radar)
-loss = iw.SpectrumLoss(kind="likelihood")
-settings = {"depth": 1, "steps": 60, "samples": 100_000, "loss": loss, "seed": 1}
+unknown, capture = OnTheFloor(0.0, 0.0, 0.0), iw.Capture.from_beat(recorded.beat, radar)
 kernels = iw.Surrogate(range_width=3.0, angle_width=1.5)  # extra widths, annealed to zero
-fit = iw.reconstruct(start, radar, capture, [sought], grid=grid, surrogate=kernels, **settings)
+model = iw.SurrogateMap(grid, kernels, iw.Sampling(depth=1, samples=100_000))
+seen, loss = iw.Observation(model, radar, capture), iw.SpectrumLoss(kind="likelihood")
+fit = iw.reconstruct(start, seen, [unknown], loss=loss, schedule=iw.Schedule(steps=60), seed=1)
 
-for name, theta in ("start", torch.zeros(3)), ("found", sought.theta.detach()):
+for name, theta in ("start", torch.zeros(3)), ("found", unknown.theta.detach()):
     x, z, yaw = (theta - hidden.theta.detach()).tolist()
     print(f"{name}: {100 * math.hypot(x, z):.1f} cm and {math.degrees(abs(yaw)):.1f}° off")
 iw.scene.save_mesh(folder / "twin.ply", fit.scene)

@@ -9,8 +9,16 @@ from pathlib import Path
 import torch
 
 import invertwin as iw
-from invertwin.inversion import Direction
-from invertwin.scene import RoughDielectric, linear_array, plate, rigid, rotation_from_vector, text
+from invertwin.inversion import Check
+from invertwin.scene import (
+    RoughDielectric,
+    Translation,
+    linear_array,
+    plate,
+    rigid,
+    rotation_from_vector,
+    text,
+)
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
 folder.mkdir(parents=True, exist_ok=True)
@@ -28,11 +36,12 @@ row = linear_array(16, chirp.wavelength / 2)
 radar = iw.Radar(linear_array(1, 1.0), row, chirp, positions=[[0.0, 0.0, 0.0]])
 grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.5)
 
+sampling = iw.Sampling(depth=1, samples=1_000_000, boundary_samples=250_000)
+model = iw.SurrogateMap(grid, sampling=sampling)
 # θ moves the letter to the right. The differences are the truth: two maps, 8 mm apart.
 report = iw.gradcheck(
-    scene, radar, grid, Direction("translation", "letter", axis=(1.0, 0.0, 0.0)),
-    surrogate=iw.Surrogate(), depth=1, samples=1_000_000, boundary_samples=250_000, repeats=2,
-    difference_samples=2_000_000, max_pairs=4,
+    model, Translation("letter"), torch.tensor([1.0, 0.0, 0.0]), scene=scene, sensor=radar,
+    check=Check(repeats=2, difference_samples=2_000_000, max_pairs=4),
 )  # fmt: skip
 
 peak = report.value.max()

@@ -119,6 +119,9 @@ def violations(package: Path) -> list[str]:
             to = room_of(target, package)
             if to not in ALLOWED[room]:
                 problems.append(f"{where}:{line}: {room} must not import {to}")
+            inside = target != package / "channel" / "__init__.py"
+            if to == "channel" and inside and room not in KNOW_THE_RAY_TRACER:
+                problems.append(f"{where}:{line}: {name} is not in the menu of channel/")
             # A folder's __init__ is its menu: importing from it inside its room is no cycle of
             # its own, but it is one once the menu imports the importer.
             if target != file and room != "__init__":

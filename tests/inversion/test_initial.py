@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
 from invertwin.inversion.initial import (
     Ground,
@@ -70,7 +70,8 @@ def parked(yaw_deg: float) -> Scene:
 def seen() -> tuple[Scene, Capture, Grid]:
     scene, radar = parked(30.0), radar_along()
     grid = radar.grid(2.0, 10.0)
-    found = simulate(scene, radar, grid, density=1500.0, samples=1000, depth=1, snr_db=10, seed=3)
+    sampling = Sampling(depth=1, samples=1000, points_per_m2=1500.0)
+    found = simulate(scene, radar, grid, sampling=sampling, snr_db=10, seed=3)
     assert found.beat is not None
     return scene, Capture.from_beat(found.beat, radar), grid
 
@@ -174,7 +175,8 @@ def test_single_channels_are_summed_coherently() -> None:
     grid = radar.grid(1.0, 4.0)
     place = float64([0.2, 0.0, 2.5])
     ball = Object(box((0.03, 0.03, 0.03)), RoughDielectric(4.0), rigid(translation=place))
-    found = simulate(Scene({"ball": ball}), radar, grid, density=1e5, samples=1000, depth=1, seed=0)
+    sampling = Sampling(depth=1, samples=1000, points_per_m2=1e5)
+    found = simulate(Scene({"ball": ball}), radar, grid, sampling=sampling, seed=0)
     assert found.beat is not None
     capture = Capture.from_beat(found.beat, radar)
     points = image_points(capture, grid, [-0.5, -0.01, 2.0], [0.5, 0.01, 3.0], step=0.02, share=0.7)

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -37,6 +38,7 @@ from invertwin.scene import (
 from invertwin.simulation import simulate, simulate_chirps
 from oracles import moving_point as oracle
 
+FEW = Sampling(depth=1, points_per_m2=3e3)
 WAVE = FMCW(start_frequency=77e9, bandwidth=1e9, duration=50e-6, samples=32)
 HALF = WAVE.wavelength / 2
 RADAR = Radar(
@@ -66,7 +68,7 @@ def test_doppler_equals_moved_geometry(tdm, material):
     chirps = Chirps(count=4, interval=80e-6, tdm=tdm)
     # Sideways little enough that no point crosses the terminator.
     scene = moving([0.0, 0.0, -3.0], material)
-    options = {"seed": 1, "density": 3e3, "samples": 4000}
+    options: dict[str, Any] = {"seed": 1, "sampling": replace(FEW, samples=4000)}
     moved = simulate_chirps(scene, RADAR, chirps, **options)
     traced = simulate_chirps(scene, RADAR, chirps, retrace=True, **options)
     assert moved.shape == (1, 4, 2, 2, 32)
@@ -80,7 +82,7 @@ def test_a_rotating_body_has_a_velocity_per_vertex():
     scene = moving([0.0, 0.0, 0.0])
     arms = scene["ball"].vertices - scene["ball"].center
     turning = scene.replace("ball", velocity=torch.linalg.cross(spin.expand_as(arms), arms))
-    options = {"seed": 2, "density": 3e3}
+    options: dict[str, Any] = {"seed": 2, "sampling": FEW}
     moved = simulate_chirps(turning, RADAR, CHIRPS, **options)
     traced = simulate_chirps(turning, RADAR, CHIRPS, retrace=True, **options)
     assert relative(moved, traced) < 0.1  # points that turn into or out of view
@@ -98,7 +100,9 @@ def test_phase_of_an_approaching_mirror_falls_by_4_pi_v_t_over_lambda():
     )
     alone = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Isotropic())
     radar = Radar(alone, alone, WAVE, torch.zeros(1, 3, dtype=torch.float64))
-    cube = simulate_chirps(Scene({"mirror": mirror}), radar, CHIRPS, seed=1, samples=2000)[0]
+    cube = simulate_chirps(
+        Scene({"mirror": mirror}), radar, CHIRPS, seed=1, sampling=Sampling(depth=1, samples=2000)
+    )[0]
     steps = torch.angle(cube[1:, 0, 0] / cube[:-1, 0, 0])
     frequency = WAVE.start_frequency + WAVE.slope * WAVE.sample_times
     expected = -4 * math.pi * speed * CHIRPS.interval * frequency / SPEED_OF_LIGHT
@@ -107,8 +111,8 @@ def test_phase_of_an_approaching_mirror_falls_by_4_pi_v_t_over_lambda():
 
 def test_transmitters_that_take_turns_see_the_scene_at_their_own_times():
     scene = moving([0.0, 0.0, -3.0])
-    turns = simulate_chirps(scene, RADAR, Chirps(3, 80e-6), seed=1, density=3e3)
-    together = simulate_chirps(scene, RADAR, Chirps(5, 80e-6, tdm=False), seed=1, density=3e3)
+    turns = simulate_chirps(scene, RADAR, Chirps(3, 80e-6), seed=1, sampling=FEW)
+    together = simulate_chirps(scene, RADAR, Chirps(5, 80e-6, tdm=False), seed=1, sampling=FEW)
     # Slot 2k of the turns is TX 0 in loop k, slot 2k + 1 is TX 1.
     for loop in range(2):
         assert relative(turns[:, loop, 0], together[:, 2 * loop, 0]) < 1e-7
@@ -118,8 +122,8 @@ def test_transmitters_that_take_turns_see_the_scene_at_their_own_times():
 def test_a_scene_at_rest_gives_the_same_beat_in_every_chirp():
     scene = moving([0.0, 0.0, 0.0]).replace("ball", velocity=None)
     grid = RADAR.grid(2.0, 4.0)
-    beat = simulate(scene, RADAR, grid, seed=1, density=3e3, depth=1).beat  # as chirps have it
-    cube = simulate_chirps(scene, RADAR, CHIRPS, seed=1, density=3e3)
+    beat = simulate(scene, RADAR, grid, seed=1, sampling=FEW).beat  # as chirps have it
+    cube = simulate_chirps(scene, RADAR, CHIRPS, seed=1, sampling=FEW)
     assert beat is not None
     for chirp in range(CHIRPS.count):
         assert relative(cube[:, chirp], beat) < 1e-7
@@ -162,7 +166,7 @@ def test_any_motion_as_a_function_of_time(name):
     expected = oracle.moving_beat(
         RADAR, chirps, lambda times: way(times) + offsets, paths.coefficient
     )
-    found = simulate_chirps(scene, RADAR, chirps, points=speckle.points, seed=3)
+    found = simulate_chirps(scene, RADAR, chirps, sampling=drawn, speckle=speckle, seed=3)
     # Amplitudes change a little while the ball moves by up to 3 cm.
     assert relative(found, expected) < 0.02
     listed = moving_beat(
@@ -176,7 +180,7 @@ def test_any_motion_as_a_function_of_time(name):
 
 def test_a_function_of_time_is_what_velocities_are():
     scene = moving([1.0, 0.0, -3.0])
-    options = {"seed": 1, "density": 3e3}
+    options: dict[str, Any] = {"seed": 1, "sampling": FEW}
     by_velocity = simulate_chirps(scene, RADAR, CHIRPS, retrace=True, **options)
     by_function = simulate_chirps(scene.at, RADAR, CHIRPS, **options)
     assert relative(by_function, by_velocity) < 1e-9
@@ -184,7 +188,8 @@ def test_a_function_of_time_is_what_velocities_are():
 
 def test_impairments_of_moving_scenes():
     """The front end's own numbers on top; phase noise follows the paths of the frame's start."""
-    scene, options = moving([0.0, 0.0, -3.0]), {"seed": 1, "density": 3e3}
+    scene = moving([0.0, 0.0, -3.0])
+    options: dict[str, Any] = {"seed": 1, "sampling": FEW}
     front = Impairments(snr_db=20, gain_std_db=1.0)
     for retrace in (False, True):
         clean = simulate_chirps(scene, RADAR, CHIRPS, retrace=retrace, **options)

@@ -408,20 +408,21 @@ def test_one_switch_for_all(linear):
         chosen_surrogate("bessel")
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_wrong_input(planar):
     grid = planar.grid(4, 5)
     with pytest.raises(InputError, match="expected a map of shape"):
         Surrogate().shape(torch.zeros(1, 2, 3, 4), planar, grid)
     with pytest.raises(InputError, match="range_kernel"):
-        Surrogate(range_kernel="sinc")
+        Surrogate(range_kernel="sinc")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="angle_kernel"):
-        Surrogate(angle_kernel="gaussian")
+        Surrogate(angle_kernel="gaussian")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="widths >= 0"):
         Surrogate(range_width=-1.0)
     with pytest.raises(InputError, match="positive aperture_radius"):
         Surrogate(aperture_radius=0.0)
     with pytest.raises(InputError, match="phases"):
-        Surrogate(phases="coherent")
+        Surrogate(phases="coherent")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="'gaussian', angle_kernel 'airy'"):
         Surrogate(phases="random")
     with pytest.raises(InputError, match="angle_width 0 with random"):

@@ -31,7 +31,6 @@ samples = 20_000
 CHECK = RUN.replace("[0.02, 0.01, 1.2]", "[0.0, 0.0, 1.2]") + GRADCHECK + METHODS
 SCAN = (
     RUN.replace('task = "reconstruct"', 'task = "loss-scan"')
-    .replace("density = 2e3", "density = 2e3\ndepth = 1")
     .replace("snr_db = 20.0\n", "")
     + LOSS_SCAN
 )

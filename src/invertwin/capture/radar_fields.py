@@ -2,7 +2,7 @@
 
 from collections.abc import Hashable, Mapping
 from dataclasses import asdict, fields
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import torch
@@ -87,11 +87,17 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
     """
     kind = _named(attributes, "waveform", WAVEFORMS)
     # Numbers come back from a file as NumPy scalars.
+    types = get_type_hints(kind)  # without the limits that annotations may have
     values = {
-        field.name: (int if field.type is int else float)(attribute(attributes, field.name))
+        field.name: (int if _whole(field.type) else float)(attribute(attributes, field.name))
         for field in fields(kind)
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
+
+
+def _whole(kind: Any) -> bool:
+    """Whether a field holds an integer, with limits or without."""
+    return getattr(kind, "__origin__", kind) is int
 
 
 def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:

@@ -185,15 +185,11 @@ def listed(
     """Paths of one kind; what is not given is zero.
 
     Args:
-        frame: Radar pose.
+        frame, kind, power, coefficient, velocity: See ``Paths``.
         length: From antenna to antenna [m].
         position: Of the last point [m].
-        kind: See ``Paths``.
         first: Position of the first point; None = the same as the last.
-        power: Received over transmitted.
-        coefficient: Of the field.
         boundary: Whether all rows are boundary paths.
-        velocity: Of the points [m/s].
     """
     zero = torch.zeros(len(frame), dtype=torch.float64)
     return Paths(

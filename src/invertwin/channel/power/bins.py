@@ -91,14 +91,25 @@ class Bins:
         self.values = dr.zeros(mi.Float, math.prod(self.shape))
 
     def add(self, found: Contribution, active: Any) -> None:
-        """Add paths."""
+        """Add paths.
+
+        Args:
+            found: The paths.
+            active: Which paths exist.
+        """
         taps = _Taps.of(self.grid, found)
         (_, rw, _), (_, uw, _), (_, vw, _) = taps.axes
         for index, ok, (i, j, k) in taps:
             self._add(index, found.power * rw[i] * uw[j] * vw[k], ok & active)
 
     def add_derivative(self, found: Contribution, dots: tuple, active: Any) -> None:
-        """Add the derivative of paths' deposit, given those of power, range, u and v."""
+        """Add the derivative of paths' deposit, given those of power, range, u and v.
+
+        Args:
+            found: The paths.
+            dots: Derivatives of power, range, u and v.
+            active: Which paths exist.
+        """
         taps = _Taps.of(self.grid, found)
         (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
         power = dr.detach(found.power)
@@ -121,7 +132,14 @@ class Bins:
 
 
 def gather(seed: Any, grid: Grid, found: Contribution, active: Any) -> tuple[Any, Any, Any, Any]:
-    """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path."""
+    """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path.
+
+    Args:
+        seed: ∂loss/∂map, flat.
+        grid: The bins.
+        found: The paths.
+        active: Which paths exist.
+    """
     taps = _Taps.of(grid, found)
     (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
     bars = [mi.Float(0.0) for _ in range(4)]

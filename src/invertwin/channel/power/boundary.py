@@ -55,7 +55,12 @@ class BoundaryPaths:
             return self.run(state, visit)["total"]
 
     def deposit(self, rate: Any, scatter: Callable[[Contribution, Any], None]) -> None:
-        """Hand on every path with its power times a lane's rate."""
+        """Hand on every path with its power times a lane's rate.
+
+        Args:
+            rate: Of each lane.
+            scatter: Takes a path and whether it exists.
+        """
         state = dict(self.state)
         state["throughput"] = state["throughput"] * dr.detach(rate)
         with dr.suspend_grad():
@@ -122,6 +127,12 @@ def boundary_paths(
     """The boundary paths through edge points; ``inputs`` are attached, ``walker`` continues paths.
 
     The first points are counted now, so that their paths are prepared while another kernel runs.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Attached tables.
+        walker: Continues the paths.
+        points: On edges.
     """
     families = points.families()
 
@@ -171,7 +182,7 @@ def _antenna_segment(
             points.index, frame, points.face, shadow.b1, shadow.b2, back,
             throughput=throughput * transmittance * sign,
             length=distance + extra,
-            passed=Passage(transmittance, extra) if fixed.sheets else None,
+            passed=Passage(transmittance, extra) if fixed.surfaces.sheets else None,
         )  # fmt: skip
         if at_receiver is not False:
             state |= {"u": seen.x, "v": seen.y, "to_receiver": ~at_receiver}

@@ -35,6 +35,11 @@ class Directions:
         """A unit direction from four uniform numbers, and its density per solid angle.
 
         Where total reflection leaves no direction, the density is infinite.
+
+        Args:
+            point: The vertex.
+            back: Unit direction from where the path comes.
+            numbers: Four uniform numbers.
         """
         caps, outside = self._caps(point)
         count: Any = mi.Float(0)

@@ -55,7 +55,7 @@ class EdgePoints:
     def sides(self, inputs: Inputs) -> list[tuple[float, Any, Any]]:
         """Sign, transmittance and extra length of either side of the shadow's edge."""
         lit = (1.0, self.transmittance * self.open, self.extra + self.open_extra)
-        if not inputs.sheets:
+        if not inputs.surfaces.sheets:
             return [lit]
         return [lit, (-1.0, self.transmittance * self.covered, self.extra + self.covered_extra)]
 
@@ -275,7 +275,7 @@ class InteriorEdgeSampler:
         unsure = mi.Bool(False)
         for column in topology.device_opposite[2:]:
             unsure |= dr.gather(mi.Int32, column, edge) >= 0
-        if self.inputs.sheets:
+        if self.inputs.surfaces.sheets:
             unsure |= self._sheet(edge) & (span > _FLAT)
         return dr.select(unsure, 0.0, start), dr.select(unsure, dr.pi, span)
 
@@ -398,7 +398,7 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, directio
     transmittances, lengths = [mi.Float(1.0), mi.Float(1.0)], [mi.Float(0.0), mi.Float(0.0)]
     for number, (offset, height) in enumerate(zip(offsets, heights, strict=True)):
         transmittance, extra = mi.Float(0.0), mi.Float(0.0)
-        if inputs.sheets:
+        if inputs.surfaces.sheets:
             face = dr.gather(mi.UInt32, topology.device_beside[number], edge)
             row = dr.gather(mi.UInt32, inputs.face_surface, face)
             normal = dr.cross(y1 - y0, offset)
@@ -434,6 +434,11 @@ def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
     ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
     x_m the material point under it; T is the edge's image turned to the shadowed side.
     Source: derivations §3.
+
+    Args:
+        inputs: Attached tables.
+        points: On edges.
+        centre: From where the shadow is cast, attached.
     """
     c, fixed = centre, inputs.detached()
     y0, y1 = integrand.edge_ends(inputs, points.first, points.second)

@@ -31,12 +31,23 @@ POINTS = DIFFERENTIABLE[:3]
 
 
 def to_table(name: str, values: Tensor) -> Any:
-    """A torch table as the kernel reads it."""
+    """A torch table as the kernel reads it.
+
+    Args:
+        name: Of the table.
+        values: The torch table.
+    """
     return to_points(values) if name in POINTS else to_float(values)
 
 
 def from_table(name: str, values: Any, like: Tensor) -> Tensor:
-    """The torch form of an array that is laid out as one of the tables."""
+    """The torch form of an array that is laid out as one of the tables.
+
+    Args:
+        name: Of the table.
+        values: The array.
+        like: The torch table that it is laid out as.
+    """
     flat = from_points(values) if name in POINTS else to_torch(values)
     return flat.reshape(like.shape).to(like)
 
@@ -81,16 +92,6 @@ class Inputs:
             scale=(link.wavelength / (4 * np.pi)) ** 2,
         )
 
-    @property
-    def sheets(self) -> bool:
-        """Whether something passes straight through any surface."""
-        return self.surfaces.sheets
-
-    @property
-    def bodies(self) -> bool:
-        """Whether any surface is the skin of a refracting body."""
-        return self.surfaces.bodies
-
     def table(self, name: str) -> Any:
         """One of the differentiable inputs."""
         return getattr(self.surfaces if name in SURFACE else self, name)
@@ -106,7 +107,13 @@ class Inputs:
         return self.replaced({name: dr.detach(self.table(name)) for name in DIFFERENTIABLE})
 
     def antenna(self, frame: Any, receiver: Any, active: Any = True) -> Any:
-        """Position of the receiver or the transmitter (a Python bool, or one per lane)."""
+        """Position of the receiver or the transmitter (a Python bool, or one per lane).
+
+        Args:
+            frame: Radar pose.
+            receiver: Whether it is the receiver (a bool, or one per lane).
+            active: Lanes.
+        """
         if receiver is True or receiver is False:
             table = self.rx if receiver and not self.monostatic else self.tx
             return point_at(table, frame, active)
@@ -115,7 +122,13 @@ class Inputs:
         )
 
     def gain(self, frame: Any, receiver: Any, seen: Any) -> Any:
-        """Linear power gain of the receiver or the transmitter towards a radar-frame direction."""
+        """Linear power gain of the receiver or the transmitter towards a radar-frame direction.
+
+        Args:
+            frame: Radar pose.
+            receiver: Whether it is the receiver (a bool, or one per lane).
+            seen: Unit direction in the radar frame.
+        """
         if receiver is True or receiver is False:
             return (self.rx_pattern if receiver else self.tx_pattern).gain(seen)
         return dr.select(receiver, self.rx_pattern.gain(seen), self.tx_pattern.gain(seen))
@@ -160,12 +173,23 @@ class PatternTable:
 
 
 def corners(inputs: Inputs, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
-    """Corners of triangles, attached."""
+    """Corners of triangles, attached.
+
+    Args:
+        inputs: Tables of the kernel.
+        face: Triangle.
+        active: Lanes.
+    """
     return arrays.corners(inputs.vertices, inputs.faces, face, active)
 
 
 def edge_ends(inputs: Inputs, first: Any, second: Any) -> tuple[Any, Any]:
-    """Ends of edges, attached."""
+    """Ends of edges, attached.
+
+    Args:
+        inputs: Tables of the kernel.
+        first, second: Vertices at the ends.
+    """
     return point_at(inputs.vertices, first), point_at(inputs.vertices, second)
 
 
@@ -183,7 +207,14 @@ class Place:
 
 
 def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Place:
-    """Where a pair of barycentric coordinates lies now."""
+    """Where a pair of barycentric coordinates lies now.
+
+    Args:
+        inputs: Tables of the kernel.
+        face: Triangle.
+        b1, b2: Barycentric coordinates.
+        active: Lanes.
+    """
     triangle = p0, p1, p2 = corners(inputs, face, active)
     normal = dr.cross(p1 - p0, p2 - p0)
     double_area = dr.norm(normal)
@@ -196,14 +227,25 @@ def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Pl
 
 
 def segment(start: Any, end: Any) -> tuple[Any, Any]:
-    """Unit direction and distance from one point to another."""
+    """Unit direction and distance from one point to another.
+
+    Args:
+        start, end: Of the segment.
+    """
     offset = end - start
     distance = dr.norm(offset)
     return offset / distance, distance
 
 
 def to_radar(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> Any:
-    """World direction in the radar frame (the rotation's columns are the radar's axes)."""
+    """World direction in the radar frame (the rotation's columns are the radar's axes).
+
+    Args:
+        inputs: Tables of the kernel.
+        frame: Radar pose.
+        direction: Unit direction in the world.
+        active: Lanes.
+    """
     rows = [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k, active) for k in range(3)]
     return mi.Vector3f(*(sum(rows[k][axis] * direction[k] for k in range(3)) for axis in range(3)))
 
@@ -228,7 +270,7 @@ def medium(inputs: Inputs, start: Place, end: Place | None, towards: Any, active
     """
     index, attenuation = mi.Float(1.0), mi.Float(0.0)
     ends = ((start, 1.0),) if end is None else ((start, 1.0), (end, -1.0))
-    for place, sign in ends if inputs.bodies else ():
+    for place, sign in ends if inputs.surfaces.bodies else ():
         inside = active & (dr.detach(dr.dot(place.normal, towards)) * sign < 0)
         inside &= inputs.surfaces.is_skin(place.surface)
         values = (inputs.surfaces.value(n, place.surface, inside) for n in ("index", "attenuation"))
@@ -258,7 +300,17 @@ def connection(
     *,
     same: bool = False,
 ) -> Connection:
-    """Scatter what comes from ``back`` towards an antenna; ``same`` if it lies there."""
+    """Scatter what comes from ``back`` towards an antenna; ``same`` if it lies there.
+
+    Args:
+        inputs: Tables of the kernel.
+        frame: Radar pose.
+        point: The vertex.
+        back: Unit direction from where the path comes.
+        receiver: Whether the antenna is the receiver (a bool, or one per lane).
+        active: Lanes.
+        same: Whether the path comes from that very antenna.
+    """
     antenna = inputs.antenna(frame, receiver, active)
     to_antenna, distance = segment(point.position, antenna)
     seen = to_radar(inputs, frame, -to_antenna, active)

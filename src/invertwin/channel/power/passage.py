@@ -10,7 +10,7 @@ from typing import Any
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.rays.arrays import opaque
+from invertwin.channel.rays.arrays import opaque, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, RayScene
 
@@ -29,8 +29,15 @@ class Passage:
 
 
 def passage(rays: RayScene, inputs: Inputs, start: Any, end: Any, active: Any) -> Passage:
-    """What gets from one point to another (their own surfaces excluded). Detached."""
-    if not inputs.sheets:
+    """What gets from one point to another (their own surfaces excluded). Detached.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Detached tables.
+        start, end: Points.
+        active: Lanes.
+    """
+    if not inputs.surfaces.sheets:
         return Passage(dr.select(rays.clear(start, end, active), 1.0, 0.0), mi.Float(0.0))
     lanes = dr.width(active)
     state = {
@@ -66,6 +73,15 @@ def crossed(
 
     The ends are functions, so that the loop over sheets gathers them anew: no derivative has to
     cross the loop's border.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Attached tables.
+        start: Gives the points at one end.
+        end: Gives those at the other.
+        active: Lanes.
+        carry: Arrays that the loop carries.
+        act: Called with what the loop carries, a transmittance and an extra length.
     """
     fixed_start, fixed_end = dr.detach(start()), dr.detach(end())
     state = {"active": mi.Bool(active), **carry}
@@ -161,7 +177,7 @@ def land(
     """
     one = mi.Float(1.0)
     hit = rays.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-    if not inputs.sheets:
+    if not inputs.surfaces.sheets:
         valid = active & hit.is_valid()
         face = dr.select(valid, hit.prim_index, rays.sound_face)
         b1, b2 = (dr.select(valid, b, 0.25) for b in (hit.prim_uv.x, hit.prim_uv.y))
@@ -190,8 +206,8 @@ def land(
         point = origin + ray.d * dr.select(found, hit.t, 0.0)
         transmittance, extra = _through(inputs, face, origin, origin + ray.d, found)
         chance = dr.select(transmittance > 0, _CHANCE, 0.0)
-        first, _ = mi.sample_tea_32(index, seed + state["count"] * 0x85EBCA6B)
-        passes = found & (mi.Float(first >> 8) * 2.0**-24 < chance)
+        dice, _ = uniform_pair(index, seed + state["count"] * 0x85EBCA6B)
+        passes = found & (dice < chance)
         ends = found & ~passes
         for name, value in (("face", face), ("b1", hit.prim_uv.x), ("b2", hit.prim_uv.y)):
             state[name] = dr.select(ends, value, state[name])

@@ -73,7 +73,7 @@ def _vertex(rays: RayScene, inputs: Inputs, records: Records, number: Any, depth
     here, before = located(number, active), previous()
     back, distance = integrand.segment(here.position, before)
     optical, lost = distance, mi.Float(1.0)
-    if inputs.bodies and not single:
+    if inputs.surfaces.bodies and not single:
         inside = integrand.medium(inputs, here, located(number - 1, inner), back, inner)
         optical, lost = distance * inside.index, dr.exp(-inside.attenuation * distance)
     first = active if single else active & (number == 0)
@@ -93,7 +93,7 @@ def _vertex(rays: RayScene, inputs: Inputs, records: Records, number: Any, depth
         scattered = inputs.surfaces.scattered(here.surface, here.normal, back, direction, goes_on)
     seen = active & read("seen", number)
     twice, passed = mi.Bool(False), Passage(mi.Float(1.0), mi.Float(0.0))
-    if inputs.sheets:
+    if inputs.surfaces.sheets:
         twice = first if rays.link.shared_visibility else twice
         end = dr.select(twice, before, inputs.antenna(frame, True, active))
         fixed = (dr.detach(here.position), dr.detach(end))
@@ -134,6 +134,12 @@ def pull(
     """Reverse mode: adds to the gradients of the attached inputs.
 
     ``gather`` gives ∂loss/∂power, and power · ∂loss/∂(range, u, v)-like adjoints of paths.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Attached tables.
+        records: Vertices of the paths.
+        gather: Adjoints of paths: ∂loss/∂power, and power · ∂loss/∂(range, u, v).
     """
     depth = opaque(records.depth)
 
@@ -154,7 +160,7 @@ def pull(
             objective = dr.select(vertex.active, so_far, 0.0) + dr.select(vertex.seen, ending, 0.0)
             objective += dr.select(vertex.goes_on, later, 0.0)
             dr.backward_from(objective)
-        if inputs.sheets:
+        if inputs.surfaces.sheets:
             pull_sheets(vertex, power * dr.detach(path.power), length, power_sum, range_sum)
         return power_sum, range_sum
 
@@ -198,7 +204,14 @@ def push(
     records: Records,
     scatter: Callable[[Contribution, tuple[Any, Any, Any, Any], Any], None],
 ) -> None:
-    """Forward mode: hands every path and the derivatives of its power, range, u, v on."""
+    """Forward mode: hands every path and the derivatives of its power, range, u, v on.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Attached tables.
+        records: Vertices of the paths.
+        scatter: Takes paths, the derivatives of their power, range, u and v, and which exist.
+    """
     depth = opaque(records.depth)
 
     def sweep(number: Any, growth: Any, longer: Any) -> tuple[Any, Any]:
@@ -216,7 +229,7 @@ def push(
         growth = growth + _per(vertex.active, arriving, vertex.arriving)
         longer = longer + dr.select(vertex.active, segment, 0.0)
         found, more, further = dr.detach(path.power), mi.Float(0.0), mi.Float(0.0)
-        if inputs.sheets:
+        if inputs.surfaces.sheets:
             by_segment = push_sheets(vertex.ends[0], vertex.ends[1], vertex.active)
             by_end = push_sheets(vertex.ends[2], vertex.ends[1], vertex.seen & ~vertex.twice)
             growth, longer = growth + by_segment[0], longer + by_segment[1]

@@ -78,7 +78,12 @@ class RaySampler:
         self.seed, self.dice = scrambled(seed, 0), scrambled(seed, 8)
 
     def draw(self, index: Any, inputs: Inputs) -> Samples:
-        """The samples of the given indices below ``size``."""
+        """The samples of the given indices below ``size``.
+
+        Args:
+            index: Numbers below ``size``.
+            inputs: Detached tables.
+        """
         rays, per_block = self.rays, self.rows * self.columns
         block, place = index // per_block, index % per_block
         frame = block // self.objects
@@ -140,7 +145,12 @@ class AreaSampler:
         self.seeds = scrambled(seed, 1), scrambled(seed, 2)
 
     def draw(self, index: Any, inputs: Inputs) -> Samples:
-        """The samples of the given indices below ``size``."""
+        """The samples of the given indices below ``size``.
+
+        Args:
+            index: Numbers below ``size``.
+            inputs: Detached tables.
+        """
         rays = self.rays
         frame, place = index // self.per_frame, index % self.per_frame
         jitter, _ = uniform_pair(index, self.seeds[0])

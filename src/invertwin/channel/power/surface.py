@@ -30,7 +30,7 @@ class Surfaces:
     index: Any
     attenuation: Any
     cosines: int
-    lobed: tuple[bool, bool, bool]
+    lobed: tuple[bool, ...]
     sheets: bool
     bodies: bool
 
@@ -46,7 +46,13 @@ class Surfaces:
         )
 
     def value(self, name: str, row: Any, active: Any = True) -> Any:
-        """A number of each row: ``diffuse``, ``index`` or ``attenuation``."""
+        """A number of each row: ``diffuse``, ``index`` or ``attenuation``.
+
+        Args:
+            name: Of the table.
+            row: Row of the surface.
+            active: Lanes.
+        """
         return dr.gather(mi.Float, getattr(self, name), row, active)
 
     def tabulated(self, name: str, row: Any, cosine: Any, active: Any = True) -> Any:
@@ -66,7 +72,13 @@ class Surfaces:
         return first + (second - first) * (t - mi.Float(low))
 
     def through(self, row: Any, cosine: Any, active: Any = True) -> tuple[Any, Any]:
-        """Transmittance of a sheet, and the length [m] that it adds."""
+        """Transmittance of a sheet, and the length [m] that it adds.
+
+        Args:
+            row: Row of the surface.
+            cosine: Of the angle of incidence.
+            active: Lanes.
+        """
         return tuple(  # type: ignore[return-value]
             self.tabulated(name, row, cosine, active) for name in ("transmittance", "excess")
         )
@@ -141,6 +153,12 @@ class Surfaces:
         ``f = n'² sqrt(T(θ) T(θ')) g(m)`` with the mismatch ``m = n d + n' d'`` of the directions'
         tangential parts and a Gaussian ``g`` of the variance of the specular lobe: ``f / n'²`` is
         reciprocal, and a lobe within the propagating directions passes T.
+
+        Args:
+            row: Row of the surface.
+            normal: Unit normal.
+            back, on: Unit directions of the path, away from the surface.
+            active: Lanes.
         """
         first, second = dr.dot(normal, back), dr.dot(normal, on)
         inner = self.value("index", row, active)
@@ -158,7 +176,12 @@ class Surfaces:
         return roots[0] * roots[1] * dr.square(index) * lobe * dr.abs(first * second)
 
     def refraction_variance(self, row: Any, active: Any = True) -> Any:
-        """Variance of the refracted direction's tangential part: that of the specular lobe."""
+        """Variance of the refracted direction's tangential part: that of the specular lobe.
+
+        Args:
+            row: Row of the surface.
+            active: Lanes.
+        """
         exponent = dr.gather(mi.Float, self.exponents, row * 3, active)
         return 2 / dr.maximum(exponent, 1.0)
 
@@ -169,5 +192,10 @@ class Surfaces:
 
 
 def gaussian(mismatch: Any, variance: Any) -> Any:
-    """Density of a plane Gaussian at an offset from its centre."""
+    """Density of a plane Gaussian at an offset from its centre.
+
+    Args:
+        mismatch: Offset from the centre.
+        variance: Along each axis.
+    """
     return dr.exp(-dr.squared_norm(mismatch) / (2 * variance)) / (2 * dr.pi * variance)

@@ -130,11 +130,12 @@ class Trace:
             drawn.frame, False, integrand.to_radar(self.fixed, drawn.frame, -back)
         )
         weight = drawn.weight * drawn.transmittance * self.fixed.scale * gain / dr.square(distance)
+        passed = Passage(drawn.transmittance, drawn.extra)
         return walk.start(
             index, drawn.frame, drawn.face, drawn.b1, drawn.b2, back,
             throughput=dr.select(drawn.weight > 0, weight, 0.0),
             length=distance + drawn.extra,
-            passed=Passage(drawn.transmittance, drawn.extra) if self.fixed.sheets else None,
+            passed=passed if self.fixed.surfaces.sheets else None,
         )  # fmt: skip
 
     @cached_property
@@ -159,7 +160,12 @@ class Trace:
 
 
 def chunks(size: int, chunk: int) -> Iterator[Any]:
-    """Index arrays that together count to ``size``; their offset is opaque (no recompilation)."""
+    """Index arrays that together count to ``size``; their offset is opaque (no recompilation).
+
+    Args:
+        size: How many there are in all.
+        chunk: Most of them at a time.
+    """
     # Of one size but for the last, so that a chunk takes the memory of the one before.
     chunk = max(1, -(-size // max(1, -(-size // chunk))))
     for start in range(0, size, chunk):

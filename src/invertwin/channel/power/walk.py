@@ -14,7 +14,7 @@ from invertwin.channel.power.bins import Contribution
 from invertwin.channel.power.directions import Directions
 from invertwin.channel.power.integrand import Inputs, Place
 from invertwin.channel.power.passage import Passage, land, passage
-from invertwin.channel.rays.arrays import opaque, scrambled
+from invertwin.channel.rays.arrays import opaque, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, RayScene
 
@@ -43,6 +43,16 @@ def start(
     here, one over the density of the samples included; ``length`` is that of the path so far.
     ``passed`` is what lies on the first segment, for antennas that share what they see. A state
     with a ``weight`` also follows one over the density of its points per area.
+
+    Args:
+        index: Number of the path.
+        frame: Radar pose.
+        face: Triangle.
+        b1, b2: Barycentric coordinates.
+        back: Unit direction to where the path comes from.
+        throughput: All factors up to arriving here, over the density of the samples.
+        length: Of the path so far [m].
+        passed: What lies on the first segment, for antennas that share what they see.
     """
     count = dr.width(index)
     return {
@@ -79,6 +89,11 @@ class Walk:
         """Walk up to ``depth`` vertices (a number, or one per lane); returns the last state.
 
         ``visit`` may change what it put into the state itself.
+
+        Args:
+            state: The first vertex.
+            depth: Most vertices (a number, or one per lane).
+            visit: Called at every vertex; may change what it put into the state itself.
         """
         if isinstance(depth, int) and depth == 1:
             visit(state, self._place(state))
@@ -156,8 +171,7 @@ class Walk:
         numbers = []
         for stream in streams:
             seed = self.seed + (state["number"] * 4 + stream) * _STREAM
-            first, second = mi.sample_tea_32(state["index"], seed)
-            numbers += [mi.Float(first >> 8) * 2.0**-24, mi.Float(second >> 8) * 2.0**-24]
+            numbers += uniform_pair(state["index"], seed)
         return numbers
 
 
@@ -227,26 +241,38 @@ class Records:
 
     @staticmethod
     def single(state: State, seen: Any) -> "Records":
-        """Records of paths of one vertex."""
+        """Records of paths of one vertex.
+
+        Args:
+            state: The path so far.
+            seen: Whether the vertex is connected to the receiver.
+        """
         names = ("frame", "face", "b1", "b2", "throughput", "length")
         columns = {name: state[name] for name in names}
         return Records(lanes=dr.width(state["index"]), depth=1, **columns, seen=seen)
 
     @staticmethod
     def empty(state: State, depth: int, sound_face: Any) -> "Records":
-        """Room for paths that start in this state."""
+        """Room for paths that start in this state.
+
+        Args:
+            state: The path so far.
+            depth: Most vertices of a path.
+            sound_face: A triangle that any lane may read.
+        """
         lanes = dr.width(state["index"])
         size = lanes * depth
         face = dr.zeros(mi.UInt32, size)
+        b1, b2, throughput, length = (dr.zeros(mi.Float, size) for _ in range(4))
         return Records(
             lanes=lanes,
             depth=depth,
             frame=state["frame"],
             face=face + sound_face if size else face,
-            b1=dr.zeros(mi.Float, size),
-            b2=dr.zeros(mi.Float, size),
-            throughput=dr.zeros(mi.Float, size),
-            length=dr.zeros(mi.Float, size),
+            b1=b1,
+            b2=b2,
+            throughput=throughput,
+            length=length,
             seen=dr.zeros(mi.Bool, size),
         )
 
@@ -256,7 +282,12 @@ class Records:
         return [column for column in vars(self).values() if not isinstance(column, int)]
 
     def write(self, state: State, seen: Any) -> None:
-        """Store the latest vertex."""
+        """Store the latest vertex.
+
+        Args:
+            state: The path so far.
+            seen: Whether the vertex is connected to the receiver.
+        """
         at = (state["number"] - 1) * self.lanes + state["lane"]
         values = {**state, "seen": seen}
         for name in ("face", "b1", "b2", "throughput", "length", "seen"):

@@ -48,29 +48,56 @@ def to_torch(values: Any) -> Tensor:
 
 
 def opaque(value: float | int, kind: str = "UInt32") -> Any:
-    """A Dr.Jit scalar that the kernel reads from memory, so that a new value does not recompile."""
+    """A Dr.Jit scalar that the kernel reads from memory, so that a new value does not recompile.
+
+    Args:
+        value: The number.
+        kind: Its Dr.Jit type.
+    """
     return dr.opaque(getattr(mi, kind), value)
 
 
 def scrambled(seed: int, stream: int) -> Any:
-    """An opaque 32-bit seed; neighbouring seeds and streams are unrelated."""
+    """An opaque 32-bit seed; neighbouring seeds and streams are unrelated.
+
+    Args:
+        seed: Of the user.
+        stream: Number of the use.
+    """
     state = np.random.SeedSequence([seed, stream]).generate_state(1)[0]
     return opaque(int(state))
 
 
 def uniform_pair(index: Any, seed: Any) -> tuple[Any, Any]:
-    """Two uniform numbers in [0, 1) for each index."""
+    """Two uniform numbers in [0, 1) for each index.
+
+    Args:
+        index: One a lane.
+        seed: From ``scrambled``.
+    """
     first, second = mi.sample_tea_32(index, seed)
     return mi.Float(first >> 8) * 2.0**-24, mi.Float(second >> 8) * 2.0**-24
 
 
 def corners(vertices: Any, faces: Any, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
-    """Corners of triangles, from tables of points and of vertex indices."""
+    """Corners of triangles, from tables of points and of vertex indices.
+
+    Args:
+        vertices: Table of points.
+        faces: Vertex indices of triangles.
+        face: Triangles.
+        active: Lanes.
+    """
     index = dr.gather(mi.Vector3u, faces, face, active)
     return tuple(point_at(vertices, i, active) for i in index)  # type: ignore[return-value]
 
 
 def between(triangle: tuple[Any, Any, Any], b1: Any, b2: Any) -> Any:
-    """The point of a triangle with these barycentric coordinates."""
+    """The point of a triangle with these barycentric coordinates.
+
+    Args:
+        triangle: Its corners.
+        b1, b2: Barycentric coordinates.
+    """
     p0, p1, p2 = triangle
     return p0 * (1 - b1 - b2) + p1 * b1 + p2 * b2

@@ -22,8 +22,7 @@ def mixed(corners: tuple[Tensor, Tensor, Tensor], b1: Tensor, b2: Tensor) -> Ten
 
     Args:
         corners: Values at the three corners.
-        b1: Weight of the second corner.
-        b2: Weight of the third corner.
+        b1, b2: Barycentric coordinates.
     """
     c0, c1, c2 = corners
     b1, b2 = b1[:, None], b2[:, None]
@@ -53,7 +52,7 @@ class Geometry:
     face_object: Int64[Tensor, " f"]
     face_surface: Int64[Tensor, " f"]
     surfaces: Surface
-    lobed: tuple[bool, bool, bool]
+    lobed: tuple[bool, ...]
     sheets: bool
     bodies: bool
     coherent: tuple[bool, ...]
@@ -72,8 +71,7 @@ class Geometry:
 
         Args:
             face: Triangles.
-            b1: Weight of the second corner.
-            b2: Weight of the third corner.
+            b1, b2: Barycentric coordinates.
         """
         if self.velocities is None:
             return None
@@ -101,12 +99,22 @@ def differentiated(value: Tensor | None) -> bool:
 
 
 def silhouettes_move(geometry: Geometry, link: Link) -> bool:
-    """Whether a derivative flows through anything that decides what is visible."""
+    """Whether a derivative flows through anything that decides what is visible.
+
+    Args:
+        geometry: The scene.
+        link: Antennas.
+    """
     return any(differentiated(value) for value in (geometry.vertices, link.tx, link.rx))
 
 
 def require_edges(geometry: Geometry, link: Link, samples: int) -> None:
     """Refuse a derivative that would silently leave moving silhouettes out.
+
+    Args:
+        geometry: The scene.
+        link: Antennas.
+        samples: How many there are.
 
     Raises:
         InputError: Silhouettes move and there are no samples of them.
@@ -165,11 +173,7 @@ def flatten(
         face_object=topology.face_object,
         face_surface=face_surface,
         surfaces=surfaces,
-        lobed=(
-            free or bool(weights[:, 0].any()),
-            free or bool(weights[:, 1].any()),
-            free or bool(weights[:, 2].any()),
-        ),
+        lobed=tuple(free or bool(weight.any()) for weight in weights.T),
         sheets=bool(surfaces.transmittance.any()),
         bodies=bool(skins.any()),
         coherent=tuple(item.material.coherent for item in objects),

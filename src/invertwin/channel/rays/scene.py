@@ -39,7 +39,12 @@ class Occluders:
         return self.topology.ray_scene(self.local_vertices)
 
     def clear(self, start: Any, end: Any, active: Any = True) -> Any:
-        """Whether nothing lies between two points (their own surfaces excluded)."""
+        """Whether nothing lies between two points (their own surfaces excluded).
+
+        Args:
+            start, end: Points.
+            active: Lanes.
+        """
         return active & ~self.scene.ray_test(
             mi.Ray3f(start + (end - start) * NEAR, end - start, 1 - 2 * NEAR, 0.0, []), active
         )
@@ -70,7 +75,12 @@ class RayScene(Occluders):
         return bounding_spheres(self.geometry)
 
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
-        """Corners of triangles, detached."""
+        """Corners of triangles, detached.
+
+        Args:
+            face: Triangle.
+            active: Lanes.
+        """
         return arrays.corners(self.vertices, self.topology.device_faces, face, active)
 
 
@@ -112,7 +122,12 @@ def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
 
 
 def visible(rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]) -> Tensor:
-    """Whether nothing lies between pairs of world points (torch in, torch out)."""
+    """Whether nothing lies between pairs of world points (torch in, torch out).
+
+    Args:
+        rays: What may be in the way.
+        start, end: Points.
+    """
     if not len(start):
         return torch.zeros(0, dtype=torch.bool)
     return to_torch(rays.clear(rays.located(start), rays.located(end))).bool()
@@ -121,7 +136,12 @@ def visible(rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor,
 def next_surface(
     rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
 ) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
-    """First triangle between pairs of world points (−1: none), and how far along it lies."""
+    """First triangle between pairs of world points (−1: none), and how far along it lies.
+
+    Args:
+        rays: What may be in the way.
+        start, end: Points.
+    """
     origin = rays.located(start)
     offset = rays.located(end) - origin
     ray = mi.Ray3f(origin + offset * NEAR, mi.Vector3f(offset), 1 - 2 * NEAR, 0.0, [])

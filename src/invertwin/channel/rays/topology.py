@@ -114,6 +114,10 @@ def edges_of(
     with split vertices has no false open edges; objects that touch may part. The other two tables
     have as many columns as the edge with most triangles (2 for a manifold mesh); absent ones are
     −1.
+
+    Args:
+        faces: Vertex indices of triangles.
+        places: One row a vertex: object and position.
     """
     _, first, inverse = np.unique(places, axis=0, return_index=True, return_inverse=True)
     welded = first[inverse.ravel()][faces]

@@ -5,7 +5,7 @@ fields are made of it, too. A path is a row of material points; its power is the
 segments' 1/R², the scattering at its points and the gains of both antennas.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
@@ -73,8 +73,7 @@ def place(
     Args:
         geometry: The scene.
         face: Triangles.
-        b1: Weight of the second corner.
-        b2: Weight of the third corner.
+        b1, b2: Barycentric coordinates.
     """
     p0, p1, p2 = geometry.corners(face)
     normal = torch.linalg.cross(p1 - p0, p2 - p0)
@@ -115,19 +114,22 @@ class SurfacePoints:
 
 @dataclass(frozen=True)
 class Echo:
-    """What paths carry through free space, attached; one row a path.
+    """What paths carry, attached; one row a path.
 
     Attributes:
         power: Received over transmitted power per m² of every point; Jacobians included.
         spread: Gains and 1/R² alone: the power without scattering, over (λ/4π)².
         length: From antenna to antenna [m].
         ending: Scattering at the last point, gain and 1/R² of the last segment; detached.
+        first, last: World positions of the ends [m].
     """
 
     power: Float64[Tensor, " n"]
     spread: Float64[Tensor, " n"]
     length: Float64[Tensor, " n"]
     ending: Float64[Tensor, " n"]
+    first: Float64[Tensor, "n 3"]
+    last: Float64[Tensor, "n 3"]
 
 
 def radar_equation(
@@ -164,7 +166,7 @@ def radar_equation(
         scattering = scattered(geometry, point, -back, on)
         power = power * (point.jacobian * scattering)
     ending = (scattering * gains[1] / distances[-1] ** 2).detach()
-    return Echo(power, spread, length, ending)
+    return Echo(power, spread, length, ending, stops[1], stops[-2])
 
 
 def mirror_field(
@@ -194,7 +196,13 @@ def mirror_field(
 def seen_from(
     link: Link, frame: Int64[Tensor, " n"], direction: Float64[Tensor, "n 3"]
 ) -> Float64[Tensor, "n 3"]:
-    """World directions in the radar frame."""
+    """World directions in the radar frame.
+
+    Args:
+        link: Antennas.
+        frame: Radar pose.
+        direction: Unit directions in the world.
+    """
     return torch.einsum("nij,ni->nj", link.rotations[frame], direction)
 
 
@@ -287,8 +295,7 @@ def passed(
 
     Args:
         rays: The scene.
-        start: Points.
-        end: Points.
+        start, end: Points.
     """
     geometry, surfaces = rays.geometry, rays.geometry.surfaces
     if not geometry.sheets:
@@ -319,25 +326,7 @@ def passed(
     return transmittance * torch.ones_like(transmittance).index_fill(0, rows, 0.0), extra
 
 
-@dataclass(frozen=True)
-class PathView:
-    """What paths carry past all that lies between their points, attached.
-
-    Attributes:
-        power: Received over transmitted power per m² of every point; Jacobians included.
-        ending: The factor of the last point and its segment to the receiver, detached.
-        length: From antenna to antenna [m].
-        first, last: World positions of the ends [m].
-    """
-
-    power: Float64[Tensor, " n"]
-    ending: Float64[Tensor, " n"]
-    length: Float64[Tensor, " n"]
-    first: Float64[Tensor, "n 3"]
-    last: Float64[Tensor, "n 3"]
-
-
-def path_view(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -> PathView:
+def path_view(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -> Echo:
     """Evaluate the radar equation along paths; those that are blocked carry nothing.
 
     Args:
@@ -357,4 +346,4 @@ def path_view(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -
         transmittance, extra = passed(rays, start, end)
         power, length = power * transmittance, length + extra
     ending = echo.ending * transmittance.detach()
-    return PathView(power, ending, length, stops[1], stops[-2])
+    return replace(echo, power=power, length=length, ending=ending)

@@ -153,7 +153,12 @@ def barycentric(
     p1: Float64[Tensor, "n 3"],
     p2: Float64[Tensor, "n 3"],
 ) -> tuple[Float64[Tensor, " n"], Float64[Tensor, " n"]]:
-    """Second and third barycentric coordinates of points in the planes of triangles."""
+    """Second and third barycentric coordinates of points in the planes of triangles.
+
+    Args:
+        point: Points.
+        p0, p1, p2: Corners.
+    """
     a, b, r = p1 - p0, p2 - p0, point - p0
     aa, ab, bb, ra, rb = _dot(a, a), _dot(a, b), _dot(b, b), _dot(r, a), _dot(r, b)
     determinant = aa * bb - ab * ab
