@@ -178,7 +178,7 @@ def log_loss(share):
     def loss(simulated, measured):
         floor = share * measured.mean()
         lit = simulated.clamp_min(0.0)
-        a, b = lit / lit.mean() * measured.mean() + floor, measured + floor
+        a, b = lit / lit.mean() * measured.mean() + floor, measured.clamp_min(0.0) + floor
         return (a.log() - b.log()).square().mean()
 
     return loss
