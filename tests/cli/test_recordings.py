@@ -157,12 +157,8 @@ def test_impairments_reach_the_front_end():
     assert found.phase_noise.levels == (-90.0,)
     assert found.phase_std == pytest.approx(torch.pi / 2)
     assert (found.noise_figure_db, found.adc, found.leakage) == (12.0, None, None)
-    run = read(impairments={"phase_noise": {"offsets": [1e6], "levels": [-90, -95]}})
-    assert run.impairments is not None
-    data = read(data={"kind": "simulated", "density": 1.0}).data
-    assert isinstance(data, schema.SimulatedData)
-    with pytest.raises(InputError, match="impairments: expected 1 levels"):
-        sensors.impairments(run.impairments, data)
+    with pytest.raises(InputError, match=r"impairments\.phase_noise: expected 1 levels"):
+        read(impairments={"phase_noise": {"offsets": [1e6], "levels": [-90, -95]}})
 
 
 @pytest.mark.slow
@@ -252,7 +248,7 @@ def test_raw_files_are_data_of_a_fit(train, run_file, monkeypatch):
 
 def data_table(**changes):
     data = read(data=changes).data
-    assert isinstance(data, schema.ArraysData)
+    assert data is not None
     return data
 
 

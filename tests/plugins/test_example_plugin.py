@@ -134,12 +134,16 @@ def test_a_reader_of_a_plugin_is_data(call, tmp_path):
     ("old", "new", "said"),
     [
         ('kind = "foliage", share = 0.2', 'kind = "folage"', "did you mean `foliage`?"),
-        ("share = 0.2", "share = 1.2", "scene.hedge.material.share: expected a number less than"),
+        (
+            "share = 0.2",
+            "share = 1.2",
+            "material.share: expected less than or equal to 1, got 1.2",
+        ),
         ("share = 0.2", "shar = 0.2", "scene.hedge.material.shar: expected one of the keys kind"),
         ("lean_deg", "lean", "scene.hedge.lean: expected one of the keys"),
         ("survey =", "surwey =", "surwey: expected one of the keys"),
         ("count = 12", "count = 1.5", "survey.count: expected an integer, got 1.5"),
-        ("floor = 0.1", "floor = 0.0", "loss.floor: expected a number greater than 0"),
+        ("floor = 0.1", "floor = 0.0", "loss.floor: expected greater than 0, got 0.0"),
     ],
 )
 def test_errors_know_what_a_plugin_adds(call, tmp_path, old, new, said):

@@ -30,8 +30,7 @@ samples = 20_000
 """
 CHECK = RUN.replace("[0.02, 0.01, 1.2]", "[0.0, 0.0, 1.2]") + GRADCHECK + METHODS
 SCAN = (
-    RUN.replace('task = "reconstruct"', 'task = "loss-scan"')
-    .replace("snr_db = 20.0\n", "")
+    RUN.replace('task = "reconstruct"', 'task = "loss-scan"').replace("snr_db = 20.0\n", "")
     + LOSS_SCAN
 )
 

@@ -21,9 +21,10 @@ from invertwin.radar.waveform import (
 )
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, Table
 
-WAVEFORMS: dict[str, type[FMCW] | type[Impulse] | type[SteppedFrequency] | type[OFDM]] = {
+WAVEFORMS: dict[str, type[Waveform]] = {
     kind.__name__: kind for kind in (FMCW, Impulse, SteppedFrequency, OFDM)
 }
+"""Dataclasses that a file may name. Add one of your own to keep what it has measured."""
 
 _VISIBILITY = {None: "auto", True: "shared", False: "separate"}
 
@@ -44,7 +45,7 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     }
     attributes: dict[str, Any] = {
         "waveform": kind,
-        **asdict(waveform),
+        **asdict(waveform),  # type: ignore[call-overload]
         "window": radar.window,
         "array_window": radar.array_window,
         "visibility": _VISIBILITY[radar.shared_visibility],
@@ -89,15 +90,10 @@ def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
     # Numbers come back from a file as NumPy scalars.
     types = get_type_hints(kind)  # without the limits that annotations may have
     values = {
-        field.name: (int if _whole(field.type) else float)(attribute(attributes, field.name))
+        field.name: (int if types[field.name] is int else float)(attribute(attributes, field.name))
         for field in fields(kind)
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
-
-
-def _whole(kind: Any) -> bool:
-    """Whether a field holds an integer, with limits or without."""
-    return getattr(kind, "__origin__", kind) is int
 
 
 def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:

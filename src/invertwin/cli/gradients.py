@@ -197,5 +197,5 @@ def _bump(table: schema.GradientParameter, lattice: Lattice) -> Tensor:
     return torch.exp(-far.square().sum(-1) / (2 * table.width**2))
 
 
-def _shape(item: Any) -> str | None:
-    return getattr(item, "shape", None)
+def _shape(item: Any) -> str:
+    return getattr(item, "shape", "")

@@ -35,7 +35,7 @@ from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import evaluated
 from invertwin.scene.parameters import MaterialValues
 
-MaterialValue = Literal[tuple(RANGES)]  # type: ignore[valid-type]
+MaterialValue: Any = Literal[tuple(RANGES)]
 _KINDS: Mapping[str, type[Material]] = {
     "rough_dielectric": RoughDielectric,
     "perfect_conductor": PerfectConductor,

@@ -15,7 +15,8 @@ from invertwin.capture import (
     described_arrays,
     ti,
 )
-from invertwin.cli.registry import Group, OneOf, Registry, Table
+from invertwin.capture.radar_fields import WAVEFORMS
+from invertwin.cli.registry import Group, OneOf, Registry, Table, registry
 from invertwin.cli.section import Depth, InputPath, Section, Seed, about, fail, key
 from invertwin.cli.sensors import (
     BoardTable,
@@ -117,15 +118,15 @@ class ChirpTable(DataTable):
         return replace(found, positions=positions, rotations=rotations)
 
 
-def register(registry: Registry) -> None:
+def register(kinds: Registry) -> None:
     """Adds the readers; what one returns says which keys it has beside its own."""
-    registry.group(Group("data"))
-    registry.base(Capture, DataTable)
-    registry.base(Recording, ChirpTable)
-    registry.add("data", "simulated", SimulatedData)
-    registry.add("data", "capture", saved)
-    registry.add("data", "dca1000", dca1000)
-    registry.add("data", "arrays", arrays)
+    kinds.group(Group("data"))
+    kinds.base(Capture, DataTable)
+    kinds.base(Recording, ChirpTable)
+    kinds.add("data", "simulated", SimulatedData)
+    kinds.add("data", "capture", saved)
+    kinds.add("data", "dca1000", dca1000)
+    kinds.add("data", "arrays", arrays)
 
 
 def saved(file: InputPath) -> Capture:
@@ -134,6 +135,10 @@ def saved(file: InputPath) -> Capture:
     Args:
         file: path, from the run file's folder.
     """
+    for name in registry.names("waveform"):
+        kind = registry.table("waveform", name).made_by
+        if isinstance(kind, type):  # a file of a plugin's radar names its waveform
+            WAVEFORMS.setdefault(kind.__name__, kind)
     with about("file"):
         return Capture.load(file)
 

@@ -335,7 +335,7 @@ class Registry:
         if isinstance(default, float) and _is_angle(hint):
             default = round(math.degrees(default), 9)
         if isinstance(default, tuple) or _letters(hint):
-            default = list(default)
+            default = [*default]  # type: ignore[misc]
         return kind, key(words, default, validate_default=isinstance(default, str))
 
     def read_type(self, hint: Any, name: str) -> Any:

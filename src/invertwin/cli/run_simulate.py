@@ -17,7 +17,6 @@ from invertwin.cli.report import DOPPLER_NOTE, Again, Picture, Table, report_htm
 from invertwin.cli.run_file import about, need, to_toml
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.cli.sensors import ChirpsTable
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span
@@ -159,7 +158,7 @@ def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> tor
 
 
 def _chirp_train(
-    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: ChirpsTable
+    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid, table: Any
 ) -> list[Table]:
     """Simulate several ramps a frame, between which objects move."""
     begin = time.perf_counter()

@@ -10,6 +10,7 @@ from annotated_types import Ge, Gt, Le, Len, MinLen
 from pydantic import Tag, model_validator
 from torch import Tensor
 
+from invertwin.capture.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
 from invertwin.cli.registry import Group, OneOf, Registry, Table
 from invertwin.cli.section import (
@@ -48,7 +49,7 @@ from invertwin.scene import Table as PatternTable
 
 _MOST_BINS = 1e9  # 4 GB a map
 Numbers = Annotated[list[Count], MinLen(1)]
-Window = Literal[tuple(WINDOWS)]  # type: ignore[valid-type]
+Window: Any = Literal[tuple(WINDOWS)]
 Elements = tuple[AntennaArray, AntennaArray]
 
 
@@ -233,8 +234,8 @@ def own_board(tx_places: _Places, rx_places: _Places, design_frequency: Positive
         rx_places: column, row of RX1, RX2, … in half wavelengths.
         design_frequency: Hz, whose half wavelength is the unit.
     """
-    ends = (tuple((x, y) for x, y in places) for places in (tx_places, rx_places))
-    return boards.Board("the board", *ends, design_frequency)
+    tx, rx = (tuple((x, y) for x, y in places) for places in (tx_places, rx_places))
+    return boards.Board("the board", tx, rx, design_frequency)
 
 
 def line(start: Vector, stop: Vector, count: Count) -> Tensor:
@@ -292,6 +293,7 @@ def radar(table: RadarTable) -> Radar:
     with about("radar"):
         with about("waveform"):
             waveform = table.waveform.build()
+        WAVEFORMS.setdefault(type(waveform).__name__, type(waveform))
         if table.board is not None:
             with about("board"):
                 transmitters, receivers = board_elements(table.board)

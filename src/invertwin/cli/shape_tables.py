@@ -70,7 +70,8 @@ class ObjectTable(Placement, _Body):
         mesh = more["mesh"] if more else self.mesh()
         with about("material"):
             material = self.material.build({Mesh: mesh})
-        velocity = self.velocity and torch.tensor(self.velocity, dtype=torch.float64)
+        still = self.velocity is None
+        velocity = None if still else torch.tensor(self.velocity, dtype=torch.float64)
         return Object(mesh, material, self.pose(), velocity)
 
 

@@ -161,7 +161,11 @@ class Scale(nn.Module):
     """
 
     def __init__(self, object: str, initial: float = 1.0) -> None:
-        """Scale `object`, by the factor `initial` at the start.
+        """Scale `object`, from this size at the start.
+
+        Args:
+            object: name of the object.
+            initial: factor.
 
         Args:
             object: name of the object.

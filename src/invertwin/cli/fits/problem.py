@@ -331,7 +331,7 @@ def observations_of(problem: Problem) -> list[Observation]:
     poses = {
         name: Unknown(lambda _: RadarPose(), getattr(table, "rate", None))
         for name, table in build.named(run.parameters).items()
-        if table.kind == "radar"
+        if table.kind == "radar_pose"
     }
     return [
         Observation(
@@ -364,5 +364,5 @@ def unknowns_of(run: RunFile, start: build.Start) -> dict[str, Unknown]:
     return {
         name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
         for name, table in tables.items()
-        if table.kind != "radar"
+        if table.kind != "radar_pose"
     }
