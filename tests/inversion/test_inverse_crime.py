@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 
 from invertwin.capture import Capture
+from invertwin.channel import Sampling
 from invertwin.cli import build
 from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
-from invertwin.radar import Surrogate
-from invertwin.simulation import simulate
+from invertwin.models import SurrogateMap
 from scenes import occluder, radar
 
+FEW = Sampling(depth=1, samples=1_000)
 ROOT = Path(__file__).resolve().parents[2]
 RUNS = sorted(file for file in (ROOT / "experiments").rglob("*.toml") if file.stem != "pyproject")
 PUBLIC = [
@@ -42,13 +43,12 @@ def test_there_is_something_to_guard():
 
 
 def test_a_surrogate_has_no_signal_to_fit():
-    """A capture is made of signals, and the smooth model makes none."""
+    """A capture is made of signals, and the smooth model makes a map."""
     device = radar()
-    found = simulate(
-        occluder(), device, device.grid(0.5, 2.5), seed=0, surrogate=Surrogate(), samples=1_000
-    )
-    assert found.beat is None
-    assert found.paths is None
+    grid = device.grid(0.5, 2.5)
+    found = SurrogateMap(grid, sampling=FEW).predict(occluder(), device, 0)
+    assert not found.is_complex()
+    assert found.shape == (1, *grid.shape)
     assert {name for name in dir(Capture) if name.startswith("from_")} == {
         "from_beat",
         "from_range_profile",
@@ -104,8 +104,7 @@ def test_scripts_fit_exact_or_recorded_signals(name):
         for node in ast.walk(tree)
         if isinstance(node, ast.Assign)
         and isinstance(node.value, ast.Call)
-        and any(word.arg == "surrogate" for word in node.value.keywords)
-        and ast.unparse(node.value.func).endswith("simulate")
+        and ast.unparse(node.value.func).endswith("predict")
         for target in node.targets
         if isinstance(target, ast.Name)
     }
@@ -123,7 +122,6 @@ def test_scripts_fit_exact_or_recorded_signals(name):
 
 def test_the_guard_sees_a_crime(unchecked):
     device = radar()
-    grid = device.grid(0.5, 2.5)
-    smooth = simulate(occluder(), device, grid, seed=0, surrogate=Surrogate(), samples=1_000)
+    smooth = SurrogateMap(device.grid(0.5, 2.5), sampling=FEW).predict(occluder(), device, 0)
     with pytest.raises(InputError, match="beat samples"):
-        Capture.from_beat(smooth.beat, device)  # pyright: ignore[reportArgumentType]
+        Capture.from_beat(smooth, device)
