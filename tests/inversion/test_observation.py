@@ -78,15 +78,15 @@ def place_of(observations: Any, kind: str = "adam", steps: int = 40, **changes: 
 
 @pytest.mark.parametrize(("kind", "steps"), [("adam", 50), ("gauss_newton", 8)])
 def test_two_ranges_find_what_each_alone_cannot(seen, kind, steps):
-    """A range pins one coordinate; two at right angles pin both."""
+    """A range pins one coordinate to 0.4 cells; two at right angles pin both."""
     alone = {name: place_of(one, kind, steps) for name, one in seen.items()}
     both = place_of(list(seen.values()), kind, steps)
     truth = float64(BALL)
-    assert abs(float(alone["ahead"][2] - truth[2])) < 0.02
+    assert abs(float(alone["ahead"][2] - truth[2])) < 0.03
     assert abs(float(alone["ahead"][0] - truth[0])) > 0.05
-    assert abs(float(alone["beside"][0] - truth[0])) < 0.02
+    assert abs(float(alone["beside"][0] - truth[0])) < 0.03
     assert abs(float(alone["beside"][2] - truth[2])) > 0.05
-    assert float((both - truth).norm()) < 0.02
+    assert float((both - truth).norm()) < 0.03
 
 
 @dataclass(frozen=True, eq=False)
