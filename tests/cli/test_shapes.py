@@ -12,7 +12,7 @@ from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import is_shape_key, shape_label, shape_scores
 from invertwin.cli.fits.problem import FULL, annealed_until, problem_of, stages_of, varied_run
-from invertwin.cli.fits.writing import tables_of
+from invertwin.cli.fits.writing import Fitted, tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, box
@@ -172,7 +172,7 @@ def test_a_twin_that_has_collapsed_has_no_measures(tmp_path):
     assert found["start_chamfer_m"] > 0
     assert not {"chamfer_m", "chamfer_seen_m", "iou"} & set(found)
     metrics = {"steps": 1, "status": "budget", "parameters": {}, **found}
-    result = tables_of(problem, metrics, start, twin, {FULL: [found]})[0]
+    result = tables_of(Fitted(problem, metrics, {FULL: [found]}, start, twin, {}))[0]
     assert ["Chamfer distance, mean of both directions [m]", None] in result.rows
 
 

@@ -1,6 +1,6 @@
 """The scalar θ of a gradient check, from the tables of a run file: a module and a tangent."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -44,19 +44,12 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Theta:
-    """What a gradient check moves.
+    """What a gradient check moves."""
 
-    Attributes:
-        module: Maps the scene, or the radar.
-        tangent: How its parameters change with θ, by name.
-        of_radar: Whether it maps the radar.
-        shape: Whether it changes a shape.
-    """
-
-    module: nn.Module
-    tangent: Mapping[str, Tensor]
+    module: nn.Module  # maps the scene, or the radar
+    tangent: Mapping[str, Tensor]  # how its parameters change with θ, by name
     of_radar: bool = False
-    shape: bool = False
+    shape: bool = False  # whether it changes a shape
 
     def direction(self) -> Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]:
         """A function that moves scene and radar by θ."""
@@ -70,94 +63,71 @@ class Theta:
 
 
 def theta_of(table: schema.GradientParameter, run: schema.RunFile, scene: Scene) -> Theta:
-    """The θ of a `[gradcheck.parameter]` table.
-
-    Args:
-        table: Kind and values.
-        run: Its scene tables.
-        scene: The scene of the run file.
+    """The θ of a `[gradcheck.parameter]` table, at the scene of the run file.
 
     Raises:
         InputError: The object has no such value, joint, coordinate or shape.
     """
-    name = table.object or ""
-    item = run.scene.get(name)
+    name: str = table.object or ""
+    item: Any = run.scene.get(name)
     match table.kind:
         case "translation" | "radar_translation" | "rotation" | "radar_rotation":
             radar = table.kind.startswith("radar")
-            axis = torch.tensor(table.axis, dtype=torch.float64)
-            axis = axis / axis.norm()
-            key = table.kind.removeprefix("radar_")
+            axis, key = _axis(table), table.kind.removeprefix("radar_")
             # A small q = (1, r) turns by the rotation vector r.
             change = axis if key == "translation" else torch.cat([axis.new_zeros(1), axis])
             return Theta(RadarPose() if radar else Pose(name), {key: change}, radar)
         case "scale":
             return Theta(Scale(name), {"log_scale": torch.ones((), dtype=torch.float64)})
         case "material":
-            return _material(table, scene)
+            return _material(name, table.value or "", scene)
         case "joint":
-            return Theta(*_joint(table, item), shape=True)
+            return _joint(name, table, item)
         case "latent":
-            return Theta(*_latent(table, item), shape=True)
-    low, high, counts = _box(table)
-    distance = partial(signed_distance, scene[name].mesh)
-    if table.kind == "distance":
-        module = DistanceGrid.sampled(name, low, high, counts, distance)
-        # The surface moves outwards where the distance falls.
-        return Theta(module, {"value": -_bump(table, module.lattice)}, shape=True)
-    lattice = Lattice.between(low, high, counts)
-    inside = -distance(lattice.nodes.reshape(-1, 3))
-    share = torch.sigmoid(4 * inside / lattice.spacing.mean()).reshape(lattice.counts)
-    cloud = DensityGrid(name, low, high, float(table.extinction or 0) * share)
-    with torch.no_grad():
-        # σ = softplus(value) / h: this change of the value changes σ by σ times the bump.
-        slope = torch.sigmoid(cloud.value) / torch.nn.functional.softplus(cloud.value)
-        return Theta(cloud, {"value": _bump(table, lattice) / slope}, shape=True)
+            return _latent(name, table.index or 0, item)
+    return _bump(name, table, partial(signed_distance, scene[name].mesh))
 
 
-def _material(table: schema.GradientParameter, scene: Scene) -> Theta:
-    material, value = scene[table.object or ""].material, table.value or ""
+def _axis(table: schema.GradientParameter) -> Tensor:
+    axis = torch.tensor(table.axis, dtype=torch.float64)
+    return axis / axis.norm()
+
+
+def _material(name: str, value: str, scene: Scene) -> Theta:
+    material = scene[name].material
     if value not in vars(material):
         raise InputError(
-            f"expected a value of {table.object}'s material ({', '.join(vars(material))}), "
+            f"expected a value of {name}'s material ({', '.join(vars(material))}), "
             f"got {value!r}; choose one"
         )
-    module = MaterialValues(table.object or "", **{value: getattr(material, value)})
+    module = MaterialValues(name, **{value: getattr(material, value)})
     key = f"raw.{value}"
     raw = module.get_parameter(key).detach()
-    found, slope = torch.func.jvp(  # type: ignore[misc]
-        lambda parameter: _value(module, key, parameter, scene, value),
-        (raw,),
-        (torch.ones_like(raw),),
-    )
-    return Theta(module, {key: torch.ones_like(found) / slope})
+
+    def found(parameter: Tensor) -> Tensor:
+        moved = torch.func.functional_call(module, {key: parameter}, (scene,))
+        return getattr(moved[name].material, value)
+
+    slope = torch.func.jvp(found, (raw,), (torch.ones_like(raw),))[1]
+    return Theta(module, {key: torch.ones_like(slope) / slope})
 
 
-def _value(module: nn.Module, key: str, parameter: Tensor, scene: Scene, value: str) -> Tensor:
-    moved = torch.func.functional_call(module, {key: parameter}, (scene,))
-    return getattr(moved[module.object].material, value)  # type: ignore[attr-defined]
-
-
-def _joint(table: schema.GradientParameter, item: Any) -> tuple[SkinnedBody, dict[str, Tensor]]:
+def _joint(name: str, table: schema.GradientParameter, item: Any) -> Theta:
     if _shape(item) != "body":
-        raise InputError(f'expected an object with shape = "body", got {table.object}; choose one')
+        raise InputError(f'expected an object with shape = "body", got {name}; choose one')
     body = template(item).scaled(item.scale)
     angles = {
-        name: torch.tensor(turn, dtype=torch.float64).deg2rad()
-        for name, turn in item.angles_deg.items()
+        joint: torch.tensor(turn, dtype=torch.float64).deg2rad()
+        for joint, turn in item.angles_deg.items()
     }
     change = torch.zeros(len(body.parents), 3, dtype=torch.float64)
-    axis = torch.tensor(table.axis, dtype=torch.float64)
-    change[body.joint(table.joint or "")] = axis / axis.norm()
-    module = SkinnedBody(table.object or "", body, body.rotations(angles))
-    return module, {"rotation": change}
+    change[body.joint(table.joint or "")] = _axis(table)
+    module = SkinnedBody(name, body, body.rotations(angles))
+    return Theta(module, {"rotation": change}, shape=True)
 
 
-def _latent(
-    table: schema.GradientParameter, item: Any
-) -> tuple[LinearShape | PriorShape, dict[str, Tensor]]:
-    index, name = table.index or 0, table.object or ""
-    whole = item is not None and item.scale == 1
+def _latent(name: str, index: int, item: Any) -> Theta:
+    whole = getattr(item, "scale", None) == 1
     if _shape(item) == "vehicle" and whole and item.max_edge is None:
         start = torch.zeros(max(index + 1, len(item.coefficients)), dtype=torch.float64)
         start[: len(item.coefficients)] = torch.tensor(item.coefficients, dtype=torch.float64)
@@ -165,9 +135,7 @@ def _latent(
     elif _shape(item) == "prior" and whole:
         prior = load_prior(item.prior)
         start = torch.zeros(prior.latent_size, dtype=torch.float64)
-        if item.latent is not None:
-            start = start.new_tensor(item.latent)
-        module = PriorShape(name, prior, start)
+        module = PriorShape(name, prior, start.new_tensor(item.latent) if item.latent else start)
     else:
         raise InputError(
             'expected an object with shape = "vehicle" without max_edge, or "prior", and scale 1, '
@@ -179,22 +147,25 @@ def _latent(
         )
     change = torch.zeros_like(module.latent.detach())
     change[index] = 1.0
-    return module, {"latent": change}
+    return Theta(module, {"latent": change}, shape=True)
 
 
-def _box(table: schema.GradientParameter) -> tuple[list[float], list[float], Sequence[int]]:
-    assert table.low is not None
-    assert table.high is not None
-    assert table.counts is not None
-    return table.low, table.high, table.counts
-
-
-def _bump(table: schema.GradientParameter, lattice: Lattice) -> Tensor:
-    """A round bump with this centre and width at the nodes, 1 in the middle."""
-    assert table.center is not None
-    assert table.width is not None
+def _bump(name: str, table: Any, distance: Callable[[Tensor], Tensor]) -> Theta:
+    """A signed distance or a density that changes in a round bump, 1 in the middle."""
+    box = table.low, table.high, table.counts
+    lattice = Lattice.between(*box)
     far = lattice.nodes - lattice.nodes.new_tensor(table.center)
-    return torch.exp(-far.square().sum(-1) / (2 * table.width**2))
+    bump = torch.exp(-far.square().sum(-1) / (2 * table.width**2))
+    if table.kind == "distance":
+        # The surface moves outwards where the distance falls.
+        return Theta(DistanceGrid.sampled(name, *box, distance), {"value": -bump}, shape=True)
+    inside = -distance(lattice.nodes.reshape(-1, 3))
+    share = torch.sigmoid(4 * inside / lattice.spacing.mean()).reshape(lattice.counts)
+    cloud = DensityGrid(name, table.low, table.high, table.extinction * share)
+    with torch.no_grad():
+        # σ = softplus(value) / h: this change of the value changes σ by σ times the bump.
+        slope = torch.sigmoid(cloud.value) / torch.nn.functional.softplus(cloud.value)
+        return Theta(cloud, {"value": bump / slope}, shape=True)
 
 
 def _shape(item: Any) -> str:
