@@ -44,9 +44,12 @@ class Sight:
     grid: Grid
     surrogate: SurrogateTable
     weight: float = 1.0  # in the loss
+    table: Any = None  # `[model]` of a plugin
 
     def model(self, sampling: Sampling) -> ForwardModel:
         """The forward model that is fitted."""
+        if self.table is not None:
+            return build.model(self.table, self.grid, build.surrogate(self.surrogate))
         if self.surrogate.exact:
             return ExactMap(self.grid, sampling)
         return SurrogateMap(self.grid, build.surrogate(self.surrogate), sampling)
@@ -121,7 +124,7 @@ def _sight(run: RunFile, weight: float, truth: Scene, console: Console) -> Sight
         grid = build.grid(table, radar)
         console.print("simulating the exact signals of the true scene")
         capture = Capture.from_beat(exact(run, truth, radar, grid).beat, radar)
-        return Sight(capture, radar, grid, run.surrogate, weight)
+        return Sight(capture, radar, grid, run.surrogate, weight, run.model)
     if run.radar is not None:
         raise InputError(
             f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
@@ -129,7 +132,7 @@ def _sight(run: RunFile, weight: float, truth: Scene, console: Console) -> Sight
         )
     capture = measured(data)
     radar = capture.radar()
-    return Sight(capture, radar, build.grid(table, radar), run.surrogate, weight)
+    return Sight(capture, radar, build.grid(table, radar), run.surrogate, weight, run.model)
 
 
 def sought_objects(run: RunFile) -> list[str]:
