@@ -1,21 +1,26 @@
-"""The scalar θ of a gradient check, from the tables of a run file: a module and a tangent."""
+"""The scalar θ of a gradient check: a module, and how its parameters change with θ."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge
 from torch import Tensor, nn
 
-from invertwin.cli import schema
-from invertwin.cli.bodies import template
+from invertwin.cli.bodies import Bodies, template
+from invertwin.cli.materials import MaterialValue
+from invertwin.cli.registry import Group, Registry
+from invertwin.cli.section import Counts, Vector
+from invertwin.cli.shape_tables import ObjectTable, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.lines import Line
 from invertwin.inversion.remeshing import signed_distance
+from invertwin.limits import Positive
 from invertwin.radar.parameters import RadarPose
 from invertwin.radar.radar import Radar
-from invertwin.scene import Scene
+from invertwin.scene import Mesh, Scene
 from invertwin.scene.geometry import (
     DensityGrid,
     DistanceGrid,
@@ -28,19 +33,6 @@ from invertwin.scene.geometry import (
 )
 from invertwin.scene.parameters import MaterialValues, Pose, Scale
 
-UNITS = {
-    "translation": "1/m",
-    "rotation": "1/rad",
-    "scale": "per relative size",
-    "radar_translation": "1/m",
-    "radar_rotation": "1/rad",
-    "joint": "1/rad",
-    "latent": "per unit of the latent",
-    "distance": "1/m",
-    "density": "per relative density",
-}
-"""Units of the derivative of a power, by kind of θ."""
-
 
 @dataclass(frozen=True)
 class Theta:
@@ -48,6 +40,7 @@ class Theta:
 
     module: nn.Module  # maps the scene, or the radar
     tangent: Mapping[str, Tensor]  # how its parameters change with θ, by name
+    unit: str  # of the derivative of a power
     of_radar: bool = False
     shape: bool = False  # whether it changes a shape
 
@@ -62,84 +55,120 @@ class Theta:
         return moved
 
 
-def theta_of(table: schema.GradientParameter, run: schema.RunFile, scene: Scene) -> Theta:
+def register(registry: Registry) -> None:
+    """Adds the kinds of θ."""
+    registry.group(Group("theta"))
+    for name, make in (
+        ("translation", translation),
+        ("rotation", rotation),
+        ("radar_translation", radar_translation),
+        ("radar_rotation", radar_rotation),
+        ("scale", scale),
+        ("material", material),
+        ("joint", joint),
+        ("latent", latent),
+        ("distance", distance),
+        ("density", density),
+    ):
+        registry.add("theta", name, make)
+
+
+def theta_of(table: Any, run: Any, scene: Scene) -> Theta:
     """The θ of a `[gradcheck.parameter]` table, at the scene of the run file.
 
     Raises:
         InputError: The object has no such value, joint, coordinate or shape.
     """
-    name: str = table.object or ""
-    item: Any = run.scene.get(name)
-    match table.kind:
-        case "translation" | "radar_translation" | "rotation" | "radar_rotation":
-            radar = table.kind.startswith("radar")
-            axis, key = _axis(table), table.kind.removeprefix("radar_")
-            # A small q = (1, r) turns by the rotation vector r.
-            change = axis if key == "translation" else torch.cat([axis.new_zeros(1), axis])
-            return Theta(RadarPose() if radar else Pose(name), {key: change}, radar)
-        case "scale":
-            return Theta(Scale(name), {"log_scale": torch.ones((), dtype=torch.float64)})
-        case "material":
-            return _material(name, table.value or "", scene)
-        case "joint":
-            return _joint(name, table, item)
-        case "latent":
-            return _latent(name, table.index or 0, item)
-    return _bump(name, table, partial(signed_distance, scene[name].mesh))
+    name = getattr(table, "object", None)
+    return table.build({} if name is None else given_for(name, scene, Bodies(), run.scene))
 
 
-def _axis(table: schema.GradientParameter) -> Tensor:
-    axis = torch.tensor(table.axis, dtype=torch.float64)
-    return axis / axis.norm()
+def translation(object: str, axis: Vector) -> Theta:
+    """Moves an object."""
+    return Theta(Pose(object), {"translation": _unit(axis)}, "1/m")
 
 
-def _material(name: str, value: str, scene: Scene) -> Theta:
-    material = scene[name].material
-    if value not in vars(material):
+def rotation(object: str, axis: Vector) -> Theta:
+    """Turns an object about its centre."""
+    return Theta(Pose(object), {"rotation": _turn(axis)}, "1/rad")
+
+
+def radar_translation(axis: Vector) -> Theta:
+    """Moves the radar."""
+    return Theta(RadarPose(), {"translation": _unit(axis)}, "1/m", of_radar=True)
+
+
+def radar_rotation(axis: Vector) -> Theta:
+    """Turns the radar."""
+    return Theta(RadarPose(), {"rotation": _turn(axis)}, "1/rad", of_radar=True)
+
+
+def scale(object: str) -> Theta:
+    """Makes an object larger."""
+    change = torch.ones((), dtype=torch.float64)
+    return Theta(Scale(object), {"log_scale": change}, "per relative size")
+
+
+def material(object: str, value: MaterialValue, scene: Scene) -> Theta:
+    """Changes a value of an object's material."""
+    found = scene[object].material
+    if value not in vars(found):
         raise InputError(
-            f"expected a value of {name}'s material ({', '.join(vars(material))}), "
+            f"expected a value of {object}'s material ({', '.join(vars(found))}), "
             f"got {value!r}; choose one"
         )
-    module = MaterialValues(name, **{value: getattr(material, value)})
+    module = MaterialValues(object, **{value: getattr(found, value)})
     key = f"raw.{value}"
     raw = module.get_parameter(key).detach()
 
-    def found(parameter: Tensor) -> Tensor:
+    def read(parameter: Tensor) -> Tensor:
         moved = torch.func.functional_call(module, {key: parameter}, (scene,))
-        return getattr(moved[name].material, value)
+        return getattr(moved[object].material, value)
 
-    slope = torch.func.jvp(found, (raw,), (torch.ones_like(raw),))[1]
-    return Theta(module, {key: torch.ones_like(slope) / slope})
+    slope = torch.func.jvp(read, (raw,), (torch.ones_like(raw),))[1]
+    return Theta(module, {key: torch.ones_like(slope) / slope}, f"per unit of {value}")
 
 
-def _joint(name: str, table: schema.GradientParameter, item: Any) -> Theta:
+def joint(object: str, joint: str, axis: Vector, table: ObjectTable | None = None) -> Theta:
+    """Turns a joint of a body.
+
+    Args:
+        joint: name.
+    """
+    item: Any = table
     if _shape(item) != "body":
-        raise InputError(f'expected an object with shape = "body", got {name}; choose one')
+        raise InputError(f'expected an object with shape = "body", got {object}; choose one')
     body = template(item).scaled(item.scale)
     angles = {
-        joint: torch.tensor(turn, dtype=torch.float64).deg2rad()
-        for joint, turn in item.angles_deg.items()
+        name: torch.tensor(turn, dtype=torch.float64).deg2rad()
+        for name, turn in item.angles_deg.items()
     }
     change = torch.zeros(len(body.parents), 3, dtype=torch.float64)
-    change[body.joint(table.joint or "")] = _axis(table)
-    module = SkinnedBody(name, body, body.rotations(angles))
-    return Theta(module, {"rotation": change}, shape=True)
+    change[body.joint(joint)] = _unit(axis)
+    module = SkinnedBody(object, body, body.rotations(angles))
+    return Theta(module, {"rotation": change}, "1/rad", shape=True)
 
 
-def _latent(name: str, index: int, item: Any) -> Theta:
+def latent(object: str, index: Annotated[int, Ge(0)], table: ObjectTable | None = None) -> Theta:
+    """Changes a coordinate of a vehicle or prior, in standard deviations.
+
+    Args:
+        index: from 0.
+    """
+    item: Any = table
     whole = getattr(item, "scale", None) == 1
     if _shape(item) == "vehicle" and whole and item.max_edge is None:
         start = torch.zeros(max(index + 1, len(item.coefficients)), dtype=torch.float64)
         start[: len(item.coefficients)] = torch.tensor(item.coefficients, dtype=torch.float64)
-        module = LinearShape(name, load_vehicle_space(item.folder, item.level), start)
+        module = LinearShape(object, load_vehicle_space(item.folder, item.level), start)
     elif _shape(item) == "prior" and whole:
         prior = load_prior(item.prior)
         start = torch.zeros(prior.latent_size, dtype=torch.float64)
-        module = PriorShape(name, prior, start.new_tensor(item.latent) if item.latent else start)
+        module = PriorShape(object, prior, start.new_tensor(item.latent) if item.latent else start)
     else:
         raise InputError(
             'expected an object with shape = "vehicle" without max_edge, or "prior", and scale 1, '
-            f"got {name}; choose one"
+            f"got {object}; choose one"
         )
     if index >= len(module.latent):
         raise InputError(
@@ -147,25 +176,73 @@ def _latent(name: str, index: int, item: Any) -> Theta:
         )
     change = torch.zeros_like(module.latent.detach())
     change[index] = 1.0
-    return Theta(module, {"latent": change}, shape=True)
+    return Theta(module, {"latent": change}, "per unit of the latent", shape=True)
 
 
-def _bump(name: str, table: Any, distance: Callable[[Tensor], Tensor]) -> Theta:
-    """A signed distance or a density that changes in a round bump, 1 in the middle."""
-    box = table.low, table.high, table.counts
-    lattice = Lattice.between(*box)
-    far = lattice.nodes - lattice.nodes.new_tensor(table.center)
-    bump = torch.exp(-far.square().sum(-1) / (2 * table.width**2))
-    if table.kind == "distance":
-        # The surface moves outwards where the distance falls.
-        return Theta(DistanceGrid.sampled(name, *box, distance), {"value": -bump}, shape=True)
-    inside = -distance(lattice.nodes.reshape(-1, 3))
+def distance(
+    object: str,
+    center: Vector,
+    width: Positive,
+    low: Vector,
+    high: Vector,
+    counts: Counts,
+    mesh: Mesh,
+) -> Theta:
+    """Moves the surface of a signed distance outwards, in a round bump.
+
+    Args:
+        center: of the bump, in the object's frame [m].
+        width: standard deviation of the bump [m].
+    """
+    inside = partial(signed_distance, mesh)
+    module = DistanceGrid.sampled(object, low, high, counts, inside)
+    # The surface moves outwards where the distance falls.
+    bump = _bump(module.lattice, center, width)
+    return Theta(module, {"value": -bump}, "1/m", shape=True)
+
+
+def density(
+    object: str,
+    center: Vector,
+    width: Positive,
+    low: Vector,
+    high: Vector,
+    counts: Counts,
+    extinction: Positive,
+    mesh: Mesh,
+) -> Theta:
+    """Thickens a cloud in the object's place, in a round bump.
+
+    Args:
+        center: of the bump, in the object's frame [m].
+        width: standard deviation of the bump [m].
+        extinction: of the cloud [1/m].
+    """
+    lattice = Lattice.between(low, high, counts)
+    inside = -signed_distance(mesh, lattice.nodes.reshape(-1, 3))
     share = torch.sigmoid(4 * inside / lattice.spacing.mean()).reshape(lattice.counts)
-    cloud = DensityGrid(name, table.low, table.high, table.extinction * share)
+    cloud = DensityGrid(object, low, high, extinction * share)
     with torch.no_grad():
         # σ = softplus(value) / h: this change of the value changes σ by σ times the bump.
         slope = torch.sigmoid(cloud.value) / torch.nn.functional.softplus(cloud.value)
-        return Theta(cloud, {"value": bump / slope}, shape=True)
+        change = _bump(lattice, center, width) / slope
+    return Theta(cloud, {"value": change}, "per relative density", shape=True)
+
+
+def _unit(axis: Vector) -> Tensor:
+    found = torch.tensor(axis, dtype=torch.float64)
+    return found / found.norm()
+
+
+def _turn(axis: Vector) -> Tensor:
+    """A small q = (1, r) turns by the rotation vector r."""
+    return torch.cat([torch.zeros(1, dtype=torch.float64), _unit(axis)])
+
+
+def _bump(lattice: Lattice, center: Vector, width: float) -> Tensor:
+    """A round bump with this centre and width at the nodes, 1 in the middle."""
+    far = lattice.nodes - lattice.nodes.new_tensor(center)
+    return torch.exp(-far.square().sum(-1) / (2 * width**2))
 
 
 def _shape(item: Any) -> str:

@@ -120,9 +120,7 @@ def sought_values(
     """Material values that are sought, from the values of the scene table.
 
     Args:
-        object: name in the scene.
         values: which are sought.
-        item: the object.
         layer: of a multilayer, from 0: the layer whose values they are.
 
     Raises:

@@ -13,7 +13,7 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.gradients import UNITS, theta_of
+from invertwin.cli.gradients import theta_of
 from invertwin.cli.report import Picture, Table, finish, texts
 from invertwin.cli.run_file import about, about_file, need
 from invertwin.cli.runs import PARTS, RunFolder
@@ -170,9 +170,8 @@ def _check(
         progress=say,
     )
     outer = report.no_interior_edges
-    unit = UNITS.get(table.kind, f"per unit of {table.value}")
-    folder.write_figure(f"{name}.png", _maps(report, grid, unit))
-    moved = [table.object] if table.object else []
+    folder.write_figure(f"{name}.png", _maps(report, grid, theta.unit))
+    moved = [table.object] if hasattr(table, "object") else []
     folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=moved))
     others = {}
     checked = Checked(run, scene, radar, grid, theta.direction(), check.step, report, say)
@@ -227,5 +226,6 @@ def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
 
 def _note(run: RunFile, found: Mapping[str, Any]) -> str:
     parameter = need(run, "gradcheck", "gradcheck").parameter
-    what = f"{parameter.joint or ''} {parameter.kind} of {parameter.object or 'the radar'}".strip()
+    what = f"{parameter.kind} of {getattr(parameter, 'object', 'the radar')}"
+    what = f"{getattr(parameter, 'joint', '')} {what}".strip()
     return f"Derivative with respect to the {what}; {found['seconds']:.0f} s. {run.note}"

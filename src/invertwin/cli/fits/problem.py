@@ -32,7 +32,7 @@ FULL, INTERIOR = "full", "interior_only"
 
 _POINTS_PER_M2 = 2_000.0
 _WIDTHS = ("range_width", "angle_width")
-_OWN = ("radar", "grid", "data", "surrogate", "chirps")  # sections of a sensor
+_OWN = ("radar", "grid", "data", "surrogate", "chirps", "model")  # sections of a sensor
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,11 @@
 
 from invertwin.cli.recordings import SimulatedData
 from invertwin.cli.schema.fits import Initial, Reconstruct, Settings, Stage, Starts, Variant
-from invertwin.cli.schema.gradcheck import Gradcheck, GradientParameter
+from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.schema.run import ObservationTable, Raw, RunFile, SceneFile, Truth
 
 __all__ = [
     "Gradcheck",
-    "GradientParameter",
     "Initial",
     "ObservationTable",
     "Raw",
