@@ -110,7 +110,11 @@ def scale(object: str) -> Theta:
 
 
 def material(object: str, value: MaterialValue, scene: Scene) -> Theta:
-    """Changes a value of an object's material."""
+    """Changes a value of an object's material.
+
+    Args:
+        value: of the material.
+    """
     found = scene[object].material
     if value not in vars(found):
         raise InputError(
