@@ -17,7 +17,7 @@ import pytest
 from invertwin.cli.registry import PLUGINS
 from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
-from invertwin.datasets import rail_sar
+from invertwin_studies.recordings import rail_sar
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]

@@ -1,6 +1,5 @@
 """`invertwin look`: pictures of a recording as it is, and the recording as a capture."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,9 @@ from invertwin.capture import (
 )
 from invertwin.capture.elements import elements
 from invertwin.channel import Grid
+from invertwin.cli.registry import load_plugins, registry
 from invertwin.cli.report import DOPPLER_NOTE, Again, Picture, Table, report_html
 from invertwin.cli.runs import RunFolder
-from invertwin.datasets import openradar, rail_sar
 from invertwin.errors import InputError
 from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
 from invertwin.radar import (
@@ -193,22 +192,18 @@ def _read(look: Look) -> _Recording:
 
 
 def _read_public(look: Look, folder: Path) -> _Recording:
-    readers: dict[str, Callable[[], _Recording]] = {
-        openradar.FILE: lambda: _read_openradar(look, folder),
-        rail_sar.FILE: lambda: _whole("rail_sar", rail_sar.read(folder)),
-    }
-    for file, reader in readers.items():
+    known = load_plugins().recordings
+    for file, (kind, board) in known.items():
         if (folder / file).is_file() and look.recording.name in (file, folder.name):
-            return reader()
+            found = registry.table("data", kind).made_by(str(folder))
+            if isinstance(found, Capture):
+                return _whole(kind, found)
+            arrays = _preset(look, found.chirps, look.board or board)
+            return _of_chirps(kind, found.chirps, arrays, look)
     raise InputError(
-        f"expected a folder with {' or '.join(readers)}, got {look.recording}; of other arrays "
-        "name the TOML description"
+        f"expected a folder with {' or '.join(known) or 'a recording that a plugin reads'}, got "
+        f"{look.recording}; of other arrays name the TOML description"
     )
-
-
-def _read_openradar(look: Look, folder: Path) -> _Recording:
-    data = openradar.read_chirps(folder)
-    return _of_chirps("openradar", data, _preset(look, data, look.board or "xWR1642"), look)
 
 
 def _preset(look: Look, data: ChirpData, board: str | None) -> tuple[AntennaArray, AntennaArray]:
