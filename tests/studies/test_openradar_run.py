@@ -33,6 +33,7 @@ rate = 0.05
 steps = 40
 samples = 800
 """
+SCALE = '[[parameters]]\nkind = "scale"\nobject = "mover"\n'
 
 
 @pytest.fixture
@@ -85,8 +86,14 @@ def test_the_run_file_holds_what_its_note_says(repository, data_folder, tmp_path
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("[optimizer]", "[truth.mover]\nposition = [0.0, 0.0, 3.0]\n\n[optimizer]"), "truth: "),
-        (('kind = "mover"', 'kind = "translation"'), "parameters: expected one of kind mover"),
+        (
+            ("[optimizer]", '[starts]\nobject = "mover"\ndistance = [0.1, 0.1]\n[optimizer]'),
+            "starts: ",
+        ),
+        (
+            ("[optimizer]", f"{SCALE}\n[optimizer]"),
+            "parameters: expected a mover alone, got mover, sc",
+        ),
         (('folder = "openradar"', 'folder = "elsewhere"'), "github.com/PreSenseRadar/OpenRadar"),
         (('folder = "openradar"', 'folder = "openradar"\nboard = { name = "xWR1443" }'), "board"),
         (("diffuse = 0.5", "diffuse = 1.0"), "scene.mover: expected a number between 0 and 1"),
@@ -102,12 +109,12 @@ def test_run_files_that_ask_for_something_else_are_refused(
     assert error.count("\n") == 1
 
 
-def test_a_mover_needs_that_recording(write, monkeypatch, capsys):
+def test_a_mover_needs_chirps(write, monkeypatch, capsys):
     head, rest = RUN.split("[[parameters]]", 1)
     other = rest[rest.index("\n[") :] if "\n[" in rest else ""
     file = write(f'{head}[[parameters]]\nkind = "mover"\nobject = "plate"\n{other}')
     assert call(monkeypatch, "reconstruct", file) == 2
-    assert 'data.kind = "openradar" only, got "simulated"' in capsys.readouterr().err
+    assert "expected a section [chirps] for a mover in simulated data" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -157,7 +157,7 @@ def _latent(
     table: schema.GradientParameter, item: Any
 ) -> tuple[LinearShape | PriorShape, dict[str, Tensor]]:
     index, name = table.index or 0, table.object or ""
-    whole = item is not None and item.scale == 1
+    whole = getattr(item, "scale", None) == 1
     if _shape(item) == "vehicle" and whole and item.max_edge is None:
         start = torch.zeros(max(index + 1, len(item.coefficients)), dtype=torch.float64)
         start[: len(item.coefficients)] = torch.tensor(item.coefficients, dtype=torch.float64)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -35,7 +35,10 @@ from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import evaluated
 from invertwin.scene.parameters import MaterialValues
 
-MaterialValue: Any = Literal[tuple(RANGES)]
+if TYPE_CHECKING:
+    MaterialValue = str
+else:
+    MaterialValue = Literal[tuple(RANGES)]
 _KINDS: Mapping[str, type[Material]] = {
     "rough_dielectric": RoughDielectric,
     "perfect_conductor": PerfectConductor,

@@ -97,6 +97,9 @@ class ChirpTable(DataTable):
     chirp: Annotated[int, Ge(0)] | None = key(
         "number from 0 of one; without it the mean of a frame's, in which movers fade", None
     )
+    frame: Annotated[int, Ge(0)] | None = key(
+        "number from 0 of the only one that is used; without it all", None
+    )
     positions: Track | None = key(
         "m, of the radar in every frame, or one for all; without it the origin", None
     )
@@ -107,6 +110,9 @@ class ChirpTable(DataTable):
     def build(self, given: Any = None, /, **more: Any) -> Recording:
         """The recording with its poses."""
         found: Recording = super().build(given, **more)
+        if self.frame is not None:
+            with about("frame"):
+                found = replace(found, chirps=_frame(found.chirps, self.frame))
         if self.positions is None and self.orientation is None:
             return found
         with about("positions"):
@@ -183,6 +189,15 @@ def recorded(chirps: ChirpData, board: BoardTable) -> Recording:
     with about("board"):
         elements = board_elements(board, settings.transmit_order, settings.receivers)
     return Recording(chirps, elements)
+
+
+def _frame(chirps: ChirpData, number: int) -> ChirpData:
+    if number >= chirps.frame_count:
+        raise InputError(
+            f"expected a number below {chirps.frame_count}, got {number}; count frames from 0"
+        )
+    one = replace(chirps.settings, frames=1)
+    return ChirpData(chirps.samples[number : number + 1], one)
 
 
 def measured(data: Any, path: str = "data") -> Capture:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Gt, Le, Len, MinLen
@@ -49,7 +49,10 @@ from invertwin.scene import Table as PatternTable
 
 _MOST_BINS = 1e9  # 4 GB a map
 Numbers = Annotated[list[Count], MinLen(1)]
-Window: Any = Literal[tuple(WINDOWS)]
+if TYPE_CHECKING:
+    Window = str
+else:
+    Window = Literal[tuple(WINDOWS)]
 Elements = tuple[AntennaArray, AntennaArray]
 
 
