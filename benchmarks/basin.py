@@ -50,9 +50,9 @@ from rich.table import Table
 from torch import Tensor, nn
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid, RoughPoints, Sampling, draw_speckle
-from invertwin.inversion.loss import SpectrumLoss
-from invertwin.inversion.reconstruction import Optimizer, reconstruct
+from invertwin.channel import Grid, Sampling, Speckle, draw_speckle
+from invertwin.inversion import Observation, Optimizer, Schedule, SpectrumLoss, reconstruct
+from invertwin.models import ExactMap, SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate
 from invertwin.scene import AntennaArray, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array
@@ -133,7 +133,7 @@ class Task:
     radar: Radar
     grid: Grid
     scene: Scene
-    points: RoughPoints | None
+    speckle: Speckle
     beat: Tensor
 
     @staticmethod
@@ -149,10 +149,11 @@ class Task:
         with torch.no_grad():
             scene = Place(0.0, 0.0, radar.beamwidth[0])(Scene({"panel": panel}))
             drawn = Sampling(depth=1, points_per_m2=DENSITY)
-            points = draw_speckle(scene, radar.link(), drawn, seed).points
-            found = simulate(scene, radar, grid, points=points, snr_db=SNR_DB, seed=seed, depth=1)
-        assert found.beat is not None
-        return Task(seed, radar, grid, scene, points, found.beat)
+            speckle = draw_speckle(scene, radar.link(), drawn, seed)
+            found = simulate(
+                scene, radar, grid, seed=seed, sampling=drawn, speckle=speckle, snr_db=SNR_DB
+            )
+        return Task(seed, radar, grid, scene, speckle, found.beat)
 
     def fit(self, method: str, cells: float, beamwidths: float) -> tuple[float, float]:
         """Where a method takes the panel from a start [range cells, beamwidths off the truth]."""
@@ -161,23 +162,20 @@ class Task:
             radar = replace(radar, window="rectangular")
             grid = _grid(radar, oversample=3)
         module = Place(cells, beamwidths, radar.beamwidth[0])
+        drawn = Sampling(depth=1, samples=10_000, boundary_samples=2_000)
         for stage in STAGES[method]:
+            model = (
+                ExactMap(grid, replace(drawn, boundary=False), self.speckle)
+                if stage.kernel == "exact"
+                else SurrogateMap(grid, stage.kernel, drawn)
+            )
             reconstruct(
                 self.scene,
-                radar,
-                Capture.from_beat(self.beat, radar),
-                [module],
-                grid=grid,
+                Observation(model, radar, Capture.from_beat(self.beat, radar)),
+                module,
                 loss=LOSS,
-                surrogate=stage.kernel,
-                annealing=ANNEALING,
                 optimizer=Optimizer(rate=stage.rate, final_rate=stage.final_rate),
-                steps=stage.steps,
-                samples=10_000,
-                boundary_samples=2_000,
-                boundary=stage.kernel != "exact",
-                depth=1,
-                points=self.points,
+                schedule=Schedule(stage.steps, ANNEALING),
                 seed=self.seed,
             )
         return float(module.cells.detach()), float(module.beamwidths.detach())

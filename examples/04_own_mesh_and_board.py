@@ -38,7 +38,6 @@ grid = radar.grid(range_min=0.5, range_max=4.0)
 sampling = iw.Sampling(depth=1, samples=400_000)
 simulated = iw.simulate(scene, radar, grid, seed=1, sampling=sampling, noise_figure_db=15.0)
 # ADC samples of a real board go the same way: complex [frame, tx, rx, sample].
-assert simulated.beat is not None
 capture = iw.Capture.from_beat(simulated.beat, radar)
 capture.save(folder / "ball.nc")
 

@@ -27,7 +27,8 @@ nan 0 0
 3 0 1 2
 """
 MEASURED = (RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]).replace(
-    'kind = "simulated"\ndensity = 2e3\nsnr_db = 20.0', 'kind = "capture"\nfile = "data.nc"'
+    'kind = "simulated"\ndepth = 1\ndensity = 2e3\nsnr_db = 20.0',
+    'kind = "capture"\nfile = "data.nc"',
 )
 RAIL = MEASURED.replace('"capture"\nfile = "data.nc"', '"rail_sar"\nfolder = "rail_sar"')
 SOUGHT = 'kind = "translation"\nobject = "plate"'

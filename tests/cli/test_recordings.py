@@ -22,7 +22,7 @@ from invertwin.radar.boards import board
 BOARD = {"name": "xWR1843", "elevation": -1, "transmitters": [1, 3, 2]}
 WAVE = RADAR["waveform"]
 MEASURED = RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]
-SIMULATED = 'kind = "simulated"\ndensity = 2e3\nsnr_db = 20.0\n'
+SIMULATED = 'kind = "simulated"\ndepth = 1\ndensity = 2e3\nsnr_db = 20.0\n'
 # The plate before the wall, seen by a board with two transmitters.
 TRAIN = (
     (
@@ -265,6 +265,8 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
         "positions": [[0, 0, -1]],
         "orientation": {"rotation_deg": [0, 90, 0]},
     }
+    second = measured(data_table(**table, frame=1))
+    assert torch.equal(second.beat, plain.beat[1:])
     placed = measured(data_table(**table, **changes))
     expected = chirps.samples[:, 2] / ChannelCalibration(gains).gains[..., None]
     torch.testing.assert_close(placed.beat, expected)
@@ -280,6 +282,7 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
         ({"file": "none.toml"}, r"data\.file: .*none\.toml"),
         ({"positions": [[0, 0, 0]] * 3}, "data: expected .* along frame"),
         ({"chirp": 8}, "data: .*number from 0 to 7"),
+        ({"frame": 2}, r"data\.frame: expected a number below 2, got 2"),
         ({"channels": "none.json"}, r"data\.channels: .*none\.json"),
         ({"board": {"name": "xWR1642", "transmitters": [1]}}, r"data\.board: .*remove the key"),
         ({"orientation": {"look_at": [0, 1, 0]}}, r"data\.positions: "),

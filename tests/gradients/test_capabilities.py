@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -18,7 +18,9 @@ from invertwin.capture.track import Track
 from invertwin.channel import Sampling, deposit_power, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import gradcheck
+from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.lines import line_of
+from invertwin.models import SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum, surrogate_spectrum
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.scene import (
@@ -42,8 +44,6 @@ from invertwin.scene.parameters import (
     Vertices,
 )
 from scenes import float64, occluder, relative
-
-Moves = Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "limitations.md"
 MECHANISMS = {
@@ -99,62 +99,50 @@ def field_radar(wavelength: float) -> Radar:
     return Radar(one, one, FMCW(middle - 0.5e9, 1e9, 50e-6, 32), float64(places))
 
 
-def on_scene(module: nn.Module, values: Callable[[Tensor], dict[str, Tensor]]) -> Moves:
-    return lambda scene, radar, theta: (functional_call(module, values(theta), (scene,)), radar)
+@dataclass(frozen=True)
+class Move:
+    """What θ changes: a parameter of a module of the scene or the radar, along a tangent."""
+
+    module: nn.Module
+    tangent: dict[str, Tensor]
+    of: Literal["scene", "sensor"] = "scene"
+    wall: Material | None = None  # in place of the scene's
+
+    def start(self, scene: Scene) -> Scene:
+        return scene if self.wall is None else scene.replace("wall", material=self.wall)
+
+    def __call__(self, scene: Scene, radar: Radar, theta: Tensor) -> tuple[Scene, Radar]:
+        scene = self.start(scene)
+        if self.of == "scene":
+            return line_of(self.module, self.tangent, scene).at(theta), radar
+        return scene, line_of(self.module, self.tangent, radar).at(theta)
 
 
-def on_radar(module: nn.Module, values: Callable[[Tensor], dict[str, Tensor]]) -> Moves:
-    return lambda scene, radar, theta: (scene, functional_call(module, values(theta), (radar,)))
-
-
-def material(name: str, start: float, wall: Material | None = None) -> Moves:
+def material(name: str, start: float, wall: Material | None = None) -> Move:
     """A value of the wall's material, which is another one if ``wall`` is given."""
     values: dict[str, Any] = {name: start}
     module = MaterialValues("wall", **values)
-    raw = module.raw[name].detach()
-    moves = on_scene(module, lambda theta: {f"raw.{name}": raw + theta})
-    if wall is None:
-        return moves
-    return lambda scene, radar, theta: moves(scene.replace("wall", material=wall), radar, theta)
+    return Move(module, {f"raw.{name}": float64(1.0)}, wall=wall)
 
 
-def turned(axis: list[float]) -> Callable[[Tensor], Tensor]:
-    return lambda theta: torch.cat([torch.ones(1, dtype=torch.float64), theta * float64(axis)])
-
-
-def soft() -> Moves:
+def soft() -> Move:
     """The occluder as a soft ball, whose densities change at random."""
     reach = [0.3, 0.3, 0.3]
-    module = DensityGrid.even("occluder", [-x for x in reach], reach, (9, 9, 9))
-    ball = 15 * torch.sigmoid((0.2 - module.lattice.nodes.norm(dim=-1)) / 0.03)
+    nodes = DensityGrid.even("occluder", [-x for x in reach], reach, (9, 9, 9)).lattice.nodes
+    ball = 15 * torch.sigmoid((0.2 - nodes.norm(dim=-1)) / 0.03)
     change = torch.randn(ball.shape, generator=torch.Generator().manual_seed(2)).double()
-    value = DensityGrid("occluder", [-x for x in reach], reach, ball).value.detach()
-    return on_scene(module, lambda theta: {"value": value + theta * change})
+    return Move(DensityGrid("occluder", [-x for x in reach], reach, ball), {"value": change})
 
 
 CORNERS = float64([[1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.3]])
-STILL = float64([0.0, 0.0, 0.0])
-MOVES: dict[str, Moves] = {
-    "translation": on_scene(
-        Translation("occluder"), lambda theta: {"translation": theta * float64([0.9, 0.3, 0.1])}
-    ),
-    "pose": on_scene(
-        Pose("occluder"),
-        lambda theta: {"translation": STILL, "rotation": turned([0.2, 0.9, 0.6])(theta)},
-    ),
-    "scale": on_scene(Scale("occluder"), lambda theta: {"log_scale": theta}),
-    "vertices": on_scene(Vertices("occluder", 4), lambda theta: {"offsets": theta * CORNERS}),
-    "radar position": on_radar(
-        RadarPose(),
-        lambda theta: {
-            "translation": theta * float64([0.9, 0.3, 0.1]),
-            "rotation": turned([0, 0, 0])(theta),
-        },
-    ),
-    "radar rotation": on_radar(
-        RadarPose(),
-        lambda theta: {"translation": STILL, "rotation": turned([0.2, 0.9, 0.1])(theta)},
-    ),
+ASIDE = {"translation": float64([0.9, 0.3, 0.1])}
+MOVES: dict[str, Move] = {
+    "translation": Move(Translation("occluder"), ASIDE),
+    "pose": Move(Pose("occluder"), {"rotation": float64([0.0, 0.2, 0.9, 0.6])}),
+    "scale": Move(Scale("occluder"), {"log_scale": float64(1.0)}),
+    "vertices": Move(Vertices("occluder", 4), {"offsets": CORNERS}),
+    "radar position": Move(RadarPose(), ASIDE, "sensor"),
+    "radar rotation": Move(RadarPose(), {"rotation": float64([0.0, 0.2, 0.9, 0.1])}, "sensor"),
     "permittivity": material("permittivity", 4.0),
     # As lossy as it is dense, so that the derivative is no small difference of two angles.
     "conductivity": material("conductivity", 10.0),
@@ -167,7 +155,7 @@ MOVES: dict[str, Moves] = {
 }
 
 
-def clock() -> tuple[Radar, Moves]:
+def clock() -> tuple[Radar, Move]:
     """A radar on a track, and the module that shifts its clock."""
     times = torch.linspace(0, 1, 3, dtype=torch.float64)
     path = float64([[-0.5, 0.0, 0.0], [0.5, 0.1, 0.1]])
@@ -178,7 +166,7 @@ def clock() -> tuple[Radar, Moves]:
     capture = Capture.from_range_profile(
         profile, torch.arange(8).double() * 0.1 + 1, single, times, track=track
     )
-    return radar, on_radar(ClockOffset(capture.positions), lambda theta: {"shift": theta})
+    return radar, Move(ClockOffset(capture.positions), {"shift": float64(1.0)}, "sensor")
 
 
 @dataclass(frozen=True)
@@ -193,20 +181,30 @@ class Found:
 
 def power_case(parameter: str) -> Found:
     scene = occluder(wall=ROUGH, occluder=ROUGH)
-    radar, moves = clock() if parameter == "clock offset" else (power_radar(), MOVES[parameter])
-    report = gradcheck(
-        scene,
-        radar,
+    radar, move = clock() if parameter == "clock offset" else (power_radar(), MOVES[parameter])
+    model = SurrogateMap(
         radar.grid(0.4, 2.8, 0.6, oversample=1),
-        moves,
-        surrogate=Surrogate("gaussian", range_width=2.0, angle_width=1.0),
-        samples=200_000 * radar.frame_count,
-        boundary_samples=50_000 * radar.frame_count,
-        depth=1,
+        Surrogate("gaussian", range_width=2.0, angle_width=1.0),
+        Sampling(
+            depth=1,
+            samples=200_000 * radar.frame_count,
+            boundary_samples=50_000 * radar.frame_count,
+        ),
+    )
+    check = Check(
         repeats=2,
         difference_samples=300_000 * radar.frame_count,
         noise=0.01,
         max_pairs=16,
+    )
+    report = gradcheck(
+        model,
+        move.module,
+        move.tangent,
+        scene=move.start(scene),
+        sensor=radar,
+        of=move.of,
+        check=check,
     )
     return Found(
         report.gradient, report.interior_gradient, report.difference, report.difference_noise

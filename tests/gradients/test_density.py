@@ -2,10 +2,11 @@
 
 import pytest
 import torch
-from torch import Tensor
 
-from invertwin.inversion.gradcheck import gradcheck
-from invertwin.radar import Radar, Surrogate
+from invertwin.channel import Sampling
+from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.models import SurrogateMap
+from invertwin.radar import Surrogate
 from invertwin.scene import DensityGrid, Scene, plate
 from scenes import radar, thing
 
@@ -20,27 +21,20 @@ def test_gradient_by_densities_is_that_of_converged_differences():
     module = DensityGrid.even("object", LOW, HIGH, (10, 9, 8))
     distance = module.lattice.nodes.norm(dim=-1)
     module = DensityGrid("object", LOW, HIGH, 15 * torch.sigmoid((0.22 - distance) / 0.03))
-    value = module.value.detach()
-    change = torch.randn(value.shape, generator=torch.Generator().manual_seed(2)).double()
-
-    def direction(found: Scene, seen: Radar, theta: Tensor) -> tuple[Scene, Radar]:
-        return torch.func.functional_call(module, {"value": value + theta * change}, (found,)), seen
-
+    change = torch.randn(module.value.shape, generator=torch.Generator().manual_seed(2)).double()
     device = radar()
-    report = gradcheck(
-        module(scene),
-        device,
+    model = SurrogateMap(
         device.grid(0.4, 2.8, 0.6, oversample=1),
-        direction,
-        surrogate=Surrogate("gaussian", range_width=2.0, angle_width=1.0),
-        depth=1,
-        samples=300_000,
-        boundary_samples=1000,
-        repeats=2,
-        step=0.02,
-        difference_samples=300_000,
-        noise=0.008,
-        max_pairs=8,
+        Surrogate("gaussian", range_width=2.0, angle_width=1.0),
+        Sampling(depth=1, samples=300_000, boundary_samples=1000),
+    )
+    report = gradcheck(
+        model,
+        module,
+        change,
+        scene=scene,
+        sensor=device,
+        check=Check(repeats=2, step=0.02, difference_samples=300_000, noise=0.008, max_pairs=8),
         seed=1,
     )
     print(f"L1 {report.full.relative_l1:.4f}, noise {report.difference_noise:.4f}")

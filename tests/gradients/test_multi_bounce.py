@@ -1,13 +1,11 @@
 """The gradient scenes of several bounces, in small: fewer samples than the run files ask for."""
 
-import math
 from pathlib import Path
 
 import pytest
 
-from invertwin.cli import build
-from invertwin.cli.run_file import load_run
-from invertwin.inversion.gradcheck import Direction, GradientReport, gradcheck
+from gradients.run_files import check_run
+from invertwin.inversion.gradcheck import Check, GradientReport
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "multi_bounce"
 
@@ -18,28 +16,11 @@ def test_all_scenes_are_here():
 
 
 def checked(name: str, samples: int, boundary_samples: int, pairs: int) -> GradientReport:
-    run = load_run(FOLDER / f"{name}.toml")
-    assert run.radar is not None
-    assert run.grid is not None
-    assert run.gradcheck is not None
-    radar, settings = build.radar(run.radar), run.gradcheck
-    table = settings.parameter
-    x, y, z = table.axis or (1.0, 0.0, 0.0)
-    return gradcheck(
-        build.scene(run),
-        radar,
-        build.grid(run.grid, radar),
-        Direction(table.kind, table.object or "", (x, y, z)),
-        surrogate=build.surrogate(run.surrogate),
-        depth=settings.depth,
+    return check_run(
+        FOLDER / f"{name}.toml",
         samples=samples,
         boundary_samples=boundary_samples,
-        repeats=2,
-        step=math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0,
-        difference_samples=2 * samples,
-        noise=0.0,
-        max_pairs=pairs,
-        seed=1,
+        check=Check(repeats=2, difference_samples=2 * samples, noise=0.0, max_pairs=pairs),
     )
 
 

@@ -1,16 +1,16 @@
 """Every gradient scene of the experiments, in small: fewer samples, a smoother map."""
 
-import math
 from pathlib import Path
 
 import pytest
 
-from invertwin.cli import build
-from invertwin.cli.run_file import load_run
-from invertwin.inversion.gradcheck import Direction, gradcheck
+from gradients.run_files import check_run
+from invertwin.channel import Sampling
+from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.models import SurrogateMap
 from invertwin.radar import Surrogate
-from invertwin.scene import Scene, plate, sphere
-from scenes import radar, thing
+from invertwin.scene import Scene, Translation, plate, sphere
+from scenes import float64, radar, thing
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "one_bounce"
 FILES = sorted(FOLDER.glob("*.toml"))
@@ -30,29 +30,13 @@ def test_all_scenes_are_here():
 
 @pytest.mark.parametrize("file", FILES, ids=[file.stem for file in FILES])
 def test_gradient_is_that_of_converged_differences(file):
-    run = load_run(file)
-    assert run.radar is not None
-    assert run.grid is not None
-    assert run.gradcheck is not None
-    sensor, settings = build.radar(run.radar), run.gradcheck
-    table = settings.parameter
-    x, y, z = table.axis or (1.0, 0.0, 0.0)
-    report = gradcheck(
-        build.scene(run),
-        sensor,
-        sensor.grid(run.grid.range_min, run.grid.range_max, run.grid.u_max, oversample=1),
-        Direction(table.kind, table.object or "", (x, y, z)),
-        surrogate=Surrogate("gaussian", range_width=1.5, angle_width=1.0),
-        depth=settings.depth,
+    report = check_run(
+        file,
         samples=400_000,
         boundary_samples=100_000,
-        repeats=3,
-        step=math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0,
-        difference_samples=500_000,
-        noise=0.01,
-        max_pairs=16,
-        sampling=settings.sampling,
-        seed=1,
+        check=Check(repeats=3, difference_samples=500_000, noise=0.01, max_pairs=16),
+        surrogate=Surrogate("gaussian", range_width=1.5, angle_width=1.0),
+        oversample=1,
     )
     assert report.difference_noise < 0.015
     assert report.full.relative_l1 < 0.03
@@ -70,19 +54,18 @@ def test_a_fine_mesh_keeps_its_silhouette(axis):
     ball = thing(sphere(0.2, 5), (0.05, 0.02, 1.1))
     scene = Scene({"wall": thing(plate(2.4, 2.4, divisions=2), (0, 0, 2)), "ball": ball})
     seen = radar()
-    report = gradcheck(
-        scene,
-        seen,
+    model = SurrogateMap(
         seen.grid(0.7, 2.6, 0.6, oversample=1),
-        Direction("translation", "ball", axis),
-        surrogate=Surrogate("gaussian", range_width=2.0, angle_width=1.0),
-        depth=1,
-        samples=1_000_000,
-        boundary_samples=400_000,
-        repeats=2,
-        difference_samples=1_500_000,
-        noise=0.015,
-        max_pairs=8,
+        Surrogate("gaussian", range_width=2.0, angle_width=1.0),
+        Sampling(depth=1, samples=1_000_000, boundary_samples=400_000),
+    )
+    report = gradcheck(
+        model,
+        Translation("ball"),
+        float64(axis),
+        scene=scene,
+        sensor=seen,
+        check=Check(repeats=2, difference_samples=1_500_000, noise=0.015, max_pairs=8),
     )
     assert report.difference_noise < 0.02
     assert report.full.relative_l1 < 0.03

@@ -5,10 +5,11 @@ import math
 
 import pytest
 import torch
-from invertwin.inversion.shape_directions import ShapeDirection, along, along_field
-from torch import Tensor
+from torch import Tensor, nn
 
-from invertwin.inversion.gradcheck import gradcheck
+from invertwin.channel import Sampling
+from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.models import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import Mesh, Scene, box, plate, rigid, rotation_from_vector, sphere
 from invertwin.scene.geometry import (
@@ -28,6 +29,7 @@ from invertwin.scene.geometry import (
 )
 from scenes import float64, radar, thing
 
+Line = tuple[Scene, nn.Module, dict[str, Tensor]]
 LOW, HIGH = [-0.45, -0.4, -0.35], [0.45, 0.4, 0.35]
 
 
@@ -74,7 +76,7 @@ def space() -> ShapeSpace:
     )
 
 
-def distance_grid() -> tuple[Scene, ShapeDirection]:
+def distance_grid() -> Line:
     def ellipsoid(points: Tensor) -> Tensor:
         return 0.2 * ((points / float64([0.3, 0.2, 0.2])).norm(dim=1) - 1)
 
@@ -82,10 +84,10 @@ def distance_grid() -> tuple[Scene, ShapeDirection]:
     scene = before_a_wall(sphere(0.2, 1))
     # Values on one side fall: the surface moves outwards there.
     change = -(module.lattice.nodes[..., 0] > 0.1).double()
-    return module(scene), along_field(module, scene, value=change)
+    return scene, module, {"value": change}
 
 
-def neural_distance() -> tuple[Scene, ShapeDirection]:
+def neural_distance() -> Line:
     module = NeuralDistance(
         "object", LOW, HIGH, (13, 12, 11), radius=0.22, width=8, frequency=3.0, seed=1
     )
@@ -94,7 +96,7 @@ def neural_distance() -> tuple[Scene, ShapeDirection]:
     weights[name].data = 0.03 * noise(weights[name].shape)
     scene = before_a_wall(sphere(0.2, 1))
     change = noise(weights[name].shape, 4)
-    return module(scene), along_field(module, scene, **{name: change})
+    return scene, module, {name: change}
 
 
 def small_prior(size: float = 0.13) -> ShapePrior:
@@ -107,7 +109,7 @@ def small_prior(size: float = 0.13) -> ShapePrior:
     return ShapePrior(decoder, lattice)
 
 
-def prior_latent() -> tuple[Scene, ShapeDirection]:
+def prior_latent() -> Line:
     prior = small_prior()
     module = PriorShape(
         "object", prior, 0.5 * noise(torch.Size([prior.latent_size]), 5), (56, 21, 20)
@@ -121,36 +123,36 @@ def prior_latent() -> tuple[Scene, ShapeDirection]:
     )
     scene = start.replace("object", pose=turned)
     change = 8.0 * noise(torch.Size([prior.latent_size]), 6)
-    return module(scene), along_field(module, scene, latent=change)
+    return scene, module, {"latent": change}
 
 
-def latent() -> tuple[Scene, ShapeDirection]:
+def latent() -> Line:
     module = LinearShape("object", space(), [0.1, 0.2])
-    return module(before_a_wall(box(0.1))), along(module, latent=float64([5.0, -10.0]))
+    return before_a_wall(box(0.1)), module, {"latent": float64([5.0, -10.0])}
 
 
-def joint_angle() -> tuple[Scene, ShapeDirection]:
+def joint_angle() -> Line:
     module = SkinnedBody("object", arm(), [[0, 0, 0.1], [0.0, 0.2, 0.5]])
     turn = float64([[0, 0, 0], [0, 0.5, 3.0]])
-    return module(before_a_wall(box(0.1))), along(module, rotation=turn)
+    return before_a_wall(box(0.1)), module, {"rotation": turn}
 
 
-def skinning() -> tuple[Scene, ShapeDirection]:
+def skinning() -> Line:
     module = SkinnedBody("object", skin(), [[0, 0, 0.1], [0.0, 0.2, 0.5]])
     turn = float64([[0, 0, 2.0], [0, 1.0, 4.0]])
-    return module(before_a_wall(box(0.1))), along(module, rotation=turn)
+    return before_a_wall(box(0.1)), module, {"rotation": turn}
 
 
-def lattice() -> tuple[Scene, ShapeDirection]:
+def lattice() -> Line:
     scene = before_a_wall(sphere(0.2, 3))
     module = LatticeDeformation("object", LOW, HIGH, (3, 3, 3))
-    return scene, along(module, offsets=noise(module.offsets.shape, 2))
+    return scene, module, {"offsets": noise(module.offsets.shape, 2)}
 
 
-def smooth_vertices() -> tuple[Scene, ShapeDirection]:
+def smooth_vertices() -> Line:
     ball = sphere(0.2, 3)
     module = SmoothVertices("object", ball, 10.0)
-    return before_a_wall(ball), along(module, latent=6.0 * noise(module.latent.shape, 3))
+    return before_a_wall(ball), module, {"latent": 6.0 * noise(module.latent.shape, 3)}
 
 
 CASES = [
@@ -162,24 +164,21 @@ CASES = [
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=[case.__name__ for case in CASES])
 def test_gradient_is_that_of_converged_differences(case):
-    scene, direction = case()
+    scene, module, tangent = case()
     device = radar()
-    report = gradcheck(
-        scene,
-        device,
+    model = SurrogateMap(
         device.grid(0.4, 2.8, 0.6, oversample=1),
-        direction,
-        surrogate=Surrogate("gaussian", range_width=2.0, angle_width=1.0),
-        depth=1,
-        samples=400_000,
-        boundary_samples=200_000,
+        Surrogate("gaussian", range_width=2.0, angle_width=1.0),
+        Sampling(depth=1, samples=400_000, boundary_samples=200_000),
+    )
+    check = Check(
         repeats=3,
         step=2e-3 if "distance" in case.__name__ else 6e-3,
         difference_samples=1_000_000,
         noise=0.008,
         max_pairs=24,
-        seed=1,
     )
+    report = gradcheck(model, module, tangent, scene=scene, sensor=device, check=check, seed=1)
     print(
         f"L1 {report.full.relative_l1:.4f}, interior {report.interior.relative_l1:.3f}, "
         f"noise {report.difference_noise:.4f}, {report.pairs} pairs"

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.inversion import Optimizer
 from invertwin.radar import Radar, Surrogate
 from invertwin.scene import Scene, plate
@@ -17,6 +17,7 @@ from invertwin.simulation import simulate
 from scenes import float64, radar, thing
 
 OFFSET = float64([0.06, 0.0, -0.09])
+DRAWN = Sampling(depth=1, points_per_m2=3_000.0)
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Case:
     grid: Grid
 
     def settings(self, **changes: Any) -> dict[str, Any]:
-        """Keyword arguments of ``reconstruct``."""
+        """Keyword arguments of ``fits.fit``."""
         return {
             "grid": self.grid,
             "steps": 30,
@@ -68,6 +69,5 @@ def case() -> Case:
     grid = device.grid(1.0, 2.4, 0.5, oversample=1)
     with torch.no_grad():
         true = Translation("plate", OFFSET)(scene)
-        beat = simulate(true, device, grid, depth=1, density=3_000.0, seed=7).beat
-    assert beat is not None
+        beat = simulate(true, device, grid, sampling=DRAWN, seed=7).beat
     return Case(scene, device, Capture.from_beat(beat, device), grid)

@@ -9,15 +9,22 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 
+from fits import fit
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
-from invertwin.inversion import Optimizer, SpectrumLoss, reconstruct
+from invertwin.inversion import Optimizer, SpectrumLoss
 from invertwin.inversion.gauss_newton import GaussNewton
+from invertwin.inversion.loss import Maps, Objective
 from invertwin.radar import surrogate_spectrum
 from invertwin.scene.parameters import Pose, Translation
 from scenes import float64
 
 SHAPE = (2, 8, 6, 1)
+
+
+def alone(loss: Any) -> Objective:
+    """The objective of one observation."""
+    return Objective((loss,), (1.0,))
 
 
 def random_map(seed: int) -> Tensor:
@@ -47,8 +54,8 @@ TRUTH = [0.4, -0.3, 0.0]
 def test_linear_maps_are_solved_in_a_few_steps(kind, gain):
     model, measured = Mixture([0.0, 0.0, 0.0]), Mixture(TRUTH)().detach()
     scale = 3.0 if gain == "fitted" else 1.0
-    solver = GaussNewton(model, SpectrumLoss(kind, gain=gain), damping=1e-4)
-    losses = [solver.step(lambda: (model(), scale * measured)) for _ in range(6)]
+    solver = GaussNewton(model, alone(SpectrumLoss(kind, gain=gain)), damping=1e-4)
+    losses = [solver.step(lambda: [(model(), scale * measured)]) for _ in range(6)]
     assert torch.allclose(model.share.detach(), float64(TRUTH), atol=1e-4)
     assert losses[-1] < 1e-6 * losses[0]
     assert isinstance(model.share, nn.Parameter)
@@ -74,11 +81,13 @@ def test_curvature_is_the_second_derivative_at_the_truth(kind, background):
 
 def test_reaches_of_parameters_are_their_own():
     model, measured = Mixture([0.0, 0.0, 0.0]), Mixture(TRUTH)().detach()
-    solver = GaussNewton(model, SpectrumLoss(gain="one"), reaches={model.share: 0.1})
-    solver.step(lambda: (model(), measured))
+    solver = GaussNewton(model, alone(SpectrumLoss(gain="one")), reaches={model.share: 0.1})
+    solver.step(lambda: [(model(), measured)])
     assert float(model.share.detach().abs().max()) == pytest.approx(0.1)
-    rates = Optimizer("gauss_newton", rate=0.3, module_rates=(0.2, None))
-    built = rates.build(nn.ModuleList([Translation("a"), Pose("b")]), SpectrumLoss())
+    rates, first = Optimizer("gauss_newton", rate=0.3), Translation("a")
+    built = rates.build(
+        nn.ModuleList([first, Pose("b")]), alone(SpectrumLoss()), {first.translation: 0.2}
+    )
     assert isinstance(built, GaussNewton)
     assert built.reach.tolist() == [0.2] * 3 + [0.3] * (len(built.reach) - 3)
 
@@ -95,7 +104,7 @@ def test_what_a_gain_explains_tells_nothing():
 def test_a_fixed_coordinate_stays_to_the_last_bit():
     model = Mixture([0.1, 0.2, 0.123456789])
     measured = Mixture(TRUTH)().detach()
-    GaussNewton(model, SpectrumLoss()).step(lambda: (model(), measured))
+    GaussNewton(model, alone(SpectrumLoss())).step(lambda: [(model(), measured)])
     assert float(model.share[2].detach()) == 0.123456789
     assert float(model.share[0].detach()) != 0.1
 
@@ -103,7 +112,7 @@ def test_a_fixed_coordinate_stays_to_the_last_bit():
 def test_no_step_is_longer_than_its_reach_and_none_makes_it_worse():
     measured = Mixture(TRUTH)().detach()
     model = Mixture([0.0, 0.0, 0.0])
-    GaussNewton(model, SpectrumLoss(), reach=0.01).step(lambda: (model(), measured))
+    GaussNewton(model, alone(SpectrumLoss()), reach=0.01).step(lambda: [(model(), measured)])
     assert float(model.share.detach().abs().max()) == pytest.approx(0.01, rel=1e-6)
 
     class Wrong(Mixture):
@@ -113,11 +122,11 @@ def test_no_step_is_longer_than_its_reach_and_none_makes_it_worse():
             return self.base + torch.tensordot(2 * self.share.detach() - self.share, self.parts, 1)
 
     wrong = Wrong([0.0, 0.0, 0.0])
-    solver = GaussNewton(wrong, SpectrumLoss(gain="one"))
-    solver.step(lambda: (wrong(), measured))
+    solver = GaussNewton(wrong, alone(SpectrumLoss(gain="one")))
+    solver.step(lambda: [(wrong(), measured)])
     assert torch.equal(wrong.share.detach(), torch.zeros(3, dtype=torch.float64))
     assert solver.damping > 0.01
-    again = GaussNewton(wrong, SpectrumLoss())
+    again = GaussNewton(wrong, alone(SpectrumLoss()))
     again.load_state_dict(solver.state_dict())
     assert again.damping == solver.damping
 
@@ -128,12 +137,12 @@ def test_a_curvature_serves_several_steps():
 
     def asked(every: int) -> tuple[int, Tensor]:
         model, count = Mixture([0.0, 0.0, 0.0]), 0
-        solver = GaussNewton(model, SpectrumLoss(gain="one"), damping=1e-4, every=every)
+        solver = GaussNewton(model, alone(SpectrumLoss(gain="one")), damping=1e-4, every=every)
 
-        def maps() -> tuple[Tensor, Tensor]:
+        def maps() -> Maps:
             nonlocal count
             count += forward_ad.unpack_dual(model.share).tangent is not None
-            return model(), measured
+            return [(model(), measured)]
 
         for _ in range(6):
             solver.step(maps)
@@ -151,12 +160,12 @@ def test_a_kept_curvature_goes_on_from_a_checkpoint():
 
     def steps(count: int, state: Any = None) -> tuple[Tensor, dict[str, Any]]:
         model = Mixture([0.0, 0.0, 0.0])
-        solver = GaussNewton(model, SpectrumLoss(), reach=0.1, every=4)
+        solver = GaussNewton(model, alone(SpectrumLoss()), reach=0.1, every=4)
         if state is not None:
             solver.load_state_dict(state[1])
             model.share.data.copy_(state[0])
         for _ in range(count):
-            solver.step(lambda: (model(), measured))
+            solver.step(lambda: [(model(), measured)])
         return model.share.detach().clone(), solver.state_dict()
 
     assert torch.equal(steps(6)[0], steps(3, steps(3))[0])
@@ -166,10 +175,10 @@ def test_a_penalty_takes_part_with_its_own_curvature():
     model = Mixture([0.0, 0.0, 0.0])
     measured = Mixture([0.0, 0.0, 0.0])().detach()
     wish = float64([0.2, 0.1, 0.0])
-    heavy = GaussNewton(model, SpectrumLoss(gain="one"), damping=1e-4)
+    heavy = GaussNewton(model, alone(SpectrumLoss(gain="one")), damping=1e-4)
     for _ in range(3):
         heavy.step(
-            lambda: (model(), measured),
+            lambda: [(model(), measured)],
             lambda: 1e4 * (model.share * model.free - wish).square().sum(),
         )
     assert torch.allclose(model.share.detach(), wish, atol=1e-4)
@@ -179,12 +188,12 @@ def test_a_displaced_plate_is_found_in_eight_steps(case):
     """The same plate takes Adam 60 steps (test_reconstruction). The array tells nothing of y."""
     module = Translation("plate", axes="xz")
     surrogate = case.settings()["surrogate"]
-    solver = GaussNewton(module, SpectrumLoss(), reach=0.1)
+    solver = GaussNewton(module, alone(SpectrumLoss()), reach=0.1)
     for step in range(8):
         left = max(0.0, 1 - step / 5)
         kernels = replace(surrogate, range_width=2 * left, angle_width=left)
 
-        def maps(step: int = step, kernels: Any = kernels) -> tuple[Tensor, Tensor]:
+        def maps(step: int = step, kernels: Any = kernels) -> Maps:
             simulated = surrogate_spectrum(
                 module(case.scene),
                 case.radar,
@@ -194,7 +203,7 @@ def test_a_displaced_plate_is_found_in_eight_steps(case):
                 seed=step,
             )
             measured = case.capture.spectrum(case.grid).float()
-            return simulated, kernels.blur(measured, case.radar, case.grid)
+            return [(simulated, kernels.blur(measured, case.radar, case.grid))]
 
         solver.step(maps)
     error = case.error(module(case.scene))
@@ -204,21 +213,21 @@ def test_a_displaced_plate_is_found_in_eight_steps(case):
 def test_bad_input(unchecked):
     model, many = Mixture([0.0, 0.0, 0.0]), Translation("plate")
     many.translation = nn.Parameter(torch.zeros(65, dtype=torch.float64))
-    with pytest.raises(InputError, match="expected a SpectrumLoss, got function"):
-        GaussNewton(model, lambda a, b: a)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="expected a SpectrumLoss for Gauss–Newton, got function"):
+        GaussNewton(model, alone(lambda a, b: a))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="reach > 0"):
-        GaussNewton(model, SpectrumLoss(), reach=0.0)
+        GaussNewton(model, alone(SpectrumLoss()), reach=0.0)
     with pytest.raises(InputError, match="got 0,"):
-        GaussNewton(nn.ReLU(), SpectrumLoss())
-    solver = GaussNewton(many, SpectrumLoss())
+        GaussNewton(nn.ReLU(), alone(SpectrumLoss()))
+    solver = GaussNewton(many, alone(SpectrumLoss()))
     with pytest.raises(InputError, match="expected at most 64 parameters"):
-        solver.step(lambda: (many.translation.exp().sum() * random_map(0), random_map(1)))
+        solver.step(lambda: [(many.translation.exp().sum() * random_map(0), random_map(1))])
 
 
 def test_a_map_that_is_not_finite_is_reported_not_followed():
     model = Mixture([0.1, 0.0, 0.0])
     measured = Mixture(TRUTH)().detach()
-    found = GaussNewton(model, SpectrumLoss()).step(lambda: (model() * math.nan, measured))
+    found = GaussNewton(model, alone(SpectrumLoss())).step(lambda: [(model() * math.nan, measured)])
     assert math.isnan(found)
     assert float(model.share[0].detach()) == 0.1
 
@@ -227,7 +236,7 @@ def test_a_turned_pose_has_free_quaternion_numbers_only(case):
     module = Pose("plate", axes="z", rotation_axes="y")
     measured = case.capture.spectrum(case.grid).float()
 
-    def maps() -> tuple[Tensor, Tensor]:
+    def maps() -> Maps:
         simulated = surrogate_spectrum(
             module(case.scene),
             case.radar,
@@ -236,10 +245,10 @@ def test_a_turned_pose_has_free_quaternion_numbers_only(case):
             sampling=Sampling(depth=1, samples=4_000, boundary_samples=1_000),
             seed=0,
         )
-        return simulated, measured
+        return [(simulated, measured)]
 
     names = [name for name, _ in module.named_parameters()]
-    GaussNewton(module, SpectrumLoss("likelihood")).step(maps)
+    GaussNewton(module, alone(SpectrumLoss("likelihood"))).step(maps)
     assert [name for name, _ in module.named_parameters()] == names
     state = module.state_dict()
     assert torch.equal(state["translation"][:2], torch.zeros(2, dtype=torch.float64))
@@ -253,12 +262,12 @@ class InterruptError(Exception):
 
 @pytest.mark.slow
 def test_reconstruct_takes_its_steps_and_resumes(case, tmp_path):
-    def fit(**changes: Any) -> Any:
+    def fitted(**changes: Any) -> Any:
         settings = case.settings(steps=4, optimizer=Optimizer("gauss_newton", rate=0.1))
         module = Translation("plate", axes="xz")
-        return reconstruct(case.scene, case.radar, case.capture, module, **(settings | changes))
+        return fit(case.scene, case.radar, case.capture, module, **(settings | changes))
 
-    whole = fit()
+    whole = fitted()
     assert float(case.error(whole.scene)[[0, 2]].norm()) < 0.05
     assert [row["step"] for row in whole.history] == [0, 1, 2, 3]
 
@@ -268,14 +277,17 @@ def test_reconstruct_takes_its_steps_and_resumes(case, tmp_path):
 
     kept = {"checkpoint": tmp_path / "fit.pt", "checkpoint_every": 1}
     with pytest.raises(InterruptError):
-        fit(progress=stop, **kept)
-    resumed = fit(resume=True, **kept)
+        fitted(progress=stop, **kept)
+    resumed = fitted(resume=True, **kept)
     first, second = (
         torch.tensor(found.history[-1]["values"]["plate.translation"]) for found in (whole, resumed)
     )
     assert torch.allclose(first, second, atol=2e-3)
-    fit(optimizer=Optimizer(), **kept)
+    fitted(optimizer=Optimizer(), **kept)
     with pytest.raises(InputError, match="one of another"):
-        fit(resume=True, **kept)
-    with pytest.raises(InputError, match="expected a surrogate with kind 'gauss_newton'"):
-        fit(surrogate="exact")
+        fitted(resume=True, **kept)
+    with pytest.raises(
+        InputError,
+        match=r"smooth models .* 'gauss_newton', got ExactMap",
+    ):
+        fitted(surrogate="exact")

@@ -1,33 +1,42 @@
 """The check of gradients, checked: it passes right ones and fails wrong ones."""
 
-from typing import Any
-
 import pytest
 import torch
 
+from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Direction, gradcheck
-from invertwin.radar import Surrogate
-from scenes import occluder, radar
+from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.lines import line_of
+from invertwin.models import ExactMap, SurrogateMap
+from invertwin.radar import Radar, Surrogate
+from invertwin.radar.parameters import RadarPose
+from invertwin.scene import Scene
+from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation
+from scenes import float64, occluder, radar
 
-CHEAP: dict[str, Any] = {
-    "depth": 1,
-    "surrogate": Surrogate("gaussian", range_width=2.0, angle_width=1.0),
-    "samples": 100_000,
-    "boundary_samples": 50_000,
-    "repeats": 2,
-    "difference_samples": 200_000,
-    "noise": 0.02,
-    "max_pairs": 6,
-}
-SLIDE = Direction("translation", "occluder", (1.0, 0.0, 0.0))
+CHEAP = Check(repeats=2, difference_samples=200_000, noise=0.02, max_pairs=6)
+KERNELS = Surrogate("gaussian", range_width=2.0, angle_width=1.0)
+DRAWN = Sampling(depth=1, samples=100_000, boundary_samples=50_000)
+SLIDE = {"translation": float64([1.0, 0.0, 0.0])}
+
+
+def model_of(grid: Grid) -> SurrogateMap:
+    return SurrogateMap(grid, KERNELS, DRAWN)
 
 
 def test_a_right_gradient_passes_and_reports():
     device = radar()
     lines: list[str] = []
     grid = device.grid(0.4, 2.8, 0.6, oversample=1)
-    report = gradcheck(occluder(), device, grid, SLIDE, progress=lines.append, **CHEAP)
+    report = gradcheck(
+        model_of(grid),
+        Translation("occluder"),
+        SLIDE,
+        scene=occluder(),
+        sensor=device,
+        check=CHEAP,
+        progress=lines.append,
+    )
     assert report.full.relative_l1 < 0.03
     assert report.full.relative_l2 < 0.03
     assert report.full.correlation > 0.999
@@ -55,10 +64,20 @@ def test_a_wrong_gradient_fails():
         def jvp(ctx, tangent):
             return 0.5 * tangent
 
-    def wrong(scene, seen, theta):
-        return SLIDE(scene, seen, Halved.apply(theta))
+    class Wrong(Translation):
+        def forward(self, scene):
+            (x, y, z) = self.translation
+            moved = {"translation": torch.stack([Halved.apply(x), y, z])}
+            return torch.func.functional_call(Translation("occluder"), moved, (scene,))
 
-    report = gradcheck(occluder(), device, device.grid(0.4, 2.8, 0.6, oversample=1), wrong, **CHEAP)
+    report = gradcheck(
+        model_of(device.grid(0.4, 2.8, 0.6, oversample=1)),
+        Wrong("occluder"),
+        SLIDE["translation"],
+        scene=occluder(),
+        sensor=device,
+        check=CHEAP,
+    )
     assert report.full.relative_l1 == pytest.approx(0.5, abs=0.05)
     assert abs(report.full.order) < 0.5
 
@@ -66,54 +85,73 @@ def test_a_wrong_gradient_fails():
 def test_nothing_that_moves_is_refused():
     device = radar()
     with pytest.raises(InputError, match="expected a map that depends on θ"):
-        gradcheck(occluder(), device, device.grid(2.7, 3.0), SLIDE, **CHEAP)
+        gradcheck(
+            model_of(device.grid(2.7, 3.0)),
+            Translation("occluder"),
+            SLIDE,
+            scene=occluder(),
+            sensor=device,
+            check=CHEAP,
+        )
 
 
 @pytest.mark.parametrize(
-    ("direction", "message"),
+    ("module", "tangent", "message"),
     [
-        (lambda: Direction("shear"), "expected a parameter kind among translation, rotation"),
         (
-            lambda: Direction("material", "wall", value="colour")(
-                occluder(), radar(), torch.zeros((), dtype=torch.float64)
-            ),
-            "expected a value of wall's material",
+            Translation("occluder"),
+            {"shear": float64(1.0)},
+            r"Translation \(translation \(3,\)\), got",
         ),
-        (
-            lambda: Direction("scale", "door")(
-                occluder(), radar(), torch.zeros((), dtype=torch.float64)
-            ),
-            "got 'door'",
-        ),
+        (Translation("occluder"), float64([1.0, 0.0]), r"got translation \(2,\)"),
+        (Pose("occluder"), float64([1.0, 0.0, 0.0]), r"by name for Pose \(translation, rotation\)"),
+        (Scale("door"), float64(1.0), "got 'door'"),
     ],
+    ids=["name", "shape", "several", "object"],
 )
-def test_bad_directions_are_named(direction, message):
+def test_bad_tangents_are_named(module, tangent, message):
+    device = radar()
+    model = model_of(device.grid(0.4, 2.8))
     with pytest.raises(InputError, match=message):
-        direction()
+        gradcheck(model, module, tangent, scene=occluder(), sensor=device, check=CHEAP)
+
+
+def test_models_without_a_mean_derivative_are_refused():
+    device = radar()
+    model = ExactMap(device.grid(0.4, 2.8))
+    with pytest.raises(InputError, match="expected a smooth model such as SurrogateMap, got Exact"):
+        gradcheck(model, Translation("occluder"), SLIDE, scene=occluder(), sensor=device)
 
 
 @pytest.mark.parametrize(
-    "direction",
+    ("module", "tangent"),
     [
-        SLIDE,
-        Direction("rotation", "occluder", (0.0, 2.0, 0.0)),
-        Direction("scale", "occluder"),
-        Direction("material", "wall", value="permittivity"),
-        Direction("radar_translation"),
-        Direction("radar_rotation"),
+        (Translation("occluder"), SLIDE),
+        (Pose("occluder"), {"rotation": float64([0.0, 0.0, 2.0, 0.0])}),
+        (Scale("occluder"), {"log_scale": float64(1.0)}),
+        (MaterialValues("wall", permittivity=4.0), {"raw.permittivity": float64(1.0)}),
+        (RadarPose(), SLIDE),
+        (RadarPose(), {"rotation": float64([0.0, 0.0, 1.0, 0.0])}),
     ],
-    ids=lambda d: d.kind,
+    ids=["translation", "rotation", "scale", "material", "radar translation", "radar rotation"],
 )
-def test_directions_start_at_the_scene(direction):
+def test_lines_start_at_the_scene(module, tangent):
     scene, device = occluder(), radar()
-    moved, seen = direction(scene, device, torch.zeros((), dtype=torch.float64))
+    of_radar = isinstance(module, RadarPose)
+    line = line_of(module, tangent, device if of_radar else scene)
+
+    def at(theta: float) -> tuple[Scene, Radar]:
+        found = line.end(theta)
+        return (scene, found) if of_radar else (found, device)
+
+    moved, seen = at(0.0)
     for name in scene.names:
         assert torch.allclose(moved[name].vertices, scene[name].vertices, atol=1e-12)
     assert torch.allclose(seen.positions, device.positions)
-    turned, other = direction(scene, device, torch.tensor(0.1, dtype=torch.float64))
+    turned, other = at(0.1)
     changed = [
         not torch.equal(turned["occluder"].vertices, scene["occluder"].vertices),
-        vars(turned["wall"].material) != vars(scene["wall"].material),
+        abs(float(turned["wall"].material.permittivity) - 4.0) > 1e-3,
         not torch.equal(other.link().rotations, device.link().rotations),
         not torch.equal(other.positions, device.positions),
     ]

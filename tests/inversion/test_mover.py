@@ -6,16 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from invertwin.capture import ChirpCapture
+from invertwin.channel import Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.mover import (
-    MovingBody,
-    body_power,
-    fit_mover,
-    motion_map,
-    pattern_correlation,
-    strongest_mover,
-)
-from invertwin.inversion.reconstruction import Optimizer
+from invertwin.inversion import CorrelationLoss, Observation, Optimizer, Schedule, reconstruct
+from invertwin.inversion.mover import MovingBody, of_point, strongest_mover
+from invertwin.models import MotionMap
 from invertwin.radar.boards import board
 from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar
@@ -46,7 +42,8 @@ def recorded(place, velocity, radius, seed):
         shapes.sphere(radius, 2), GLOSSY, rigid(translation=start), velocity=float64(*velocity)
     )
     scene = Scene({"ball": ball})
-    return simulate_chirps(scene, RADAR, CHIRPS, seed=seed, density=1e3)[0]
+    drawn = Sampling(depth=1, points_per_m2=1e3)
+    return simulate_chirps(scene, RADAR, CHIRPS, seed=seed, sampling=drawn)
 
 
 @pytest.fixture(scope="module")
@@ -57,17 +54,23 @@ def frame():
     places = torch.stack([start, float64(0.8, 0.0, 1.6)])
     paths = paths_of(RADAR, places, float64(1.0, 50.0))
     motion = torch.stack([velocity, 0 * velocity])
-    return noisy(moving_beat(replace(paths, velocity=motion), RADAR, CHIRPS)[0])
+    return noisy(moving_beat(replace(paths, velocity=motion), RADAR, CHIRPS))
 
 
 def noisy(beat):
     noise = torch.randn(beat.shape, dtype=beat.dtype, generator=torch.Generator().manual_seed(3))
-    return beat + 0.1 * noise
+    return ChirpCapture(beat + 0.1 * noise, RADAR, CHIRPS)
+
+
+def correlation(one, other, scale="magnitude"):
+    return 1 - float(CorrelationLoss(scale)(one, other))
+
+
+WHOLE = MotionMap.of(RADAR, GRID, CHIRPS)
 
 
 def test_the_strongest_mover_is_found_beside_what_stands_still(frame):
-    found = motion_map(frame, RADAR, GRID, CHIRPS)
-    echo = strongest_mover(frame, found)
+    echo = strongest_mover(frame, WHOLE)
     away = math.hypot(0.5, 2.8)
     assert echo.range == pytest.approx(away, abs=0.02)
     assert echo.rate == pytest.approx(2.0 * 2.8 / away, abs=0.1)
@@ -76,42 +79,42 @@ def test_the_strongest_mover_is_found_beside_what_stands_still(frame):
     torch.testing.assert_close(
         echo.position, echo.range * float64(echo.u, 0.0, math.sqrt(1 - echo.u**2))
     )
-    near = found.around(echo, 4)
-    assert near.power.shape[0] in (16, 17)
-    assert near.power.shape[1] in (16, 17)
-    assert float(near.power.max()) == float(found.power.max())
-    assert float(pattern_correlation(near.of_point(echo), near.power, "power")) > 0.97
+    near = WHOLE.around(echo.range, echo.rate, 4, RADAR)
+    power = near.observe(frame)
+    assert power.shape[1] in (16, 17)
+    assert power.shape[2] in (16, 17)
+    assert float(power.max()) == pytest.approx(float(WHOLE.observe(frame).max()), rel=1e-9)
+    assert correlation(of_point(near, RADAR, echo), power, "power") > 0.97
 
 
 def test_a_point_that_moves_on_is_where_its_rate_takes_it(frame):
-    found = motion_map(frame, RADAR, GRID, CHIRPS)
-    echo = strongest_mover(frame, found)
-    later = found.around(echo, 4, time=0.1)
+    echo = strongest_mover(frame, WHOLE)
+    later = WHOLE.around(echo.range + 0.1 * echo.rate, echo.rate, 4, RADAR)
     middle = later.grid.ranges.mean()
     assert float(middle) == pytest.approx(echo.range + 0.1 * echo.rate, abs=0.03)
-    ranges = later.of_point(echo, time=0.1).amax((0, 2, 3))
+    ranges = of_point(later, RADAR, echo, time=0.1).amax((0, 1, 3, 4))
     assert float(later.grid.ranges[ranges.argmax()]) == pytest.approx(float(middle), abs=0.06)
 
 
 def test_without_a_mover_there_is_nothing_to_fit():
     beat = beat_signal(paths_of(RADAR, float64(0.0, 0.0, 2.0)[None], float64(1.0)), RADAR)
-    still = noisy(beat.repeat(CHIRPS.count, 1, 1, 1))
+    still = noisy(beat[:, None].repeat(1, CHIRPS.count, 1, 1, 1))
     with pytest.raises(InputError, match="no echo above the noise"):
-        strongest_mover(still, motion_map(still, RADAR, GRID, CHIRPS))
+        strongest_mover(still, WHOLE)
 
 
 def test_correlation_ignores_gain_and_knows_three_scales(unchecked):
     one = torch.rand(5, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     other = one.flip(0)
     for scale in ("magnitude", "power", "level"):
-        assert float(pattern_correlation(7 * one, one, scale)) == pytest.approx(1)
-        assert float(pattern_correlation(one, other, scale)) < 0.9
+        assert correlation(7 * one, one, scale) == pytest.approx(1)
+        assert correlation(one, other, scale) < 0.9
     root = torch.corrcoef(torch.stack([one.sqrt().flatten(), other.sqrt().flatten()]))[0, 1]
-    assert float(pattern_correlation(one, other)) == pytest.approx(float(root), abs=1e-6)
+    assert correlation(one, other) == pytest.approx(float(root), abs=1e-6)
     with pytest.raises(InputError, match="expected maps of one shape"):
-        pattern_correlation(one, other[1:])
+        CorrelationLoss()(one, other[1:])
     with pytest.raises(InputError, match="'volts'"):
-        pattern_correlation(one, other, "volts")
+        CorrelationLoss("volts")
 
 
 def start(echo, **changes):
@@ -120,7 +123,7 @@ def start(echo, **changes):
 
 
 def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
-    echo = strongest_mover(frame, motion_map(frame, RADAR, GRID, CHIRPS))
+    echo = strongest_mover(frame, WHOLE)
     scene, body = start(echo)
     vertices = body(scene)["ball"].vertices.detach()
     assert float(vertices.norm(dim=1).min()) == pytest.approx(echo.range, abs=1e-3)
@@ -128,7 +131,8 @@ def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
         body.spin.add_(3.0)
         body.velocity.add_(float64(0.7, 0.0))
         body.size.add_(float64(0.5, 0.1, -0.2))
-    twin = body.moving(scene)["ball"]
+    with torch.no_grad():
+        twin = body(scene)["ball"]
     assert twin.velocity is not None
     step = 1e-6
     later = twin.vertices + twin.velocity * step
@@ -138,12 +142,12 @@ def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
     torch.testing.assert_close(moved, 0.5 * twin.velocity.mean(0), rtol=0, atol=1e-6)
     # One row of antennas: nothing moves upwards, and the body turns about the axis up.
     assert not twin.velocity[:, 1].any()
-    extent = body.values(scene)["extent_m"]
+    extent = body.values()["extent_m"].tolist()
     assert extent == pytest.approx([0.2 * math.exp(x) for x in (0.5, 0.1, -0.2)], rel=1e-6)
 
 
 def test_materials_without_a_diffuse_share_are_refused(frame):
-    echo = strongest_mover(frame, motion_map(frame, RADAR, GRID, CHIRPS))
+    echo = strongest_mover(frame, WHOLE)
     for material, message in (
         (PerfectConductor(), "rough_dielectric"),
         (replace(GLOSSY, diffuse=1.0), "between 0 and 1"),
@@ -158,37 +162,46 @@ def test_a_twin_finds_place_and_motion_in_the_exact_chain():
     """A ball that fills several range cells, at mean power: 12 looks of other phases."""
     place, velocity, radius = (-0.4, 0.0, 2.6), (0.0, 0.0, 1.6), 0.3
     frames = [recorded(place, velocity, radius, seed) for seed in range(12)]
-    maps = [motion_map(frame, RADAR, GRID, CHIRPS) for frame in frames]
-    mean = replace(maps[0], power=torch.stack([m.power for m in maps]).mean(0))
-    echo = strongest_mover(frames[0], mean)
+    records = [ChirpCapture(beat, RADAR, CHIRPS) for beat in frames]
+    echo = strongest_mover(records[0], WHOLE)
     scene, body = start(echo)
-    near = mean.around(echo, 6)
-    losses = fit_mover(
-        body, scene, near, steps=80, samples=1500, seed=1, optimizer=Optimizer(rate=0.05)
+    near = replace(
+        WHOLE.around(echo.range, echo.rate, 6, RADAR),
+        sampling=Sampling(depth=1, boundary=False, samples=1500),
     )
+    mean = torch.stack([near.observe(record) for record in records]).mean(0)
+    fit = reconstruct(
+        scene,
+        Observation(near, RADAR, mean),
+        body,
+        loss=CorrelationLoss(),
+        optimizer=Optimizer(rate=0.05),
+        schedule=Schedule(80),
+        seed=1,
+    )
+    losses = [row["loss"] for row in fit.history]
     assert losses[-1] < 0.5 * losses[0]
-    found = body.values(scene)
+    found = body.values()
     front = math.hypot(*place) - radius
     nearest = body(scene)["ball"].vertices.detach().norm(dim=1).min()
     assert float(nearest) == pytest.approx(front, abs=0.03)
     # Along the line of sight; a row of antennas hardly sees motion across it.
-    center, motion = float64(*found["position_m"]), float64(*found["velocity_m_s"])
+    center, motion = found["position_m"], found["velocity_m_s"]
     assert float(center @ motion / center.norm()) == pytest.approx(1.6 * 2.6 / 2.63, abs=0.05)
     assert found["extent_m"][2] > 0.3
+    many = replace(near, sampling=replace(near.sampling, samples=20_000))
     with torch.no_grad():
-        shown = body_power(body, scene, near, samples=20_000, seed=5)
-    twin, point = (float(pattern_correlation(p, near.power)) for p in (shown, near.of_point(echo)))
+        shown = many.predict(body(scene), RADAR, 5)
+    twin, point = (correlation(p, mean) for p in (shown, of_point(near, RADAR, echo)))
     assert twin > 0.97
     assert twin > point + 0.02
 
 
 def test_a_body_that_leaves_the_view_is_an_error(frame):
-    found = motion_map(frame, RADAR, GRID, CHIRPS)
-    echo = strongest_mover(frame, found)
+    echo = strongest_mover(frame, WHOLE)
     scene, body = start(echo)
     with torch.no_grad():
         body.size.add_(float64(math.nan, 0.0, 0.0))
+    near = WHOLE.around(echo.range, echo.rate, 4, RADAR)
     with pytest.raises(InputError):
-        fit_mover(
-            body, scene, found.around(echo, 4), steps=1, samples=100, seed=1, optimizer=Optimizer()
-        )
+        reconstruct(scene, Observation(near, RADAR, frame), body, schedule=Schedule(1))

@@ -6,8 +6,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+import fits
 from invertwin.capture import Capture
-from invertwin.inversion import Optimizer, compare_shapes, reconstruct
+from invertwin.channel import Sampling
+from invertwin.inversion import Optimizer, compare_shapes
 from invertwin.radar import Surrogate
 from invertwin.scene import (
     DistanceGrid,
@@ -65,8 +67,7 @@ def settings(**changes: Any) -> dict[str, Any]:
 def recorded(scene: Scene) -> Capture:
     device = radar(PLACES)
     grid = settings()["grid"]
-    data = simulate(scene, device, grid, seed=5, depth=1, density=5e3)
-    assert data.beat is not None
+    data = simulate(scene, device, grid, seed=5, sampling=Sampling(depth=1, points_per_m2=5e3))
     return Capture.from_beat(data.beat, device)
 
 
@@ -79,7 +80,7 @@ def wide() -> Capture:
 @pytest.mark.slow
 def test_a_wide_box_is_found_in_the_space(wide):
     start = placed(box(0.1))
-    found = reconstruct(
+    found = fits.fit(
         start,
         radar(PLACES),
         wide,
@@ -126,7 +127,7 @@ def test_every_shape_is_fitted_and_resumed(name, wide, tmp_path):
 
     def fit(**changes: Any) -> tuple[nn.Module, Any]:
         module = SHAPES[name]()
-        found = reconstruct(placed(BALL), radar(PLACES), wide, module, **settings(**changes))
+        found = fits.fit(placed(BALL), radar(PLACES), wide, module, **settings(**changes))
         return module, found
 
     first = {key: value.clone() for key, value in SHAPES[name]().state_dict().items()}

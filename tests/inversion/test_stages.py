@@ -4,10 +4,11 @@ from functools import partial
 
 import pytest
 import torch
-from invertwin.inversion.stages import Stage, reconstruct_in_stages, stage_checkpoint
 
+import fits
 from invertwin.errors import InputError
-from invertwin.inversion import Optimizer, reconstruct
+from invertwin.inversion import Optimizer, Stage, Unknown
+from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.regularization import Laplacian
 from invertwin.inversion.remeshing import remeshed
 from invertwin.scene import Mesh, SmoothVertices, plate
@@ -17,13 +18,16 @@ BUILDERS = {"place": lambda _: Translation("plate"), "size": lambda _: Scale("pl
 
 
 def fit(case, stages, builders=BUILDERS, **changes):
-    settings = case.settings(**changes)
-    settings.pop("steps")
-    return reconstruct_in_stages(case.scene, case.radar, case.capture, builders, stages, **settings)
+    unknowns = {
+        name: made if isinstance(made, Unknown) else Unknown(made)
+        for name, made in builders.items()
+    }
+    settings = case.settings(stages=stages, **changes)
+    return fits.fit(case.scene, case.radar, case.capture, unknowns, **settings)
 
 
 def test_one_stage_is_a_reconstruction(case):
-    alone = reconstruct(
+    alone = fits.fit(
         case.scene, case.radar, case.capture, [Translation("plate")], **case.settings(steps=4)
     )
     staged = fit(case, [Stage(4)], {"place": BUILDERS["place"]})
@@ -35,7 +39,7 @@ def test_one_stage_is_a_reconstruction(case):
 
 
 def test_only_what_a_stage_names_is_free(case):
-    found = fit(case, [Stage(3, ("place",)), Stage(3, ("size",))])
+    found = fit(case, [Stage(3, unknowns=("place",)), Stage(3, unknowns=("size",))])
     first, last = found.history[2]["values"], found.history[5]["values"]
     assert first["plate.scale"] == pytest.approx(1.0, abs=0)
     assert last["plate.translation"] == first["plate.translation"]
@@ -47,7 +51,8 @@ def test_only_what_a_stage_names_is_free(case):
 
 def test_rates_of_parameters_are_their_own(case):
     optimizer = Optimizer(rate=1e-9, final_rate=1e-9)
-    found = fit(case, [Stage(1)], rates={"size": 1e-2}, optimizer=optimizer)
+    builders = BUILDERS | {"size": Unknown(BUILDERS["size"], rate=1e-2)}
+    found = fit(case, [Stage(1)], builders, optimizer=optimizer)
     values = found.history[-1]["values"]
     assert max(map(abs, values["plate.translation"])) < 1e-8
     assert abs(values["plate.scale"] - 1) > 5e-3
@@ -58,8 +63,10 @@ def test_a_rebuilt_stage_begins_on_the_twin_so_far(case):
         "place": BUILDERS["place"],
         "shape": lambda scene: Vertices("plate", len(scene["plate"].mesh.vertices)),
     }
-    before = fit(case, [Stage(3, ("place",))], builders)
-    found = fit(case, [Stage(3, ("place",)), Stage(1, ("shape",), rebuild=True)], builders)
+    before = fit(case, [Stage(3, unknowns=("place",))], builders)
+    found = fit(
+        case, [Stage(3, unknowns=("place",)), Stage(1, unknowns=("shape",), rebuild=True)], builders
+    )
     assert len(found.parameters) == 1
     gap = found.scene["plate"].vertices - before.scene["plate"].vertices
     assert 0 < float(gap.norm(dim=1).max()) <= 0.02 * 3**0.5 * (1 + 1e-6)  # one step of Adam
@@ -78,7 +85,7 @@ def test_meshes_are_made_finer_between_stages(case):
 
 
 def test_interrupted_in_the_second_stage_it_ends_the_same(case, tmp_path):
-    stages = [Stage(4, ("place",)), Stage(6, ("place", "size"))]
+    stages = [Stage(4, unknowns=("place",)), Stage(6, unknowns=("place", "size"))]
     whole = fit(case, stages)
     file = tmp_path / "fit.pt"
     done = []
@@ -90,7 +97,7 @@ def test_interrupted_in_the_second_stage_it_ends_the_same(case, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         fit(case, stages, checkpoint=file, checkpoint_every=2, progress=stop)
-    assert (tmp_path / stage_checkpoint("fit.pt", 0)).exists()
+    assert stage_file(file, 0).exists()
     again = []
     resumed = fit(case, stages, checkpoint=file, resume=True, progress=again.append)
     assert [row["step"] for row in again] == [6, 7, 8, 9]  # from the last checkpoint on
@@ -106,7 +113,7 @@ def test_what_is_watched_joins_the_history(case):
     def watch(scene):
         return {"error": float(case.error(scene).norm())}
 
-    found = fit(case, [Stage(4, ("place",))], watch=watch, watch_every=2)
+    found = fit(case, [Stage(4, unknowns=("place",))], watch=watch, watch_every=2)
     assert ["error" in row for row in found.history] == [False, True, False, True]
     assert found.history[-1]["error"] == watch(found.scene)["error"]
 
@@ -115,8 +122,15 @@ def test_what_is_watched_joins_the_history(case):
     ("stages", "message"),
     [
         ([], "at least one stage, got none"),
-        ([Stage(1, ("shape",))], r"stage 1 \(place, size\), got 'shape'"),
-        ([Stage(1, ("size",)), Stage(1, ("size",), rebuild=True), Stage(1, ("place",))], "rebuild"),
+        ([Stage(1, unknowns=("shape",))], r"stage 1 \(place, size\), got 'shape'"),
+        (
+            [
+                Stage(1, unknowns=("size",)),
+                Stage(1, unknowns=("size",), rebuild=True),
+                Stage(1, unknowns=("place",)),
+            ],
+            "rebuild",
+        ),
     ],
 )
 def test_wrong_stages(case, stages, message):
@@ -135,13 +149,12 @@ def test_terms_are_of_the_scene_that_a_module_was_built_for(case):
 
     builders = {
         "finer": lambda _: Finer(),
-        "shape": lambda scene: Vertices("plate", len(scene["plate"].mesh.vertices)),
+        "shape": Unknown(
+            lambda scene: Vertices("plate", len(scene["plate"].mesh.vertices)),
+            regularize=lambda _, scene: [Laplacian(scene, "plate", 1.0)],
+        ),
     }
-
-    def terms(_, scenes):
-        return [Laplacian(scenes["shape"], "plate", 1.0)]
-
-    found = fit(case, [Stage(1), Stage(1)], builders, regularize=terms)
+    found = fit(case, [Stage(1), Stage(1)], builders)
     assert len(found.scene["plate"].mesh.vertices) == 16
 
 
@@ -157,12 +170,14 @@ def test_a_shape_that_another_replaces_is_no_parameter(case, kind, sought):
             return self.place(case.scene)
 
     builders = {"shape": BUILDERS["size"], "other": lambda _: Replaced()}
-    with pytest.raises(InputError, match="got log_scale of Scale, which does not: a later one"):
-        fit(case, [Stage(1, sought)], builders, optimizer=Optimizer(kind))
+    with pytest.raises(
+        InputError, match="got log_scale of Scale, which has no gradient; probably a later"
+    ):
+        fit(case, [Stage(1, unknowns=sought)], builders, optimizer=Optimizer(kind))
 
 
 def test_the_mesh_of_a_stage_is_plain(case):
     """Nothing of a stage's graph is kept by the next."""
-    found = fit(case, [Stage(1, ("size",)), Stage(1, ("size",), rebuild=True)])
+    found = fit(case, [Stage(1, unknowns=("size",)), Stage(1, unknowns=("size",), rebuild=True)])
     mesh: Mesh = found.scene["plate"].mesh
     assert not mesh.vertices.requires_grad

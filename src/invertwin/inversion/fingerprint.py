@@ -15,14 +15,17 @@ from torch import Tensor, nn
 _PROJECTIONS = 6  # of a tensor onto fixed waves: one changed number changes them
 _ROUNDING = 1e-5  # of a tensor's norm: what another order of additions may change
 _OWN_TO_TORCH = frozenset(vars(nn.Module()))
+# Code of classes from here belongs to a version, not to a fit.
+_LIBRARIES = ("builtins", "collections", "functools", "invertwin", "numpy", "torch", "typing")
 
 
 class Fingerprint:
     """The digest of values by their content.
 
     Dataclasses, modules and objects count by class and fields, functions by their code and what
-    they enclose, tensors of numbers by projections that tolerate rounding. No address of a value
-    takes part, so that a function of one's own has the same fingerprint in a new process.
+    they use from around them, tensors of numbers by projections that tolerate rounding. A class
+    of one's own counts with the code of its methods. No address of a value takes part, so that a
+    function of one's own has the same fingerprint in a new process.
     """
 
     def __init__(self, *values: Any) -> None:
@@ -90,8 +93,10 @@ class Fingerprint:
 
     def _add_function(self, value: types.FunctionType) -> None:
         self._note("function", value.__module__, value.__qualname__)
-        enclosed = inspect.getclosurevars(value).nonlocals if value.__closure__ else {}
-        self._add([value.__code__, value.__defaults__, value.__kwdefaults__, enclosed])
+        used = inspect.getclosurevars(value)
+        around = {n: v for n, v in sorted(used.globals.items()) if not _foreign(v, value)}
+        enclosed = dict(used.nonlocals)
+        self._add([value.__code__, value.__defaults__, value.__kwdefaults__, enclosed, around])
 
     def _add_object(self, value: Any) -> None:
         self._note("object", type(value).__module__, type(value).__qualname__)
@@ -100,6 +105,10 @@ class Fingerprint:
             self._add({n: p.requires_grad for n, p in value.named_parameters(recurse=False)})
             self._add(dict(value.named_buffers(recurse=False)))
             self._add(dict(value.named_children()))
+        for kind in type(value).__mro__:
+            if kind.__module__.split(".")[0] not in _LIBRARIES:
+                methods = {n: f for n, f in vars(kind).items() if isinstance(f, types.FunctionType)}
+                self._add(methods)
         kept = getattr(value, "__dict__", {})
         slots = [n for c in type(value).__mro__ for n in getattr(c, "__slots__", ())]
         fields = {n: getattr(value, n) for n in slots if hasattr(value, n) and n != "__weakref__"}
@@ -120,3 +129,10 @@ class Fingerprint:
         ]
         # In units of the norm, so that one tolerance serves all of them.
         self._numbers += [math.log(norm) if norm > 0 else -1e9, *(w / (norm or 1.0) for w in waves)]
+
+
+def _foreign(value: Any, function: types.FunctionType) -> bool:
+    """Whether a global name stands for something that is not the function's own."""
+    if isinstance(value, types.FunctionType):
+        return value.__module__ != function.__module__
+    return isinstance(value, type | types.ModuleType | types.BuiltinFunctionType)

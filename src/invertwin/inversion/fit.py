@@ -109,7 +109,7 @@ class Fit:
                 f"{stage.steps}; give modules such as Pose('object')"
             )
         rules = stage.optimizer or settings.optimizer
-        rough = [o.model for o in observations if not getattr(o.model, "smooth", True)]
+        rough = [o.model for o in observations if not o.model.smooth]
         if rough and rules.kind == "gauss_newton":
             raise InputError(
                 "expected smooth models such as SurrogateMap with kind 'gauss_newton', got "

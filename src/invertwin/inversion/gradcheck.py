@@ -120,7 +120,7 @@ def gradcheck(
             mean, or a map that does not depend on θ (all differences are zero).
     """
     check = check or Check()
-    if not getattr(model, "smooth", True):
+    if not model.smooth:
         raise InputError(
             f"expected a smooth model such as SurrogateMap, got {type(model).__name__}: "
             "silhouettes of single rough points have no derivative"

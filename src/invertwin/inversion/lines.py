@@ -45,7 +45,7 @@ class Line:
             theta: A scalar.
         """
         moved = {n: self._start[n] + theta * change for n, change in self._tangent.items()}
-        return torch.func.functional_call(self._module, moved, (self._target,))
+        return torch.func.functional_call(self._module, self._start | moved, (self._target,))
 
     def end(self, theta: float) -> Any:
         """The module's result at one end of a difference.

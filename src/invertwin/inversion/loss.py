@@ -299,7 +299,8 @@ class CorrelationLoss:
 _FLOOR = 1e-4  # of the peak: below it levels are noise
 _TINY = 1e-12  # of the peak: keeps the derivative of a magnitude finite
 _SCALES: dict[str, Callable[[Tensor], Tensor]] = {
-    "magnitude": lambda share: (share + _TINY).sqrt(),
+    # An interpolated response may fall a little below zero.
+    "magnitude": lambda share: (share.clamp(min=0) + _TINY).sqrt(),
     "power": lambda share: share,
     "level": lambda share: share.clamp(min=_FLOOR).log(),
 }

@@ -28,6 +28,11 @@ class Unknown:
     rate: float | None = None
     regularize: Callable[[nn.Module, Any], Sequence[Regularizer]] | None = None
 
+    @property
+    def depends(self) -> bool:
+        """Whether it must know the scene (or sensor) as the unknowns before it leave it."""
+        return not isinstance(self.module, nn.Module) or self.regularize is not None
+
     def made(self, target: Any) -> nn.Module:
         """The module, for a scene or a sensor."""
         return self.module if isinstance(self.module, nn.Module) else self.module(target)
@@ -59,7 +64,8 @@ class Observation:
     """What one sensor has observed, and the model that explains it.
 
     Attributes:
-        model: Forward model, such as ``SurrogateMap``.
+        model: Forward model, such as ``SurrogateMap``, or one's own that derives from
+            ``ForwardModel``.
         sensor: What recorded the data, such as a ``Radar``.
         data: A recording that ``model.observe`` understands, or its map.
         weight: Share of this observation in the loss.
@@ -67,7 +73,7 @@ class Observation:
         loss: How maps are compared, in place of the loss of the fit.
 
     Raises:
-        InputError: A weight that is not positive, or a model without ``predict``.
+        InputError: A weight that is not positive, or a model that is no ``ForwardModel``.
     """
 
     model: ForwardModel
@@ -80,10 +86,10 @@ class Observation:
     def __post_init__(self) -> None:
         if not self.weight > 0:
             raise InputError(f"expected a weight > 0, got {self.weight}; leave the observation out")
-        if not (hasattr(self.model, "predict") and hasattr(self.model, "observe")):
+        if not isinstance(self.model, ForwardModel):
             raise InputError(
-                f"expected a forward model, got {type(self.model).__name__}; give one with "
-                "predict and observe, such as SurrogateMap(grid)"
+                f"expected a forward model, got {type(self.model).__name__}; give one such as "
+                "SurrogateMap(grid), or derive a class from ForwardModel"
             )
 
     def observed(self) -> Tensor:

@@ -138,12 +138,14 @@ def _made(scene: Scene, unknowns: Mapping[str, Unknown]) -> tuple[dict[str, nn.M
     """Modules by name, each for the scene as those before it leave it, and their regularisers."""
     modules: dict[str, nn.Module] = {}
     terms: list[Regularizer] = []
-    for name, unknown in unknowns.items():
+    last = max((k for k, item in enumerate(unknowns.values()) if item.depends), default=0)
+    for number, (name, unknown) in enumerate(unknowns.items()):
         modules[name] = unknown.made(scene)
         if unknown.regularize is not None:
             terms += unknown.regularize(modules[name], scene)
-        with torch.no_grad():
-            scene = modules[name](scene)
+        if number < last:
+            with torch.no_grad():
+                scene = modules[name](scene)
     return modules, terms
 
 

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
+from fits import fit
 from invertwin.capture import Capture
-from invertwin.inversion import Optimizer, reconstruct
+from invertwin.channel import Sampling
+from invertwin.inversion import Optimizer
 from invertwin.radar import RangeBias, Surrogate
 from invertwin.scene.parameters import Translation
 from invertwin.simulation import simulate
@@ -15,32 +17,33 @@ BIAS = 0.12
 def test_range_bias_is_found_in_shifted_data(case):
     """A beat of frequency S 2b/c more is a target b farther."""
     with torch.no_grad():
-        beat = simulate(case.scene, case.radar, case.grid, depth=1, density=3_000.0, seed=7).beat
-    assert beat is not None
+        drawn = Sampling(depth=1, points_per_m2=3_000.0)
+        beat = simulate(case.scene, case.radar, case.grid, sampling=drawn, seed=7).beat
     waveform = case.radar.waveform
     phase = 2 * torch.pi * waveform.slope * 2 * BIAS / 299_792_458.0 * waveform.sample_times
     shifted = Capture.from_beat(beat * torch.polar(torch.ones_like(phase), phase), case.radar)
     bias = RangeBias()
-    found = reconstruct(
+    found = fit(
         case.scene,
         case.radar,
         shifted,
         [],
-        nuisances=[bias],
+        of_radar=[bias],
         **case.settings(steps=40, optimizer=Optimizer(rate=0.02)),
     )
     assert float(bias.bias.detach()) == pytest.approx(BIAS, abs=0.01)
+    assert float(found.sensors[0].range_bias) == float(bias.bias.detach())
     assert found.history[-1]["values"].keys() == {"range_bias"}
     assert found.scene["plate"].center.equal(case.scene["plate"].center)
 
 
-def test_nuisances_are_named_in_the_history(case):
-    found = reconstruct(
+def test_unknowns_of_the_radar_are_named_in_the_history(case):
+    found = fit(
         case.scene,
         case.radar,
         case.capture,
         [Translation("plate")],
-        nuisances=[RangeBias(0.05)],
+        of_radar=[RangeBias(0.05)],
         **case.settings(steps=2, samples=2_000, boundary_samples=500, surrogate=Surrogate()),
     )
     assert found.history[-1]["values"].keys() == {"plate.translation", "range_bias"}

@@ -1,0 +1,295 @@
+"""Observations: several sensors in one fit, what each may compare, and models of one's own."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from invertwin.capture import Capture
+from invertwin.channel import Sampling
+from invertwin.errors import InputError
+from invertwin.inversion import (
+    Observation,
+    Optimizer,
+    Schedule,
+    SpectrumLoss,
+    Stage,
+    reconstruct,
+)
+from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.models import ForwardModel, SurrogateMap
+from invertwin.radar import Radar, RadarPose, RangeBias, Surrogate
+from invertwin.scene import Scene, Translation, look_at, sphere
+from invertwin.simulation import simulate
+from scenes import float64, occluder, radar, relative, thing
+
+BALL = (0.1, 0.0, -0.08)  # off its start
+PLACES = {"ahead": [0.0, 0.0, -1.5], "beside": [-1.5, 0.0, 0.0]}
+SAMPLING = Sampling(depth=1, samples=8_000, boundary_samples=2_000)
+
+
+def of_ranges(place: list[float]) -> Radar:
+    """One antenna that sees ranges only, and looks at the origin."""
+    device = radar([place], receivers=1)
+    return replace(device, rotations=look_at(float64([place]), [0.0, 0.0, 0.0]))
+
+
+def scene() -> Scene:
+    return Scene({"ball": thing(sphere(0.15, 3))})
+
+
+@pytest.fixture(scope="module")
+def seen() -> dict[str, Observation]:
+    """What two radars at right angles have recorded of a ball: its range alone."""
+    found = {}
+    with torch.no_grad():
+        true = Translation("ball", BALL)(scene())
+        for name, place in PLACES.items():
+            device = of_ranges(place)
+            grid = device.grid(0.9, 2.0, oversample=2)
+            # Looks from places a wavelength apart: the mean over speckle.
+            looks = replace(
+                device,
+                positions=device.positions + 0.02 * float64([[0, k, 0] for k in range(-8, 8)]),
+                rotations=device.rotations.expand(16, 3, 3),
+            )
+            drawn = Sampling(depth=1, points_per_m2=5_000.0)
+            beat = simulate(true, looks, grid, sampling=drawn, seed=3).beat
+            model = SurrogateMap(grid, Surrogate(range_width=2.0), SAMPLING)
+            found[name] = Observation(model, looks, Capture.from_beat(beat, looks))
+    return found
+
+
+def place_of(observations: Any, kind: str = "adam", steps: int = 40, **changes: Any) -> Tensor:
+    fit = reconstruct(
+        scene(),
+        observations,
+        Translation("ball", axes="xz"),
+        loss=SpectrumLoss(),
+        optimizer=Optimizer(kind, rate=0.01 if kind == "adam" else 0.08),
+        schedule=Schedule(steps),
+        seed=1,
+        **changes,
+    )
+    return fit.scene["ball"].center.detach()
+
+
+@pytest.mark.parametrize(("kind", "steps"), [("adam", 50), ("gauss_newton", 8)])
+def test_two_ranges_find_what_each_alone_cannot(seen, kind, steps):
+    """A range pins one coordinate to 0.4 cells; two at right angles pin both."""
+    alone = {name: place_of(one, kind, steps) for name, one in seen.items()}
+    both = place_of(list(seen.values()), kind, steps)
+    truth = float64(BALL)
+    assert abs(float(alone["ahead"][2] - truth[2])) < 0.03
+    assert abs(float(alone["ahead"][0] - truth[0])) > 0.05
+    assert abs(float(alone["beside"][0] - truth[0])) < 0.03
+    assert abs(float(alone["beside"][2] - truth[2])) > 0.05
+    assert float((both - truth).norm()) < 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Level(ForwardModel):
+    """A model of one's own: the height of an object, seen by a number."""
+
+    sampling: Sampling = Sampling(depth=1, boundary=False)
+
+    def predict(self, scene: Scene, sensor: Tensor, seed: int) -> Tensor:
+        x, y, z = scene["ball"].center
+        return torch.stack([sensor * x, y**2, z + 0 * x])[None]
+
+    def observe(self, recording: Any) -> Tensor:
+        return torch.as_tensor(recording, dtype=torch.float64)[None]
+
+
+def squared(one: Tensor, other: Tensor) -> Tensor:
+    return (one - other).square().sum()
+
+
+def absolute(one: Tensor, other: Tensor) -> Tensor:
+    return (one - other).abs().sum()
+
+
+def test_the_loss_is_the_weighted_mean_of_the_losses():
+    """Each in its own way, on numbers that can be checked by hand."""
+    observations = [
+        Observation(Level(), float64(1.0), [1.0, 0.0, 2.0], weight=3.0),
+        Observation(Level(), float64(2.0), [1.0, 0.0, -1.0], weight=1.0, loss=absolute),
+    ]
+    fit = reconstruct(
+        scene(), observations, Translation("ball"), loss=squared, schedule=Schedule(1)
+    )
+    assert fit.history[0]["loss"] == pytest.approx((3 * 5.0 + 1 * 2.0) / 4)
+
+
+def test_weights_say_whom_to_believe():
+    """Two that contradict each other: the mean of both, by weight."""
+
+    def found(weight: float) -> float:
+        observations = [
+            Observation(Level(), float64(1.0), [1.0, 0.0, 0.0], weight=weight),
+            Observation(Level(), float64(1.0), [0.0, 0.0, 0.0]),
+        ]
+        fit = reconstruct(
+            scene(),
+            observations,
+            Translation("ball"),
+            loss=squared,
+            optimizer=Optimizer(rate=0.1, final_rate=1e-4),
+            schedule=Schedule(150),
+        )
+        return float(fit.scene["ball"].center[0].detach())
+
+    assert found(1.0) == pytest.approx(0.5, abs=0.01)
+    assert found(3.0) == pytest.approx(0.75, abs=0.01)
+
+
+class Gain(nn.Module):
+    """An unknown of that sensor."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(float64(1.0))
+
+    def forward(self, sensor: Tensor) -> Tensor:
+        return sensor * self.gain
+
+
+def test_an_unknown_of_a_sensor_changes_that_sensor_alone():
+    observations = [
+        Observation(Level(), float64(1.0), [1.0, 0.0, 0.0]),
+        Observation(Level(), float64(1.0), [3.0, 0.0, 0.0], parameters={"gain": Gain()}),
+    ]
+    fit = reconstruct(
+        scene(),
+        observations,
+        {"place": Translation("ball")},
+        loss=squared,
+        optimizer=Optimizer(rate=0.1, final_rate=1e-3),
+        schedule=[
+            Stage(150, unknowns=("place",)),
+            Stage(300, unknowns=("gain",)),
+        ],
+    )
+    # The place alone is the mean of both; then the second sensor explains what is left.
+    assert float(fit.scene["ball"].center[0].detach()) == pytest.approx(2.0, abs=0.02)
+    assert [float(sensor) for sensor in fit.sensors] == pytest.approx([1.0, 1.5], abs=0.02)
+
+
+def test_a_model_of_ones_own_derives_from_forward_model(unchecked):
+    class Looks:
+        def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
+            return torch.zeros(1)
+
+        def observe(self, recording: Any) -> Tensor:
+            return torch.zeros(1)
+
+    with pytest.raises(InputError, match=r"got Looks; .*derive a class from ForwardModel"):
+        Observation(Looks(), None, None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("weight", [0.0, -1.0, float("nan")])
+def test_weights_are_positive(weight):
+    with pytest.raises(InputError, match="expected a weight > 0"):
+        Observation(Level(), float64(1.0), [0.0, 0.0, 0.0], weight=weight)
+
+
+def test_no_observation_is_refused():
+    with pytest.raises(InputError, match="expected at least one observation"):
+        reconstruct(scene(), [], Translation("ball"))
+
+
+class Bend(nn.Module):
+    """An unknown of one's own: the ball slides along a parabola."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.way = nn.Parameter(float64(0.3))
+
+    def forward(self, scene: Scene) -> Scene:
+        offset = torch.stack([self.way, 0 * self.way, self.way**2])
+        return torch.func.functional_call(Translation("ball"), {"translation": offset}, (scene,))
+
+
+def test_gradients_of_a_module_and_a_model_of_ones_own_are_checked():
+    """x = 2 w and z = w²: their derivatives at w = 0.3 are 2 and 0.6."""
+    report = gradcheck(
+        Level(),
+        Bend(),
+        float64(1.0),
+        scene=scene(),
+        sensor=float64(2.0),
+        check=Check(repeats=1, max_pairs=4),
+    )
+    assert report.gradient[0].tolist() == pytest.approx([2.0, 0.0, 0.6])
+    assert report.difference[0].tolist() == pytest.approx([2.0, 0.0, 0.6], abs=1e-9)
+    assert report.full.relative_l1 < 1e-9
+    assert report.no_interior_edges is None
+
+
+@pytest.mark.parametrize(
+    ("module", "tangent"),
+    [
+        (RadarPose(), {"translation": float64([0.9, 0.3, 0.1])}),
+        (RangeBias(0.02), {"bias": float64(1.0)}),
+    ],
+    ids=["pose", "bias"],
+)
+def test_gradients_of_sensor_unknowns_are_checked(module, tangent):
+    device = radar()
+    model = SurrogateMap(
+        device.grid(0.4, 2.8, 0.6, oversample=1),
+        Surrogate("gaussian", range_width=2.0, angle_width=1.0),
+        Sampling(depth=1, samples=200_000, boundary_samples=50_000),
+    )
+    report = gradcheck(
+        model,
+        module,
+        tangent,
+        scene=occluder(),
+        sensor=device,
+        of="sensor",
+        check=Check(repeats=2, difference_samples=300_000, noise=0.01, max_pairs=8),
+    )
+    assert report.full.relative_l1 < 0.03
+
+
+def frames(case: Any, count: int) -> tuple[list[list[float]], Any]:
+    """Where the radar was in every step of a fit, and the fit."""
+    looked: list[list[float]] = []
+
+    @dataclass(frozen=True)
+    class Spy(SurrogateMap):
+        def predict(self, scene: Scene, sensor: Radar, seed: int) -> Tensor:
+            looked.append(sensor.positions[:, 0].tolist())
+            return super().predict(scene, sensor, seed)
+
+    few = Sampling(depth=1, samples=1_000, boundary_samples=100)
+    one = Observation(Spy(case.grid, sampling=few), case.radar, case.capture)
+    fit = reconstruct(
+        case.scene,
+        [one, one],
+        case.parameters(),
+        schedule=Schedule(6, frames_per_step=count),
+        seed=1,
+    )
+    return looked[:12], fit
+
+
+def test_every_observation_has_frames_of_its_own_in_a_step(case):
+    looked, _ = frames(case, 2)
+    assert all(len(places) == 2 for places in looked)
+    assert looked[::2] != looked[1::2]
+    assert looked == frames(case, 2)[0]
+
+
+def test_an_observed_map_is_compared_as_it_is(case):
+    """A recording and its map are the same data."""
+    few = Sampling(depth=1, samples=1_000, boundary_samples=100)
+    model = SurrogateMap(case.grid, sampling=few)
+    first, second = (
+        Observation(model, case.radar, data).observed()
+        for data in (case.capture, model.observe(case.capture))
+    )
+    assert relative(second, first) == 0

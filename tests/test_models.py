@@ -1,0 +1,198 @@
+"""Forward models: what they predict, observe, blur and prepare."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from invertwin.capture import Capture
+from invertwin.capture.chirp_capture import ChirpCapture
+from invertwin.channel import Sampling
+from invertwin.errors import InputError
+from invertwin.models import ExactMap, MotionMap, SurrogateMap, surrogate_correlation
+from invertwin.radar import Chirps, Radar, Surrogate, velocity_axis
+from invertwin.scene import PerfectConductor, Scene, plate
+from invertwin.simulation import simulate, simulate_chirps
+from scenes import float64, occluder, radar, relative, thing
+
+FEW = Sampling(samples=2_000, points_per_m2=100.0)
+
+
+def test_the_surrogate_correlates_with_the_mean_over_looks():
+    """One look is mostly speckle; looks averaged over are the surrogate's map."""
+    device = radar()
+    grid = device.grid(0.7, 1.7, 0.7)
+    scene = Scene({"plate": thing(plate(0.6, 0.4), (0.1, 0.0, 1.2), (0.0, 0.5, 0.0))})
+    drawn = Sampling(depth=1, samples=100_000, points_per_m2=600.0)
+
+    def found(surrogate: str = "response", looks: int = 24) -> float:
+        model = SurrogateMap(grid, surrogate, drawn)
+        return surrogate_correlation(scene, device, model, seed=0, looks=looks)
+
+    assert found() >= 0.9
+    assert found(looks=1) < found()
+    # Another place is another map.
+    away = scene.replace("plate", pose=thing(plate(1, 1), (-0.4, 0.0, 1.5)).pose)
+    model = SurrogateMap(grid, sampling=Sampling(depth=1, points_per_m2=600.0))
+    assert surrogate_correlation(away, device, model, seed=0) >= 0.9
+    assert found("gaussian") < found()
+
+
+def test_looks_of_conductors_are_all_the_same():
+    device = radar()
+    scene = Scene({"plate": thing(plate(0.2, 0.2), (0, 0, 1.2), material=PerfectConductor())})
+    model = SurrogateMap(device.grid(0.7, 1.7, 0.7), sampling=Sampling(samples=5_000))
+    few, many = (
+        surrogate_correlation(scene, device, model, seed=0, looks=looks) for looks in (1, 4)
+    )
+    assert few == pytest.approx(many, rel=1e-5)
+
+
+def test_a_correlation_needs_looks():
+    device = radar()
+    model = SurrogateMap(device.grid(0.5, 2.5))
+    with pytest.raises(InputError, match="expected looks >= 1, got 0"):
+        surrogate_correlation(occluder(), device, model, seed=0, looks=0)
+
+
+def test_a_surrogate_goes_by_its_name():
+    device = radar()
+    grid = device.grid(0.5, 2.5)
+    named, smooth = (
+        SurrogateMap(grid, surrogate, FEW).predict(occluder(), device, 0)
+        for surrogate in ("response", Surrogate())
+    )
+    assert torch.allclose(named, smooth, rtol=1e-5)
+    with pytest.raises(InputError, match="expected a Surrogate or one of exact"):
+        SurrogateMap(grid, "sharp")
+    with pytest.raises(InputError, match=r'got "exact"; use ExactMap\(grid\)'):
+        SurrogateMap(grid, "exact")
+
+
+def test_extra_widths_are_taken_away_by_shares():
+    device = radar()
+    model = SurrogateMap(device.grid(0.5, 2.5), Surrogate(range_width=3.0, angle_width=1.5))
+    assert model.widened
+    half = model.narrowed(0.5).kernels
+    assert (half.range_width, half.angle_width) == (1.5, 0.75)
+    assert not model.narrowed(0).widened
+    assert not ExactMap(model.grid).widened
+    observed = torch.rand(1, *model.grid.shape)
+    blurred = model.kernels.blur(observed, device, model.grid)
+    assert torch.equal(model.blurred(observed, device), blurred)
+    assert torch.equal(ExactMap(model.grid).blurred(observed, device), observed)
+
+
+def test_an_exact_map_is_the_spectrum_of_its_recording():
+    device = radar()
+    grid = device.grid(0.5, 2.5)
+    model = ExactMap(grid, FEW)
+    found = simulate(occluder(), device, grid, seed=3, sampling=FEW)
+    seen = model.observe(Capture.from_beat(found.beat, device))
+    assert relative(model.predict(occluder(), device, 3), seen) < 1e-5
+
+
+def test_prepared_speckle_stays_while_the_scene_moves():
+    """A step of a micrometre is a new look with new points, and the same one with prepared ones."""
+    device = radar()
+    model, scene = ExactMap(device.grid(0.5, 2.5), FEW), occluder()
+    kept = model.prepared(scene, device, 7)
+    assert kept.prepared(scene, device, 8) is kept
+    first, other = (kept.predict(scene, device, seed) for seed in (1, 2))
+    assert relative(other, first) < 1e-5
+    assert relative(model.predict(scene, device, 2), model.predict(scene, device, 1)) > 0.1
+
+
+def test_sampling_is_changed_by_name():
+    model = SurrogateMap(radar().grid(0.5, 2.5), sampling=FEW)
+    changed = model.sampled_by(depth=1, boundary=False).sampling
+    assert changed == replace(FEW, depth=1, boundary=False)
+
+
+CHIRPS = Chirps(16, 60e-6)
+MOVES = Sampling(depth=1, boundary=False, samples=20_000)
+
+
+def moving(speed: float = 8.0) -> Scene:
+    """A small ball that moves away, beside a plate at rest."""
+    ball = thing(plate(0.05, 0.05), (-0.3, 0.0, 1.5))
+    still = thing(plate(0.3, 0.3), (0.4, 0.0, 1.9))
+    moves = Scene({"mover": ball, "still": still})
+    return moves.replace("mover", velocity=float64([0.0, 0.0, speed]))
+
+
+def motion(device: Radar, **changes: Any) -> MotionMap:
+    grid = device.grid(1.0, 2.4, 0.6)
+    return replace(MotionMap.of(device, grid, CHIRPS, sampling=MOVES), **changes)
+
+
+def recorded(scene: Scene, device: Radar, looks: int) -> torch.Tensor:
+    """The mean map of recordings of other phases."""
+    drawn = Sampling(depth=1, points_per_m2=4_000.0)
+    model, maps = motion(device), []
+    middle = 0.5 * float(CHIRPS.times(1)[-1, 0])
+    # A recording begins half a frame before the middle, to which a prediction belongs.
+    earlier = scene.replace("mover", pose=scene.at(-middle)["mover"].pose)
+    for seed in range(looks):
+        beat = simulate_chirps(earlier, device, CHIRPS, seed=seed, sampling=drawn)
+        maps.append(model.observe(ChirpCapture(beat, device, CHIRPS)))
+    return torch.stack(maps).mean(0)
+
+
+def test_power_in_motion_is_the_mean_of_recordings():
+    """The plate at rest is in neither map, and the mover has one place, rate and power in both."""
+    device = radar()
+    model = motion(device)
+    found = model.predict(moving(), device, 1)
+    seen = recorded(moving(), device, 40)
+    assert found.shape == seen.shape == (1, 32, *model.grid.shape)
+    for axes in ((2, 3, 4), (1, 3, 4), (1, 2, 4)):
+        truth = seen.sum(axes)
+        assert relative(found.sum(axes) * truth.sum() / found.sum(), truth) < 0.08
+    assert float(found.sum() / seen.sum()) == pytest.approx(1, abs=0.15)
+    rate = float(model.rates[found.sum((0, 2, 3, 4)).argmax()])
+    assert rate == pytest.approx(8.0 * 1.5 / (1.5**2 + 0.3**2) ** 0.5, abs=0.6)
+
+
+def test_derivatives_of_motion_are_those_of_differences():
+    device = radar()
+    model, step = motion(device), 1e-3
+    weights = torch.rand(
+        1, 32, *model.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+
+    def value(speed: torch.Tensor) -> torch.Tensor:
+        velocity = torch.stack([0 * speed, 0 * speed, speed])
+        scene = moving().replace("mover", velocity=velocity)
+        return (weights * model.predict(scene, device, 1)).sum()
+
+    speed = torch.tensor(8.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(value(speed), speed)
+    with torch.no_grad():
+        truth = float(value(speed + step) - value(speed - step)) / (2 * step)
+    assert float(slope) == pytest.approx(truth, rel=1e-3)
+
+
+def test_what_stands_still_has_no_map_of_motion():
+    device = radar()
+    still = moving().replace("mover", velocity=None)
+    with pytest.raises(InputError, match="expected an object with a velocity for a MotionMap"):
+        motion(device).predict(still, device, 0)
+    with pytest.raises(InputError, match=r"expected Sampling\(depth=1, boundary=False\)"):
+        motion(device, sampling=Sampling())
+
+
+def test_a_part_of_a_map_is_cut_around_an_echo():
+    device = radar()
+    model = motion(device)
+    part = model.around(1.6, 1.2, 3, device)
+    cell, doppler = device.waveform.range_resolution, float(velocity_axis(device, CHIRPS).diff()[0])
+    assert float((part.grid.ranges - 1.6).abs().max()) <= 3 * cell
+    assert float((part.rates - 1.2).abs().max()) <= 3 * doppler
+    whole, cut = (m.predict(moving(), device, 1) for m in (model, part))
+    rows = [int((model.rates - rate).abs().argmin()) for rate in part.rates]
+    columns = [int((model.grid.ranges - r).abs().argmin()) for r in part.grid.ranges]
+    assert torch.allclose(cut, whole[:, rows][:, :, columns], rtol=1e-6, atol=1e-12)
+    with pytest.raises(InputError, match="expected an echo within the map"):
+        model.around(9.0, 1.2, 3, device)
