@@ -285,7 +285,8 @@ def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str
         for file in (settings, *recordings):
             if not (path.parent / Path(file).name).is_file():
                 raise InputError(
-                    f"expected {Path(file).name} beside {path}, got no such file; write it there first"
+                    f"expected {Path(file).name} beside {path}, got no such file; write it there "
+                    "first"
                 )
         names = [{"rawFileName": Path(file).name, "processedFileName": ""} for file in recordings]
         files = {"numFilesCollected": len(names), "fileBasePath": "", "files": names}
