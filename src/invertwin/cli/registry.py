@@ -40,10 +40,20 @@ BUILT_IN = (
     "invertwin.cli.sensors",
     "invertwin.cli.materials",
     "invertwin.cli.shape_tables",
+    "invertwin.cli.gradients",
     "invertwin.cli.recordings",
     "invertwin.cli.fit_tables",
 )
 PLUGINS = "invertwin.plugins"
+_MEANINGS = {
+    "object": "name in the scene",
+    "axis": "direction, or axis of the turn",
+    "low": "corner of the box, in the object's frame [m]",
+    "high": "the opposite corner [m]",
+    "counts": "nodes along x, y and z",
+    "smooth": "λ of steps preconditioned by (I + λL)⁻²; 0 = none",
+}
+"""Of keys that many tables have, where a constructor says nothing."""
 _PLAIN = (bool, int, float, str, list, tuple, dict)
 
 
@@ -294,13 +304,8 @@ class Registry:
     ) -> Any:
         """The table of a constructor, made from its signature and docstring.
 
-        Args:
-            make: Class, function, "module:name", or a model, which is taken as it is.
-            title: Name of the model.
-            base: Keys that it has beside those of the constructor.
-            fields: Further fields, as pydantic's `create_model` takes them.
-            without: Arguments that are no keys.
-            checked: Whether it is built as soon as it is read; None = if it is a dataclass.
+        A model is taken as it is. `fields` and the keys of `base` stand beside those of the
+        arguments; `checked` is as in `add`.
         """
         self._complete()
         make = pkgutil.resolve_name(make) if isinstance(make, str) else make
@@ -537,7 +542,7 @@ def _documents(make: Any) -> dict[str, str]:
                 ):
                     for name in names.split(", "):
                         found.setdefault(name, " ".join(words.split()).removesuffix("."))
-    return found
+    return {**_MEANINGS, **found}
 
 
 def _title(name: str) -> str:

@@ -1,5 +1,6 @@
 """The recordings as `[data]` kinds of run files."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,7 +38,8 @@ def openradar_data(
     """
     with about("folder"):
         chirps = openradar.read_chirps(_holding(openradar.FILE, Path(folder)))
-    return recorded(chirps, board or registry.table("board", "name")(name="xWR1642"))
+    found = recorded(chirps, board or registry.table("board", "name")(name="xWR1642"))
+    return replace(found, moving=True)
 
 
 def _holding(file: str, folder: Path) -> Path:
