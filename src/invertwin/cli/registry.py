@@ -43,7 +43,6 @@ BUILT_IN = (
     "invertwin.cli.gradients",
     "invertwin.cli.recordings",
     "invertwin.cli.fit_tables",
-    "invertwin.datasets.kinds",
 )
 PLUGINS = "invertwin.plugins"
 _MEANINGS = {
@@ -189,6 +188,7 @@ class Registry:
     def __init__(self) -> None:
         self.sections: dict[str, Any] = {}
         self.commands: dict[str, Callable[..., Any]] = {}
+        self.recordings: dict[str, tuple[str, str | None]] = {}
         self._groups: dict[str, Group] = {}
         self._forms: dict[Any, Form] = {}
         self._bases: dict[type, type[Table]] = {}
@@ -232,6 +232,16 @@ class Registry:
     def command(self, name: str, function: Callable[..., Any]) -> None:
         """Adds a command to the command line, as typer takes it, and a task of its name."""
         self.commands[name] = function
+
+    def recording(self, file: str, kind: str, board: str | None = None) -> None:
+        """Lets `invertwin look` know a recording by the name of its file.
+
+        Args:
+            file: Its name.
+            kind: Of the data; its constructor is given the folder alone.
+            board: Preset that recorded, unless the user names another.
+        """
+        self.recordings[file] = (kind, board)
 
     def group(self, group: Group) -> None:
         """Adds a group."""

@@ -16,9 +16,9 @@ from invertwin.capture import (
 )
 from invertwin.capture.elements import elements
 from invertwin.channel import Grid
+from invertwin.cli.registry import load_plugins, registry
 from invertwin.cli.report import Table, finish, picture, quantities, texts
 from invertwin.cli.runs import RunFolder
-from invertwin.datasets import openradar, rail_sar
 from invertwin.errors import InputError
 from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
 from invertwin.radar import (
@@ -151,17 +151,17 @@ def _read(look: Look) -> _Recording:
 
 
 def _read_public(look: Look, folder: Path) -> _Recording:
-    files = (openradar.FILE, rail_sar.FILE)
-    named = [name for name in files if look.recording.name in (name, folder.name)]
-    file = next((name for name in named if (folder / name).is_file()), None)
-    if file == rail_sar.FILE:
-        return _whole("rail_sar", rail_sar.read(folder))
-    if file == openradar.FILE:
-        data = openradar.read_chirps(folder)
-        return _of_chirps("openradar", data, _preset(look, data, look.board or "xWR1642"), look)
+    known = load_plugins().recordings
+    for file, (kind, board) in known.items():
+        if (folder / file).is_file() and look.recording.name in (file, folder.name):
+            found = registry.table("data", kind).made_by(str(folder))
+            if isinstance(found, Capture):
+                return _whole(kind, found)
+            arrays = _preset(look, found.chirps, look.board or board)
+            return _of_chirps(kind, found.chirps, arrays, look)
     raise InputError(
-        f"expected a folder with {' or '.join(files)}, got {look.recording}; of other arrays "
-        "name the TOML description"
+        f"expected a folder with {' or '.join(known) or 'a recording that a plugin reads'}, got "
+        f"{look.recording}; of other arrays name the TOML description"
     )
 
 

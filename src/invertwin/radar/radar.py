@@ -7,7 +7,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Complex, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, differentiated
@@ -261,6 +261,28 @@ def sampled(radar: Radar) -> SampledWaveform:
         f"expected an FMCW, stepped frequency or OFDM radar, got {type(radar.waveform).__name__}, "
         "which has no beat signal; use the surrogate for it"
     )
+
+
+def checked_beat(
+    beat: Complex[Tensor, "frame tx rx sample"], radar: Radar
+) -> Complex[Tensor, "frame tx rx sample"]:
+    """A beat signal that fits a radar.
+
+    Args:
+        beat: One signal per frame and channel.
+        radar: What recorded it.
+
+    Raises:
+        InputError: It has another shape.
+    """
+    channels = len(radar.transmitters.positions), len(radar.receivers.positions)
+    expected = (radar.frame_count, *channels, sampled(radar).samples)
+    if tuple(beat.shape) != expected:
+        raise InputError(
+            f"expected a beat signal of shape {expected} (frame, tx, rx, sample), got "
+            f"{tuple(beat.shape)}; use the radar that recorded it"
+        )
+    return beat
 
 
 def _checked_rotations(value: object, frames: int) -> Tensor:

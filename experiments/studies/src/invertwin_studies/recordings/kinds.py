@@ -6,21 +6,15 @@ from typing import Annotated, Any
 
 from invertwin.capture import Capture
 from invertwin.cli.recordings import Recording, recorded
-from invertwin.cli.registry import OneOf, Registry, registry
+from invertwin.cli.registry import OneOf, registry
 from invertwin.cli.section import InputPath, about
-from invertwin.datasets import openradar, rail_sar
 from invertwin.errors import InputError
+from invertwin_studies.recordings import openradar, rail_sar
 
 _ORIGINALS = {
     rail_sar.FILE: "github.com/jjimmykang/bwsi-backprojection, trial 6",
     openradar.FILE: "of github.com/PreSenseRadar/OpenRadar",
 }
-
-
-def register(kinds: Registry) -> None:
-    """Adds the readers."""
-    kinds.add("data", "rail_sar", rail_sar_data)
-    kinds.add("data", "openradar", openradar_data)
 
 
 def rail_sar_data(folder: InputPath) -> Capture:
