@@ -205,6 +205,12 @@ class SpectrumLoss:
     def _divergence(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         lit, data = self._floored(pairs)
         gain = self._likeliest(lit, data)
+        if torch._C._are_functorch_transforms_active():  # such as a second derivative
+            ratios = [
+                b / (gain * a.clamp_min(0.0) + self.floor)
+                for (a, _), b in zip(pairs, data, strict=True)
+            ]
+            return torch.stack([(q - q.log() - 1).mean() for q in ratios]).mean()
         terms = [
             _Divergence.apply(a, power, b, gain, self.floor)
             for (a, _), power, b in zip(pairs, lit, data, strict=True)
