@@ -12,7 +12,8 @@ time over ours (> 1: we are faster).
   step, so that the tree is rebuilt. Shadow edges are sampled, though a convex room has none.
 - They (`PathSolver`, loop mode `evaluated`) list paths that end with a diffuse reflection; the step
   adds the derivative of the total power with respect to the scattering coefficient: their diffuse
-  paths have no other. With specular reflection on, as in our room, a vertex is diffuse with probability 1/4;
+  paths have no other. With specular reflection on, as in our room, a vertex is diffuse with
+  probability 1/4;
   `forward_ratio_sionna_diffuse` and `step_ratio_sionna_diffuse` are with it off: every vertex
   is diffuse, and ends a path. The list is long enough for all paths.
 
