@@ -6,25 +6,25 @@ Prints a table and writes `metrics.json` and `basin.png` into DIR (default `out/
 
 A rough panel of 0.6 m (random phases, so fully developed speckle) faces a radar of 2 GHz and 16
 antennas, 3 m away; the radar looks from 16 places on a vertical rail, so that the data are 16 looks
-at the speckle. They are beat signals of the exact chain with noise. A fit seeks range and direction
+at the speckle. They are exact beat signals with noise. A fit seeks range and direction
 at once. It starts some range cells, or some beamwidths along the arc about the radar, off the
 truth, and converges if it ends within half a range cell and half a beamwidth of it. A seed is one
 realisation of speckle and noise, and converges at an offset if the fits from both sides do. The
 basin is the largest offset up to which 19 of 20 seeds converge; no larger one is tried once a
 second seed has failed.
 
-- `exact`: the exact chain is differentiated (visibility fixed, derivations §4) and given the very
-  phases of the data's scatterers, which nobody has; the loss compares power spectra.
+- `exact`: the model is the exact signals (visibility fixed, derivations §4). It is given the phases
+  of the data's scatterers, which a user never has. The loss compares power spectra.
 - `gaussian`: the paper's kernels (Gaussian pulse, Airy lobe) on powers, no extra width.
 - `dirichlet`: the response without a window, no extra width; the data have no window either, and
   finer bins, which it needs.
 - `surrogate`: annealed. Extra widths fall to zero, and a last stage of its own has none: it fits
-  the exact mean response of the radar. It knows nothing of phases, as the two before.
+  the exact mean response of the radar. Like `gaussian` and `dirichlet` it knows no phases.
 
 `final_error_cells` and `final_error_beamwidths` are what 19 of 20 seeds stay within after the last
 stage, from the required offsets. All fits are `invertwin.reconstruct` with one loss.
-Surrogates take as many steps, the exact chain fewer. Only the exact chain's rate was compared with
-others (0.1 and 1 on two seeds); those of fixed width may do better at rates of their own.
+All surrogates take equally many steps, `exact` takes fewer. Only the rate of `exact` was compared
+with others (0.1 and 1 on two seeds); surrogates of fixed width may do better at rates of their own.
 """
 
 import argparse

@@ -1,13 +1,13 @@
-"""What weighting the edges is worth where surfaces hide each other, at equal time.
+"""Weighted against uniform sampling of edges, where surfaces hide each other, at equal time.
 
     python benchmarks/edges.py [-o DIR]
 
 A body before a wall and above a floor, seen by separate antennas at depth 2. The derivative of the
-received power by a shift of the body, as far as it is due to the shadows that surfaces cast on each
-other (family 2), is estimated with the weighted edge sampling and with uniform edge sampling (edges
-by length alone, directions from the whole sphere), with the same numbers of samples and seeds, in
-turns. Prints a table and writes `metrics.json` into DIR (default `out/edges`): for a plate, whose
-four edges are open, and for a ball, a closed mesh whose edges are nearly flat,
+received power with respect to a shift of the body has a part from the shadows that surfaces cast on
+each other (family 2). This part is estimated with the weighted edge sampling and with uniform edge
+sampling (edges by length alone, directions from the whole sphere), with the same numbers of samples
+and seeds, in turns. Prints a table and writes `metrics.json` into DIR (default `out/edges`): for a
+plate, whose four edges are open, and for a ball, a closed mesh whose edges are nearly flat,
 `edge_sampling.<body>.variance_ratio` is variance × time of uniform sampling over that of the
 weighted one (> 1: the weighted one is better); `edge_sampling.variance_ratio` is the lesser.
 """

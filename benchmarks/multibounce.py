@@ -7,12 +7,13 @@ with coefficient 0.5; transmitter and receiver are 4.1 m apart. Both sides start
 from the transmitter, with a new seed each step, in turns; ratios are medians over steps of their
 time over ours (> 1: we are faster).
 
-- We (`deposit_power`) join every vertex of a chain to the receiver and sum the paths into a map of
-  range × angle; the step adds the derivative by all vertices, which move from step to step (tree
-  rebuilt), the samples of shadow edges included (a convex room has no shadows to find with them).
+- We (`deposit_power`) join every vertex of a path to the receiver and sum the paths into a map of
+  range × angle. The step adds the derivative with respect to all vertices, which move from step to
+  step, so that the tree is rebuilt. Shadow edges are sampled, though a convex room has none.
 - They (`PathSolver`, loop mode `evaluated`) list paths that end with a diffuse reflection; the step
-  adds the derivative of the total power by the scattering coefficient, the one that their diffuse
-  paths have. With specular reflection on, as in our room, a vertex is diffuse with probability 1/4;
+  adds the derivative of the total power with respect to the scattering coefficient: their diffuse
+  paths have no other. With specular reflection on, as in our room, a vertex is diffuse with
+  probability 1/4;
   `forward_ratio_sionna_diffuse` and `step_ratio_sionna_diffuse` are with it off: every vertex
   is diffuse, and ends a path. The list is long enough for all paths.
 

@@ -1,4 +1,4 @@
-"""What the benchmarks have in common: a table of metrics, what must hold of them, their file."""
+"""Tables of metrics for all benchmarks: what must hold, and the file that keeps them."""
 
 import json
 import sys

@@ -5,7 +5,7 @@
 Prints a table and writes `metrics.json` and `shapes.png` into DIR (default `out/shapes`). Cars that
 an interrupted run has finished are not fitted again.
 
-Radar, data, fits and measures are those of `experiments/shape_car_prior_public.toml`; every car has
+Radar, data, fits and metrics are those of `experiments/shape_car_prior_public.toml`; every car has
 a shape, start, speckle and noise of its own. The cars are drawn from the public learned space of
 vehicles (coordinates of a normal distribution, cut at two standard deviations), which the prior of
 the package has never seen: it was trained on procedural cars. Settings were chosen on other cars of
@@ -24,7 +24,7 @@ are restricted to the surface that some position sees. Medians over the cars:
 - `iou_gain`: volume IoU of `prior` minus that of `pose_only`.
 - `iteration_ratio`: the iteration at which `prior` is first as near as `free` ends, over the
   iterations of `free`; infinite where it never is.
-- `seconds_ratio`: the same in time, without a limit.
+- `seconds_ratio`: the time until `prior` is as near as `free` ends, over the time of `free`.
 """
 
 import argparse

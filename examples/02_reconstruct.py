@@ -1,6 +1,6 @@
 """Find where a letter stands and how it is turned, from radar signals alone.
 
-What may move is a torch module of one's own: here the letter slides and turns on the floor.
+The unknown is a torch module of your own: here the letter slides and turns on the floor.
 Usage: .venv/bin/python examples/02_reconstruct.py [folder]     (default out/examples)
 """
 

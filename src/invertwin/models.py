@@ -159,7 +159,7 @@ class SurrogateMap(ForwardModel):
     def for_differences(
         self, scene: Scene, sensor: Radar, samples: int, scheme: Literal["rays", "area"]
     ) -> "SurrogateMap":
-        """Samples come from a density that belongs to this scene."""
+        """The model with sampling probabilities that belong to this scene."""
         sampling = replace(self.sampling, samples=samples, boundary_samples=0)
         return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
 
@@ -169,7 +169,7 @@ class SurrogateMap(ForwardModel):
         return self.kernels.range_width > 0 or self.kernels.angle_width > 0
 
     def narrowed(self, share: float) -> "SurrogateMap":
-        """The same kernels with this share of the extra widths."""
+        """The surrogate with this share of its extra widths."""
         kernels = self.kernels
         return replace(
             self,
@@ -348,7 +348,7 @@ def _chosen(paths: Paths, mask: Bool[Tensor, " path"]) -> Paths:
 def surrogate_correlation(
     scene: Scene, radar: Radar, model: SurrogateMap, *, seed: int, looks: int = 16
 ) -> float:
-    """How well a surrogate's map is that of the exact chain, the mean over looks at the scene.
+    """Correlation of a surrogate's map with the mean exact spectrum over several looks.
 
     A look has its own phases of the rough surfaces. One look is speckle as strong as the map
     itself; a scene of conductors has none, and looks the same each time.
@@ -356,7 +356,7 @@ def surrogate_correlation(
     Args:
         scene: What is seen.
         radar: Arrays, waveform and poses.
-        model: The surrogate; its ``sampling`` serves the exact chain too.
+        model: The surrogate; its ``sampling`` serves the exact spectra too.
         seed: Of the first look, and of the surrogate's samples.
         looks: Exact spectra that are averaged.
 

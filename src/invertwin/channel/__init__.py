@@ -1,4 +1,4 @@
-"""Scene to paths to channel impulse response: the only room that knows the ray tracer."""
+"""From a scene to propagation paths: the only room that knows the ray tracer."""
 
 from invertwin.channel.field.field import trace_field as trace_field
 from invertwin.channel.field.rough_paths import RoughPaths as RoughPaths

@@ -20,7 +20,7 @@ class Pattern(Protocol):
         ...
 
     def table(self) -> Float[Tensor, "cos phi"]:
-        """The same on a grid uniform in cosθ in [-1, 1] and periodic in φ in [-π, π)."""
+        """Power gain on a grid uniform in cosθ in [-1, 1] and periodic in φ in [-π, π)."""
         ...
 
 
@@ -131,7 +131,7 @@ class Paths:
             power paths.
         power: Expected received over transmitted power of the sample; zero for field paths.
         first: World position of the first scattering point [m].
-        last: World position of the last one (the same for one bounce) [m].
+        last: World position of the last point [m]; equal to ``first`` for one bounce.
         kind: ``power``, ``coherent``, ``rough`` or ``field`` (a mixture of the last two).
         boundary: Which rows are boundary paths: zero in value, with the derivative of a moving
             shadow edge (derivations §3).
@@ -188,7 +188,7 @@ def listed(
         frame, kind, power, coefficient, velocity: See ``Paths``.
         length: From antenna to antenna [m].
         position: Of the last point [m].
-        first: Position of the first point; None = the same as the last.
+        first: Position of the first point; None = that of the last.
         boundary: Whether all rows are boundary paths.
     """
     zero = torch.zeros(len(frame), dtype=torch.float64)

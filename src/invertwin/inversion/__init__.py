@@ -1,4 +1,4 @@
-"""Spectrum to loss to scene: reconstruction, and the check that its gradients are right."""
+"""From observed maps to the scene: observations, loss, schedule, fit; and gradient checks."""
 
 from invertwin.inversion.callbacks import Checkpoint as Checkpoint
 from invertwin.inversion.callbacks import Report as Report

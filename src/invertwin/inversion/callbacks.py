@@ -95,12 +95,12 @@ class Checkpoint(Callback):
             )
 
     def step(self, fit: Fit, row: dict[str, Any]) -> None:
-        """Write the file now and then."""
+        """Write the file every ``every`` steps."""
         if fit.progress.step % self.every == 0:
             self.end(fit)
 
     def end(self, fit: Fit) -> None:
-        """Write the file; a kill leaves the last whole one."""
+        """Write the file. If the process is killed, the last whole file is left."""
         path = self._path(fit)
         part = path.with_suffix(path.suffix + ".part")
         torch.save(fit.state(), part)

@@ -301,7 +301,7 @@ class Fit:
         return number
 
     def _keep_if_better(self, loss: float, parameters: dict[str, Tensor]) -> None:
-        """Remember the parameters of the lowest loss; without extra widths beats with."""
+        """Remember the best parameters; a loss without extra widths beats any with them."""
         best, step = self.progress.best, self.progress.step
         if best is not None:
             first = self.annealed(step) and not self.annealed(best[0])
@@ -310,7 +310,7 @@ class Fit:
         self._note(best=(step, loss, parameters))
 
     def _judged(self, status: Status) -> Status:
-        """The status, or ``diverged`` if the fit ends worse than it started; the best is kept."""
+        """The status: ``diverged`` if the fit ends worse than it began; the best is kept."""
         best = self.progress.best
         if best is None:
             return status

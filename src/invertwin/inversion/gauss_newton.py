@@ -26,7 +26,7 @@ class GaussNewton:
 
     The step d solves ``(H + μ D) d = −g`` with no number beyond ``reach``: g the gradient of the
     loss with all its terms, in reverse mode; H the loss's Gauss–Newton matrix from derivatives of
-    the map by every single parameter, in forward mode, silhouettes included; D the diagonal of H,
+    the map with respect to every parameter, in forward mode with silhouettes; D the diagonal of H,
     at least its mean. A step that raises the loss, on the same samples, is taken back and tried
     again with more damping μ.
 
@@ -54,7 +54,7 @@ class GaussNewton:
             modules: what is fitted.
             objective: how maps are compared, of `SpectrumLoss` only.
             reach: the longest change of one parameter in a step, in its unit.
-            reaches: of some parameters, in place of `reach`.
+            reaches: the reach of single parameters, in place of `reach`.
             damping: μ at the first step.
             every: steps from one H to the next; those between take the last one.
 
@@ -97,7 +97,7 @@ class GaussNewton:
         Args:
             maps: gives the predicted and the observed map of every observation under the present
                 parameters; the same samples each time it is called within one step.
-            penalty: → a differentiable term added to the loss, such as that of a regulariser. It
+            penalty: gives a differentiable term added to the loss, as a regulariser does. It
                 takes part in g, and by its own second derivatives in H.
 
         Raises:
@@ -167,7 +167,7 @@ class GaussNewton:
         """Nothing: gradients are not kept in the parameters."""
 
     def _solved(self, curvature: Tensor, slope: Tensor, reach: Tensor) -> Float64[Tensor, " p"]:
-        """The least of the damped quadratic model within the reach of every parameter."""
+        """The minimum of the damped quadratic model within the reach of every parameter."""
         own = curvature.diagonal()
         # What the data hardly tell is damped as much as what they tell on average: noise would
         # carry it away otherwise.

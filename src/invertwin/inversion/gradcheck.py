@@ -27,7 +27,7 @@ class Check:
         repeats: Derivatives averaged, with different seeds.
         step: ε of the differences; ε/2 is evaluated too, and 4ε and 8ε for the order.
         difference_samples: Samples of one end of a pair.
-        noise: Pairs are added until the relative standard error (L1) is below.
+        noise: Pairs are added until the relative standard error (L1) is below this.
         max_pairs: Most pairs; the report says what was reached.
         scheme: How the differences sample surfaces: "rays" from the antenna, or by "area".
     """
@@ -64,7 +64,7 @@ class GradientReport:
 
     Attributes:
         full: Agreement with boundary paths.
-        interior: Agreement without them; the same where the model has none.
+        interior: Agreement without boundary paths; equal to ``full`` if the model has none.
         no_interior_edges: With boundary paths, but without those of the shadows that surfaces
             cast on each other; None for paths of one bounce, which have none.
         difference_noise: ‖standard error‖₁ / ‖g_FD‖₁.
@@ -100,7 +100,7 @@ def gradcheck(
     """Compare the derivative of a map with central differences that have converged.
 
     The parameters of the module move along the tangent: p + θ · tangent. The differences use
-    common random numbers: both ends of a pair draw the same numbers from a density fixed at
+    common random numbers: both ends of a pair draw the same numbers, with probabilities fixed at
     θ = 0, and every pair draws others. Pairs are added until the standard error of their mean is
     small enough.
 

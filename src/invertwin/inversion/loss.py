@@ -1,4 +1,4 @@
-"""How far a simulated power map is from a measured one."""
+"""How far a predicted power map is from an observed one."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -111,7 +111,7 @@ class SpectrumLoss:
         parameters.
         """
         pairs = self._pyramid(simulated.detach(), measured)
-        # A map's own derivative by the logarithm of the gain is the map.
+        # The derivative of a map with respect to the logarithm of its gain is the map.
         rows = torch.cat([tangents, simulated.detach()[None].to(tangents)])
         rows = rows / self._units(simulated, measured)[0]
         if self.kind == "mse":
@@ -226,7 +226,7 @@ class SpectrumLoss:
 
 
 class _Divergence(torch.autograd.Function):
-    """The mean of ``q − log q − 1``, with its derivative by the simulated map written out.
+    """The mean of ``q − log q − 1``, with its derivative with respect to the predicted map.
 
     The maps are large, and torch's own derivative keeps and reads each of them several times.
     """

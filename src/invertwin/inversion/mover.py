@@ -1,4 +1,4 @@
-"""The twin of something that moves: found in range, range rate and direction, then fitted there."""
+"""The twin of a mover: its echo is found in range, range rate and direction, then fitted there."""
 
 from dataclasses import dataclass, replace
 

@@ -30,7 +30,7 @@ class Unknown:
 
     @property
     def depends(self) -> bool:
-        """Whether it must know the scene (or sensor) as the unknowns before it leave it."""
+        """Whether it must know what the unknowns before it make of the scene (or sensor)."""
         return not isinstance(self.module, nn.Module) or self.regularize is not None
 
     def made(self, target: Any) -> nn.Module:
@@ -68,7 +68,7 @@ class Observation:
             ``ForwardModel``.
         sensor: What recorded the data, such as a ``Radar``.
         data: A recording that ``model.observe`` understands, or its map.
-        weight: Share of this observation in the loss.
+        weight: Of its loss in the weighted mean over all observations.
         parameters: Unknowns of the sensor: modules sensor → sensor, such as ``RangeBias``.
         loss: How maps are compared, in place of the loss of the fit.
 

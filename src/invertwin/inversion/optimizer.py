@@ -21,15 +21,14 @@ class Optimizer:
 
     Attributes:
         kind: ``adam``, ``sgd`` with momentum, or ``gauss_newton`` for few parameters.
-        rate: Learning rate at the first step; parameters are in metres and radians. Of
-            Gauss–Newton, like all rates, the longest change of a parameter in a step; it does not
-            fall.
-        rotation_rate: The same for parameters named ``rotation``; None = ``rate``.
-        final_rate: At the last step (cosine in between), of ``rate``; None = ``rate`` / 20.
-            The rates of all parameters fall alike.
+        rate: Learning rate at the first step; parameters are in metres and radians. For
+            Gauss–Newton, a rate is the longest change of a parameter in a step; it does not fall.
+        rotation_rate: Rate of parameters named ``rotation``; None = ``rate``.
+        final_rate: What ``rate`` has fallen to at the last step, along a cosine; None = ``rate`` /
+            20. The rates of all parameters fall alike.
         momentum: Of SGD.
-        curvature_every: Of Gauss–Newton, steps from one curvature to the next: the map's
-            derivatives by every parameter cost the most of a step.
+        curvature_every: For Gauss–Newton, steps from one curvature to the next. Derivatives of the
+            map with respect to every parameter cost most of a step.
     """
 
     kind: Literal["adam", "sgd", "gauss_newton"] = "adam"

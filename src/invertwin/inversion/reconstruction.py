@@ -64,7 +64,7 @@ def reconstruct(
         scene: Starting scene.
         observations: What was observed, by one or several sensors.
         parameters: Modules Scene → Scene, applied in order; an :class:`Unknown` has a rate and
-            regularisers of its own. By name, so that stages can call them.
+            regularisers of its own. Give them by name if stages choose among them.
         loss: How maps are compared: (predicted, observed) → a number. None = ``SpectrumLoss()``.
         optimizer: Kind and rates.
         schedule: A ``Schedule``, or stages that follow each other.

@@ -1,6 +1,6 @@
 """New triangles for the surface of a fit: even ones between stages, and distances to it.
 
-Remeshing is written out here because no library does it (as of 2026) for everyone: gpytoolbox has
+Remeshing is written out here because no library (in 2026) serves all platforms: gpytoolbox has
 no wheels for Linux on ARM, pymeshlab is GPL, trueform is for noncommercial use, pyacvd needs VTK
 and keeps neither borders nor topology, and MMG (mmgpy) leaves edges of 1.8 times the target length,
 and folds a box unless its ridges are frozen.

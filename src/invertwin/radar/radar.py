@@ -180,7 +180,7 @@ class Radar:
             range_min: First range to cover [m].
             range_max: Last range to cover [m].
             u_max: Direction cosines from -u_max to u_max.
-            v_max: The same for v.
+            v_max: As ``u_max``, for v.
             oversample: Bins per range cell.
 
         Raises:

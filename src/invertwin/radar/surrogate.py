@@ -50,7 +50,7 @@ class Surrogate:
             first two are one.
         angle_kernel: "response", or "airy" (an evenly lit ellipse that fills the aperture).
         range_width: Standard deviation of the extra Gaussian [range cells].
-        angle_width: The same in u and v [beamwidths λ/D].
+        angle_width: Standard deviation of the extra Gaussian in u and v [beamwidths λ/D].
         aperture_radius: Radius for "airy" [m]; None = half the virtual aperture along x and y.
         phases: "mean" over random phases, or "random": one draw of them, new with every seed,
             as ``random_phase_spectrum`` does with the kernels "gaussian" and "airy". Its gradient

@@ -60,7 +60,7 @@ def test_velocities_are_differentiable():
 
 def test_fields_refuse_derivatives_with_respect_to_velocity():
     drift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    with pytest.raises(InputError, match="expected no derivatives by velocities"):
+    with pytest.raises(InputError, match="expected velocities without gradients"):
         trace_field(spinning(drift), link(), sampling=ONCE, seed=1)
     with pytest.raises(InputError, match="expected depth 1 for objects in motion, got 2"):
         trace_power(spinning(drift), link(), sampling=Sampling(depth=2, samples=10), seed=1)

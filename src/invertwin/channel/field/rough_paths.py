@@ -60,7 +60,7 @@ def draw_rough_paths(scene: Scene, link: Link, *, count: int, depth: int, seed: 
 
     Args:
         scene: Surfaces.
-        link: Antennas, of which a few frames say what a path is worth.
+        link: Antennas, a few frames of which tell how much a path contributes.
         count: Paths to draw, of each length; at most a quarter of them are kept.
         depth: Most points of a path.
         seed: Of places and phases.
@@ -200,7 +200,7 @@ class _Drawer:
     def _power(self, paths: SurfacePaths, *, received: bool) -> Tensor:
         """Power at the receiver or the last point, the mean of the reference frames.
 
-        What lies between points is left out: it only makes the draw less good.
+        What lies between points is left out: this changes only how well paths are chosen.
         """
         places = paths.places(self.geometry)
         points = [place.position for place in places]

@@ -55,7 +55,7 @@ class BoundaryPaths:
             return self.run(state, visit)["total"]
 
     def deposit(self, rate: Any, scatter: Callable[[Contribution, Any], None]) -> None:
-        """Hand on every path with its power times a lane's rate.
+        """Pass on every path with its power times a lane's rate.
 
         Args:
             rate: Of each lane.

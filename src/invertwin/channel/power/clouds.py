@@ -1,8 +1,8 @@
 """Power that clouds of soft scatterers send back, into the bins of a map: rays that fade.
 
 Geometry and transmittance are torch in float64, so that automatic differentiation in both modes
-does their derivatives; only the deposit is a integrand. A cloud has no silhouette: its power is
-continuous in all that moves, so no boundary terms are due.
+gives their derivatives; only the deposit is a kernel. A cloud has no silhouette: its power is
+continuous in all that moves, so it needs no boundary terms.
 """
 
 import math

@@ -104,7 +104,7 @@ class Inputs:
         return replace(self, surfaces=surfaces, **others)
 
     def detached(self) -> "Inputs":
-        """The same values without derivatives."""
+        """These values without derivatives."""
         return self.replaced({name: dr.detach(self.table(name)) for name in DIFFERENTIABLE})
 
     def antenna(self, frame: Any, receiver: Any, active: Any = True) -> Any:

@@ -22,7 +22,7 @@ _CHANCE = 0.5
 
 @dataclass(frozen=True)
 class Passage:
-    """Share of the power that gets through (0 if blocked), and the length it adds."""
+    """Transmittance of what lies on a segment (0 if blocked), and the extra length it adds."""
 
     transmittance: Any
     extra: Any

@@ -26,7 +26,7 @@ _BYTES_PER_VERTEX = 21  # one record: triangle, two barycentrics, throughput, le
 
 
 class Trace:
-    """The detached half of a call: which paths there are. The same each time it is asked."""
+    """The detached half of a call: which paths there are. Every call gives the same ones."""
 
     def __init__(
         self,

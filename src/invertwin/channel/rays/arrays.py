@@ -38,7 +38,7 @@ def point_at(table: Any, index: Any, active: Any = True) -> Any:
 
 
 def from_points(values: Any) -> Float32[Tensor, "n 3"]:
-    """Points, or derivatives by them, of such an array."""
+    """Points of such an array, or derivatives with respect to them."""
     return to_torch(values).reshape(-1, 4)[:, :3]
 
 

@@ -151,7 +151,7 @@ def flatten(
     moving = fitted or [n for n, o in scene.objects.items() if _moves(o)]
     if (fitted and motion != "free") or (moving and motion == "refused"):
         names = ", ".join(moving)
-        what = "no derivatives by velocities, got" if fitted else "objects at rest, got"
+        what = "velocities without gradients, got" if fitted else "objects at rest, got"
         raise InputError(
             f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time) "
             "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"

@@ -1,1 +1,1 @@
-"""Slow, readable statements of the same laws: the oracles of the kernels' tests."""
+"""Slow, readable statements of the kernels' laws: the oracles of their tests."""

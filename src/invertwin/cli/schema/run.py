@@ -213,12 +213,12 @@ class _RunFile(Section):
         for parameter in self.parameters:
             if parameter.kind not in ("shape_space", "prior"):
                 continue
-            name, why = parameter.object, f'an object sought with kind = "{parameter.kind}"'
+            name, why = parameter.object, f'with kind = "{parameter.kind}", which has its own size'
             scale = self.scene[name].scale if name in self.scene else 1.0
             if scale != 1:
-                fail(f"expected 1 of {why}, got {scale:g}; remove it", f"scene.{name}.scale")
+                fail(f"expected 1 {why}, got {scale:g}; remove it", f"scene.{name}.scale")
             if self.initial is not None and self.initial.object == name and self.initial.scale:
-                fail(f"expected false with {why}, got true; remove it", "initial.scale")
+                fail(f"expected false {why}, got true; remove it", "initial.scale")
         return self
 
     @property
