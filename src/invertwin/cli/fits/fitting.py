@@ -88,7 +88,10 @@ def calibrated(
                 loss=build.loss(problem.run.loss),
                 optimizer=replace(build.optimizer(problem.run.optimizer), rate=rate),
                 schedule=Schedule(
-                    stage.steps, stage.annealing, stage.frames_per_step, stage.tolerance
+                    stage.steps,
+                    annealing=stage.annealing,
+                    frames_per_step=stage.frames_per_step,
+                    tolerance=stage.tolerance,
                 ),
                 callbacks=[*advance, Checkpoint(checkpoint, every, resume=True)],
                 seed=problem.run.seed,

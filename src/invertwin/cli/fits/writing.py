@@ -260,7 +260,7 @@ def draw_shapes(
 def _curve(row: dict[str, Any]) -> list[list[float]]:
     """How the measure went, from the start on where that is scored."""
     begun = row.get(f"start_{CURVE}")
-    first = [] if begun is None or not row["curve"] else [[0, begun]]
+    first: list[list[float]] = [] if begun is None or not row["curve"] else [[0, begun]]
     return [*first, *row["curve"]]
 
 
