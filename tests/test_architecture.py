@@ -32,8 +32,7 @@ ALLOWED = {
     "models": MODELS,
     "inversion": INVERSION,
     "plotting": INVERSION | {"plotting"},
-    "datasets": CAPTURE | {"datasets", "cli"},
-    "cli": INVERSION | {"doctor", "plotting", "datasets", "cli", "__init__"},
+    "cli": INVERSION | {"doctor", "plotting", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

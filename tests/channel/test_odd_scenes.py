@@ -16,7 +16,6 @@ from invertwin.channel import (
     trace_power,
     use_backend,
 )
-from invertwin.datasets import rail_sar
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,
@@ -30,6 +29,7 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
+from invertwin_studies.recordings import rail_sar
 from scenes import GRID, float64, link, occluder, shift_error, thing
 
 COUNTS = Sampling(depth=1, samples=2_000, boundary_samples=500)

@@ -139,8 +139,14 @@ def test_theta_thickens_a_cloud():
 @pytest.mark.parametrize(
     ("parameter", "message"),
     [
-        ({"kind": "joint", "axis": [0.0, 1.0, 0.0]}, "expected `joint` with kind = joint"),
-        ({"kind": "distance", "center": [0.0] * 3}, "expected `width` with kind = distance"),
+        (
+            {"kind": "joint", "axis": [0.0, 1.0, 0.0]},
+            "parameter.joint: expected a value, got",
+        ),
+        (
+            {"kind": "distance", "center": [0.0] * 3},
+            "parameter.width: expected a value, got",
+        ),
         ({"kind": "latent", "index": 0}, 'shape = "vehicle" without max_edge, or "prior"'),
         ({"kind": "joint", "joint": "wing", "axis": [0.0, 1.0, 0.0]}, "got 'wing'; choose one"),
     ],

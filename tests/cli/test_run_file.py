@@ -102,7 +102,7 @@ def radar(**changes):
         ),
         (
             run(gradcheck={"parameter": {"kind": "translation", "object": "letter"}, "step": 1e-3}),
-            ["gradcheck.parameter: ", "`axis` with kind = translation", "add it"],
+            ["gradcheck.parameter.axis: ", "expected a value, got nothing", "add the key `axis`"],
         ),
         (
             run(gradcheck={"parameter": SCALE, "step_deg": 1.0}),

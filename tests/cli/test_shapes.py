@@ -12,8 +12,9 @@ from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import is_shape_key, shape_label, shape_scores
 from invertwin.cli.fits.problem import FULL, annealed_until, problem_of, stages_of, varied_run
-from invertwin.cli.fits.writing import tables_of
+from invertwin.cli.fits.writing import Fitted, tables_of
 from invertwin.cli.run_file import to_toml, validate
+from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, box
 from invertwin.scene.files import load_mesh
@@ -172,7 +173,7 @@ def test_a_twin_that_has_collapsed_has_no_measures(tmp_path):
     assert found["start_chamfer_m"] > 0
     assert not {"chamfer_m", "chamfer_seen_m", "iou"} & set(found)
     metrics = {"steps": 1, "status": "budget", "parameters": {}, **found}
-    result = tables_of(problem, metrics, start, twin, {FULL: [found]})[0]
+    result = tables_of(Fitted(problem, metrics, {FULL: [found]}, start, twin, {}))[0]
     assert ["Chamfer distance, mean of both directions [m]", None] in result.rows
 
 
@@ -240,7 +241,7 @@ def test_learned_shapes_are_objects_and_parameters(tmp_path):
     assert len(scene["plate"].mesh.faces) > 200
     tables = build.named(run.parameters)
     module = build.builders(run.parameters, build.Start(scene))["vertices"](scene)
-    assert len(build.regularizers(tables, {"vertices": module}, {"vertices": scene})) == 1
+    assert len(shape_terms(tables["vertices"], module, scene)) == 1
 
 
 def save_vehicles(folder):

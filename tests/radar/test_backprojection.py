@@ -18,7 +18,7 @@ from invertwin.radar import (
     beat_signal,
     range_profile,
 )
-from invertwin.radar.waveform import sample_window
+from invertwin.radar.waveform import unit_window
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.pose import rotation_from_vector
 
@@ -50,7 +50,7 @@ def recorded(point_paths, radar, points, coefficients):
 def plain(beat, radar, points):
     """The sum as it is written, sample by sample."""
     waveform = radar.waveform
-    window = sample_window(waveform, radar.window)
+    window = unit_window(radar.window, waveform.samples)
     tx, rx = radar.elements()
     image = []
     for point in points:

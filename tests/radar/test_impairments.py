@@ -30,7 +30,7 @@ from invertwin.radar import (
     range_profile,
     residual_phase,
 )
-from invertwin.radar.waveform import sample_window
+from invertwin.radar.waveform import unit_window
 from invertwin.scene.antenna import linear_array
 
 LEVEL = -85.0
@@ -134,7 +134,7 @@ def test_skirt_of_a_target(point_paths):
     beside = torch.arange(5, 40)
     offsets = beside / 20e-6
     factor = 4 * torch.sin(math.pi * offsets * 2 * distance / SPEED_OF_LIGHT).square()
-    weight = sample_window(FMCW(76.5e9, 0.25e9, 20e-6, 128), "hann")
+    weight = unit_window("hann", 128)
     bandwidth = 6.4e6 * weight.square().sum() / weight.sum().square()
     expected = 10 ** (level / 10) * factor * bandwidth
     for side in (1, -1):

@@ -259,7 +259,7 @@ def test_every_value_of_a_slab_can_be_fitted():
         assert float(getattr(material, name).detach()) == pytest.approx(value, rel=1e-12)
     surface = material.surface(77e9)
     # The exponent of a lobe tells about the slope, the weights about the rest.
-    parts = (surface.amplitude, surface.transmittance, surface.excess, surface.lobes.square())
+    parts = (surface.amplitude, surface.transmittance, surface.extra_length, surface.lobes.square())
     torch.stack([part[1:].sum() for part in parts]).sum().backward()
     assert all(p.grad is not None and torch.isfinite(p.grad) for p in module.parameters())
     for extreme in (-30.0, 30.0):

@@ -46,6 +46,18 @@ def test_a_bare_wheel_says_what_to_install(tmp_path, section):
     assert "install the studies: pip install -e ./experiments/studies" in ended.stderr
 
 
+@pytest.mark.parametrize("kind", ["openradar", "rail_sar"])
+def test_a_bare_wheel_says_what_reads_a_public_recording(tmp_path, kind):
+    head, rest = RUN.split("[data]", 1)
+    rest = rest[rest.index("\n[") :]
+    (tmp_path / "run.toml").write_text(f'{head}[data]\nkind = "{kind}"\nfolder = "."\n{rest}')
+    ended = bare(tmp_path, "reconstruct", "run.toml")
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1
+    assert "run.toml: data.kind: expected one of simulated, " in ended.stderr
+    assert "install the studies: pip install -e ./experiments/studies" in ended.stderr
+
+
 def test_a_bare_wheel_lacks_the_commands(tmp_path):
     ended = bare(tmp_path, "train-prior")
     assert ended.returncode == 2

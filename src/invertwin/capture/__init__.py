@@ -7,12 +7,18 @@ from types import MappingProxyType
 from typing import Any
 
 from invertwin.capture import described_arrays, ti
-from invertwin.capture.backprojection import backproject, calibrate, locate
-from invertwin.capture.capture import Capture
-from invertwin.capture.channels import ChannelCalibration, estimate_channels
-from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.capture.chirps import ChirpData, ChirpSettings, adc_counts, settings_of
-from invertwin.capture.track import Track
+from invertwin.capture.backprojection import backproject as backproject
+from invertwin.capture.backprojection import calibrate as calibrate
+from invertwin.capture.backprojection import locate as locate
+from invertwin.capture.capture import Capture as Capture
+from invertwin.capture.channels import ChannelCalibration as ChannelCalibration
+from invertwin.capture.channels import estimate_channels as estimate_channels
+from invertwin.capture.chirp_capture import ChirpCapture as ChirpCapture
+from invertwin.capture.chirps import ChirpData as ChirpData
+from invertwin.capture.chirps import ChirpSettings as ChirpSettings
+from invertwin.capture.chirps import adc_counts as adc_counts
+from invertwin.capture.chirps import settings_of as settings_of
+from invertwin.capture.track import Track as Track
 from invertwin.errors import InputError
 
 READERS: MappingProxyType[str, Callable[..., Capture]] = MappingProxyType(
@@ -42,21 +48,3 @@ def read(path: str | Path, reader: str = "netcdf", **options: Any) -> Capture:
             f"expected a reader of {', '.join(READERS)}, got {reader!r}; did you mean {near!r}?"
         )
     return READERS[reader](path, **options)
-
-
-__all__ = [
-    "READERS",
-    "Capture",
-    "ChannelCalibration",
-    "ChirpCapture",
-    "ChirpData",
-    "ChirpSettings",
-    "Track",
-    "adc_counts",
-    "backproject",
-    "calibrate",
-    "estimate_channels",
-    "locate",
-    "read",
-    "settings_of",
-]

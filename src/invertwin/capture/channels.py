@@ -15,7 +15,7 @@ from invertwin.capture.radar_fields import labelled
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.radar import sampled
-from invertwin.radar.waveform import sample_window
+from invertwin.radar.waveform import unit_window
 from invertwin.scene.checks import checked_tensor
 
 _DEAD = 1e-3
@@ -166,7 +166,7 @@ def estimate_channels(
     cycles = waveform.frequencies * delay[..., None]
     cycles = cycles - 0.5 * waveform.residual_slope * delay.square()[..., None]
     ideal = torch.exp(2j * torch.pi * cycles)
-    window = sample_window(waveform, radar.window)
+    window = unit_window(radar.window, waveform.samples)
     matched = (capture.beat.to(torch.complex128) * ideal.conj() * window).sum(dim=-1)
     # Rows are frames, columns channels.
     _, strength, channels = torch.linalg.svd(matched.flatten(1), full_matrices=False)

@@ -1,34 +1,19 @@
 """Scene to paths to channel impulse response: the only room that knows the ray tracer."""
 
-from invertwin.channel.field.field import trace_field
-from invertwin.channel.field.rough_paths import RoughPaths
-from invertwin.channel.field.rough_points import RoughPoints
-from invertwin.channel.field.speckle import Speckle, draw_speckle
-from invertwin.channel.paths import Grid, Link, Paths, Pattern
-from invertwin.channel.power.clouds import deposit_density
-from invertwin.channel.power.deposit import deposit_power
-from invertwin.channel.rays.backend import backend, use_backend
-from invertwin.channel.rays.geometry import differentiated
-from invertwin.channel.rays.scene import visible_points
-from invertwin.channel.reference.power import trace_power
-from invertwin.channel.sampling import Sampling
-
-__all__ = [
-    "Grid",
-    "Link",
-    "Paths",
-    "Pattern",
-    "RoughPaths",
-    "RoughPoints",
-    "Sampling",
-    "Speckle",
-    "backend",
-    "deposit_density",
-    "deposit_power",
-    "differentiated",
-    "draw_speckle",
-    "trace_field",
-    "trace_power",
-    "use_backend",
-    "visible_points",
-]
+from invertwin.channel.field.field import trace_field as trace_field
+from invertwin.channel.field.rough_paths import RoughPaths as RoughPaths
+from invertwin.channel.field.rough_points import RoughPoints as RoughPoints
+from invertwin.channel.field.speckle import Speckle as Speckle
+from invertwin.channel.field.speckle import draw_speckle as draw_speckle
+from invertwin.channel.paths import Grid as Grid
+from invertwin.channel.paths import Link as Link
+from invertwin.channel.paths import Paths as Paths
+from invertwin.channel.paths import Pattern as Pattern
+from invertwin.channel.power.clouds import deposit_density as deposit_density
+from invertwin.channel.power.deposit import deposit_power as deposit_power
+from invertwin.channel.rays.backend import backend as backend
+from invertwin.channel.rays.backend import use_backend as use_backend
+from invertwin.channel.rays.geometry import differentiated as differentiated
+from invertwin.channel.rays.scene import visible_points as visible_points
+from invertwin.channel.reference.power import trace_power as trace_power
+from invertwin.channel.sampling import Sampling as Sampling

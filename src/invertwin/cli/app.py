@@ -160,28 +160,12 @@ def look(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
+    given = {name: value for name, value in locals().items() if name not in ("out", "overwrite")}
     from invertwin.cli.run_look import Look, run_look
 
-    wanted = Look(
-        recording,
-        config,
-        board,
-        elevation,
-        azimuth,
-        lanes,
-        chirp,
-        frame,
-        range_min,
-        range_max,
-        method.value,
-        sources,
-        channels,
-        reflector,
-    )
     default = Path("out") / recording.name.split(".")[0]
     with run_folder(out or default, {}, overwrite, False) as folder:
-        tables = run_look(wanted, folder)
-        print_tables(tables)
+        print_tables(run_look(Look(**given), folder))
 
 
 @app.command()

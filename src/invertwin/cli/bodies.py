@@ -131,10 +131,7 @@ def joints(
     """Joint angles of an object with shape = "body", from those it has.
 
     Args:
-        object: name in the scene.
         joints: by name: the components of the rotation vector that are sought, such as ["y"].
-        mesh: of the object.
-        bodies: all that are sought.
     """
     return bodies[object].module(object, mesh)
 

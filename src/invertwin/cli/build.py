@@ -17,9 +17,8 @@ from invertwin.cli.run_file import unknown_object
 from invertwin.cli.schema import RunFile, SceneFile, Starts
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
-from invertwin.cli.shape_tables import ObjectTable, Placement, given_for, joined, shape_terms
+from invertwin.cli.shape_tables import ObjectTable, Placement, given_for, joined
 from invertwin.errors import InputError
-from invertwin.inversion.regularization import Regularizer
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Mesh, Object, Scene, rigid, rotation_angle, rotation_from_vector
 from invertwin.scene.files import CONCRETE, load_scene_xml
@@ -96,28 +95,17 @@ def optimizer(table: Any) -> Any:
 
 
 def model(table: Any, grid: Grid, surrogate: Surrogate) -> Any:
-    """The forward model of a `model` table, which plugins add.
-
-    Args:
-        table: The table.
-        grid: Handed over where the model asks for a `Grid`.
-        surrogate: Handed over where the model asks for a `Surrogate`.
-    """
+    """The forward model of a `[model]` table, which plugins add; it may ask for the others."""
     with about("model"):
         return table.build({Grid: grid, Surrogate: surrogate})
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit starts.
-
-    Attributes:
-        scene: Objects where they are thought to be.
-        bodies: Whose joints are sought, by object.
-    """
+    """Where a fit starts."""
 
     scene: Scene
-    bodies: Mapping[str, SoughtBody] = field(default_factory=dict)
+    bodies: Mapping[str, SoughtBody] = field(default_factory=dict)  # whose joints are sought
 
 
 def builders(
@@ -125,10 +113,7 @@ def builders(
 ) -> dict[str, Callable[[Scene], nn.Module]]:
     """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order.
 
-    Args:
-        tables: What is sought.
-        start: Where the fit starts.
-        objects: The `[scene.<name>]` tables, whose coordinates learned shapes start from.
+    Learned shapes start from the coordinates of their `[scene.<name>]` tables, the objects.
     """
     return {
         name: partial(_module, table, f"parameters[{i}]", start, objects or {})
@@ -171,24 +156,6 @@ def _module(
         return table.build(given)
 
 
-def regularizers(
-    tables: Mapping[str, Any],
-    modules: Mapping[str, nn.Module],
-    scenes: Mapping[str, Scene],
-) -> list[Regularizer]:
-    """The terms that shapes add to the loss.
-
-    Args:
-        tables: All parameters, by name.
-        modules: Those of a fit, by name.
-        scenes: By name, where they start.
-    """
-    terms: list[Regularizer] = []
-    for name, module in modules.items():
-        terms += shape_terms(tables[name], module, scenes[name])
-    return terms
-
-
 def starts(
     table: Starts,
     scene: Scene,
@@ -196,15 +163,7 @@ def starts(
     seed: int,
     bodies: Mapping[str, SoughtBody] | None = None,
 ) -> list[Start]:
-    """From where the fits of the `[starts]` table start.
-
-    Args:
-        table: How many, how far from the truth.
-        scene: The scene as known; only the pose of the object is replaced.
-        truth: The true scene.
-        seed: Used where the table has none; the same seed gives the same starts.
-        bodies: Whose joints are sought, by object.
-    """
+    """From where the fits of the `[starts]` table start; of its object the pose is replaced."""
     generator = torch.Generator().manual_seed(seed if table.seed is None else table.seed)
 
     def uniform(low: float, high: float) -> float:
@@ -238,14 +197,7 @@ def starts(
 
 
 def displaced(scene: Scene, name: str, offset: Tensor, rotation: Tensor) -> Scene:
-    """The scene with one object turned about its centre and moved.
-
-    Args:
-        scene: Where everything is.
-        name: The object.
-        offset: [3], m.
-        rotation: Rotation vector [3], rad.
-    """
+    """The scene with one object turned [rad, rotation vector] about its centre and moved [m]."""
     item = scene[name]
     turn = rotation_from_vector(rotation)
     motion = rigid(turn, offset + item.center - turn @ item.center)

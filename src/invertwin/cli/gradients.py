@@ -1,21 +1,26 @@
-"""The scalar θ of a gradient check, from the tables of a run file: a module and a tangent."""
+"""The scalar θ of a gradient check: a module, and how its parameters change with θ."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge
 from torch import Tensor, nn
 
-from invertwin.cli import schema
-from invertwin.cli.bodies import template
+from invertwin.cli.bodies import Bodies, template
+from invertwin.cli.materials import MaterialValue
+from invertwin.cli.registry import Group, Registry
+from invertwin.cli.section import Counts, Vector
+from invertwin.cli.shape_tables import ObjectTable, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.lines import Line
 from invertwin.inversion.remeshing import signed_distance
+from invertwin.limits import Positive
 from invertwin.radar.parameters import RadarPose
 from invertwin.radar.radar import Radar
-from invertwin.scene import Scene
+from invertwin.scene import Mesh, Scene
 from invertwin.scene.geometry import (
     DensityGrid,
     DistanceGrid,
@@ -28,35 +33,16 @@ from invertwin.scene.geometry import (
 )
 from invertwin.scene.parameters import MaterialValues, Pose, Scale
 
-UNITS = {
-    "translation": "1/m",
-    "rotation": "1/rad",
-    "scale": "per relative size",
-    "radar_translation": "1/m",
-    "radar_rotation": "1/rad",
-    "joint": "1/rad",
-    "latent": "per unit of the latent",
-    "distance": "1/m",
-    "density": "per relative density",
-}
-"""Units of the derivative of a power, by kind of θ."""
-
 
 @dataclass(frozen=True)
 class Theta:
-    """What a gradient check moves.
+    """What a gradient check moves."""
 
-    Attributes:
-        module: Maps the scene, or the radar.
-        tangent: How its parameters change with θ, by name.
-        of_radar: Whether it maps the radar.
-        shape: Whether it changes a shape.
-    """
-
-    module: nn.Module
-    tangent: Mapping[str, Tensor]
+    module: nn.Module  # maps the scene, or the radar
+    tangent: Mapping[str, Tensor]  # how its parameters change with θ, by name
+    unit: str  # of the derivative of a power
     of_radar: bool = False
-    shape: bool = False
+    shape: bool = False  # whether it changes a shape
 
     def direction(self) -> Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]:
         """A function that moves scene and radar by θ."""
@@ -69,109 +55,124 @@ class Theta:
         return moved
 
 
-def theta_of(table: schema.GradientParameter, run: schema.RunFile, scene: Scene) -> Theta:
-    """The θ of a `[gradcheck.parameter]` table.
+def register(registry: Registry) -> None:
+    """Adds the kinds of θ."""
+    registry.group(Group("theta"))
+    for name, make in (
+        ("translation", translation),
+        ("rotation", rotation),
+        ("radar_translation", radar_translation),
+        ("radar_rotation", radar_rotation),
+        ("scale", scale),
+        ("material", material),
+        ("joint", joint),
+        ("latent", latent),
+        ("distance", distance),
+        ("density", density),
+    ):
+        registry.add("theta", name, make)
 
-    Args:
-        table: Kind and values.
-        run: Its scene tables.
-        scene: The scene of the run file.
+
+def theta_of(table: Any, run: Any, scene: Scene) -> Theta:
+    """The θ of a `[gradcheck.parameter]` table, at the scene of the run file.
 
     Raises:
         InputError: The object has no such value, joint, coordinate or shape.
     """
-    name = table.object or ""
-    item = run.scene.get(name)
-    match table.kind:
-        case "translation" | "radar_translation" | "rotation" | "radar_rotation":
-            radar = table.kind.startswith("radar")
-            axis = torch.tensor(table.axis, dtype=torch.float64)
-            axis = axis / axis.norm()
-            key = table.kind.removeprefix("radar_")
-            # A small q = (1, r) turns by the rotation vector r.
-            change = axis if key == "translation" else torch.cat([axis.new_zeros(1), axis])
-            return Theta(RadarPose() if radar else Pose(name), {key: change}, radar)
-        case "scale":
-            return Theta(Scale(name), {"log_scale": torch.ones((), dtype=torch.float64)})
-        case "material":
-            return _material(table, scene)
-        case "joint":
-            return Theta(*_joint(table, item), shape=True)
-        case "latent":
-            return Theta(*_latent(table, item), shape=True)
-    low, high, counts = _box(table)
-    distance = partial(signed_distance, scene[name].mesh)
-    if table.kind == "distance":
-        module = DistanceGrid.sampled(name, low, high, counts, distance)
-        # The surface moves outwards where the distance falls.
-        return Theta(module, {"value": -_bump(table, module.lattice)}, shape=True)
-    lattice = Lattice.between(low, high, counts)
-    inside = -distance(lattice.nodes.reshape(-1, 3))
-    share = torch.sigmoid(4 * inside / lattice.spacing.mean()).reshape(lattice.counts)
-    cloud = DensityGrid(name, low, high, float(table.extinction or 0) * share)
-    with torch.no_grad():
-        # σ = softplus(value) / h: this change of the value changes σ by σ times the bump.
-        slope = torch.sigmoid(cloud.value) / torch.nn.functional.softplus(cloud.value)
-        return Theta(cloud, {"value": _bump(table, lattice) / slope}, shape=True)
+    name = getattr(table, "object", None)
+    return table.build({} if name is None else given_for(name, scene, Bodies(), run.scene))
 
 
-def _material(table: schema.GradientParameter, scene: Scene) -> Theta:
-    material, value = scene[table.object or ""].material, table.value or ""
-    if value not in vars(material):
+def translation(object: str, axis: Vector) -> Theta:
+    """Moves an object."""
+    return Theta(Pose(object), {"translation": _unit(axis)}, "1/m")
+
+
+def rotation(object: str, axis: Vector) -> Theta:
+    """Turns an object about its centre."""
+    return Theta(Pose(object), {"rotation": _turn(axis)}, "1/rad")
+
+
+def radar_translation(axis: Vector) -> Theta:
+    """Moves the radar."""
+    return Theta(RadarPose(), {"translation": _unit(axis)}, "1/m", of_radar=True)
+
+
+def radar_rotation(axis: Vector) -> Theta:
+    """Turns the radar."""
+    return Theta(RadarPose(), {"rotation": _turn(axis)}, "1/rad", of_radar=True)
+
+
+def scale(object: str) -> Theta:
+    """Makes an object larger."""
+    change = torch.ones((), dtype=torch.float64)
+    return Theta(Scale(object), {"log_scale": change}, "per relative size")
+
+
+def material(object: str, value: MaterialValue, scene: Scene) -> Theta:
+    """Changes a value of an object's material.
+
+    Args:
+        value: of the material.
+    """
+    found = scene[object].material
+    if value not in vars(found):
         raise InputError(
-            f"expected a value of {table.object}'s material ({', '.join(vars(material))}), "
+            f"expected a value of {object}'s material ({', '.join(vars(found))}), "
             f"got {value!r}; choose one"
         )
-    module = MaterialValues(table.object or "", **{value: getattr(material, value)})
+    module = MaterialValues(object, **{value: getattr(found, value)})
     key = f"raw.{value}"
     raw = module.get_parameter(key).detach()
-    found, slope = torch.func.jvp(  # type: ignore[misc]
-        lambda parameter: _value(module, key, parameter, scene, value),
-        (raw,),
-        (torch.ones_like(raw),),
-    )
-    return Theta(module, {key: torch.ones_like(found) / slope})
+
+    def read(parameter: Tensor) -> Tensor:
+        moved = torch.func.functional_call(module, {key: parameter}, (scene,))
+        return getattr(moved[object].material, value)
+
+    slope = torch.func.jvp(read, (raw,), (torch.ones_like(raw),))[1]
+    return Theta(module, {key: torch.ones_like(slope) / slope}, f"per unit of {value}")
 
 
-def _value(module: nn.Module, key: str, parameter: Tensor, scene: Scene, value: str) -> Tensor:
-    moved = torch.func.functional_call(module, {key: parameter}, (scene,))
-    return getattr(moved[module.object].material, value)  # type: ignore[attr-defined]
+def joint(object: str, joint: str, axis: Vector, table: ObjectTable | None = None) -> Theta:
+    """Turns a joint of a body.
 
-
-def _joint(table: schema.GradientParameter, item: Any) -> tuple[SkinnedBody, dict[str, Tensor]]:
+    Args:
+        joint: name.
+    """
+    item: Any = table
     if _shape(item) != "body":
-        raise InputError(f'expected an object with shape = "body", got {table.object}; choose one')
+        raise InputError(f'expected an object with shape = "body", got {object}; choose one')
     body = template(item).scaled(item.scale)
     angles = {
         name: torch.tensor(turn, dtype=torch.float64).deg2rad()
         for name, turn in item.angles_deg.items()
     }
     change = torch.zeros(len(body.parents), 3, dtype=torch.float64)
-    axis = torch.tensor(table.axis, dtype=torch.float64)
-    change[body.joint(table.joint or "")] = axis / axis.norm()
-    module = SkinnedBody(table.object or "", body, body.rotations(angles))
-    return module, {"rotation": change}
+    change[body.joint(joint)] = _unit(axis)
+    module = SkinnedBody(object, body, body.rotations(angles))
+    return Theta(module, {"rotation": change}, "1/rad", shape=True)
 
 
-def _latent(
-    table: schema.GradientParameter, item: Any
-) -> tuple[LinearShape | PriorShape, dict[str, Tensor]]:
-    index, name = table.index or 0, table.object or ""
+def latent(object: str, index: Annotated[int, Ge(0)], table: ObjectTable | None = None) -> Theta:
+    """Changes a coordinate of a vehicle or prior, in standard deviations.
+
+    Args:
+        index: from 0.
+    """
+    item: Any = table
     whole = getattr(item, "scale", None) == 1
     if _shape(item) == "vehicle" and whole and item.max_edge is None:
         start = torch.zeros(max(index + 1, len(item.coefficients)), dtype=torch.float64)
         start[: len(item.coefficients)] = torch.tensor(item.coefficients, dtype=torch.float64)
-        module = LinearShape(name, load_vehicle_space(item.folder, item.level), start)
+        module = LinearShape(object, load_vehicle_space(item.folder, item.level), start)
     elif _shape(item) == "prior" and whole:
         prior = load_prior(item.prior)
         start = torch.zeros(prior.latent_size, dtype=torch.float64)
-        if item.latent is not None:
-            start = start.new_tensor(item.latent)
-        module = PriorShape(name, prior, start)
+        module = PriorShape(object, prior, start.new_tensor(item.latent) if item.latent else start)
     else:
         raise InputError(
             'expected an object with shape = "vehicle" without max_edge, or "prior", and scale 1, '
-            f"got {name}; choose one"
+            f"got {object}; choose one"
         )
     if index >= len(module.latent):
         raise InputError(
@@ -179,22 +180,73 @@ def _latent(
         )
     change = torch.zeros_like(module.latent.detach())
     change[index] = 1.0
-    return module, {"latent": change}
+    return Theta(module, {"latent": change}, "per unit of the latent", shape=True)
 
 
-def _box(table: schema.GradientParameter) -> tuple[list[float], list[float], Sequence[int]]:
-    assert table.low is not None
-    assert table.high is not None
-    assert table.counts is not None
-    return table.low, table.high, table.counts
+def distance(
+    object: str,
+    center: Vector,
+    width: Positive,
+    low: Vector,
+    high: Vector,
+    counts: Counts,
+    mesh: Mesh,
+) -> Theta:
+    """Moves the surface of a signed distance outwards, in a round bump.
+
+    Args:
+        center: of the bump, in the object's frame [m].
+        width: standard deviation of the bump [m].
+    """
+    inside = partial(signed_distance, mesh)
+    module = DistanceGrid.sampled(object, low, high, counts, inside)
+    # The surface moves outwards where the distance falls.
+    bump = _bump(module.lattice, center, width)
+    return Theta(module, {"value": -bump}, "1/m", shape=True)
 
 
-def _bump(table: schema.GradientParameter, lattice: Lattice) -> Tensor:
+def density(
+    object: str,
+    center: Vector,
+    width: Positive,
+    low: Vector,
+    high: Vector,
+    counts: Counts,
+    extinction: Positive,
+    mesh: Mesh,
+) -> Theta:
+    """Thickens a cloud in the object's place, in a round bump.
+
+    Args:
+        center: of the bump, in the object's frame [m].
+        width: standard deviation of the bump [m].
+        extinction: of the cloud [1/m].
+    """
+    lattice = Lattice.between(low, high, counts)
+    inside = -signed_distance(mesh, lattice.nodes.reshape(-1, 3))
+    share = torch.sigmoid(4 * inside / lattice.spacing.mean()).reshape(lattice.counts)
+    cloud = DensityGrid(object, low, high, extinction * share)
+    with torch.no_grad():
+        # σ = softplus(value) / h: this change of the value changes σ by σ times the bump.
+        slope = torch.sigmoid(cloud.value) / torch.nn.functional.softplus(cloud.value)
+        change = _bump(lattice, center, width) / slope
+    return Theta(cloud, {"value": change}, "per relative density", shape=True)
+
+
+def _unit(axis: Vector) -> Tensor:
+    found = torch.tensor(axis, dtype=torch.float64)
+    return found / found.norm()
+
+
+def _turn(axis: Vector) -> Tensor:
+    """A small q = (1, r) turns by the rotation vector r."""
+    return torch.cat([torch.zeros(1, dtype=torch.float64), _unit(axis)])
+
+
+def _bump(lattice: Lattice, center: Vector, width: float) -> Tensor:
     """A round bump with this centre and width at the nodes, 1 in the middle."""
-    assert table.center is not None
-    assert table.width is not None
-    far = lattice.nodes - lattice.nodes.new_tensor(table.center)
-    return torch.exp(-far.square().sum(-1) / (2 * table.width**2))
+    far = lattice.nodes - lattice.nodes.new_tensor(center)
+    return torch.exp(-far.square().sum(-1) / (2 * width**2))
 
 
 def _shape(item: Any) -> str:

@@ -24,48 +24,33 @@ from invertwin.scene import AntennaArray, Scene
 
 
 def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[Figure, dict[str, Any]]:
-    """The figure and the numbers of the `[landscape]` table.
+    """The figure of the `[landscape]` table, and the local minima of every curve.
 
     For the exact signal one channel of one frame is enough to show the shape.
-
-    Args:
-        run: The run file.
-        truth: The true scene.
-        sight: What the sensor has recorded.
-
-    Returns:
-        The figure; and the number of local minima of every curve.
     """
     table = need(run, "landscape", "the loss landscape")
+    first, beat = sight.radar.frames([0]), sight.capture.beat[:1, :1, :1]
+    fine = np.linspace(-table.exact_span, table.exact_span, table.exact_points)
+    wide = np.linspace(-table.span, table.span, table.points)
+    along = table.object, table.axis
+    model = sight.model(sampling_of(run))
+    assert isinstance(model, SurrogateMap)
+    models = {
+        "surrogate, first widths": model,
+        "surrogate, no extra width": model.narrowed(0.0),
+    }
     with torch.no_grad():
-        x = np.linspace(-table.exact_span, table.exact_span, table.exact_points)
-        first = sight.radar.frames([0])
-        losses = exact_losses(
-            run,
-            truth,
-            first,
-            moved(truth, table.object, table.axis, x),
-            sight.capture.beat[:1, :1, :1],
-            {"beat": lambda beat: beat},
-            _one_channel(first),
-        )
-        exact = (x, losses["beat"])
-        x = np.linspace(-table.span, table.span, table.points)
-        scenes = moved(truth, table.object, table.axis, x)
-        model = sight.model(sampling_of(run))
-        assert isinstance(model, SurrogateMap)
-        models = {
-            "surrogate, first widths": model,
-            "surrogate, no extra width": model.narrowed(0.0),
-        }
+        near, scenes = moved(truth, *along, fine), moved(truth, *along, wide)
+        views = {"beat": lambda beat: beat}
+        exact = exact_losses(run, truth, first, near, beat, views, _one_channel(first))["beat"]
         smooth = {
-            name: (x, smooth_losses(run, sight.radar, sight.capture, scenes, model))
+            name: (wide, smooth_losses(run, sight.radar, sight.capture, scenes, model))
             for name, model in models.items()
         }
-    counts = {name: plotting.count_minima(losses) for name, (_, losses) in smooth.items()}
-    minima = {"exact": plotting.count_minima(exact[1]), **counts}
-    along = line_name(table.object, table.axis)
-    return plotting.landscape(exact, smooth, along), {"local_minima": minima}
+    minima = {"exact": plotting.count_minima(exact)}
+    minima |= {name: plotting.count_minima(losses) for name, (_, losses) in smooth.items()}
+    figure = plotting.landscape((fine, exact), smooth, line_name(*along))
+    return figure, {"local_minima": minima}
 
 
 def moved(truth: Scene, name: str, axis: Sequence[float], offsets: Iterable[float]) -> list[Scene]:
@@ -77,14 +62,10 @@ def moved(truth: Scene, name: str, axis: Sequence[float], offsets: Iterable[floa
 
 def line_name(name: str, axis: Sequence[float]) -> str:
     """What moves and along what: x, y or z, or the direction's numbers."""
-    return f"{name} along {_axis_name(axis)}"
-
-
-def _axis_name(axis: Sequence[float]) -> str:
-    used = [name for name, value in zip("xyz", axis, strict=True) if value]
+    used = [letter for letter, value in zip("xyz", axis, strict=True) if value]
     if len(used) == 1 and sum(axis) > 0:
-        return used[0]
-    return f"({', '.join(f'{value:g}' for value in axis)})"
+        return f"{name} along {used[0]}"
+    return f"{name} along ({', '.join(f'{value:g}' for value in axis)})"
 
 
 def exact_losses(
@@ -154,15 +135,7 @@ def _one_channel(radar: Radar) -> Radar:
 def smooth_losses(
     run: RunFile, radar: Radar, capture: Capture, scenes: Sequence[Scene], model: SurrogateMap
 ) -> np.ndarray:
-    """The `[loss]` of the surrogate's maps of scenes against the measured spectrum.
-
-    Args:
-        run: Its loss and seed.
-        radar: What sees the scenes.
-        capture: The data.
-        scenes: Along a line.
-        model: The surrogate.
-    """
+    """The `[loss]` of the surrogate's maps of scenes against the measured spectrum."""
     measured = model.blurred(model.observe(capture), radar)
     loss = build.loss(run.loss)
     # The same points of the surfaces in every scene, or steps as fine as these would show the

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from pydantic import GetCoreSchemaHandler, model_validator
 from torch import Tensor
 
 from invertwin.cli.registry import Form, Group, Registry, Table, number_or_list
-from invertwin.cli.section import InputPath, Section, about, fail, key
+from invertwin.cli.section import Among, InputPath, Section, about, fail, key
 from invertwin.errors import InputError
 from invertwin.scene import (
     Dielectric,
@@ -35,10 +35,7 @@ from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import evaluated
 from invertwin.scene.parameters import MaterialValues
 
-if TYPE_CHECKING:
-    MaterialValue = str
-else:
-    MaterialValue = Literal[tuple(RANGES)]
+MaterialValue = Annotated[str, Among(tuple(RANGES))]
 _KINDS: Mapping[str, type[Material]] = {
     "rough_dielectric": RoughDielectric,
     "perfect_conductor": PerfectConductor,
@@ -123,9 +120,7 @@ def sought_values(
     """Material values that are sought, from the values of the scene table.
 
     Args:
-        object: name in the scene.
         values: which are sought.
-        item: the object.
         layer: of a multilayer, from 0: the layer whose values they are.
 
     Raises:

@@ -55,26 +55,29 @@ class SimulatedData(Section):
 
 @dataclass(frozen=True)
 class Recording:
-    """Every chirp of a recording, and what recorded it. Readers return it, or a `Capture`.
-
-    Attributes:
-        chirps: The samples and their settings.
-        elements: Of TX in the order of sending, of RX.
-        positions: Of the radar in every frame [m]; None = the origin.
-        rotations: Of the radar in every frame; None = axes of the world.
-    """
+    """Every chirp of a recording, and what recorded it. Readers return it, or a `Capture`."""
 
     chirps: ChirpData
-    elements: Elements
-    positions: Tensor | None = None
-    rotations: Tensor | None = None
+    elements: Elements  # of TX in the order of sending, of RX
+    positions: Tensor | None = None  # of the radar in every frame [m]; None = the origin
+    rotations: Tensor | None = None  # None = axes of the world
+    moving: bool = False  # what it shows moves, and fades in the mean of a frame's chirps
 
     def radar(self) -> Radar:
         """What recorded it, one frame per position."""
         return self.chirps.radar(*self.elements, self.positions, self.rotations)
 
     def capture(self, chirp: int | None = None) -> Capture:
-        """One signal per frame and channel: of one chirp, counted from 0, or the mean."""
+        """One signal per frame and channel: of one chirp, counted from 0, or the mean.
+
+        Raises:
+            InputError: The mean of a recording of movers.
+        """
+        if self.moving and chirp is None:
+            raise InputError(
+                "expected a parameter of kind mover, since the recording has chirps and movers, "
+                "which fade in the mean of the chirps; seek a mover, or choose one `chirp`"
+            )
         return self.chirps.capture(
             *self.elements,
             chirps="mean" if chirp is None else chirp,
@@ -203,10 +206,6 @@ def _frame(chirps: ChirpData, number: int) -> ChirpData:
 def measured(data: Any, path: str = "data") -> Capture:
     """The capture of a `[data]` table that names a recording.
 
-    Args:
-        data: The table.
-        path: Of the table, for errors.
-
     Raises:
         InputError: Files that are missing, damaged or contradict each other.
     """
@@ -221,10 +220,6 @@ def measured(data: Any, path: str = "data") -> Capture:
 
 def chirp_capture(data: Any, path: str = "data") -> ChirpCapture:
     """The recording of a `[data]` table with every chirp of its frames.
-
-    Args:
-        data: The table.
-        path: Of the table, for errors.
 
     Raises:
         InputError: Data without chirps, or files that are missing or damaged.

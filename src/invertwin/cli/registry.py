@@ -40,11 +40,20 @@ BUILT_IN = (
     "invertwin.cli.sensors",
     "invertwin.cli.materials",
     "invertwin.cli.shape_tables",
+    "invertwin.cli.gradients",
     "invertwin.cli.recordings",
     "invertwin.cli.fit_tables",
-    "invertwin.datasets.kinds",
 )
 PLUGINS = "invertwin.plugins"
+_MEANINGS = {
+    "object": "name in the scene",
+    "axis": "direction, or axis of the turn",
+    "low": "corner of the box, in the object's frame [m]",
+    "high": "the opposite corner [m]",
+    "counts": "nodes along x, y and z",
+    "smooth": "λ of steps preconditioned by (I + λL)⁻²; 0 = none",
+}
+"""Of keys that many tables have, where a constructor says nothing."""
 _PLAIN = (bool, int, float, str, list, tuple, dict)
 
 
@@ -179,6 +188,7 @@ class Registry:
     def __init__(self) -> None:
         self.sections: dict[str, Any] = {}
         self.commands: dict[str, Callable[..., Any]] = {}
+        self.recordings: dict[str, tuple[str, str | None]] = {}
         self._groups: dict[str, Group] = {}
         self._forms: dict[Any, Form] = {}
         self._bases: dict[type, type[Table]] = {}
@@ -222,6 +232,16 @@ class Registry:
     def command(self, name: str, function: Callable[..., Any]) -> None:
         """Adds a command to the command line, as typer takes it, and a task of its name."""
         self.commands[name] = function
+
+    def recording(self, file: str, kind: str, board: str | None = None) -> None:
+        """Lets `invertwin look` know a recording by the name of its file.
+
+        Args:
+            file: Its name.
+            kind: Of the data; its constructor is given the folder alone.
+            board: Preset that recorded, unless the user names another.
+        """
+        self.recordings[file] = (kind, board)
 
     def group(self, group: Group) -> None:
         """Adds a group."""
@@ -284,13 +304,8 @@ class Registry:
     ) -> Any:
         """The table of a constructor, made from its signature and docstring.
 
-        Args:
-            make: Class, function, "module:name", or a model, which is taken as it is.
-            title: Name of the model.
-            base: Keys that it has beside those of the constructor.
-            fields: Further fields, as pydantic's `create_model` takes them.
-            without: Arguments that are no keys.
-            checked: Whether it is built as soon as it is read; None = if it is a dataclass.
+        A model is taken as it is. `fields` and the keys of `base` stand beside those of the
+        arguments; `checked` is as in `add`.
         """
         self._complete()
         make = pkgutil.resolve_name(make) if isinstance(make, str) else make
@@ -527,7 +542,7 @@ def _documents(make: Any) -> dict[str, str]:
                 ):
                     for name in names.split(", "):
                         found.setdefault(name, " ".join(words.split()).removesuffix("."))
-    return found
+    return {**_MEANINGS, **found}
 
 
 def _title(name: str) -> str:

@@ -1,21 +1,23 @@
-"""report.html: one file that opens anywhere, pictures inside."""
+"""What a run shows: tables of its numbers, pictures, and report.html that opens anywhere."""
 
 import base64
 import math
 import os
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment
 
 from invertwin import __version__
 
-DOPPLER_NOTE = (
-    "Range rates are modulo the unambiguous span; phases that transmitters in turn add to movers "
-    "are taken out for range rates within it. Directions show the strongest of the other axis."
-)
+if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
+    from matplotlib.figure import Figure
+
+    from invertwin.cli.runs import RunFolder
 
 
 @dataclass(frozen=True)
@@ -63,10 +65,9 @@ def report_html(
         again: How the run is done again.
     """
     pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    pages.filters |= {"shown": shown, "base64": lambda png: base64.b64encode(png).decode("ascii")}
-    template = resources.files("invertwin.cli") / "report.html.jinja"
+    pages.filters |= {"shown": shown, "base64": _base64}
     backend = os.environ.get("INVERTWIN_BACKEND")
-    return pages.from_string(template.read_text(encoding="utf-8")).render(
+    return pages.from_string(_resource("report.html.jinja")).render(
         title=title,
         status=status,
         note=note,
@@ -76,6 +77,83 @@ def report_html(
         + (f" --backend {backend}" if backend else ""),
         files=again.files,
     )
+
+
+def finish(
+    folder: "RunFolder",
+    metrics: Mapping[str, Any],
+    title: str,
+    status: str,
+    parts: Sequence[Table | Picture],
+    *,
+    again: str,
+    note: str = "",
+) -> list[Table]:
+    """Writes metrics.json and report.html; returns the tables, to be printed.
+
+    Args:
+        folder: Of the run.
+        metrics: Numbers of the run.
+        title: Heading.
+        status: What came out, in a sentence.
+        parts: Tables and pictures in reading order.
+        again: The command, with its file where the run has no run file.
+        note: What the run file says about the run.
+    """
+    folder.write_json("metrics.json", metrics)
+    files = folder.run_files
+    if files:
+        again += " run.toml" if len(files) == 1 else " runs/*.toml"
+    html = report_html(title, status, note, parts, Again(again, files))
+    folder.write_text("report.html", html)
+    return [part for part in parts if isinstance(part, Table)]
+
+
+def picture(
+    folder: "RunFolder", name: str, figure: "Figure", title: str = "", note: str = ""
+) -> Picture:
+    """Writes a figure as a PNG file, and returns it for the report.
+
+    Args:
+        folder: Of the run.
+        name: Of the file, without its ending.
+        figure: The figure.
+        title: In the report; without it the name.
+        note: A key among the notes of texts.toml, or none.
+    """
+    png = folder.write_figure(f"{name}.png", figure)
+    title = title or name.capitalize().replace("_", ", ")
+    return Picture(title, png, texts("notes").get(note, note))
+
+
+def quantities(
+    title: str, values: Mapping[str, Any], *, skip: Collection[str] = (), of: str = "quantities"
+) -> Table:
+    """A table of the values that texts.toml has a label for, in its order.
+
+    Args:
+        title: Of the table.
+        values: By the keys of metrics.json.
+        skip: Keys to leave out.
+        of: The table of labels.
+    """
+    labels = {key: label for key, label in texts(of).items() if key in values and key not in skip}
+    rows = [[label, values[key]] for key, label in labels.items()]
+    return Table(title, ["quantity", "value"], rows)
+
+
+@cache
+def texts(name: str) -> dict[str, str]:
+    """A table of texts.toml."""
+    return tomllib.loads(_resource("texts.toml"))[name]
+
+
+def _resource(name: str) -> str:
+    return (resources.files("invertwin.cli") / name).read_text(encoding="utf-8")
+
+
+def _base64(png: bytes) -> str:
+    return base64.b64encode(png).decode("ascii")
 
 
 def is_number(value: Any) -> bool:

@@ -21,7 +21,9 @@ from invertwin.cli.section import about as about
 from invertwin.errors import InputError
 
 _MOST_ERRORS = 4  # in one line
-_STUDIES = ("methods", "loss_scan")  # sections of the package in experiments/studies
+# Sections and kinds of the package in experiments/studies.
+_STUDIES = ("methods", "loss_scan", "openradar", "rail_sar")
+_INSTALL = "install the studies: pip install -e ./experiments/studies"
 _WORDS = {
     r"a valid dictionary( or .*)?": "a table",
     r"a valid string": "a text in quotes",
@@ -138,7 +140,7 @@ def _explain(error: ErrorDetails) -> str:
             key, allowed = context["key"], context["allowed"]
             said = f"expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
             if not path and key in _STUDIES:
-                return f"{key}: {said}install the studies: pip install -e ./experiments/studies"
+                return f"{key}: {said}{_INSTALL}"
             return (
                 f"{path}.{key}".lstrip(".") + f": {said}" + _nearest(key, allowed, "remove the key")
             )
@@ -155,9 +157,8 @@ def _explain(error: ErrorDetails) -> str:
             tags = [t.strip(f" '{TAG_MARK}") for t in context["expected_tags"].split(",")]
             allowed = [tag for tag in tags if tag not in (*others, "points")]
             tag = context["tag"].strip(TAG_MARK)
-            return (
-                f"{path}.{key}: expected one of {', '.join(allowed)}, got {_shown(tag)}; "
-                + _nearest(tag, allowed, "choose one")
+            return f"{path}.{key}: expected one of {', '.join(allowed)}, got {_shown(tag)}; " + (
+                _INSTALL if tag in _STUDIES else _nearest(tag, allowed, "choose one")
             )
         case "literal_error":
             allowed = [t.strip(" '") for t in context["expected"].replace(" or ", ", ").split(",")]

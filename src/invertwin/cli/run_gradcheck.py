@@ -13,9 +13,9 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.gradients import UNITS, theta_of
-from invertwin.cli.report import Again, Picture, Table, report_html
-from invertwin.cli.run_file import about, about_file, need, to_toml
+from invertwin.cli.gradients import theta_of
+from invertwin.cli.report import Picture, Table, finish, texts
+from invertwin.cli.run_file import about, about_file, need
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
@@ -24,31 +24,9 @@ from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
-COLUMNS = (
-    "scene",
-    "L1 full",
-    "L1 interior",
-    "L1 no interior edges",
-    "ratio",
-    "L2 full",
-    "correlation",
-    "noise",
-    "steps differ",
-    "order",
-    "pairs",
-)
-
-
-_LEGEND = (
-    "L1 full, L1 interior: distance of the gradient to the differences over the size of the "
-    "differences, ‖g − g_FD‖₁ / ‖g_FD‖₁, with boundary terms (silhouettes) and without; 0 is best. "
-    "L1 no interior edges: without the shadows that surfaces cast on each other, where paths have "
-    "two bounces or more. ratio: interior over full, how much the boundary terms gain. L2 full: "
-    "the same in ‖·‖₂. correlation: of the two maps, bin by bin. noise: relative standard error "
-    "of the differences, "
-    "that is how sharp this check is. steps differ: relative change of the differences when "
-    "their step is halved, noise included. order: how the gap to the differences grows with their "
-    "step; 2 for a right gradient, 0 for a wrong one. pairs: difference pairs averaged."
+_COLUMNS = (
+    *("scene", "L1 full", "L1 interior", "L1 no interior edges", "ratio", "L2 full"),
+    *("correlation", "noise", "steps differ", "order", "pairs"),
 )
 
 
@@ -112,7 +90,7 @@ def run_gradcheck(
     """
     begin = time.perf_counter()
     scenes: dict[str, Any] = {}
-    parts: list[Picture] = []
+    parts: list[Table | Picture] = []
     studies: list[Table] = []
     compared: dict[str, Any] = {}
     for name, run in runs.items():
@@ -123,39 +101,28 @@ def run_gradcheck(
                 found = _check(name, run, folder, lambda line, name=name: say(f"{name}: {line}"))
             folder.write_json(part, found)
         scenes[name] = found
-        parts += [
-            Picture(run.title or name, (folder.path / f"{name}_scene.png").read_bytes()),
-            Picture(name, (folder.path / f"{name}.png").read_bytes(), note=_note(run, found)),
-        ]
+        parts.append(_picture(folder, f"{name}_scene", run.title or name))
+        parts.append(_picture(folder, name, name, _note(run, found)))
         for key, study in _studies(run).items():
             compared[key] = found[key]
             studies.append(study.table(name, found[key]))
-            png = (folder.path / f"{name}_{key}.png").read_bytes()
-            parts.append(Picture(studies[-1].title, png, note=study.picture_note))
-    seconds = time.perf_counter() - begin
-    rows = [_row(*item) for item in scenes.items()]
-    table = Table("Agreement with central differences", COLUMNS, rows, _LEGEND)
-    metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": seconds}
+            parts.append(_picture(folder, f"{name}_{key}", studies[-1].title, study.picture_note))
+    metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
         metrics |= compared
-    folder.write_json("metrics.json", metrics)
+    rows = [_row(*item) for item in scenes.items()]
+    legend = texts("notes")["gradcheck"]
+    table = Table("Agreement with central differences", _COLUMNS, rows, legend)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
-    folder.write_text(
-        "report.html",
-        report_html(
-            "Gradient check", f"{count} checked.", "", [table, *studies, *parts], _again(runs)
-        ),
-    )
+    parts = [table, *studies, *parts]
+    found = finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
     folder.remove([f"{PARTS}/{name}.json" for name in runs])
-    return [table, *studies]
+    return found
 
 
-def _again(runs: Mapping[str, RunFile]) -> Again:
-    if len(runs) == 1:
-        (run,) = runs.values()
-        return Again("gradcheck run.toml", {"run.toml": to_toml(run)})
-    files = {f"runs/{name}.toml": to_toml(run) for name, run in runs.items()}
-    return Again("gradcheck runs/*.toml", files)
+def _picture(folder: RunFolder, name: str, title: str, note: str = "") -> Picture:
+    """A picture that is in the folder, perhaps from before an interruption."""
+    return Picture(title, (folder.path / f"{name}.png").read_bytes(), note)
 
 
 def _check(
@@ -203,9 +170,8 @@ def _check(
         progress=say,
     )
     outer = report.no_interior_edges
-    unit = UNITS.get(table.kind, f"per unit of {table.value}")
-    folder.write_figure(f"{name}.png", _maps(report, grid, unit))
-    moved = [table.object] if table.object else []
+    folder.write_figure(f"{name}.png", _maps(report, grid, theta.unit))
+    moved = [table.object] if hasattr(table, "object") else []
     folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=moved))
     others = {}
     checked = Checked(run, scene, radar, grid, theta.direction(), check.step, report, say)
@@ -260,5 +226,6 @@ def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
 
 def _note(run: RunFile, found: Mapping[str, Any]) -> str:
     parameter = need(run, "gradcheck", "gradcheck").parameter
-    what = f"{parameter.joint or ''} {parameter.kind} of {parameter.object or 'the radar'}".strip()
+    what = f"{parameter.kind} of {getattr(parameter, 'object', 'the radar')}"
+    what = f"{getattr(parameter, 'joint', '')} {what}".strip()
     return f"Derivative with respect to the {what}; {found['seconds']:.0f} s. {run.note}"

@@ -1,6 +1,5 @@
 """`invertwin look`: pictures of a recording as it is, and the recording as a capture."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,9 @@ from invertwin.capture import (
 )
 from invertwin.capture.elements import elements
 from invertwin.channel import Grid
-from invertwin.cli.report import DOPPLER_NOTE, Again, Picture, Table, report_html
+from invertwin.cli.registry import load_plugins, registry
+from invertwin.cli.report import Table, finish, picture, quantities, texts
 from invertwin.cli.runs import RunFolder
-from invertwin.datasets import openradar, rail_sar
 from invertwin.errors import InputError
 from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
 from invertwin.radar import (
@@ -39,45 +38,11 @@ from invertwin.scene import AntennaArray
 _ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"
 # Leakage from transmitters to receivers outshines what is nearer than this many range cells.
 _NEAREST_CELLS = 3
-_LABELS = {
-    "reader": "read as",
-    "frames": "frames",
-    "chirps": "chirps of each transmitter in a frame",
-    "channels": "virtual channels",
-    "samples": "samples",
-    "frequency_ghz": "centre frequency [GHz]",
-    "range_cell_m": "range cell [m]",
-    "max_range_m": "unambiguous range [m]",
-    "velocity_span_m_s": "unambiguous span of range rates [m/s]",
-    "peak_range_m": "strongest bin, range [m]",
-    "peak_velocity_m_s": "strongest bin, range rate, away > 0 [m/s]",
-    "peak_azimuth_deg": "strongest bin, azimuth [°]",
-    "mover_range_m": "strongest bin that moves, range [m]",
-    "mover_velocity_m_s": "strongest bin that moves, range rate [m/s]",
-    "mover_azimuth_deg": "strongest bin that moves, azimuth [°]",
-    "points": "points that CFAR detects (points.csv)",
-    "channel_spread_db": "gains of the channels, largest over smallest [dB]",
-}
 
 
 @dataclass(frozen=True)
 class Look:
-    """What to look at, as the command line says it.
-
-    Attributes:
-        recording: File or folder.
-        config: Settings file of a raw recording.
-        board: Preset whose elements recorded.
-        elevation, azimuth: Its signs.
-        lanes: Of the LVDS link.
-        chirp: The one that the capture keeps; None = the mean.
-        frame: The one that the pictures show.
-        range_min, range_max: [m].
-        method: Of directions: bartlett, or capon or music beside it.
-        sources: For music; None = counted in each range.
-        channels: Channel calibration to divide out.
-        reflector: Known place of a reflector [m], to calibrate the channels on.
-    """
+    """What to look at: the options of the command, which say what they mean."""
 
     recording: Path
     config: Path | None = None
@@ -97,19 +62,17 @@ class Look:
 
 @dataclass(frozen=True)
 class _Recording:
-    """A recording that has been read.
-
-    Attributes:
-        reader: Who read it.
-        capture: One signal per frame.
-        chirps: Every chirp, complex, where there are several.
-        farthest: Range up to which samples mean something [m].
-    """
+    """A recording that has been read."""
 
     reader: str
     capture: Capture
-    chirps: ChirpData | None
-    farthest: float
+    chirps: ChirpData | None  # complex, where there are several
+    farthest: float  # range up to which samples mean something [m]
+
+    @property
+    def has_profiles(self) -> bool:
+        """Whether it holds range profiles in place of beat signals."""
+        return "range_profile" in self.capture.dataset
 
 
 def run_look(look: Look, folder: RunFolder) -> list[Table]:
@@ -118,23 +81,21 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     Raises:
         InputError: A recording or options that do not fit each other; nothing has been written.
     """
-    recording = _read(look)
-    recording, spread = _calibrated(look, recording, folder)
-    radar = recording.capture.radar()
+    recording, metrics = _calibrated(look, _read(look), folder)
+    radar, chirps = recording.capture.radar(), recording.chirps
     if not 0 <= look.frame < radar.frame_count:
         raise InputError(
             f"expected a --frame from 0 to {radar.frame_count - 1}, got {look.frame}; choose one "
             "of the recording"
         )
     grid = _grid(look, radar, recording)
-    metrics: dict[str, Any] = {
+    metrics |= {
         "task": "look",
         "reader": recording.reader,
         "frames": radar.frame_count,
         "channels": len(radar.virtual_positions),
         "frequency_ghz": radar.waveform.center_frequency / 1e9,
         "range_cell_m": radar.waveform.range_resolution,
-        **spread,
     }
     if isinstance(radar.waveform, SampledWaveform):
         metrics |= {"samples": radar.waveform.samples, "max_range_m": recording.farthest}
@@ -143,9 +104,8 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     if look.method != "bartlett":
         shown |= _sharper(look, recording, radar, grid)
     points = None
-    if recording.chirps is not None:
-        timing = recording.chirps.settings.chirps
-        points = points_of(recording.chirps.beat, radar, grid, timing, look.frame)
+    if chirps is not None:
+        points = points_of(chirps.beat, radar, grid, chirps.settings.chirps, look.frame)
     if radar.frame_count > 1:
         profiles = recording.capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
@@ -154,21 +114,19 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     if points is not None:
         metrics["points"] = len(points)
         folder.write_text("points.csv", points_csv(points))
-    folder.write_json("metrics.json", metrics)
-    png = folder.write_figure("look.png", panels(shown))
-    rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
-    table = Table(look.recording.name, ["quantity", "value"], rows)
-    picture = Picture(f"Frame {look.frame}", png, DOPPLER_NOTE)
-    text = report_html(
-        look.recording.name,
+    title = look.recording.name
+    return finish(
+        folder,
+        metrics,
+        title,
         f"{radar.frame_count} frames, read as {recording.reader}.",
-        "capture.nc beside this report is the recording as `reconstruct` takes it: "
-        'data = { kind = "capture", file = "capture.nc" }.',
-        [table, picture],
-        Again("look capture.nc", {}),
+        [
+            quantities(title, metrics),
+            picture(folder, "look", panels(shown), f"Frame {look.frame}", "doppler"),
+        ],
+        again="look capture.nc",
+        note=texts("notes")["look"],
     )
-    folder.write_text("report.html", text)
-    return [table]
 
 
 def _read(look: Look) -> _Recording:
@@ -193,22 +151,18 @@ def _read(look: Look) -> _Recording:
 
 
 def _read_public(look: Look, folder: Path) -> _Recording:
-    readers: dict[str, Callable[[], _Recording]] = {
-        openradar.FILE: lambda: _read_openradar(look, folder),
-        rail_sar.FILE: lambda: _whole("rail_sar", rail_sar.read(folder)),
-    }
-    for file, reader in readers.items():
+    known = load_plugins().recordings
+    for file, (kind, board) in known.items():
         if (folder / file).is_file() and look.recording.name in (file, folder.name):
-            return reader()
+            found = registry.table("data", kind).made_by(str(folder))
+            if isinstance(found, Capture):
+                return _whole(kind, found)
+            arrays = _preset(look, found.chirps, look.board or board)
+            return _of_chirps(kind, found.chirps, arrays, look)
     raise InputError(
-        f"expected a folder with {' or '.join(readers)}, got {look.recording}; of other arrays "
-        "name the TOML description"
+        f"expected a folder with {' or '.join(known) or 'a recording that a plugin reads'}, got "
+        f"{look.recording}; of other arrays name the TOML description"
     )
-
-
-def _read_openradar(look: Look, folder: Path) -> _Recording:
-    data = openradar.read_chirps(folder)
-    return _of_chirps("openradar", data, _preset(look, data, look.board or "xWR1642"), look)
 
 
 def _preset(look: Look, data: ChirpData, board: str | None) -> tuple[AntennaArray, AntennaArray]:
@@ -243,7 +197,7 @@ def _whole(reader: str, capture: Capture) -> _Recording:
 
 def _calibrated(
     look: Look, recording: _Recording, folder: RunFolder
-) -> tuple[_Recording, dict[str, float]]:
+) -> tuple[_Recording, dict[str, Any]]:
     """The recording with its channels calibrated, and how far they were apart."""
     if look.channels is not None and look.reflector is not None:
         raise InputError("expected --channels or --reflector, got both; choose one")
@@ -267,7 +221,7 @@ def _calibrated(
 def _grid(look: Look, radar: Radar, recording: _Recording) -> Grid:
     cell = radar.waveform.range_resolution
     nearest = _NEAREST_CELLS * cell
-    if "range_profile" in recording.capture.dataset:
+    if recording.has_profiles:
         nearest = float(recording.capture.ranges[0])
     low = nearest if look.range_min is None else look.range_min
     high = recording.farthest if look.range_max is None else look.range_max
@@ -276,17 +230,15 @@ def _grid(look: Look, radar: Radar, recording: _Recording) -> Grid:
             f"expected a --range-max within {recording.farthest:.4g} m, got {high:g}; samples "
             "do not tell ranges beyond it"
         )
-    if "range_profile" in recording.capture.dataset:
-        # Inside the first and last samples.
-        step = cell / 2
-        first, count = low, int((high - low) / step)
-        return Grid(range_start=first, range_step=step, range_count=max(count, 1))
+    if recording.has_profiles:
+        step = cell / 2  # inside the first and last samples
+        return Grid(low, step, max(int((high - low) / step), 1))
     return radar.grid(low, high)
 
 
 def _sharper(look: Look, recording: _Recording, radar: Radar, grid: Grid) -> dict[str, Panel]:
     """Directions by another method than Bartlett's."""
-    if "range_profile" in recording.capture.dataset:
+    if recording.has_profiles:
         raise InputError(
             f"expected --method bartlett, got {look.method}; this recording has one channel"
         )

@@ -11,7 +11,7 @@ from rich.console import Console
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fits.fitting import calibrated, fit
-from invertwin.cli.fits.initial import added, guessed
+from invertwin.cli.fits.initial import guessed
 from invertwin.cli.fits.likeness import check_measures, is_shape_key
 from invertwin.cli.fits.mover import run_mover
 from invertwin.cli.fits.problem import modes_of, problem_of
@@ -23,16 +23,9 @@ from invertwin.cli.fits.scores import (
     summary,
     without_history,
 )
-from invertwin.cli.fits.writing import (
-    COLUMNS,
-    draw,
-    draw_shapes,
-    status,
-    tables_of,
-    write_report,
-)
+from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
-from invertwin.cli.report import Table
+from invertwin.cli.report import Table, finish
 from invertwin.cli.run_file import need
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
@@ -84,11 +77,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     metrics = {
         "task": run.task,
         **summary(problem, rows, modes),
-        **{
-            key: best[key]
-            for key in best
-            if (key in COLUMNS or is_shape_key(key)) and key != "seconds"
-        },
+        **{k: best[k] for k in best if (k in COLUMNS or is_shape_key(k)) and k != "seconds"},
         "start_loss_sharp": misfit(problem, maps["start"], maps["measured"]),
         "loss_sharp": misfit(problem, maps["twin"], maps["measured"]),
         "parameters": best["values"],
@@ -110,18 +99,18 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         metrics["landscape"] = found
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
-    tables = [*tables_of(problem, metrics, start, twin, rows), *added(metrics)]
-    draw(problem, folder, rows, metrics, start, twin, maps)
+    fitted = Fitted(problem, metrics, rows, start, twin, maps)
+    result, *tables = tables_of(fitted)
+    parts = [result, *pictures_of(fitted, folder), *tables]
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:
-        draw_shapes(problem, folder, rows, start, twin)
         save_mesh(folder.file("twin.glb"), twin)
     if not single:
         shutil.copyfile(folder.path / best["checkpoint"], folder.file(CHECKPOINT))
-    folder.write_json("metrics.json", metrics)
-    write_report(run, folder, metrics, tables)
+    title, outcome = run.title or "Reconstruction", status(run, metrics)
+    tables = finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note)
     folder.remove([name for name in folder.names if name.startswith(PARTS)])
-    return tables, status(run, metrics)
+    return tables, outcome
 
 
 def _finite(loss: float | None) -> float:

@@ -73,6 +73,12 @@ class RunFolder:
         """The result files of this run."""
         return tuple(self._manifest["files"])
 
+    @property
+    def run_files(self) -> dict[str, str]:
+        """The run files as used, by their path in the folder."""
+        found = [name for name in self.names if name == "run.toml" or name.startswith("runs/")]
+        return {name: (self.path / name).read_text(encoding="utf-8") for name in found}
+
     def file(self, name: str) -> Path:
         """The path of a result file, owned by this run from now on."""
         if name not in self._manifest["files"]:

@@ -6,11 +6,20 @@ Nothing here imports torch, so that the command line can say what it offers with
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
 from annotated_types import Ge, Le, Len, Lt, MinLen
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from invertwin.errors import InputError
@@ -50,6 +59,16 @@ class KeyInputError(InputError):
     def __init__(self, path: str, text: str) -> None:
         super().__init__(f"{path}: {text}")
         self.path, self.text = path, text
+
+
+@dataclass(frozen=True)
+class Among:
+    """Annotates a key that holds one of these names."""
+
+    names: tuple[str, ...]
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(Literal[self.names])
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Gt, Le, Len, MinLen
@@ -15,6 +15,7 @@ from invertwin.channel import Grid
 from invertwin.cli.registry import Group, OneOf, Registry, Table
 from invertwin.cli.section import (
     TAG_MARK,
+    Among,
     Section,
     Vector,
     about,
@@ -49,10 +50,7 @@ from invertwin.scene import Table as PatternTable
 
 _MOST_BINS = 1e9  # 4 GB a map
 Numbers = Annotated[list[Count], MinLen(1)]
-if TYPE_CHECKING:
-    Window = str
-else:
-    Window = Literal[tuple(WINDOWS)]
+Window = Annotated[str, Among(tuple(WINDOWS))]
 Elements = tuple[AntennaArray, AntennaArray]
 
 
@@ -213,7 +211,7 @@ def planar(
 
 
 def preset(
-    name: Literal[tuple(boards.BOARDS)],  # type: ignore[valid-type]
+    name: Annotated[str, Among(tuple(boards.BOARDS))],
     design_frequency: Positive | None = None,
 ) -> boards.Board:
     """A board that the library knows.

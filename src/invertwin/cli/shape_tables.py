@@ -182,10 +182,7 @@ def vertices(
     """Free vertices, held together by a Laplacian term, or moved in smooth steps.
 
     Args:
-        object: name in the scene.
-        mesh: of the object.
         laplacian: weight of the term; 0 = none.
-        smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = none.
     """
     if smooth > 0:
         return SmoothVertices(object, mesh, smooth)
@@ -200,16 +197,7 @@ def distance_grid(
     mesh: Mesh,
     smooth: NonNegative = 0.0,
 ) -> DistanceGrid:
-    """A signed distance on a grid, whose zero is the surface; starts as the object's mesh.
-
-    Args:
-        object: name in the scene.
-        low: corner of the box, in the object's frame [m].
-        high: the opposite corner [m].
-        counts: nodes along x, y and z.
-        mesh: of the object.
-        smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = none.
-    """
+    """A signed distance on a grid, whose zero is the surface; starts as the object's mesh."""
     distance: Callable[[Tensor], Tensor] = partial(signed_distance, mesh)
     return DistanceGrid.sampled(object, low, high, counts, distance, smooth)
 
@@ -217,13 +205,6 @@ def distance_grid(
 def density(object: str, low: Vector, high: Vector, counts: Counts, item: Object) -> DensityGrid:
     """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else faint and
     even. Rates of about 0.1 suit it; measures and pictures show the surface of its usual level.
-
-    Args:
-        object: name in the scene.
-        low: corner of the box, in the object's frame [m].
-        high: the opposite corner [m].
-        counts: nodes along x, y and z.
-        item: the object.
     """
     if item.cloud is not None:
         cloud = item.cloud
@@ -242,7 +223,6 @@ def shape_space(
     """Coordinates of the public space of vehicles, from those of its object, else the mean.
 
     Args:
-        object: name in the scene.
         table: of the object; its coordinates count where they are of the same space.
         folder: path, from the run file's folder, then from INVERTWIN_DATA.
         level: of detail.
@@ -275,7 +255,6 @@ def prior(
     """Coordinates of the learned prior of vehicles, from those of its object, else the mean car.
 
     Args:
-        object: name in the scene.
         table: of the object; its coordinates count where they are of the same prior.
         weight: of ½ Σ z².
         file: that `invertwin train-prior` wrote; without it the prior of the package.

@@ -1,55 +1,33 @@
 """Spectrum to loss to scene: reconstruction, and the check that its gradients are right."""
 
-from invertwin.inversion.callbacks import Checkpoint, Report, Watch
-from invertwin.inversion.fit import Callback, Fit
-from invertwin.inversion.gradcheck import Agreement, Check, GradientReport
-from invertwin.inversion.loss import CorrelationLoss, SpectrumLoss
-from invertwin.inversion.metrics import (
-    ShapeMetrics,
-    Topology,
-    compare_shapes,
-    topology,
-    volume_iou,
-)
-from invertwin.inversion.mover import Echo, MovingBody, of_point, strongest_mover
-from invertwin.inversion.observation import Observation, Unknown
-from invertwin.inversion.optimizer import Optimizer
-from invertwin.inversion.prior import LatentNorm
-from invertwin.inversion.reconstruction import Reconstruction, reconstruct
-from invertwin.inversion.regularization import Laplacian, Regularizer
-from invertwin.inversion.remeshing import remeshed, signed_distance
-from invertwin.inversion.schedule import Schedule, Stage
-
-__all__ = [
-    "Agreement",
-    "Callback",
-    "Check",
-    "Checkpoint",
-    "CorrelationLoss",
-    "Echo",
-    "Fit",
-    "GradientReport",
-    "Laplacian",
-    "LatentNorm",
-    "MovingBody",
-    "Observation",
-    "Optimizer",
-    "Reconstruction",
-    "Regularizer",
-    "Report",
-    "Schedule",
-    "ShapeMetrics",
-    "SpectrumLoss",
-    "Stage",
-    "Topology",
-    "Unknown",
-    "Watch",
-    "compare_shapes",
-    "of_point",
-    "reconstruct",
-    "remeshed",
-    "signed_distance",
-    "strongest_mover",
-    "topology",
-    "volume_iou",
-]
+from invertwin.inversion.callbacks import Checkpoint as Checkpoint
+from invertwin.inversion.callbacks import Report as Report
+from invertwin.inversion.callbacks import Watch as Watch
+from invertwin.inversion.fit import Callback as Callback
+from invertwin.inversion.fit import Fit as Fit
+from invertwin.inversion.gradcheck import Agreement as Agreement
+from invertwin.inversion.gradcheck import Check as Check
+from invertwin.inversion.gradcheck import GradientReport as GradientReport
+from invertwin.inversion.loss import CorrelationLoss as CorrelationLoss
+from invertwin.inversion.loss import SpectrumLoss as SpectrumLoss
+from invertwin.inversion.metrics import ShapeMetrics as ShapeMetrics
+from invertwin.inversion.metrics import Topology as Topology
+from invertwin.inversion.metrics import compare_shapes as compare_shapes
+from invertwin.inversion.metrics import topology as topology
+from invertwin.inversion.metrics import volume_iou as volume_iou
+from invertwin.inversion.mover import Echo as Echo
+from invertwin.inversion.mover import MovingBody as MovingBody
+from invertwin.inversion.mover import of_point as of_point
+from invertwin.inversion.mover import strongest_mover as strongest_mover
+from invertwin.inversion.observation import Observation as Observation
+from invertwin.inversion.observation import Unknown as Unknown
+from invertwin.inversion.optimizer import Optimizer as Optimizer
+from invertwin.inversion.prior import LatentNorm as LatentNorm
+from invertwin.inversion.reconstruction import Reconstruction as Reconstruction
+from invertwin.inversion.reconstruction import reconstruct as reconstruct
+from invertwin.inversion.regularization import Laplacian as Laplacian
+from invertwin.inversion.regularization import Regularizer as Regularizer
+from invertwin.inversion.remeshing import remeshed as remeshed
+from invertwin.inversion.remeshing import signed_distance as signed_distance
+from invertwin.inversion.schedule import Schedule as Schedule
+from invertwin.inversion.schedule import Stage as Stage

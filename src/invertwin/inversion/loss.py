@@ -1,8 +1,9 @@
 """How far a simulated power map is from a measured one."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Float64
@@ -12,7 +13,8 @@ from torch.nn.functional import avg_pool3d
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 
-_GAIN_STEPS = 8  # of the fixed point; from the second on the gain moves by parts in a thousand
+_GAIN_STEPS = 8  # at most; three or four do
+_SETTLED = 1e-6  # of the gain: a step this small is the last
 
 BACKGROUNDS = ("none", "level", "static")
 Maps = Sequence[tuple[Tensor, Tensor]]
@@ -90,8 +92,6 @@ class SpectrumLoss:
                 f"expected maps of one shape, got {tuple(simulated.shape)} and "
                 f"{tuple(measured.shape)}; use one grid for both"
             )
-        if not measured.detach().abs().mean() > 0:
-            raise InputError("expected a measured map with power in it, got zeros; check the grid")
         pairs = self._pyramid(simulated, measured)
         if self.kind == "likelihood":
             return self._divergence(pairs)
@@ -147,6 +147,8 @@ class SpectrumLoss:
     def _units(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """What the simulated and the measured map are divided by."""
         scale = measured.detach().abs().mean()
+        if not scale > 0:
+            raise InputError("expected a measured map with power in it, got zeros; check the grid")
         unit = simulated.detach().abs().mean()
         return torch.where(unit > 0, unit, 1.0) if self.gain == "fitted" else scale, scale
 
@@ -162,19 +164,37 @@ class SpectrumLoss:
                 mixed = torch.stack([(a * b).mean() / n for (a, b), n in both]).sum()
                 power = torch.stack([(a * a).mean() / n for (a, _), n in both]).sum()
                 return (mixed / power.clamp_min(1e-30)).clamp_min(0.0)
-            # The maps are large: what does not change is computed once, the rest in place.
-            lit = [a.clamp_min(0.0) for a, _ in pairs]
-            data = [
-                a * (b.clamp_min(0.0) + self.floor) for a, (_, b) in zip(lit, pairs, strict=True)
-            ]
-            for _ in range(_GAIN_STEPS):
-                up, down = torch.zeros(()), torch.zeros(())
-                for a, b in zip(lit, data, strict=True):
-                    inverse = (a * gain).add_(self.floor).reciprocal_()
-                    down = down + (a * inverse).mean()
-                    up = up + inverse.square_().mul_(b).mean()
-                gain = gain * (up / down.clamp_min(1e-30))
-        return gain
+            return gain * self._likeliest(*self._floored(pairs))
+
+    def _floored(self, pairs: list[tuple[Tensor, Tensor]]) -> tuple[list[Tensor], list[Tensor]]:
+        """What both maps hold of power, the floor added to the measured one."""
+        lit = [a.detach().clamp_min(0.0) for a, _ in pairs]
+        return lit, [b.detach().clamp_min(0.0).add_(self.floor) for _, b in pairs]
+
+    def _likeliest(self, lit: list[Tensor], data: list[Tensor]) -> float:
+        """The gain of the ``likelihood``, by a secant on its logarithm."""
+        if self.gain == "one":
+            return 1.0
+        # The maps are large, and new memory takes longer than the sums: it is used again.
+        levels = [
+            (a, a * b, torch.empty_like(a), torch.empty_like(a))
+            for a, b in zip(lit, data, strict=True)
+        ]
+        place, step, before, slope = 0.0, 0.0, 0.0, 1.0
+        for _ in range(_GAIN_STEPS):
+            up, down = 0.0, 0.0
+            for a, both, inverse, product in levels:
+                torch.mul(a, math.exp(place), out=inverse).add_(self.floor).reciprocal_()
+                down += float(torch.mul(a, inverse, out=product).mean())
+                up += float(inverse.square_().mul_(both).mean())
+            move = math.log(max(up, 1e-30) / max(down, 1e-30))
+            if step != 0:
+                slope = min(max((before - move) / step, 0.1), 1.0)
+            before, step = move, move / slope
+            place += step
+            if abs(step) < _SETTLED:
+                break
+        return math.exp(place)
 
     def _error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         gain = self._gain(pairs)
@@ -183,12 +203,12 @@ class SpectrumLoss:
         return torch.stack(terms).mean()
 
     def _divergence(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-        gain = self._gain(pairs)
-        terms = []
-        for a, b in pairs:
-            lit, data = a.clamp_min(0.0), b.clamp_min(0.0) + self.floor
-            ratio = data / (gain * lit + self.floor)
-            terms.append((ratio - ratio.log() - 1).mean())
+        lit, data = self._floored(pairs)
+        gain = self._likeliest(lit, data)
+        terms = [
+            _Divergence.apply(a, power, b, gain, self.floor)
+            for (a, _), power, b in zip(pairs, lit, data, strict=True)
+        ]
         return torch.stack(terms).mean()
 
     def _cleared(self, power: Tensor) -> Tensor:
@@ -197,6 +217,38 @@ class SpectrumLoss:
         if self.background == "static":
             return power - power.mean(0, keepdim=True)
         return power
+
+
+class _Divergence(torch.autograd.Function):
+    """The mean of ``q − log q − 1``, with its derivative by the simulated map written out.
+
+    The maps are large, and torch's own derivative keeps and reads each of them several times.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, a: Tensor, lit: Tensor, data: Tensor, gain: float, floor: float
+    ) -> Tensor:
+        """The mean, of ``lit = max(a, 0)`` and ``data = b + n``, which it overwrites."""
+        inverse = lit.mul_(gain).add_(floor).reciprocal_()
+        ratio = data.mul_(inverse)
+        slope = inverse.addcmul_(inverse, ratio, value=-1).masked_fill_(a < 0, 0.0)
+        value = ratio.mean() - ratio.log_().mean() - 1
+        ctx.factor = gain / a.numel()
+        ctx.save_for_backward(slope)
+        ctx.save_for_forward(slope)
+        return value
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (slope,) = ctx.saved_tensors
+        return slope * (ctx.factor * grads[0]), None, None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:  # type: ignore[override]
+        (slope,) = ctx.saved_tensors
+        return ctx.factor * (slope * tangents[0]).sum()
 
 
 @dataclass(frozen=True)

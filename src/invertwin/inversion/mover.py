@@ -1,6 +1,5 @@
 """The twin of something that moves: found in range, range rate and direction, then fitted there."""
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +14,7 @@ from invertwin.models import MotionMap
 from invertwin.radar.detection import ordered_statistics_cfar, point_cloud
 from invertwin.radar.doppler import compensate_tdm, range_doppler, velocity_axis
 from invertwin.radar.radar import Radar
+from invertwin.radar.spectrum import aperture
 from invertwin.scene.material import RoughDielectric
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rigid
@@ -120,9 +120,8 @@ def _coherence(recording: ChirpCapture, grid: Grid, rate: float, range_: float) 
     x, y = radar.virtual_positions[:, 0], radar.virtual_positions[:, 1]
     # Fine enough that the nearest direction costs less than a thousandth.
     cosines = [torch.linspace(-1, 1, 257 if len(p.unique()) > 1 else 1) for p in (x, y)]
-    u, v = (torch.zeros(1) if len(c) == 1 else c for c in cosines)
-    beams = u[:, None, None].double() * x + v[:, None].double() * y
-    steer = torch.polar(torch.ones_like(beams), 2 * math.pi / radar.waveform.wavelength * beams)
+    u, v = (torch.zeros(1).double() if len(c) == 1 else c.double() for c in cosines)
+    steer = aperture(radar).beams(u, v, x, y)
     return float((steer @ (channels / channels.abs())).abs().max() / len(channels))
 
 

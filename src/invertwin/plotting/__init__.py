@@ -5,39 +5,20 @@ changes: save it with ``figure.savefig(path)`` or show it in a notebook. The tur
 animation and comes as the bytes of a GIF.
 """
 
-from invertwin.plotting.curves import convergence, count_minima, landscape
-from invertwin.plotting.figures import PALETTE, png_bytes
-from invertwin.plotting.maps import (
-    RATE_LABEL,
-    U_LABEL,
-    V_LABEL,
-    Panel,
-    direction_panels,
-    doppler_panels,
-    gradient,
-    panels,
-    range_doppler,
-    spectrum,
-)
-from invertwin.plotting.scenes import scene
-from invertwin.plotting.turntable import turntable
-
-__all__ = [
-    "PALETTE",
-    "RATE_LABEL",
-    "U_LABEL",
-    "V_LABEL",
-    "Panel",
-    "convergence",
-    "count_minima",
-    "direction_panels",
-    "doppler_panels",
-    "gradient",
-    "landscape",
-    "panels",
-    "png_bytes",
-    "range_doppler",
-    "scene",
-    "spectrum",
-    "turntable",
-]
+from invertwin.plotting.curves import convergence as convergence
+from invertwin.plotting.curves import count_minima as count_minima
+from invertwin.plotting.curves import landscape as landscape
+from invertwin.plotting.figures import PALETTE as PALETTE
+from invertwin.plotting.figures import png_bytes as png_bytes
+from invertwin.plotting.maps import RATE_LABEL as RATE_LABEL
+from invertwin.plotting.maps import U_LABEL as U_LABEL
+from invertwin.plotting.maps import V_LABEL as V_LABEL
+from invertwin.plotting.maps import Panel as Panel
+from invertwin.plotting.maps import direction_panels as direction_panels
+from invertwin.plotting.maps import doppler_panels as doppler_panels
+from invertwin.plotting.maps import gradient as gradient
+from invertwin.plotting.maps import panels as panels
+from invertwin.plotting.maps import range_doppler as range_doppler
+from invertwin.plotting.maps import spectrum as spectrum
+from invertwin.plotting.scenes import scene as scene
+from invertwin.plotting.turntable import turntable as turntable

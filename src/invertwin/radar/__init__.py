@@ -1,132 +1,66 @@
 """Channel to radar data: exact signals and their smooth surrogate, in plain torch."""
 
-from invertwin.radar.backprojection import backproject_beat
-from invertwin.radar.boards import BOARDS, Board, board
-from invertwin.radar.detection import (
-    PointCloud,
-    cell_averaging_cfar,
-    ordered_statistics_cfar,
-    peaks,
-    point_cloud,
-)
-from invertwin.radar.direction import capon, music, source_count
-from invertwin.radar.doppler import (
-    Spectrogram,
-    compensate_tdm,
-    micro_doppler,
-    range_doppler,
-    range_doppler_angle,
-    resolve_fold,
-    velocity_axis,
-    velocity_span,
-)
-from invertwin.radar.doppler_maps import (
-    DopplerMaps,
-    Peak,
-    doppler_maps,
-    points_csv,
-    points_of,
-    sharp_map,
-    snapshots_of,
-    still_peak,
-)
-from invertwin.radar.impairments import (
-    ADC,
-    Impairments,
-    Leakage,
-    PhaseNoise,
-    channel_errors,
-    leakage_signal,
-    noisy_oscillator_beat,
-    quantize,
-    residual_phase,
-)
-from invertwin.radar.motion import Chirps, moving_beat, range_rate
-from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
-from invertwin.radar.point_spread import airy, dirichlet, normalized_gaussian
-from invertwin.radar.radar import Radar
-from invertwin.radar.random_phase import random_phase_spectrum
-from invertwin.radar.range_profile import add_noise, beat_signal, range_profile
-from invertwin.radar.spectrum import beamform, exact_spectrum
-from invertwin.radar.surrogate import (
-    SURROGATES,
-    Surrogate,
-    chosen_surrogate,
-    surrogate_spectrum,
-)
-from invertwin.radar.waveform import (
-    FMCW,
-    OFDM,
-    Impulse,
-    PhysicsWarning,
-    SampledWaveform,
-    SteppedFrequency,
-    Waveform,
-)
-
-__all__ = [
-    "ADC",
-    "BOARDS",
-    "FMCW",
-    "OFDM",
-    "SURROGATES",
-    "Board",
-    "Chirps",
-    "ClockOffset",
-    "DopplerMaps",
-    "Impairments",
-    "Impulse",
-    "Leakage",
-    "Peak",
-    "PhaseNoise",
-    "PhysicsWarning",
-    "PointCloud",
-    "Radar",
-    "RadarPose",
-    "RangeBias",
-    "SampledWaveform",
-    "Spectrogram",
-    "SteppedFrequency",
-    "Surrogate",
-    "Waveform",
-    "add_noise",
-    "airy",
-    "backproject_beat",
-    "beamform",
-    "beat_signal",
-    "board",
-    "capon",
-    "cell_averaging_cfar",
-    "channel_errors",
-    "chosen_surrogate",
-    "compensate_tdm",
-    "dirichlet",
-    "doppler_maps",
-    "exact_spectrum",
-    "leakage_signal",
-    "micro_doppler",
-    "moving_beat",
-    "music",
-    "noisy_oscillator_beat",
-    "normalized_gaussian",
-    "ordered_statistics_cfar",
-    "peaks",
-    "point_cloud",
-    "points_csv",
-    "points_of",
-    "quantize",
-    "random_phase_spectrum",
-    "range_doppler",
-    "range_doppler_angle",
-    "range_profile",
-    "range_rate",
-    "residual_phase",
-    "resolve_fold",
-    "sharp_map",
-    "snapshots_of",
-    "source_count",
-    "still_peak",
-    "surrogate_spectrum",
-    "velocity_axis",
-    "velocity_span",
-]
+from invertwin.radar.backprojection import backproject_beat as backproject_beat
+from invertwin.radar.boards import BOARDS as BOARDS
+from invertwin.radar.boards import Board as Board
+from invertwin.radar.boards import board as board
+from invertwin.radar.detection import PointCloud as PointCloud
+from invertwin.radar.detection import cell_averaging_cfar as cell_averaging_cfar
+from invertwin.radar.detection import ordered_statistics_cfar as ordered_statistics_cfar
+from invertwin.radar.detection import peaks as peaks
+from invertwin.radar.detection import point_cloud as point_cloud
+from invertwin.radar.direction import capon as capon
+from invertwin.radar.direction import music as music
+from invertwin.radar.direction import source_count as source_count
+from invertwin.radar.doppler import Spectrogram as Spectrogram
+from invertwin.radar.doppler import compensate_tdm as compensate_tdm
+from invertwin.radar.doppler import micro_doppler as micro_doppler
+from invertwin.radar.doppler import range_doppler as range_doppler
+from invertwin.radar.doppler import range_doppler_angle as range_doppler_angle
+from invertwin.radar.doppler import resolve_fold as resolve_fold
+from invertwin.radar.doppler import velocity_axis as velocity_axis
+from invertwin.radar.doppler import velocity_span as velocity_span
+from invertwin.radar.doppler_maps import DopplerMaps as DopplerMaps
+from invertwin.radar.doppler_maps import Peak as Peak
+from invertwin.radar.doppler_maps import doppler_maps as doppler_maps
+from invertwin.radar.doppler_maps import points_csv as points_csv
+from invertwin.radar.doppler_maps import points_of as points_of
+from invertwin.radar.doppler_maps import sharp_map as sharp_map
+from invertwin.radar.doppler_maps import snapshots_of as snapshots_of
+from invertwin.radar.doppler_maps import still_peak as still_peak
+from invertwin.radar.impairments import ADC as ADC
+from invertwin.radar.impairments import Impairments as Impairments
+from invertwin.radar.impairments import Leakage as Leakage
+from invertwin.radar.impairments import PhaseNoise as PhaseNoise
+from invertwin.radar.impairments import channel_errors as channel_errors
+from invertwin.radar.impairments import leakage_signal as leakage_signal
+from invertwin.radar.impairments import noisy_oscillator_beat as noisy_oscillator_beat
+from invertwin.radar.impairments import quantize as quantize
+from invertwin.radar.impairments import residual_phase as residual_phase
+from invertwin.radar.motion import Chirps as Chirps
+from invertwin.radar.motion import moving_beat as moving_beat
+from invertwin.radar.motion import range_rate as range_rate
+from invertwin.radar.parameters import ClockOffset as ClockOffset
+from invertwin.radar.parameters import RadarPose as RadarPose
+from invertwin.radar.parameters import RangeBias as RangeBias
+from invertwin.radar.point_spread import airy as airy
+from invertwin.radar.point_spread import dirichlet as dirichlet
+from invertwin.radar.point_spread import normalized_gaussian as normalized_gaussian
+from invertwin.radar.radar import Radar as Radar
+from invertwin.radar.random_phase import random_phase_spectrum as random_phase_spectrum
+from invertwin.radar.range_profile import add_noise as add_noise
+from invertwin.radar.range_profile import beat_signal as beat_signal
+from invertwin.radar.range_profile import range_profile as range_profile
+from invertwin.radar.spectrum import beamform as beamform
+from invertwin.radar.spectrum import exact_spectrum as exact_spectrum
+from invertwin.radar.surrogate import SURROGATES as SURROGATES
+from invertwin.radar.surrogate import Surrogate as Surrogate
+from invertwin.radar.surrogate import chosen_surrogate as chosen_surrogate
+from invertwin.radar.surrogate import surrogate_spectrum as surrogate_spectrum
+from invertwin.radar.waveform import FMCW as FMCW
+from invertwin.radar.waveform import OFDM as OFDM
+from invertwin.radar.waveform import Impulse as Impulse
+from invertwin.radar.waveform import PhysicsWarning as PhysicsWarning
+from invertwin.radar.waveform import SampledWaveform as SampledWaveform
+from invertwin.radar.waveform import SteppedFrequency as SteppedFrequency
+from invertwin.radar.waveform import Waveform as Waveform

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar, sampled
-from invertwin.radar.waveform import sample_window
+from invertwin.radar.radar import Radar, checked_beat, sampled
+from invertwin.radar.waveform import unit_window
 
 # Linear interpolation between samples this much denser errs by (π/8)²/8 = 2 % at the very edge of a
 # critically sampled band, and quadratically less within it.
@@ -41,17 +41,11 @@ def backproject_beat(
     """
     waveform = sampled(radar)
     tx, rx = (places.to(beat.device) for places in radar.elements())
-    expected = (radar.frame_count, tx.shape[1], rx.shape[1], waveform.samples)
-    if tuple(beat.shape) != expected:
-        raise InputError(
-            f"expected a beat signal of shape {expected} (frame, tx, rx, sample), got "
-            f"{tuple(beat.shape)}; use the radar that recorded it"
-        )
     flat = points.reshape(-1, 3).to(beat.device)
     middle = waveform.samples // 2
     length = UPSAMPLING * waveform.samples
-    window = sample_window(waveform, radar.window)
-    tapered = beat.to(torch.complex128) * (window / window.sum()).to(beat.device)
+    window = unit_window(radar.window, waveform.samples).to(beat.device)
+    tapered = checked_beat(beat, radar).to(torch.complex128) * window
     # Samples counted from the middle one, so that the spectrum turns slowly between its bins.
     turn = torch.exp(2j * math.pi * middle / length * torch.arange(length))
     spectrum = torch.fft.fft(tapered, length) * turn.to(beat.device)

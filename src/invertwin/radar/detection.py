@@ -79,7 +79,7 @@ def cell_averaging_cfar(
     mean = torch.where(torch.isfinite(band), band, 0.0).sum(-1) / count
     numbers, index = count.unique(return_inverse=True)
     factors = f.isf(false_alarm, 2 * looks, 2 * looks * numbers.numpy())
-    return power > torch.from_numpy(factors)[index].to(power.device) * mean.to(power.device)
+    return power > (torch.from_numpy(factors)[index] * mean).to(power.device)
 
 
 def ordered_statistics_cfar(
@@ -151,16 +151,10 @@ def point_cloud(
     """
     _refuse_gradients(power, "point_cloud")
     expected = (radar.frame_count, power.shape[1], *grid.shape)
-    if tuple(power.shape) != expected or tuple(detections.shape) != expected[:3]:
-        raise InputError(
-            f"expected power of shape {expected} (frame, velocity, range, u, v) and detections of "
-            f"shape {expected[:3]}, got {tuple(power.shape)} and {tuple(detections.shape)}; use "
-            "the radar and grid of range_doppler_angle"
-        )
+    _check_shapes(power, detections, expected, "frame, velocity, range, u, v")
     power, detections = power.to("cpu", torch.float64), detections.cpu()
     count = power.shape[1]
-    outside = grid.u[:, None].square() + grid.v.square() > 1
-    seen = power.masked_fill(outside, 0.0).flatten(3)
+    seen = _within_sphere(power, grid).flatten(3)
     strongest = seen.amax(-1)
     frame, velocity, place = torch.nonzero(
         detections & (strongest == _neighbourhood_maximum(strongest)) & (strongest > 0),
@@ -169,23 +163,12 @@ def point_cloud(
     direction = seen.argmax(-1)[frame, velocity, place]
     u, v = direction // grid.v_count, direction % grid.v_count
     cell = [frame, velocity, place, u, v]
-    moved = [_refinement(power, cell, axis, wrap=axis == 1) for axis in range(1, 5)]
     span = velocity_span(radar, chirps)
-    rates = velocity_axis(radar, chirps, count)[velocity] + moved[0] * span / count
+    rates = velocity_axis(radar, chirps, count)[velocity]
+    rates = rates + _refinement(power, cell, 1, wrap=True) * span / count
     if fold is not None:
         rates = rates + fold.cpu()[frame, velocity, place] * span
-    ranges = grid.ranges[place] + moved[1] * grid.range_step
-    us = grid.u[u] + moved[2] * grid.u_step
-    vs = grid.v[v] + moved[3] * grid.v_step
-    return PointCloud(
-        frame=frame,
-        range=ranges,
-        velocity=rates,
-        u=us,
-        v=vs,
-        power=power[tuple(cell)],
-        position=_placed(radar, frame, ranges, us, vs),
-    )
+    return _refined(power, cell, rates, radar, grid)
 
 
 def peaks(
@@ -210,42 +193,44 @@ def peaks(
         InputError: Power with gradients, or shapes that do not fit each other.
     """
     _refuse_gradients(power, "peaks")
-    expected = (radar.frame_count, *grid.shape)
-    if tuple(power.shape) != expected or tuple(detections.shape) != expected[:3]:
-        raise InputError(
-            f"expected power of shape {expected} (frame, range, u, v) and detections of shape "
-            f"{expected[:3]}, got {tuple(power.shape)} and {tuple(detections.shape)}; use the "
-            "radar and grid of the spectrum"
-        )
-    outside = grid.u[:, None].square() + grid.v.square() > 1
-    seen = power.to("cpu", torch.float64).masked_fill(outside, 0.0)
+    _check_shapes(power, detections, (radar.frame_count, *grid.shape), "frame, range, u, v")
+    seen = _within_sphere(power.to("cpu", torch.float64), grid)
     highest = torch.nn.functional.max_pool3d(seen[:, None], 3, stride=1, padding=1)[:, 0]
     found = detections.cpu()[..., None] & (seen == highest) & (seen > 0)
     frame, place, u, v = torch.nonzero(found, as_tuple=True)
+    rates = torch.zeros(len(frame), dtype=torch.float64)
     cell = [frame, torch.zeros_like(frame), place, u, v]
-    moved = [_refinement(seen[:, None], cell, axis, wrap=False) for axis in range(2, 5)]
+    return _refined(seen[:, None], cell, rates, radar, grid)
+
+
+def _check_shapes(power: Tensor, detections: Tensor, expected: tuple[int, ...], axes: str) -> None:
+    if tuple(power.shape) != expected or tuple(detections.shape) != expected[:3]:
+        raise InputError(
+            f"expected power of shape {expected} ({axes}) and detections of shape {expected[:3]}, "
+            f"got {tuple(power.shape)} and {tuple(detections.shape)}; use the radar and grid that "
+            "the map was made with"
+        )
+
+
+def _within_sphere(power: Tensor, grid: Grid) -> Tensor:
+    """The map with zeros where no direction exists."""
+    return power.masked_fill(grid.u[:, None].square() + grid.v.square() > 1, 0.0)
+
+
+def _refined(
+    power: Tensor, cell: list[Tensor], rates: Tensor, radar: Radar, grid: Grid
+) -> PointCloud:
+    """Points at the cells, their ranges and directions between the bins, and their places."""
+    moved = [_refinement(power, cell, axis, wrap=False) for axis in range(2, 5)]
+    frame, _, place, u, v = cell
     ranges = grid.ranges[place] + moved[0] * grid.range_step
-    us = grid.u[u] + moved[1] * grid.u_step
-    vs = grid.v[v] + moved[2] * grid.v_step
-    return PointCloud(
-        frame=frame,
-        range=ranges,
-        velocity=torch.zeros_like(ranges),
-        u=us,
-        v=vs,
-        power=seen[frame, place, u, v],
-        position=_placed(radar, frame, ranges, us, vs),
-    )
-
-
-def _placed(radar: Radar, frame: Tensor, ranges: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """World positions from ranges and direction cosines of frames."""
-    ahead = (1 - u.square() - v.square()).clamp(min=0).sqrt()
+    us, vs = grid.u[u] + moved[1] * grid.u_step, grid.v[v] + moved[2] * grid.v_step
+    ahead = (1 - us.square() - vs.square()).clamp(min=0).sqrt()
     link = radar.link()
     origin = (0.5 * (link.tx + link.rx)).detach().cpu()
-    local = ranges[:, None] * torch.stack([u, v, ahead], dim=1)
-    turned = torch.einsum("pij,pj->pi", link.rotations.detach().cpu()[frame], local)
-    return origin[frame] + turned
+    local = ranges[:, None] * torch.stack([us, vs, ahead], dim=1)
+    position = origin[frame] + (link.rotations.detach().cpu()[frame] @ local[..., None])[..., 0]
+    return PointCloud(frame, ranges, rates, us, vs, power[tuple(cell)], position)
 
 
 def _refuse_gradients(power: Tensor, name: str) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import aperture
+from invertwin.radar.spectrum import Aperture, aperture
 
 # Gaps between signal and noise eigenvalues below this part of the largest one count as noise of
 # the arithmetic: there the derivative of the subspace is damped instead of unbounded.
@@ -26,18 +26,18 @@ class _Snapshots:
 
     Attributes:
         values: One row per snapshot, elements as columns.
+        array: The whole virtual array.
         x, y: Of the elements, in the radar frame [m].
     """
 
     values: Complex128[Tensor, "frame range snapshot element"]
+    array: Aperture
     x: Float64[Tensor, " element"]
     y: Float64[Tensor, " element"]
 
-    def manifold(self, grid: Grid, wavelength: float) -> Complex128[Tensor, "direction element"]:
+    def manifold(self, grid: Grid) -> Complex128[Tensor, "direction element"]:
         """Beat phases across the array of a source in each direction: exp(−jk(ux + vy))."""
-        k = 2 * math.pi / wavelength
-        phase = k * (grid.u[:, None, None] * self.x + grid.v[None, :, None] * self.y)
-        return torch.polar(torch.ones_like(phase), -phase).flatten(0, 1).to(self.values.device)
+        return self.array.beams(grid.u, grid.v, self.x, self.y).conj().to(self.values.device)
 
     def covariance(self) -> Complex128[Tensor, "frame range element element"]:
         """Mean of x xᴴ over the snapshots."""
@@ -84,7 +84,7 @@ def capon(
     # Empty bins have no scale; anything finite gives them the power zero.
     scale = torch.where(level > 0, level, 1.0)
     loaded = covariance / scale[..., None, None] + loading * identity
-    manifold = snapshots.manifold(grid, radar.waveform.wavelength)
+    manifold = snapshots.manifold(grid)
     whitened = torch.linalg.solve_triangular(
         torch.linalg.cholesky(loaded), manifold.mT.expand(*level.shape, -1, -1), upper=False
     )
@@ -132,7 +132,7 @@ def music(
     order = torch.arange(elements, device=covariance.device)
     signal = order >= elements - count[..., None]
     projector = _SignalProjector.apply(covariance, signal)
-    manifold = snapshots.manifold(grid, radar.waveform.wavelength)
+    manifold = snapshots.manifold(grid)
     inside = torch.einsum("dm,frmn,dn->frd", manifold.conj(), projector, manifold).real
     # What is left of a source without noise is rounding error.
     outside = (1 - inside / elements).clamp(min=1e-15)
@@ -240,12 +240,7 @@ def _snapshots(
             "range_profile"
         )
     array = aperture(radar)
-    for name, places, bins in (("u", array.x, grid.u_count), ("v", array.y, grid.v_count)):
-        if len(places) > 1 and bins == 1:
-            raise InputError(
-                f"expected a grid that resolves {name}, got 1 bin; the array extends along that "
-                "axis, so give the grid its directions"
-            )
+    array.check_directions(grid)
     rows, columns = len(array.y), len(array.x)
     flat = profile.to(torch.complex128).flatten(2, 3).movedim(-1, 1)
     index = (array.column * rows + array.row).to(flat.device)
@@ -276,7 +271,7 @@ def _snapshots(
         x, y = x.flatten(), y.flatten()
     if forward_backward:
         plane = torch.cat([plane, plane.flip(-1).conj()], dim=-2)
-    return _Snapshots(plane, x, y)
+    return _Snapshots(plane, array, x, y)
 
 
 def _uniform(places: Float64[Tensor, " place"]) -> bool:

@@ -14,7 +14,7 @@ from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
 from invertwin.radar.spectrum import beamform
-from invertwin.radar.waveform import WINDOWS, taper
+from invertwin.radar.waveform import unit_window
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,13 +249,7 @@ def _steered(
 def _doppler_transform(
     slow: Complex[Tensor, "*batch chirp"], window: str, bins: int
 ) -> Complex[Tensor, "*batch velocity"]:
-    if window not in WINDOWS:
-        raise InputError(
-            f"expected a window of {', '.join(WINDOWS)}, got {window!r}; choose one of them"
-        )
-    chirps = slow.shape[-1]
-    weight = taper(window, torch.linspace(0, 1, chirps, dtype=torch.float64), chirps)
-    weight = (weight / weight.sum()).to(slow.device, slow.real.dtype)
+    weight = unit_window(window, slow.shape[-1]).to(slow.device, slow.real.dtype)
     return torch.fft.fftshift(torch.fft.fft(slow * weight, bins), dim=-1)
 
 

@@ -14,7 +14,7 @@ from invertwin.radar.doppler import velocity_span
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import aperture
-from invertwin.radar.waveform import FMCW, WINDOWS, SteppedFrequency, Waveform, taper
+from invertwin.radar.waveform import FMCW, SteppedFrequency, Waveform, unit_window
 
 _TABLE = 32  # entries per cell of a tabulated response
 
@@ -57,10 +57,6 @@ def moving_power(
         raise InputError(
             f"expected velocities of shape {tuple(paths.first.shape)}, one per path, got "
             f"{tuple(velocities.shape)}; evaluate them at the paths' points"
-        )
-    if window not in WINDOWS:
-        raise InputError(
-            f"expected a window of {', '.join(WINDOWS)}, got {window!r}; choose one of them"
         )
     direction, own_rates = _seen(paths, velocities, radar)
     off = own_rates - rates[:, None]
@@ -114,8 +110,7 @@ def _range_spread(
 
 def _doppler_response(cycles: Tensor, chirps: Chirps, window: str) -> Tensor:
     """Power response |Σ w_n exp(2πj n x)|² of the chirps' window, x in cycles per loop."""
-    weight = taper(window, torch.linspace(0, 1, chirps.count, dtype=torch.float64), chirps.count)
-    weight = (weight / weight.sum()).to(torch.complex128)
+    weight = unit_window(window, chirps.count).to(torch.complex128)
 
     def response(places: Tensor) -> Tensor:
         turns = 2j * math.pi * places[:, None] * torch.arange(chirps.count)
@@ -149,17 +144,9 @@ def _steered(
 ) -> Complex128[Tensor, "tx path direction"]:
     """What the elements of each transmitter add to the beams, by a path of unit field."""
     array = aperture(radar)
-    for name, places, bins in (("u", array.x, grid.u_count), ("v", array.y, grid.v_count)):
-        if len(places) > 1 and bins == 1:
-            raise InputError(
-                f"expected a grid that resolves {name}, got 1 bin; the array extends along that "
-                "axis, so give the grid its directions"
-            )
-    weight = array.x_taper[array.column] * array.y_taper[array.row]
+    array.check_directions(grid)
     x, y = radar.virtual_positions[:, 0], radar.virtual_positions[:, 1]
-    beams = grid.u[:, None, None] * x + grid.v[:, None] * y
-    phase = 2 * math.pi / radar.waveform.wavelength * beams.flatten(0, 1)
-    toward = torch.polar((weight / weight.sum()).expand_as(phase), phase)
+    toward = array.beams(grid.u, grid.v, x, y) * array.weight
     waves = -2 * math.pi / radar.waveform.wavelength * direction[:, :2] @ torch.stack([x, y])
     arriving = torch.polar(torch.ones_like(waves), waves)
     elements = len(radar.receivers.positions)

@@ -3,10 +3,11 @@
 import math
 import warnings
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Complex, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, differentiated
@@ -100,17 +101,16 @@ class Radar:
     @property
     def aperture(self) -> tuple[float, float]:
         """Extent of the virtual array along x and y plus half a wavelength [m]."""
-        extent = self.virtual_positions.amax(0) - self.virtual_positions.amin(0)
+        places = self.virtual_positions
+        extent = places.amax(0) - places.amin(0)
         half = 0.5 * self.waveform.wavelength
         return float(extent[0]) + half, float(extent[1]) + half
 
     @property
     def beamwidth(self) -> tuple[float, float]:
         """One cell in u and in v, λ/D with D the virtual aperture."""
-        return (
-            self.waveform.wavelength / self.aperture[0],
-            self.waveform.wavelength / self.aperture[1],
-        )
+        width, height = self.aperture
+        return self.waveform.wavelength / width, self.waveform.wavelength / height
 
     def elements(self) -> tuple[Float64[Tensor, "frame tx 3"], Float64[Tensor, "frame rx 3"]]:
         """World positions of all TX and RX elements [m]."""
@@ -153,7 +153,13 @@ class Radar:
     def frames(self, indices: Sequence[int] | Int64[Tensor, " chosen"]) -> "Radar":
         """The radar with only these poses."""
         chosen = torch.as_tensor(indices, dtype=torch.int64)
-        return replace(self, positions=self.positions[chosen], rotations=self._rotations[chosen])
+        if not len(chosen):
+            return replace(self, positions=self.positions[chosen])  # which explains itself
+        # A copy, since a fit asks at every step: what has been checked stays right.
+        radar = copy(self)
+        object.__setattr__(radar, "positions", self.positions[chosen])
+        object.__setattr__(radar, "rotations", self._rotations[chosen])
+        return radar
 
     def grid(
         self,
@@ -255,6 +261,28 @@ def sampled(radar: Radar) -> SampledWaveform:
         f"expected an FMCW, stepped frequency or OFDM radar, got {type(radar.waveform).__name__}, "
         "which has no beat signal; use the surrogate for it"
     )
+
+
+def checked_beat(
+    beat: Complex[Tensor, "frame tx rx sample"], radar: Radar
+) -> Complex[Tensor, "frame tx rx sample"]:
+    """A beat signal that fits a radar.
+
+    Args:
+        beat: One signal per frame and channel.
+        radar: What recorded it.
+
+    Raises:
+        InputError: It has another shape.
+    """
+    channels = len(radar.transmitters.positions), len(radar.receivers.positions)
+    expected = (radar.frame_count, *channels, sampled(radar).samples)
+    if tuple(beat.shape) != expected:
+        raise InputError(
+            f"expected a beat signal of shape {expected} (frame, tx, rx, sample), got "
+            f"{tuple(beat.shape)}; use the radar that recorded it"
+        )
+    return beat
 
 
 def _checked_rotations(value: object, frames: int) -> Tensor:

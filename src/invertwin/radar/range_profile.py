@@ -11,8 +11,8 @@ from invertwin.channel import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.nonuniform import beat_of_delays
-from invertwin.radar.radar import Radar, sampled
-from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, sample_window
+from invertwin.radar.radar import Radar, checked_beat, sampled
+from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, unit_window
 
 _STANDARD_TEMPERATURE = 290.0  # K, at which noise figures are defined
 
@@ -136,19 +136,8 @@ def range_profile(
         InputError: The signal does not fit the radar.
     """
     waveform = sampled(radar)
-    expected = (
-        radar.frame_count,
-        len(radar.transmitters.positions),
-        len(radar.receivers.positions),
-        waveform.samples,
-    )
-    if tuple(beat.shape) != expected:
-        raise InputError(
-            f"expected a beat signal of shape {expected} (frame, tx, rx, sample), got "
-            f"{tuple(beat.shape)}; use the radar that recorded it"
-        )
-    window = sample_window(waveform, radar.window)
-    tapered = beat * (window / window.sum()).to(beat.device, beat.real.dtype)
+    window = unit_window(radar.window, waveform.samples)
+    tapered = checked_beat(beat, radar) * window.to(beat.device, beat.real.dtype)
     bins = _fft_bins(waveform, grid)
     if bins is None:
         return tapered @ _range_matrix(waveform, grid).to(beat.device, beat.dtype)

@@ -66,6 +66,21 @@ class Aperture:
                 "this array is not the product of a row and a column, so resolve both axes"
             )
 
+    def check_directions(self, grid: Grid) -> None:
+        """Raise where the grid leaves out an axis along which the array extends."""
+        for name, places, bins in (("u", self.x, grid.u_count), ("v", self.y, grid.v_count)):
+            if len(places) > 1 and bins == 1:
+                raise InputError(
+                    f"expected a grid that resolves {name}, got 1 bin; the array extends along "
+                    "that axis, so give the grid its directions"
+                )
+
+    @property
+    def weight(self) -> Float64[Tensor, " virtual"]:
+        """Taper of the virtual elements, with a sum of 1."""
+        weight = self.x_taper[self.column] * self.y_taper[self.row]
+        return weight / weight.sum()
+
     def steering(
         self, cosines: Float64[Tensor, " node"], places: Float64[Tensor, " place"]
     ) -> Complex[Tensor, "node place"]:
@@ -77,6 +92,23 @@ class Aperture:
         """
         phase = 2 * math.pi / self.wavelength * cosines[:, None] * places[None]
         return torch.polar(torch.ones_like(phase), phase)
+
+    def beams(
+        self,
+        u: Float64[Tensor, " u"],
+        v: Float64[Tensor, " v"],
+        x: Float64[Tensor, " element"],
+        y: Float64[Tensor, " element"],
+    ) -> Complex[Tensor, "direction element"]:
+        """``steering`` of elements in a plane towards all pairs of direction cosines, u slowest.
+
+        Args:
+            u: Direction cosines along x.
+            v: Direction cosines along y.
+            x: Of the elements [m].
+            y: Of the elements [m].
+        """
+        return (self.steering(u, x)[:, None] * self.steering(v, y)).flatten(0, 1)
 
 
 def aperture(radar: Radar) -> Aperture:
@@ -127,11 +159,8 @@ def beamform(
     array.check_resolved(grid)
     if array.separable:
         return _separable_power(channels, array, grid)
-    weight = array.x_taper[array.column] * array.y_taper[array.row]
-    u = array.steering(grid.u, array.x)[:, array.column] * (weight / weight.sum())
-    v = array.steering(grid.v, array.y)[:, array.row]
-    both = (u[:, None] * v[None]).flatten(0, 1).to(channels)
-    power = (both @ channels).abs().square().unflatten(1, (grid.u_count, grid.v_count))
+    both = array.beams(grid.u, grid.v, array.x[array.column], array.y[array.row]) * array.weight
+    power = (both.to(channels) @ channels).abs().square().unflatten(1, (grid.u_count, grid.v_count))
     return power.movedim(-1, 1)
 
 

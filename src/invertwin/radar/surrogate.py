@@ -118,11 +118,12 @@ class Surrogate:
                 "expected phases='mean' to shape deposited power, got 'random'; a field has phases "
                 "path by path: use surrogate_spectrum"
             )
+        sigmas = self._extra(radar, grid)
         for kernel in self._kernels(radar, grid):
             offset = None
             if kernel.dims == (1,) and radar.biased:
                 offset = torch.as_tensor(radar.range_bias) / grid.range_step
-            deposit = kernel.apply(deposit, self._extra(kernel.dims, radar, grid), offset)
+            deposit = kernel.apply(deposit, [sigmas[dim] for dim in kernel.dims], offset)
         return deposit
 
     def blur(
@@ -139,10 +140,9 @@ class Surrogate:
             InputError: The map does not have the grid's shape.
         """
         _check_map(power, grid)
-        for dim, count in enumerate(grid.shape, start=1):
-            extra = self._extra((dim,), radar, grid)
-            if count > 1 and extra[0] > 0:
-                power = _flat(dim, count).apply(power, extra)
+        for dim, sigma in self._extra(radar, grid).items():
+            if (count := grid.shape[dim - 1]) > 1 and sigma > 0:
+                power = _flat(dim, count).apply(power, [sigma])
         return power
 
     def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_Kernel, ...]":
@@ -157,15 +157,14 @@ class Surrogate:
             grid,
         )
 
-    def _extra(self, dims: tuple[int, ...], radar: Radar, grid: Grid) -> list[float]:
-        """Standard deviations of the extra Gaussian along map dimensions, in bins."""
+    def _extra(self, radar: Radar, grid: Grid) -> dict[int, float]:
+        """Standard deviation of the extra Gaussian along each map dimension, in bins."""
         u, v = radar.beamwidth
-        sigmas = {
+        return {
             1: self.range_width * radar.waveform.range_resolution / grid.range_step,
             2: self.angle_width * u / grid.u_step,
             3: self.angle_width * v / grid.v_step,
         }
-        return [sigmas[dim] for dim in dims]
 
 
 SURROGATES = MappingProxyType(

@@ -100,9 +100,9 @@ class SampledWaveform(Waveform):
             distance: d, from the target's range [m].
             window: Taper w of the samples.
         """
-        weight = sample_window(self, window)
+        weight = unit_window(window, self.samples).to(torch.complex128)
         cycles = distance[:, None] / self.max_range * torch.arange(self.samples)
-        return (torch.exp(2j * math.pi * cycles) @ (weight / weight.sum() + 0j)).abs().square()
+        return (torch.exp(2j * math.pi * cycles) @ weight).abs().square()
 
 
 @dataclass(frozen=True)
@@ -368,7 +368,14 @@ def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[T
         name: One of ``WINDOWS``.
         position: 0 at the first and 1 at the last place.
         count: Number of distinct places.
+
+    Raises:
+        InputError: An unknown window.
     """
+    if name not in WINDOWS:
+        raise InputError(
+            f"expected a window of {', '.join(WINDOWS)}, got {name!r}; choose one of them"
+        )
     if name == "rectangular" or count < 2:
         return torch.ones_like(position)
     if name == "hamming":
@@ -379,15 +386,18 @@ def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[T
     return 0.42 - 0.5 * torch.cos(angle) + 0.08 * torch.cos(2 * angle)
 
 
-def sample_window(waveform: SampledWaveform, window: str) -> Float64[Tensor, " sample"]:
-    """Taper of the beat signal's samples.
+def unit_window(name: str, count: int) -> Float64[Tensor, " sample"]:
+    """Taper of samples or chirps at equal steps, with a sum of 1.
 
     Args:
-        waveform: Its number of samples.
-        window: Name of the taper.
+        name: One of ``WINDOWS``.
+        count: How many there are.
+
+    Raises:
+        InputError: An unknown window.
     """
-    position = torch.linspace(0, 1, waveform.samples, dtype=torch.float64)
-    return taper(window, position, waveform.samples)
+    weight = taper(name, torch.linspace(0, 1, count, dtype=torch.float64), count)
+    return weight / weight.sum()
 
 
 def gaussian_response(

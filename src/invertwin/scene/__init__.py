@@ -1,159 +1,78 @@
 """Scenes as plain torch values: meshes, materials, antennas, and what can be fitted in them."""
 
-from invertwin.scene.antenna import (
-    AntennaArray,
-    Cosine,
-    Isotropic,
-    Pattern,
-    Table,
-    linear_array,
-    planar_array,
-)
-from invertwin.scene.cloud import Cloud
-from invertwin.scene.files import load_mesh, load_scene_xml, save_mesh
-from invertwin.scene.geometry import (
-    BodyTemplate,
-    DensityGrid,
-    DistanceGrid,
-    LatticeDeformation,
-    LinearShape,
-    NeuralDistance,
-    PriorShape,
-    ShapePrior,
-    ShapeSpace,
-    SkinnedBody,
-    SmoothVertices,
-    articulated_template,
-    iso_surface,
-    load_anny,
-    load_prior,
-    load_smpl,
-    load_vehicle_space,
-    person,
-)
-from invertwin.scene.material import (
-    ITU_MATERIALS,
-    Dielectric,
-    FieldCoefficients,
-    Itu,
-    Layer,
-    Material,
-    Multilayer,
-    OutsideTableWarning,
-    PerfectConductor,
-    RefractingBody,
-    RoughConductor,
-    RoughDielectric,
-    Slab,
-    Surface,
-    Texture,
-    complex_permittivity,
-    fresnel_amplitude,
-    fresnel_coefficients,
-    fresnel_reflectance,
-    fresnel_transmittance,
-    lobe_exponent,
-    lobe_integral,
-    slab_coefficients,
-    slope_exponent,
-)
-from invertwin.scene.mesh import Mesh
-from invertwin.scene.parameters import (
-    Compose,
-    MaterialValues,
-    Pose,
-    Scale,
-    Translation,
-    Vertices,
-)
-from invertwin.scene.pose import (
-    compose,
-    look_at,
-    quaternion_from_vector,
-    rigid,
-    rotation_angle,
-    rotation_from_quaternion,
-    rotation_from_vector,
-    vector_from_quaternion,
-)
-from invertwin.scene.scene import Object, Scene
-from invertwin.scene.shapes import box, dihedral, plate, sphere, text, trihedral
-
-__all__ = [
-    "ITU_MATERIALS",
-    "AntennaArray",
-    "BodyTemplate",
-    "Cloud",
-    "Compose",
-    "Cosine",
-    "DensityGrid",
-    "Dielectric",
-    "DistanceGrid",
-    "FieldCoefficients",
-    "Isotropic",
-    "Itu",
-    "LatticeDeformation",
-    "Layer",
-    "LinearShape",
-    "Material",
-    "MaterialValues",
-    "Mesh",
-    "Multilayer",
-    "NeuralDistance",
-    "Object",
-    "OutsideTableWarning",
-    "Pattern",
-    "PerfectConductor",
-    "Pose",
-    "PriorShape",
-    "RefractingBody",
-    "RoughConductor",
-    "RoughDielectric",
-    "Scale",
-    "Scene",
-    "ShapePrior",
-    "ShapeSpace",
-    "SkinnedBody",
-    "Slab",
-    "SmoothVertices",
-    "Surface",
-    "Table",
-    "Texture",
-    "Translation",
-    "Vertices",
-    "articulated_template",
-    "box",
-    "complex_permittivity",
-    "compose",
-    "dihedral",
-    "fresnel_amplitude",
-    "fresnel_coefficients",
-    "fresnel_reflectance",
-    "fresnel_transmittance",
-    "iso_surface",
-    "linear_array",
-    "load_anny",
-    "load_mesh",
-    "load_prior",
-    "load_scene_xml",
-    "load_smpl",
-    "load_vehicle_space",
-    "lobe_exponent",
-    "lobe_integral",
-    "look_at",
-    "person",
-    "planar_array",
-    "plate",
-    "quaternion_from_vector",
-    "rigid",
-    "rotation_angle",
-    "rotation_from_quaternion",
-    "rotation_from_vector",
-    "save_mesh",
-    "slab_coefficients",
-    "slope_exponent",
-    "sphere",
-    "text",
-    "trihedral",
-    "vector_from_quaternion",
-]
+from invertwin.scene.antenna import AntennaArray as AntennaArray
+from invertwin.scene.antenna import Cosine as Cosine
+from invertwin.scene.antenna import Isotropic as Isotropic
+from invertwin.scene.antenna import Pattern as Pattern
+from invertwin.scene.antenna import Table as Table
+from invertwin.scene.antenna import linear_array as linear_array
+from invertwin.scene.antenna import planar_array as planar_array
+from invertwin.scene.cloud import Cloud as Cloud
+from invertwin.scene.files import load_mesh as load_mesh
+from invertwin.scene.files import load_scene_xml as load_scene_xml
+from invertwin.scene.files import save_mesh as save_mesh
+from invertwin.scene.geometry import BodyTemplate as BodyTemplate
+from invertwin.scene.geometry import DensityGrid as DensityGrid
+from invertwin.scene.geometry import DistanceGrid as DistanceGrid
+from invertwin.scene.geometry import LatticeDeformation as LatticeDeformation
+from invertwin.scene.geometry import LinearShape as LinearShape
+from invertwin.scene.geometry import NeuralDistance as NeuralDistance
+from invertwin.scene.geometry import PriorShape as PriorShape
+from invertwin.scene.geometry import ShapePrior as ShapePrior
+from invertwin.scene.geometry import ShapeSpace as ShapeSpace
+from invertwin.scene.geometry import SkinnedBody as SkinnedBody
+from invertwin.scene.geometry import SmoothVertices as SmoothVertices
+from invertwin.scene.geometry import articulated_template as articulated_template
+from invertwin.scene.geometry import iso_surface as iso_surface
+from invertwin.scene.geometry import load_anny as load_anny
+from invertwin.scene.geometry import load_prior as load_prior
+from invertwin.scene.geometry import load_smpl as load_smpl
+from invertwin.scene.geometry import load_vehicle_space as load_vehicle_space
+from invertwin.scene.geometry import person as person
+from invertwin.scene.material import ITU_MATERIALS as ITU_MATERIALS
+from invertwin.scene.material import Dielectric as Dielectric
+from invertwin.scene.material import FieldCoefficients as FieldCoefficients
+from invertwin.scene.material import Itu as Itu
+from invertwin.scene.material import Layer as Layer
+from invertwin.scene.material import Material as Material
+from invertwin.scene.material import Multilayer as Multilayer
+from invertwin.scene.material import OutsideTableWarning as OutsideTableWarning
+from invertwin.scene.material import PerfectConductor as PerfectConductor
+from invertwin.scene.material import RefractingBody as RefractingBody
+from invertwin.scene.material import RoughConductor as RoughConductor
+from invertwin.scene.material import RoughDielectric as RoughDielectric
+from invertwin.scene.material import Slab as Slab
+from invertwin.scene.material import Surface as Surface
+from invertwin.scene.material import Texture as Texture
+from invertwin.scene.material import complex_permittivity as complex_permittivity
+from invertwin.scene.material import fresnel_amplitude as fresnel_amplitude
+from invertwin.scene.material import fresnel_coefficients as fresnel_coefficients
+from invertwin.scene.material import fresnel_reflectance as fresnel_reflectance
+from invertwin.scene.material import fresnel_transmittance as fresnel_transmittance
+from invertwin.scene.material import lobe_exponent as lobe_exponent
+from invertwin.scene.material import lobe_integral as lobe_integral
+from invertwin.scene.material import slab_coefficients as slab_coefficients
+from invertwin.scene.material import slope_exponent as slope_exponent
+from invertwin.scene.mesh import Mesh as Mesh
+from invertwin.scene.parameters import Compose as Compose
+from invertwin.scene.parameters import MaterialValues as MaterialValues
+from invertwin.scene.parameters import Pose as Pose
+from invertwin.scene.parameters import Scale as Scale
+from invertwin.scene.parameters import Translation as Translation
+from invertwin.scene.parameters import Vertices as Vertices
+from invertwin.scene.pose import compose as compose
+from invertwin.scene.pose import look_at as look_at
+from invertwin.scene.pose import quaternion_from_vector as quaternion_from_vector
+from invertwin.scene.pose import rigid as rigid
+from invertwin.scene.pose import rotation_angle as rotation_angle
+from invertwin.scene.pose import rotation_from_quaternion as rotation_from_quaternion
+from invertwin.scene.pose import rotation_from_vector as rotation_from_vector
+from invertwin.scene.pose import vector_from_quaternion as vector_from_quaternion
+from invertwin.scene.scene import Object as Object
+from invertwin.scene.scene import Scene as Scene
+from invertwin.scene.shapes import box as box
+from invertwin.scene.shapes import dihedral as dihedral
+from invertwin.scene.shapes import plate as plate
+from invertwin.scene.shapes import sphere as sphere
+from invertwin.scene.shapes import text as text
+from invertwin.scene.shapes import trihedral as trihedral

@@ -53,8 +53,8 @@ def expected(scene: Scene, antennas: Link, depth: int) -> Tensor:
     return (maps[1].double() - maps[0].double()).sum(dim=(1, 2, 3))
 
 
-def chained(scene: Scene, antennas: Link, seed: int, count: int) -> tuple[Tensor, Tensor]:
-    """Response and sum of powers of the chains alone, per frame."""
+def by_rough_paths(scene: Scene, antennas: Link, seed: int, count: int) -> tuple[Tensor, Tensor]:
+    """Response and sum of powers of rough paths alone, per frame."""
     drawn = Sampling(depth=3, points_per_m2=1.0, rough_paths=count)
     paths = trace_field(scene, antennas, sampling=drawn, seed=seed)
     longer = (paths.first - paths.last).norm(dim=1) > 0
@@ -72,12 +72,12 @@ def chained(scene: Scene, antennas: Link, seed: int, count: int) -> tuple[Tensor
     [False, True],
     ids=["corner", "with a board"],
 )
-def test_chains_carry_the_power_of_the_map(front):
+def test_paths_carry_the_power_of_the_map(front):
     """However many they are, within four standard errors of at most 8 %."""
     scene, antennas = corner(front), looks()
     truth = expected(scene, antennas, 3)
     for count, seeds in ((10_000, 6), (40_000, 4)):
-        sums = [chained(scene, antennas, seed, count)[1] for seed in range(seeds)]
+        sums = [by_rough_paths(scene, antennas, seed, count)[1] for seed in range(seeds)]
         ratio = torch.stack(sums).mean(1) / truth.mean()
         error = float(ratio.std()) / seeds**0.5
         assert error < 0.08
@@ -85,18 +85,21 @@ def test_chains_carry_the_power_of_the_map(front):
 
 
 @pytest.mark.slow
-def test_mean_power_of_chained_fields_is_the_power_map():
+def test_mean_power_of_rough_path_fields_is_the_power_map():
     """E|S|² over phases, within four standard errors of at most 5 %: the phases are independent."""
     scene, antennas = corner(), looks()
     truth = expected(scene, antennas, 3)
-    found = [chained(scene, antennas, seed, 2_000)[0].abs().square() / truth for seed in range(120)]
+    found = [
+        by_rough_paths(scene, antennas, seed, 2_000)[0].abs().square() / truth
+        for seed in range(120)
+    ]
     looked = torch.stack(found).mean(1)
     error = float(looked.std()) / len(found) ** 0.5
     assert error < 0.05
     assert abs(float(looked.mean()) - 1) < 4 * error
 
 
-def test_chains_stay_while_the_radar_moves():
+def test_paths_stay_while_the_radar_moves():
     scene = corner()
     antennas = [link(((x, 0.0, 0.0),), ((x + 0.25, 0.0, 0.0),)) for x in (0.0, 0.07)]
     few = Sampling(depth=3, points_per_m2=10.0, rough_paths=2_000)

@@ -1,4 +1,4 @@
-"""How rough chains are drawn: as much power as there is, by way of many chains where it is weak."""
+"""How rough paths are drawn: as much power as there is, by way of many paths where it is weak."""
 
 import math
 
@@ -57,15 +57,15 @@ def by_area(geometry: Geometry, count: int, seed: int) -> SurfacePaths:
     )
 
 
-def powers(geometry: Geometry, poses: Link, chain: SurfacePaths, frame: int) -> Tensor:
-    """What every chain carries in a frame."""
-    frames = torch.full((len(chain.weight),), frame)
-    return path_view(RayScene(geometry, poses), frames, chain).power * chain.weight
+def powers(geometry: Geometry, poses: Link, paths: SurfacePaths, frame: int) -> Tensor:
+    """What every path carries in a frame."""
+    frames = torch.full((len(paths.weight),), frame)
+    return path_view(RayScene(geometry, poses), frames, paths).power * paths.weight
 
 
 @pytest.mark.parametrize("where", ["at the reference poses", "from another pose"])
-def test_an_echo_by_a_wall_has_its_power_and_many_chains(where):
-    """The integral within four standard errors, of single draws at most 12 %, by many chains."""
+def test_an_echo_by_a_wall_has_its_power_and_many_paths(where):
+    """The integral within four standard errors, of single draws at most 12 %, by many paths."""
     whole, poses = scene(), antennas(-0.2, 0.3)
     drawn_for = poses if where == "at the reference poses" else antennas(-0.2)
     geometry = flatten(whole, poses.wavelength)
@@ -74,10 +74,10 @@ def test_an_echo_by_a_wall_has_its_power_and_many_chains(where):
     assert error < 0.02
     found = []
     for seed in (1, 2, 3):
-        chain = draw_rough_paths(whole, drawn_for, count=COUNT, depth=3, seed=seed).by_length[1]
-        objects = geometry.face_object[chain.face]
-        chain = chain.keep((objects == torch.tensor([WALL, ITEM, WALL])).all(1))
-        found.append(powers(geometry, poses, chain, 1))
+        paths = draw_rough_paths(whole, drawn_for, count=COUNT, depth=3, seed=seed).by_length[1]
+        objects = geometry.face_object[paths.face]
+        paths = paths.keep((objects == torch.tensor([WALL, ITEM, WALL])).all(1))
+        found.append(powers(geometry, poses, paths, 1))
     sums = torch.stack([power.sum() for power in found]) / truth
     many = torch.stack([power.sum().square() / power.square().sum() for power in found])
     spread = float(sums.std())
@@ -86,7 +86,7 @@ def test_an_echo_by_a_wall_has_its_power_and_many_chains(where):
     assert float(many.min()) > 100
 
 
-def test_chains_are_kept_by_what_they_carry():
+def test_paths_are_kept_by_what_they_carry():
     """A quarter of the draws at most, their phases of their own, and the same for the same seed."""
     one, same, other = (
         draw_rough_paths(scene(), antennas(0.0), count=COUNT, depth=3, seed=seed)

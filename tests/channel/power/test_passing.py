@@ -23,7 +23,7 @@ def table(values: Tensor, cosine: float) -> float:
 
 @pytest.mark.parametrize("angle", [0.0, 0.5])
 def test_a_wall_behind_a_board_is_fainter_and_later(angle):
-    """By T(θ)², and by twice the excess of the path, which is once that of the range."""
+    """By T(θ)², and by twice the extra length of the path, which is once that of the range."""
     board = Slab(2.7, 0.05, thickness=0.0125)
     direction = float64([math.sin(angle), 0.0, math.cos(angle)])
     wall = thing(plate(0.05, 0.05), (2 * direction).tolist(), material=WHITE)
@@ -49,8 +49,8 @@ def test_a_wall_behind_a_board_is_fainter_and_later(angle):
     share = table(surface.transmittance, math.cos(angle))
     assert share < 0.9
     assert float(maps[1].sum() / maps[0].sum()) == pytest.approx(share**2, rel=0.01)
-    excess = table(surface.excess, math.cos(angle))
-    assert ranges[1] - ranges[0] == pytest.approx(excess, abs=3e-4)
+    extra = table(surface.extra_length, math.cos(angle))
+    assert ranges[1] - ranges[0] == pytest.approx(extra, abs=3e-4)
 
 
 def block(index: float, thickness: float, near: float, slope: float, width: float) -> Object:

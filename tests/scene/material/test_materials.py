@@ -76,7 +76,7 @@ def test_each_material_fills_its_part_of_the_surface(make, lets_through, refract
     surface = make().surface(FREQUENCY)
     assert all(value.dtype == torch.float64 for value in vars(surface).values())
     assert bool((surface.transmittance > 0).any()) == lets_through
-    assert bool((surface.excess != 0).any()) == lets_through
+    assert bool((surface.extra_length != 0).any()) == lets_through
     assert bool((surface.refraction > 0).any()) == refracts
     assert bool(surface.index != 1) == refracts
     assert not surface.attenuation

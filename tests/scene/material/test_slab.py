@@ -110,7 +110,7 @@ def test_layers_equal_a_transmission_line_over_frequency(polarisation):
 
 
 def mean_excess(layers_at, cosine, frequency):
-    """The oracle's excess of both polarisations, weighted by what each lets through."""
+    """The oracle's extra length of both polarisations, weighted by what each lets through."""
     powers, lengths = [], []
     for polarisation in ("s", "p"):
         layers = layers_at(frequency)
@@ -124,7 +124,7 @@ def mean_excess(layers_at, cosine, frequency):
 @pytest.mark.parametrize("node", [5, 60, 128, 200, 255])
 def test_excess_is_the_group_delay_of_the_transmission_line(node):
     expected = mean_excess(line_at, NODES[node], FREQUENCY)
-    got = float(WALL.surface(FREQUENCY).excess[node])
+    got = float(WALL.surface(FREQUENCY).extra_length[node])
     assert got == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
@@ -135,7 +135,7 @@ def test_excess_of_a_table_material_includes_its_dispersion():
         return [(complex(30 * ghz**-0.4, -loss), 5e-3)]
 
     slab = Slab.itu("wet_ground", thickness=5e-3)
-    got = slab.surface(5e9).excess[[40, 255]].tolist()
+    got = slab.surface(5e9).extra_length[[40, 255]].tolist()
     for node, length in zip((40, 255), got, strict=True):
         assert length == pytest.approx(mean_excess(ground, NODES[node], 5e9), rel=1e-6)
 
@@ -145,7 +145,8 @@ def test_excess_of_a_faint_slab_is_the_extra_optical_path():
     surface = Slab(1.0004, thickness=0.02).surface(FREQUENCY)
     cosine = NODES[[100, 200, 255]]
     expected = 0.02 * (np.sqrt(0.0004 + cosine**2) - cosine)
-    assert surface.excess[[100, 200, 255]].tolist() == pytest.approx(expected.tolist(), rel=2e-3)
+    got = surface.extra_length[[100, 200, 255]].tolist()
+    assert got == pytest.approx(expected.tolist(), rel=2e-3)
 
 
 def test_the_phase_through_the_thickness_is_counted_once():
@@ -155,7 +156,7 @@ def test_the_phase_through_the_thickness_is_counted_once():
     one = torch.ones(1, dtype=torch.float64)
     got = slab_coefficients([air.sheet(FREQUENCY)], one, FREQUENCY)
     assert complex(got.transmission_s) == pytest.approx(-1j, abs=1e-12)
-    assert air.surface(FREQUENCY).excess.abs().max() < 1e-9
+    assert air.surface(FREQUENCY).extra_length.abs().max() < 1e-9
     assert (air.surface(FREQUENCY).amplitude == 0).all()
 
 
@@ -182,14 +183,14 @@ def test_a_stack_transmits_the_same_from_both_sides():
     back = Multilayer(WALL.layers[::-1])
     front, behind = WALL.surface(FREQUENCY), back.surface(FREQUENCY)
     assert torch.allclose(front.transmittance, behind.transmittance, rtol=1e-10)
-    assert torch.allclose(front.excess, behind.excess, rtol=1e-8)
+    assert torch.allclose(front.extra_length, behind.extra_length, rtol=1e-8)
     assert not torch.allclose(front.amplitude, behind.amplitude, rtol=1e-3)
 
 
 def test_two_halves_make_the_whole():
     whole = Slab(4.0, 0.2, thickness=6e-3).surface(FREQUENCY)
     halves = Multilayer([Layer(4.0, 0.2, thickness=3e-3)] * 2).surface(FREQUENCY)
-    for name in ("amplitude", "transmittance", "excess"):
+    for name in ("amplitude", "transmittance", "extra_length"):
         assert torch.allclose(getattr(whole, name), getattr(halves, name), atol=1e-12)
 
 
@@ -199,7 +200,7 @@ def test_a_thick_lossy_slab_is_a_half_space():
     expected = RoughDielectric(4.0, 1e4).surface(FREQUENCY).amplitude
     assert torch.allclose(surface.amplitude, expected, atol=1e-9)
     assert (surface.transmittance == 0).all()
-    assert torch.isfinite(surface.excess).all()
+    assert torch.isfinite(surface.extra_length).all()
 
 
 def tables(*values):
@@ -245,7 +246,7 @@ def test_power_is_kept_at_the_ends(permittivity, conductivity, thickness):
         for v in (permittivity, conductivity, thickness)
     ]
     surface = Slab(values[0], values[1], thickness=values[2]).surface(FREQUENCY)
-    for table in (surface.amplitude, surface.transmittance, surface.excess):
+    for table in (surface.amplitude, surface.transmittance, surface.extra_length):
         gradients = torch.autograd.grad(table[1:].sum(), values, retain_graph=True)
         assert all(torch.isfinite(g) for g in gradients)
     reflected = surface.amplitude.square()
@@ -263,7 +264,7 @@ def test_power_is_kept_at_the_ends(permittivity, conductivity, thickness):
         assert abs(float(change)) < 1e-6 * (1 + abs(float(scale)))
     if permittivity == 1 or thickness == 0:
         assert not reflected.any()
-        assert surface.excess[1:].abs().max() < 1e-12
+        assert surface.extra_length[1:].abs().max() < 1e-12
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -1,14 +1,15 @@
-"""Studies of invertwin: the paper's figures, peers to compare with, training of the shape prior.
+"""Studies of invertwin: figures, peers to compare with, training of the prior, public recordings.
 
-A plugin of invertwin: it adds the run-file sections `[methods]` and `[loss_scan]` and the commands
-`loss-scan` and `train-prior`. Nothing in invertwin builds on it.
+A plugin of invertwin: it adds the run-file sections `[methods]` and `[loss_scan]`, the commands
+`loss-scan` and `train-prior`, and the readers of two public recordings, the `[data]` kinds
+`openradar` and `rail_sar`. Nothing in invertwin builds on it.
 """
 
 from typing import Any
 
 
 def register(registry: Any) -> None:
-    """Adds the sections and commands of the studies to invertwin.
+    """Adds the sections, commands and readers of the studies to invertwin.
 
     Called by the entry point `invertwin.plugins`.
     """
@@ -19,3 +20,9 @@ def register(registry: Any) -> None:
     registry.section("loss_scan", LossScan)
     registry.command("loss-scan", loss_scan)
     registry.command("train-prior", train_prior)
+    for kind, file, board in (
+        ("openradar", "openradar.npz", "xWR1642"),
+        ("rail_sar", "bwsi_rail_trial6.npz", None),
+    ):
+        registry.add("data", kind, f"invertwin_studies.recordings.kinds:{kind}_data")
+        registry.recording(file, kind, board)

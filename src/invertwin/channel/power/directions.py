@@ -92,7 +92,8 @@ class Directions:
             if not present:
                 continue
             axis = mi.Vector3f(back if number == 2 else mirror)
-            exponent = dr.gather(mi.Float, self.surfaces.exponents, point.surface * 3 + number)
+            exponents = self.surfaces.tables["exponents"]
+            exponent = dr.gather(mi.Float, exponents, point.surface * 3 + number)
             # Height of the cap that a lobe ((1 + cosψ)/2)^p fills to the share of the number.
             height = 2 * (1 - dr.exp(dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)))
             lobe = _in_cap(axis, height, [mi.Float(1.0), numbers[3]])

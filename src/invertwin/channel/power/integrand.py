@@ -94,13 +94,14 @@ class Inputs:
 
     def table(self, name: str) -> Any:
         """One of the differentiable inputs."""
-        return getattr(self.surfaces if name in SURFACE else self, name)
+        return self.surfaces.tables[name] if name in SURFACE else getattr(self, name)
 
     def replaced(self, tables: dict[str, Any]) -> "Inputs":
         """With some of the differentiable inputs replaced."""
         rows = {name: table for name, table in tables.items() if name in SURFACE}
         others = {name: table for name, table in tables.items() if name not in SURFACE}
-        return replace(self, surfaces=replace(self.surfaces, **rows), **others)
+        surfaces = replace(self.surfaces, tables={**self.surfaces.tables, **rows})
+        return replace(self, surfaces=surfaces, **others)
 
     def detached(self) -> "Inputs":
         """The same values without derivatives."""

@@ -4,6 +4,7 @@ Everything here is differentiable or not, as the tables are. The same law in tor
 ``channel/reference/radar_equation.py``; tests hold the two equal.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -20,15 +21,7 @@ SURFACE = tuple(field.name for field in fields(Surface))
 class Surfaces:
     """Rows of ``scene.material.Surface`` as flat Dr.Jit arrays, and what is known of all rows."""
 
-    amplitude: Any
-    diffuse: Any
-    lobes: Any
-    exponents: Any
-    transmittance: Any
-    excess: Any
-    refraction: Any
-    index: Any
-    attenuation: Any
+    tables: Mapping[str, Any]
     cosines: int
     lobed: tuple[bool, ...]
     sheets: bool
@@ -38,7 +31,7 @@ class Surfaces:
     def of(geometry: Geometry) -> "Surfaces":
         """Upload the surfaces of a scene."""
         return Surfaces(
-            **{name: to_float(getattr(geometry.surfaces, name)) for name in SURFACE},
+            {name: to_float(getattr(geometry.surfaces, name)) for name in SURFACE},
             cosines=geometry.surfaces.amplitude.shape[1],
             lobed=geometry.lobed,
             sheets=geometry.sheets,
@@ -53,7 +46,7 @@ class Surfaces:
             row: Row of the surface.
             active: Lanes.
         """
-        return dr.gather(mi.Float, getattr(self, name), row, active)
+        return dr.gather(mi.Float, self.tables[name], row, active)
 
     def tabulated(self, name: str, row: Any, cosine: Any, active: Any = True) -> Any:
         """A table over cosθ, linear between its entries.
@@ -64,7 +57,7 @@ class Surfaces:
             cosine: Of the angle of incidence, at least 0.
             active: Lanes.
         """
-        table = getattr(self, name)
+        table = self.tables[name]
         t = dr.minimum(cosine, 1.0) * (self.cosines - 1)
         low = dr.minimum(mi.UInt32(dr.detach(t)), self.cosines - 2)
         first = dr.gather(mi.Float, table, row * self.cosines + low, active)
@@ -80,7 +73,7 @@ class Surfaces:
             active: Lanes.
         """
         return tuple(  # type: ignore[return-value]
-            self.tabulated(name, row, cosine, active) for name in ("transmittance", "excess")
+            self.tabulated(name, row, cosine, active) for name in ("transmittance", "extra_length")
         )
 
     def lobe(
@@ -96,7 +89,7 @@ class Surfaces:
             active: Lanes.
         """
         cosine = between if number == 2 else 2 * product - between
-        exponent = dr.gather(mi.Float, self.exponents, row * 3 + number, active)
+        exponent = dr.gather(mi.Float, self.tables["exponents"], row * 3 + number, active)
         return dr.exp(exponent * dr.log(dr.maximum(0.5 * (1 + cosine), 1e-7))), exponent
 
     def scattered(self, row: Any, normal: Any, back: Any, on: Any, active: Any = True) -> Any:
@@ -124,7 +117,7 @@ class Surfaces:
         for number, present in enumerate(self.lobed):
             if present:
                 lobe, _ = self.lobe(number, row, product, between, active)
-                shape += dr.gather(mi.Float, self.lobes, row * 3 + number, active) * lobe
+                shape += dr.gather(mi.Float, self.tables["lobes"], row * 3 + number, active) * lobe
         value = dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
         if self.bodies and on is not None:
             through = self.refracted(row, normal, back, on, active)
@@ -182,13 +175,13 @@ class Surfaces:
             row: Row of the surface.
             active: Lanes.
         """
-        exponent = dr.gather(mi.Float, self.exponents, row * 3, active)
+        exponent = dr.gather(mi.Float, self.tables["exponents"], row * 3, active)
         return 2 / dr.maximum(exponent, 1.0)
 
     def is_skin(self, row: Any) -> Any:
         """Whether a surface is the skin of a refracting body."""
         last = (row + 1) * self.cosines - 1
-        return dr.detach(dr.gather(mi.Float, self.refraction, last)) > 0
+        return dr.detach(dr.gather(mi.Float, self.tables["refraction"], last)) > 0
 
 
 def gaussian(mismatch: Any, variance: Any) -> Any:

@@ -321,7 +321,7 @@ def passed(
             0, rows, tabulated(surfaces.transmittance, row, cosine)
         )
         transmittance = transmittance * factor
-        extra = extra.index_add(0, rows, tabulated(surfaces.excess, row, cosine))
+        extra = extra.index_add(0, rows, tabulated(surfaces.extra_length, row, cosine))
         rows = rows[transmittance.detach()[rows] > 0]
     return transmittance * torch.ones_like(transmittance).index_fill(0, rows, 0.0), extra
 

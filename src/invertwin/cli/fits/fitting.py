@@ -52,14 +52,8 @@ from invertwin.seeds import derived_seed
 def calibrated(
     problem: Problem, folder: RunFolder, console: Console
 ) -> tuple[Problem, dict[str, Any]]:
-    """The problem with range bias and clock offset found on an object whose place is known.
-
-    Args:
-        problem: With one sensor.
-        folder: Keeps the checkpoint.
-        console: Shows progress.
-    """
-    table = problem.run.calibration
+    """The problem with range bias and clock offset found on an object whose place is known."""
+    run, table = problem.run, problem.run.calibration
     if table is None:
         return problem, {}
     if len(problem.sights) > 1:
@@ -71,30 +65,24 @@ def calibrated(
         capture, row = calibrate(sight.capture, target.center), {}
     else:
         bias, clock = RangeBias(), ClockOffset(sight.capture.positions)
-        rate = table.rate or problem.run.optimizer.rate
-        stage = replace(stages_of(problem.run)[0], steps=table.steps or steps_of(problem.run))
-        checkpoint = folder.file(f"{PARTS}/calibration.pt")
-        every = need(problem.run, "reconstruct", "reconstruct").checkpoint_every
-        with watched(Bar(console, "calibration", stage.steps)) as advance:
+        stage, model = stages_of(run)[0], sight.model(sampling_of(run))
+        steps = table.steps or steps_of(run)
+        optimizer = build.optimizer(run.optimizer)
+        with watched(Bar(console, "calibration", steps)) as shown:
             found = reconstruct(
                 Scene({table.object: target}),
-                Observation(
-                    sight.model(sampling_of(problem.run)),
-                    sight.radar,
-                    sight.capture,
-                    parameters=[bias, clock],
-                ),
+                Observation(model, sight.radar, sight.capture, parameters=[bias, clock]),
                 [],
-                loss=build.loss(problem.run.loss),
-                optimizer=replace(build.optimizer(problem.run.optimizer), rate=rate),
+                loss=build.loss(run.loss),
+                optimizer=replace(optimizer, rate=table.rate or run.optimizer.rate),
                 schedule=Schedule(
-                    stage.steps,
+                    steps,
                     annealing=stage.annealing,
                     frames_per_step=stage.frames_per_step,
                     tolerance=stage.tolerance,
                 ),
-                callbacks=[*advance, Checkpoint(checkpoint, every, resume=True)],
-                seed=problem.run.seed,
+                callbacks=[*shown, _checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
+                seed=run.seed,
             )
         capture = sight.capture.recalibrated(
             sight.capture.clock_offset + float(clock.shift.detach()),
@@ -102,8 +90,8 @@ def calibrated(
         )
         row = {"loss": found.loss, "status": found.status}
     row |= {"clock_offset_s": capture.clock_offset, "range_bias_m": capture.range_bias}
-    found = replace(sight, capture=capture, radar=capture.radar())
-    return replace(problem, sights=dict.fromkeys(problem.sights, found)), row
+    sight = replace(sight, capture=capture, radar=capture.radar())
+    return replace(problem, sights=dict.fromkeys(problem.sights, sight)), row
 
 
 def fit(
@@ -132,14 +120,14 @@ def fit(
     part = f"{PARTS}/{mode}_{index:02d}"
     checkpoint = checkpoint or f"{part}.pt"
     own = varied(problem, mode)
+    again = partial(_staged, own, start, index, folder, checkpoint)
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
-        return row, partial(_staged, own, start, index, None, folder, checkpoint)
+        return row, again
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    bar = Bar(console, name, steps_of(own.run))
-    found = _staged(own, start, index, bar, folder, checkpoint)
+    found = again(Bar(console, name, steps_of(own.run)))
     row = {
         "start": index,
         **scores(own, start, found.scene),
@@ -160,17 +148,15 @@ def _staged(
     problem: Problem,
     start: build.Start,
     index: int,
-    bar: "Bar | None",
     folder: RunFolder,
     checkpoint: str,
+    bar: "Bar | None" = None,
 ) -> Reconstruction:
-    run = problem.run
-    stages = stages_of(run)
+    run, stages, watch = problem.run, stages_of(problem.run), watch_of(problem)
     for k in range(len(stages) - 1):
         folder.file(str(stage_file(Path(checkpoint), k)))
-    watch = watch_of(problem)
     every = run.measures.every if run.measures else 1
-    with watched(bar) as advance:
+    with watched(bar) as shown:
         return reconstruct(
             start.scene,
             observations_of(problem),
@@ -180,16 +166,17 @@ def _staged(
             schedule=stages,
             callbacks=[
                 *([] if watch is None else [Watch(watch, every)]),
-                *advance,
-                # From its own unfinished part; open_run has settled what may be there.
-                Checkpoint(
-                    folder.file(checkpoint),
-                    need(run, "reconstruct", "reconstruct").checkpoint_every,
-                    resume=True,
-                ),
+                *shown,
+                _checkpoint(problem, folder, checkpoint),
             ],
             seed=derived_seed(run.seed, index),
         )
+
+
+def _checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
+    """Goes on from its own unfinished part; open_run has settled what may be there."""
+    every = need(problem.run, "reconstruct", "reconstruct").checkpoint_every
+    return Checkpoint(folder.file(name), every, resume=True)
 
 
 def _values(modules: nn.ModuleList) -> dict[str, Any]:
@@ -251,14 +238,8 @@ class Bar:
 
     def __init__(self, console: Console, name: str, steps: int):
         self._console, self._name, self._steps = console, name, steps
-        self._bar = Progress(
-            TextColumn(name),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.description}"),
-            console=console,
-        )
+        columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, TextColumn("{task.description}"), console=console)
         self._task = self._bar.add_task("", total=steps)
 
     def __enter__(self) -> "Bar":

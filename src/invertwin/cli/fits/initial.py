@@ -7,9 +7,7 @@ from typing import Any
 from rich.console import Console
 
 from invertwin.cli import build
-from invertwin.cli.fits.likeness import is_shape_key, shape_label
 from invertwin.cli.fits.problem import Problem
-from invertwin.cli.report import Table
 from invertwin.cli.run_file import about
 from invertwin.cli.schema import Initial
 from invertwin.errors import InputError
@@ -31,12 +29,6 @@ from invertwin.scene import Mesh, Scene, rigid
 
 # Wide enough for a guess that is off by a cell, sharp enough to tell front from back.
 _KERNELS = Surrogate(range_width=1.0, angle_width=0.5)
-_LABELS = (
-    ("distance to the truth [m]", "start_distance_m", "position_error_m"),
-    ("angle to the truth [°]", "start_angle_deg", "rotation_error_deg"),
-    ("size, share off the truth", "initial_scale_error", "scale_error"),
-    ("loss without extra width", "start_loss_sharp", "loss_sharp"),
-)
 
 
 def guessed(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]]:
@@ -61,26 +53,6 @@ def guessed(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]
         scene = _clouded(problem, table, scene)
     found["initial_seconds"] = time.perf_counter() - begin
     return replace(problem, scene=scene), found
-
-
-def added(metrics: dict[str, Any]) -> list[Table]:
-    """What the fit has made better: the conventional guess beside the twin."""
-    if "initial_seconds" not in metrics:
-        return []
-    shapes = [(shape_label(key), f"start_{key}", key) for key in metrics if is_shape_key(key)]
-    rows = [
-        [label, metrics[before], metrics[after]]
-        for label, before, after in (*_LABELS, *shapes)
-        if metrics.get(before) is not None and metrics.get(after) is not None
-    ]
-    legend = "The fit started from the backprojected echoes."
-    if "initial_points" in metrics:
-        legend = (
-            f"The fit started where a conventional detector and a rectangle around its "
-            f"{metrics['initial_points']} echoes put the object."
-        )
-    columns = ["quantity", "conventional guess", "refined twin"]
-    return [Table("What the refinement added", columns, rows, legend)]
 
 
 def _placed(

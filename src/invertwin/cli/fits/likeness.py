@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from invertwin.cli.fits.problem import Problem
+from invertwin.cli.report import texts
 from invertwin.cli.run_file import about
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import (
@@ -32,36 +33,20 @@ def is_shape_key(key: str) -> bool:
 def shape_label(key: str) -> str:
     """What a measure is, in words."""
     name, whose = _parted(key)
-    text, ending = name, ""
+    ending = ""
     for end, words in (("_whole", ", whole surface"), ("_seen", ", surface that is seen")):
         if end in name:
-            text, ending = name.replace(end, ""), words
-    if text.startswith("fscore"):
-        text = f"F-score at {text.removeprefix('fscore_').removesuffix('cm')} cm"
-    else:
-        words = {
-            "chamfer_m": "Chamfer distance, mean of both directions [m]",
-            "iou": "shared over joint volume",
-            "normal_consistency": "normal consistency",
-            "components": "separate parts",
-            "euler_number": "Euler number, 2 less for every hole through a part",
-        }
-        text = words.get(text, text)
-    return text + ending + whose
+            name, ending = name.replace(end, ""), words
+    if name.startswith("fscore"):
+        name = f"F-score at {name.removeprefix('fscore_').removesuffix('cm')} cm"
+    return texts("shapes").get(name, name) + ending + whose
 
 
 def short_label(key: str) -> str:
     """A measure as the head of a narrow column."""
     if key.startswith("fscore"):
         return f"F {key.removeprefix('fscore_').removesuffix('cm')} cm"
-    words = {
-        "chamfer_m": "Chamfer [m]",
-        "iou": "IoU",
-        "normal_consistency": "normals",
-        "components": "parts",
-        "euler_number": "Euler",
-    }
-    return words.get(key, key)
+    return texts("shape_columns").get(key, key)
 
 
 def check_measures(problem: Problem, start: Scene) -> None:

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Literal
 
 import torch
@@ -12,12 +13,12 @@ from torch import Tensor
 
 from invertwin import plotting
 from invertwin.capture import ChirpCapture
-from invertwin.channel import Grid, Sampling
+from invertwin.channel import Sampling
 from invertwin.cli import build, sensors
 from invertwin.cli.fits.fitting import Bar, watched
 from invertwin.cli.recordings import chirp_capture
-from invertwin.cli.report import Again, Picture, Table, report_html
-from invertwin.cli.run_file import about, need, to_toml
+from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
+from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import chirp_train
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
@@ -35,7 +36,7 @@ from invertwin.inversion import (
     strongest_mover,
 )
 from invertwin.models import MotionMap
-from invertwin.plotting import RATE_LABEL, U_LABEL, Panel, png_bytes
+from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
 from invertwin.radar import doppler_maps
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
@@ -49,121 +50,112 @@ _SCALES: dict[Scale, str] = {
     "power": "power",
     "level": "level (dB, down to −40 dB)",
 }
-_LABELS = {
-    "mover_range_m": "strongest mover, range [m]",
-    "mover_velocity_m_s": "its range rate, away > 0 [m/s]",
-    "mover_azimuth_deg": "its azimuth [°]",
-    "phase_coherence": "phase coherence of its channels (1 = a plane wave)",
-    "twin_correlation": "twin and recording, correlation of the magnitudes",
-    "bare_psf_correlation": "a point target at the peak instead",
-    "heldout_twin_correlation": "second half of the frame, predicted by a twin of the first half",
-    "heldout_bare_psf_correlation": "the same with a point target of the first half",
-    "position_error_m": "distance to the truth [m]",
-    "velocity_error_m_s": "velocity off the truth [m/s]",
-    "fit_seconds": "time of the fits [s]",
-    "wall_seconds": "time of all, pictures included [s]",
-}
-_TWIN_LABELS = {
-    "position_m": "centre (right, up, ahead) [m]",
-    "velocity_m_s": "velocity [m/s]",
-    "spin_rad_s": "turn about the axis up [rad/s]",
-    "extent_m": "size across, up, along the line of sight [m]",
-    "diffuse": "diffuse share of the echo",
-}
 
 
 @dataclass(frozen=True)
-class _Found:
-    """A fitted body.
-
-    Attributes:
-        recording: What it was fitted to.
-        model: The map of the whole recording.
-        echo: The strongest mover in it.
-        body: With the values that were found.
-        fit: The fit.
-        seconds: Time of the fit.
-    """
+class _Fit:
+    """A body that was fitted to the strongest mover of a recording."""
 
     recording: ChirpCapture
-    model: MotionMap
+    model: MotionMap  # of the whole recording
     echo: Echo
     body: MovingBody
-    fit: Reconstruction
+    found: Reconstruction
     seconds: float
 
-    def predicted(self, scene: Scene, model: MotionMap, seed: int, time: float = 0.0) -> Tensor:
-        """What the body looks like in a map, a time after the middle of its recording [s]."""
-        with torch.no_grad():
-            return model.sampled_by(samples=_RAYS).predict(
-                self.body(scene, time), self.recording.radar(), seed
-            )[0]
-
-    def near(self, cells: int, model: MotionMap | None = None, time: float = 0.0) -> MotionMap:
-        """The cells of a map about the echo, which moves along its line of sight for a time."""
+    def maps(self, scene: Scene, cells: int, seed: int, time: float = 0.0) -> "_Maps":
+        """Twin and point about the echo, a time after the middle of the recording [s]."""
+        radar = self.recording.radar()
         place = self.echo.range + self.echo.rate * time
-        return (model or self.model).around(place, self.echo.rate, cells, self.recording.radar())
+        model = self.model.around(place, self.echo.rate, cells, radar)
+        with torch.no_grad():
+            moved = self.body(scene, time)
+            twin = model.sampled_by(samples=_RAYS).predict(moved, radar, seed)[0]
+        return _Maps(model, twin, of_point(model, radar, self.echo, time)[0])
+
+
+@dataclass(frozen=True)
+class _Maps:
+    model: MotionMap
+    twin: Tensor
+    point: Tensor
+
+    def scores(self, recording: ChirpCapture, prefix: str = "") -> dict[str, Any]:
+        """Correlations with a recording, on the same cells, by scale."""
+        observed = self.model.observe(recording)[0]
+        maps = {"twin": self.twin, "bare_psf": self.point}
+        rows = {
+            scale: {
+                name: 1 - float(CorrelationLoss(scale)(power, observed))
+                for name, power in maps.items()
+            }
+            for scale in _SCALES
+        }
+        headline = {f"{prefix}{name}_correlation": v for name, v in rows["magnitude"].items()}
+        return {**headline, f"{prefix}correlations": rows}
 
 
 def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
-    """Find the strongest mover, fit a twin to it, write the folder.
-
-    Args:
-        run: The run file.
-        folder: Where to write.
-        console: Where progress is shown.
-
-    Returns:
-        The tables to print and the outcome.
+    """Finds the strongest mover, fits a twin to it, writes the folder.
 
     Raises:
         InputError: A run file that asks for something else, or data without chirps.
     """
     begin = time.perf_counter()
     table, recording = _mover(run), _recorded(run)
-    grid = build.grid(need(run, "grid", "reconstruct"), recording.radar())
     scene = build.scene(run)
-    whole = _fitted(run, table, scene, recording, grid, "twin", console)
-    seen = whole.near(_CELLS)
-    observed = seen.observe(recording)[0]
+    whole = _fitted(run, table, scene, recording, "twin", console)
+    # The first half of the chirps predicts the second; nothing is taken from that.
+    count = recording.chirps.count // 2
+    first, second = recording.loops(0, count), recording.loops(count, count)
+    half = _fitted(run, table, scene, first, "twin of the first half", console)
+    later = float(_times(recording)[count, 0])
+    values = whole.body.values()
     metrics: dict[str, Any] = {
         "task": run.task,
-        **_echo_metrics(whole.echo),
-        **_scores("", whole, scene, seen, observed, run.seed),
+        "mover_range_m": whole.echo.range,
+        "mover_velocity_m_s": whole.echo.rate,
+        "mover_azimuth_deg": math.degrees(math.asin(max(-1.0, min(1.0, whole.echo.u)))),
+        "phase_coherence": whole.echo.coherence,
+        **whole.maps(scene, _CELLS, run.seed).scores(recording),
+        **half.maps(scene, _CELLS, run.seed, later).scores(second, "heldout_"),
+        "twin": {name: value.tolist() for name, value in values.items()},
+        **_errors(run, table.object, recording, values),
+        "loss": whole.found.history[-1]["loss"],
+        "steps": whole.found.steps,
+        "status": whole.found.status,
+        "fit_seconds": whole.seconds + half.seconds,
     }
-    halves, half = _heldout(run, table, scene, recording, grid, console)
-    metrics |= halves
-    values = whole.body.values()
-    metrics["twin"] = {name: value.tolist() for name, value in values.items()}
-    metrics |= _errors(run, table.object, recording, values)
-    metrics["loss"] = whole.fit.history[-1]["loss"]
-    metrics["steps"] = whole.fit.steps
-    metrics["status"] = whole.fit.status
-    metrics["fit_seconds"] = whole.seconds + half.seconds
+    drawn = _pictures(run, folder, whole, half, scene)
     with torch.no_grad():
-        moving = whole.body(scene)
-    drawn = _pictures(run, whole, half, scene, moving)
-    for name, picture in drawn.items():
-        folder.write_bytes(f"{name}.png", picture.png)
-    save_mesh(folder.file("twin.ply"), moving)
+        save_mesh(folder.file("twin.ply"), whole.body(scene))
     metrics["wall_seconds"] = time.perf_counter() - begin
-    folder.write_json("metrics.json", metrics)
-    tables = _tables(metrics)
-    outcome = _outcome(metrics)
-    again = Again("reconstruct run.toml", {"run.toml": to_toml(run)})
-    title = run.title or "A moving twin"
-    parts = [tables[0], *drawn.values(), *tables[1:]]
-    folder.write_text("report.html", report_html(title, outcome, run.note, parts, again))
+    result, *others = _tables(metrics)
+    outcome = (
+        f"The strongest mover is {metrics['mover_range_m']:.2f} m away; its twin correlates "
+        f"{metrics['twin_correlation']:.3f} with the recording, a point target "
+        f"{metrics['bare_psf_correlation']:.3f}."
+    )
+    title, parts = run.title or "A moving twin", [result, *drawn, *others]
+    tables = finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note)
     return tables, outcome
 
 
-def _recorded(run: RunFile) -> ChirpCapture:
+def _mover(run: RunFile) -> Mover:
+    table, *others = need(run, "parameters", "reconstruct")
+    if others:
+        kinds = ", ".join(parameter.kind for parameter in run.parameters)
+        raise InputError(f"parameters: expected a mover alone, got {kinds}; leave only the mover")
     for name in ("starts", "calibration", "landscape", "initial"):
         if getattr(run, name):
             raise InputError(
                 f"{name}: expected no such section with a mover, got one; remove it: the fit "
                 "starts at the strongest echo that moves"
             )
+    return table
+
+
+def _recorded(run: RunFile) -> ChirpCapture:
     data = need(run, "data", "a mover")
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
@@ -180,35 +172,25 @@ def _recorded(run: RunFile) -> ChirpCapture:
     return recording
 
 
-def _mover(run: RunFile) -> Mover:
-    table = need(run, "parameters", "reconstruct")[0]
-    if len(run.parameters) > 1 or not isinstance(table, Mover):
-        kinds = ", ".join(parameter.kind for parameter in run.parameters)
-        raise InputError(f"parameters: expected a mover alone, got {kinds}; leave only the mover")
-    return table
-
-
 def _fitted(
-    run: RunFile,
-    table: Mover,
-    scene: Scene,
-    recording: ChirpCapture,
-    grid: Grid,
-    name: str,
-    console: Console,
-) -> _Found:
-    settings = need(run, "reconstruct", "reconstruct")
+    run: RunFile, table: Mover, scene: Scene, recording: ChirpCapture, name: str, console: Console
+) -> _Fit:
+    settings, grid = need(run, "reconstruct", "reconstruct"), need(run, "grid", "reconstruct")
     radar = recording.radar()
-    oversample = math.ceil(need(run, "grid", "reconstruct").oversample)
-    sampling = Sampling(depth=1, samples=settings.samples, boundary=False)
-    model = MotionMap.of(radar, grid, recording.chirps, oversample, sampling)
+    model = MotionMap.of(
+        radar,
+        build.grid(grid, radar),
+        recording.chirps,
+        math.ceil(grid.oversample),
+        Sampling(depth=1, samples=settings.samples, boundary=False),
+    )
     echo = strongest_mover(recording, model)
     begin = time.perf_counter()
     with about(f"scene.{table.object}"):
         body = MovingBody(table.object, scene, radar, echo)
     near = model.around(echo.range, echo.rate, table.cells, radar)
     with watched(Bar(console, name, settings.steps)) as callbacks:
-        fit = reconstruct(
+        found = reconstruct(
             scene,
             Observation(near, radar, recording),
             body,
@@ -218,29 +200,12 @@ def _fitted(
             callbacks=callbacks,
             seed=run.seed,
         )
-    return _Found(recording, model, echo, body, fit, time.perf_counter() - begin)
+    return _Fit(recording, model, echo, body, found, time.perf_counter() - begin)
 
 
-def _heldout(
-    run: RunFile,
-    table: Mover,
-    scene: Scene,
-    recording: ChirpCapture,
-    grid: Grid,
-    console: Console,
-) -> tuple[dict[str, Any], _Found]:
-    """Fits the first half of the chirps and predicts the second, with a twin and with a point.
-
-    Both move on with the velocities of the first half; nothing is taken from the second.
-    """
-    count = recording.chirps.count // 2
-    half = _fitted(
-        run, table, scene, recording.loops(0, count), grid, "twin of the first half", console
-    )
-    later = float(recording.chirps.times(len(recording.device.transmitters.positions))[count, 0])
-    second = recording.loops(count, count)
-    seen = half.near(_CELLS, time=later)
-    return _scores("heldout_", half, scene, seen, seen.observe(second)[0], run.seed, later), half
+def _times(recording: ChirpCapture) -> Tensor:
+    """When each ramp of the frame starts [chirp, tx], s."""
+    return recording.chirps.times(len(recording.device.transmitters.positions))
 
 
 def _errors(
@@ -255,139 +220,65 @@ def _errors(
     truth = build.true_scene(run)[name]
     still = torch.zeros(1, 3, dtype=torch.float64)
     velocity = (still if truth.velocity is None else truth.velocity).reshape(-1, 3).mean(0)
-    times = recording.chirps.times(len(recording.device.transmitters.positions))
-    place = truth.center + velocity * times.mean()
+    place = truth.center + velocity * _times(recording).mean()
     return {
         "position_error_m": float((found["position_m"] - place).norm()),
         "velocity_error_m_s": float((found["velocity_m_s"] - velocity).norm()),
     }
 
 
-def _echo_metrics(echo: Echo) -> dict[str, Any]:
-    return {
-        "mover_range_m": echo.range,
-        "mover_velocity_m_s": echo.rate,
-        "mover_azimuth_deg": math.degrees(math.asin(max(-1.0, min(1.0, echo.u)))),
-        "phase_coherence": echo.coherence,
-    }
-
-
-def _scores(
-    prefix: str,
-    found: _Found,
-    scene: Scene,
-    seen: MotionMap,
-    observed: Tensor,
-    seed: int,
-    time: float = 0.0,
-) -> dict[str, Any]:
-    """Correlations of twin and point with the recording, on the same cells and scales."""
-    maps = {
-        "twin": found.predicted(scene, seen, seed, time),
-        "bare_psf": of_point(seen, found.recording.radar(), found.echo, time)[0],
-    }
-    rows = {
-        scale: {
-            name: 1 - float(CorrelationLoss(scale)(power, observed)) for name, power in maps.items()
-        }
-        for scale in _SCALES
-    }
-    headline = {f"{prefix}{name}_correlation": v for name, v in rows["magnitude"].items()}
-    return {**headline, f"{prefix}correlations": rows}
-
-
 def _pictures(
-    run: RunFile, whole: _Found, half: _Found, scene: Scene, moving: Scene
-) -> dict[str, Picture]:
-    recording = whole.recording
-    radar, grid, chirps = recording.radar(), whole.model.grid, recording.chirps
-    wide = whole.near(_DRAWN_CELLS)
+    run: RunFile, folder: RunFolder, whole: _Fit, half: _Fit, scene: Scene
+) -> list[Picture]:
+    recording, radar = whole.recording, whole.recording.radar()
+    wide = whole.maps(scene, _DRAWN_CELLS, run.seed)
+    grid, rates = wide.model.grid, wide.model.rates
     maps = {
-        "recorded": wide.observe(recording)[0],
-        "twin": whole.predicted(scene, wide, run.seed),
-        "point target": of_point(wide, radar, whole.echo)[0],
+        "recorded": wide.model.observe(recording)[0],
+        "twin": wide.twin,
+        "point target": wide.point,
+    }
+    over_rates = {
+        name: Panel(power.amax((2, 3)).T, grid.ranges, rates, RATE_LABEL)
+        for name, power in maps.items()
+    }
+    over_directions = {
+        name: Panel(power.amax((0, 3)), grid.ranges, grid.u, U_LABEL)
+        for name, power in maps.items()
     }
     with torch.no_grad():
-        start = MovingBody(whole.body.object, scene, radar, whole.echo)(scene)
-    scenes = {"start": start, "twin": moving}
+        begun = MovingBody(whole.body.object, scene, radar, whole.echo)(scene)
+        scenes = {"start": begun, "twin": whole.body(scene)}
     losses = {
-        name: [[row["loss"] for row in found.fit.history]]
-        for name, found in (("twin", whole), ("twin of the first half", half))
+        name: [[row["loss"] for row in fit.found.history]]
+        for name, fit in (("twin", whole), ("twin of the first half", half))
     }
-    return {
-        "recording": Picture(
-            "The recording",
-            png_bytes(plotting.range_doppler(doppler_maps(recording.beat, radar, grid, chirps))),
-            "Range rates are modulo the unambiguous span; phases that transmitters in turn add to "
-            "movers are taken out.",
-        ),
-        "twin_doppler": Picture(
-            "The mover over range and range rate",
-            png_bytes(plotting.panels(_over_rates(maps, wide))),
-        ),
-        "twin_direction": Picture(
+    seen = doppler_maps(recording.beat, radar, whole.model.grid, recording.chirps)
+    where = plotting.scene(scenes, radar, highlight=[whole.body.object])
+    drawn = {
+        "recording": (plotting.range_doppler(seen), "The recording", "doppler"),
+        "twin_doppler": (plotting.panels(over_rates), "The mover over range and range rate", ""),
+        "twin_direction": (
+            plotting.panels(over_directions),
             "The mover over range and azimuth",
-            png_bytes(plotting.panels(_over_directions(maps, wide))),
-            "Each map in dB below its own peak, the strongest over the axis that is not shown.",
+            "mover_direction",
         ),
-        "scene": Picture(
-            "Where it is",
-            png_bytes(plotting.scene(scenes, radar, highlight=[whole.body.object])),
-            "In the middle of the frame. Place and motion in height are given, not found: one row "
-            "of antennas does not resolve it.",
-        ),
-        "loss": Picture(
-            "1 − correlation of the magnitudes", png_bytes(plotting.convergence(losses))
-        ),
+        "scene": (where, "Where it is", "mover_scene"),
+        "loss": (plotting.convergence(losses), "1 − correlation of the magnitudes", ""),
     }
-
-
-def _over_rates(maps: Mapping[str, Tensor], wide: MotionMap) -> dict[str, Panel]:
-    return {
-        name: Panel(power.amax((2, 3)).T, wide.grid.ranges, wide.rates, RATE_LABEL)
-        for name, power in maps.items()
-    }
-
-
-def _over_directions(maps: Mapping[str, Tensor], wide: MotionMap) -> dict[str, Panel]:
-    return {
-        name: Panel(power.amax((0, 3)), wide.grid.ranges, wide.grid.u, U_LABEL)
-        for name, power in maps.items()
-    }
+    return [picture(folder, name, *shown) for name, shown in drawn.items()]
 
 
 def _tables(metrics: Mapping[str, Any]) -> list[Table]:
-    rows = [[label, metrics[key]] for key, label in _LABELS.items() if key in metrics]
+    columns = list(product(("", "heldout_"), ("twin", "bare_psf")))
     scales: list[Sequence[Any]] = [
-        [
-            label,
-            *(
-                metrics[f"{prefix}correlations"][scale][name]
-                for prefix in ("", "heldout_")
-                for name in ("twin", "bare_psf")
-            ),
-        ]
+        [label, *(metrics[f"{part}correlations"][scale][name] for part, name in columns)]
         for scale, label in _SCALES.items()
     ]
-    columns = ["map", "twin", "point", "twin, second half", "point, second half"]
-    twin = [[label, metrics["twin"][key]] for key, label in _TWIN_LABELS.items()]
+    heads = ["map", "twin", "point", "twin, second half", "point, second half"]
+    note = texts("notes")["mover_correlation"]
     return [
-        Table("Result", ["quantity", "value"], rows),
-        Table(
-            "Correlation with the recording",
-            columns,
-            scales,
-            f"Pearson's, over {_CELLS} range and Doppler cells to either side of the mover and all "
-            "directions, without what stands still. The twin is fitted to the whole frame (first "
-            "columns) or to its first half alone (last columns).",
-        ),
-        Table("The twin", ["quantity", "value"], twin),
+        quantities("Result", metrics, skip=("loss",)),
+        Table("Correlation with the recording", heads, scales, note),
+        quantities("The twin", metrics["twin"], of="mover"),
     ]
-
-
-def _outcome(metrics: Mapping[str, Any]) -> str:
-    return (
-        f"The strongest mover is {metrics['mover_range_m']:.2f} m away; its twin correlates "
-        f"{metrics['twin_correlation']:.3f} with the recording, a point target "
-        f"{metrics['bare_psf_correlation']:.3f}."
-    )

@@ -1,6 +1,6 @@
 """What is to be fitted: scene, observations and unknowns of a run file."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,12 +17,7 @@ from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import (
-    RunFile,
-    Settings,
-    SimulatedData,
-    Variant,
-)
+from invertwin.cli.schema import RunFile, Settings, SimulatedData, Variant
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
@@ -36,33 +31,25 @@ from invertwin.seeds import derived_seed
 FULL, INTERIOR = "full", "interior_only"
 
 _POINTS_PER_M2 = 2_000.0
-_OWN = ("radar", "grid", "data", "surrogate", "chirps")  # sections of a sensor
+_WIDTHS = ("range_width", "angle_width")
+_OWN = ("radar", "grid", "data", "surrogate", "chirps", "model")  # sections of a sensor
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What one sensor has recorded.
-
-    Attributes:
-        capture: The data.
-        radar: What measured them.
-        grid: Bins that are compared.
-        surrogate: The `[surrogate]` table of this sensor.
-        weight: Share in the loss.
-    """
+    """What one sensor has recorded."""
 
     capture: Capture
     radar: Radar
     grid: Grid
     surrogate: SurrogateTable
-    weight: float = 1.0
+    weight: float = 1.0  # in the loss
+    table: Any = None  # `[model]` of a plugin
 
     def model(self, sampling: Sampling) -> ForwardModel:
-        """The forward model that is fitted.
-
-        Args:
-            sampling: How it samples paths.
-        """
+        """The forward model that is fitted."""
+        if self.table is not None:
+            return build.model(self.table, self.grid, build.surrogate(self.surrogate))
         if self.surrogate.exact:
             return ExactMap(self.grid, sampling)
         return SurrogateMap(self.grid, build.surrogate(self.surrogate), sampling)
@@ -70,23 +57,14 @@ class Sight:
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything a fit needs, built from the run file.
-
-    Attributes:
-        run: The run file.
-        scene: The scene as known.
-        truth: The true scene, where the run file knows it.
-        known: Names of the objects whose true pose is known.
-        sights: What every sensor has recorded, by name.
-        target: The object that is scored, if any moves.
-    """
+    """Everything a fit needs, built from the run file."""
 
     run: RunFile
-    scene: Scene
-    truth: Scene
-    known: frozenset[str]
-    sights: Mapping[str, Sight] = field(default_factory=dict)
-    target: str | None = None
+    scene: Scene  # as known
+    truth: Scene  # where the run file knows it
+    known: frozenset[str]  # objects whose true pose is known
+    sights: Mapping[str, Sight] = field(default_factory=dict)  # by the sensor's name
+    target: str | None = None  # the object that is scored
 
     @property
     def first(self) -> Sight:
@@ -95,11 +73,7 @@ class Problem:
 
 
 def problem_of(run: RunFile, console: Console) -> Problem:
-    """Build the problem; simulated data are simulated here.
-
-    Args:
-        run: The run file.
-        console: Where progress is told.
+    """The problem of a run file; simulated data are simulated here.
 
     Raises:
         InputError: A section is missing or does not fit the data.
@@ -114,11 +88,11 @@ def problem_of(run: RunFile, console: Console) -> Problem:
             )
     # Their errors come before any work.
     build.parameters(run.parameters, scene, sought_bodies(run), run.scene)
-    sights = {}
-    for name, (own, weight) in observed_runs(run).items():
+    sights, observed = {}, observed_runs(run)
+    for name, (own, weight) in observed.items():
         with about(f"observations.{name}") if name else nullcontext():
             sights[name] = _sight(own, weight, truth, console)
-    simulated = all(isinstance(own.data, SimulatedData) for own, _ in observed_runs(run).values())
+    simulated = all(isinstance(own.data, SimulatedData) for own, _ in observed.values())
     known = frozenset(truth.names if simulated else run.truth)
     target = run.starts.object if run.starts else next(iter(sought_objects(run)), None)
     return Problem(run, scene, truth, known, sights, target)
@@ -150,7 +124,7 @@ def _sight(run: RunFile, weight: float, truth: Scene, console: Console) -> Sight
         grid = build.grid(table, radar)
         console.print("simulating the exact signals of the true scene")
         capture = Capture.from_beat(exact(run, truth, radar, grid).beat, radar)
-        return Sight(capture, radar, grid, run.surrogate, weight)
+        return Sight(capture, radar, grid, run.surrogate, weight, run.model)
     if run.radar is not None:
         raise InputError(
             f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
@@ -158,7 +132,7 @@ def _sight(run: RunFile, weight: float, truth: Scene, console: Console) -> Sight
         )
     capture = measured(data)
     radar = capture.radar()
-    return Sight(capture, radar, build.grid(table, radar), run.surrogate, weight)
+    return Sight(capture, radar, build.grid(table, radar), run.surrogate, weight, run.model)
 
 
 def sought_objects(run: RunFile) -> list[str]:
@@ -167,17 +141,9 @@ def sought_objects(run: RunFile) -> list[str]:
 
 
 def varied(problem: Problem, mode: str) -> Problem:
-    """The problem of a mode: the run's own, without boundary terms, or a variant.
-
-    Args:
-        problem: With all parameters and sensors.
-        mode: Its name.
-
-    Returns:
-        The problem with the parameters and the sensors of this fit only.
-    """
+    """The problem of a mode, with the parameters and the sensors of this fit only."""
     wanted = _wanted(problem.run, mode)
-    widths = {k: v for k, v in _given(wanted).items() if k in ("range_width", "angle_width")}
+    widths = _among(_given(wanted), _WIDTHS)
     chosen = getattr(wanted, "observations", None) or problem.sights
     sights = {
         name: replace(sight, surrogate=sight.surrogate.model_copy(update=widths))
@@ -194,12 +160,7 @@ def _wanted(run: RunFile, mode: str) -> Variant:
 
 
 def varied_run(run: RunFile, mode: str) -> RunFile:
-    """The run file of a mode, with the parameters of this fit only.
-
-    Args:
-        run: The whole run file.
-        mode: Name of the mode.
-    """
+    """The run file of a mode, with the parameters of this fit only."""
     wanted = _wanted(run, mode)
     given = _given(wanted)
     changes: dict[str, Any] = {}
@@ -210,12 +171,11 @@ def varied_run(run: RunFile, mode: str) -> RunFile:
         staged = {name for stage in stages for name in stage.parameters}
         names = [name for name in staged if name in (names or tables)]
     kept = {name: table for name, table in tables.items() if name in (names or tables)}
-    if wanted.smooth is not None:
-        smooth = {"smooth": wanted.smooth}
-        for name, table in kept.items():
-            if table.kind == "vertices":
-                kept[name] = table.model_copy(update=smooth)
-    changes["parameters"] = list(kept.values())
+    smooth = {} if wanted.smooth is None else {"smooth": wanted.smooth}
+    changes["parameters"] = [
+        table.model_copy(update=smooth if table.kind == "vertices" else {})
+        for table in kept.values()
+    ]
     # Stages seek what the fit has; one that has nothing left to seek falls out.
     changes["stages"] = [
         stage.model_copy(update={"parameters": [n for n in stage.parameters if n in kept]})
@@ -225,8 +185,7 @@ def varied_run(run: RunFile, mode: str) -> RunFile:
     for section in ("reconstruct", "optimizer", "surrogate"):
         table = getattr(run, section)
         keys = set(type(table).model_fields) - {"parameters"}
-        update = {key: value for key, value in given.items() if key in keys}
-        changes[section] = table.model_copy(update=update)
+        changes[section] = table.model_copy(update=_among(given, keys))
     return run.model_copy(update=changes)
 
 
@@ -238,25 +197,23 @@ def _given(table: Settings) -> dict[str, Any]:
     return found
 
 
+def _among(values: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key in keys}
+
+
 def stages_of(run: RunFile) -> list[Stage]:
     """The stages of a fit, as the library takes them."""
-    settings = need(run, "reconstruct", "reconstruct")
-    common = {
-        "annealing": settings.annealing,
-        "frames_per_step": settings.frames_per_step,
-        "tolerance": settings.tolerance,
-    }
+    settings = vars(need(run, "reconstruct", "reconstruct"))
+    common = _among(settings, ("steps", "annealing", "frames_per_step", "tolerance"))
     if not run.stages:
-        return [Stage(settings.steps, **common)]
+        return [Stage(**common)]
     return [_stage(run, table, common) for table in run.stages]
 
 
 def _stage(run: RunFile, table: StageTable, common: dict[str, Any]) -> Stage:
     given = _given(table)
-    own = {key: given[key] for key in ("frames_per_step", "annealing") if key in given}
-    rates = {key: given[key] for key in ("kind", "rate", "final_rate") if key in given}
-    counts = {key: given[key] for key in ("samples", "boundary_samples") if key in given}
-    widths = {key: given[key] for key in ("range_width", "angle_width") if key in given}
+    rates = _among(given, ("kind", "rate", "final_rate"))
+    counts, widths = _among(given, ("samples", "boundary_samples")), _among(given, _WIDTHS)
     remesh = {}
     if table.remesh is not None:
         tables = build.named(run.parameters)
@@ -264,13 +221,12 @@ def _stage(run: RunFile, table: StageTable, common: dict[str, Any]) -> Stage:
         change = partial(remeshed, edge=table.remesh)
         remesh = {t.object: change for t in sought if t.kind == "vertices"}
     return Stage(
-        steps=table.steps or need(run, "reconstruct", "reconstruct").steps,
         unknowns=tuple(table.parameters),
         rebuild=table.rebuild,
         remesh=remesh,
         optimizer=build.optimizer(run.optimizer.model_copy(update=rates)) if rates else None,
         change=partial(_changed, counts, widths) if counts or widths else None,
-        **{**common, **own},
+        **{**common, **_among(given, common)},
     )
 
 
@@ -300,14 +256,9 @@ def modes_of(run: RunFile) -> list[str]:
 
 def sampling_of(run: RunFile) -> Sampling:
     """How the model of a fit samples paths."""
-    settings = need(run, "reconstruct", "reconstruct")
-    return Sampling(
-        depth=settings.depth,
-        samples=settings.samples,
-        boundary_samples=settings.boundary_samples,
-        boundary=settings.boundary,
-        points_per_m2=points_per_m2(run),
-    )
+    settings = vars(need(run, "reconstruct", "reconstruct"))
+    keys = ("depth", "samples", "boundary_samples", "boundary")
+    return Sampling(**_among(settings, keys), points_per_m2=points_per_m2(run))
 
 
 def points_per_m2(run: RunFile) -> float:
@@ -321,7 +272,7 @@ def annealed_until(run: RunFile) -> float | None:
     if len(stages) > 1 or run.surrogate.exact:
         return None
     given = _given(run.stages[0]) if run.stages else {}
-    wide = any(given.get(k, getattr(run.surrogate, k)) > 0 for k in ("range_width", "angle_width"))
+    wide = any(given.get(key, getattr(run.surrogate, key)) > 0 for key in _WIDTHS)
     return stages[0].annealing * stages[0].steps if wide else None
 
 
@@ -353,12 +304,7 @@ def _nuisances(run: RunFile, sight: Sight, name: str) -> dict[str, nn.Module]:
 
 
 def unknowns_of(run: RunFile, start: build.Start) -> dict[str, Unknown]:
-    """What is fitted of the scene, by name.
-
-    Args:
-        run: Its parameters.
-        start: Where the fit starts.
-    """
+    """What is fitted of the scene, by name, from a start."""
     tables = build.named(run.parameters)
     makers = build.builders(run.parameters, start, run.scene)
     return {

@@ -73,13 +73,7 @@ def _made_known(problem: Problem, parameter: Any) -> bool:
 def summary(
     problem: Problem, rows: dict[str, list[dict[str, Any]]], modes: Sequence[str]
 ) -> dict[str, Any]:
-    """Successes of every way to fit; of several sensors, together and each alone.
-
-    Args:
-        problem: With the truth.
-        rows: Of every fit, by mode.
-        modes: The run's own first.
-    """
+    """Successes of every way to fit, the run's own first; of several sensors, also each alone."""
     if problem.target not in problem.known or "success" not in rows[modes[0]][0]:
         return {}
     counts = {mode: sum(row.get("success", False) for row in rows[mode]) for mode in modes}
@@ -119,19 +113,12 @@ def heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) 
 
 def without_history(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows of the fits as metrics keep them."""
-    return [
-        {k: v for k, v in row.items() if k not in ("losses", "curve", "checkpoint")} for row in rows
-    ]
+    long = ("losses", "curve", "checkpoint")
+    return [{key: value for key, value in row.items() if key not in long} for row in rows]
 
 
 def sharp_maps(problem: Problem, scene: Scene, radars: Sequence[Radar]) -> list[torch.Tensor]:
-    """The surrogate's map of every sensor, without extra widths.
-
-    Args:
-        problem: With the run's kernels.
-        scene: What is seen.
-        radars: The sensors in order, with what was fitted of them.
-    """
+    """The surrogate's map of every sensor, as fitted, without extra widths."""
     settings = need(problem.run, "reconstruct", "reconstruct")
     counts = {"samples": 4 * settings.samples, "boundary_samples": 0}
     with torch.no_grad():
@@ -142,13 +129,7 @@ def sharp_maps(problem: Problem, scene: Scene, radars: Sequence[Radar]) -> list[
 
 
 def agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
-    """How well the surrogate is the mean of the exact chain, one bounce, first frame.
-
-    Args:
-        problem: With the run's kernels.
-        twin: The scene that was found.
-        radar: The first sensor, with what was fitted of it.
-    """
+    """How well the surrogate is the mean of the exact chain, one bounce, first frame."""
     if not isinstance(radar.waveform, SampledWaveform):
         return {}
     model = replace(
@@ -161,12 +142,7 @@ def agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
 
 
 def sharp_model(problem: Problem, sight: Sight) -> SurrogateMap:
-    """The kernels of a sensor without extra widths, mean over phases.
-
-    Args:
-        problem: Says how paths are sampled.
-        sight: The sensor.
-    """
+    """The kernels of a sensor without extra widths, mean over phases."""
     kernels = build.surrogate(sight.surrogate)
     sharp = replace(kernels, range_width=0.0, angle_width=0.0, phases="mean")
     return SurrogateMap(sight.grid, sharp, sampling_of(problem.run))
@@ -175,13 +151,7 @@ def sharp_model(problem: Problem, sight: Sight) -> SurrogateMap:
 def misfit(
     problem: Problem, simulated: Sequence[torch.Tensor], measured: Sequence[torch.Tensor]
 ) -> float | None:
-    """The weighted mean of the losses of all sensors; None where a map without power has none.
-
-    Args:
-        problem: Its loss and weights.
-        simulated: A map of every sensor.
-        measured: The measured ones.
-    """
+    """The weighted mean of the losses of all sensors; None where a map without power has none."""
     loss = build.loss(problem.run.loss)
     weights = tuple(sight.weight for sight in problem.sights.values())
     try:

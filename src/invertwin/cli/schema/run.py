@@ -236,8 +236,9 @@ class _RunFile(Section):
             name = getattr(getattr(self, section), "object", None)
             if name is not None:
                 used.append((f"{section}.object", name))
-        if self.gradcheck is not None and self.gradcheck.parameter.object is not None:
-            used.append(("gradcheck.parameter.object", self.gradcheck.parameter.object))
+        name = self.gradcheck and getattr(self.gradcheck.parameter, "object", None)
+        if name:
+            used.append(("gradcheck.parameter.object", name))
         return used
 
 

@@ -126,7 +126,7 @@ class PerfectConductor(_Values, Material):
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         nothing = torch.zeros((), dtype=torch.float64)
-        return _opaque(_mirror(), specular_weights(nothing, lobe_exponent(self.lobe_width)))
+        return Surface(_mirror(), *specular_weights(nothing, lobe_exponent(self.lobe_width)))
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class RoughConductor(_Values, EffectiveRoughness, Material):
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-        return _opaque(_mirror(), self.weights())
+        return Surface(_mirror(), *self.weights())
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class RoughDielectric(Medium, Material):
         """The reflectance at `frequency` [Hz]; differentiable in all values."""
         epsilon = self.complex_permittivity(frequency)
         weights = specular_weights(evaluated(self.diffuse), lobe_exponent(self.lobe_width))
-        return _opaque(fresnel_amplitude(epsilon[..., None], _cosines()), weights)
+        return Surface(fresnel_amplitude(epsilon[..., None], _cosines()), *weights)
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable in all values."""
         epsilon = self.complex_permittivity(frequency)
-        return _opaque(fresnel_amplitude(epsilon[..., None], _cosines()), self.weights())
+        return Surface(fresnel_amplitude(epsilon[..., None], _cosines()), *self.weights())
 
 
 @dataclass(frozen=True)
@@ -213,9 +213,9 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
     def surface(self, frequency: float) -> Surface:
         """What one face does at `frequency` [Hz]; differentiable in all values."""
         epsilon, cosine = self.complex_permittivity(frequency), _cosines()
-        return _surface(
+        return Surface(
             fresnel_amplitude(epsilon[..., None], cosine),
-            self.weights(),
+            *self.weights(),
             refraction=fresnel_transmittance(epsilon[..., None], cosine),
             index=refractive_index(epsilon),
             attenuation=attenuation(epsilon, frequency),
@@ -324,42 +324,9 @@ def _slab_surface(layers: Sequence[Layer], weights: Weights, frequency: float) -
     # The root's derivative is infinite at zero, where the amplitude has none.
     seen = tables.reflectance > _SAFE_POWER
     amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
-    return _surface(amplitude, weights, transmittance=tables.transmittance, excess=tables.excess)
-
-
-def _opaque(amplitude: Tensor, weights: Weights) -> Surface:
-    return _surface(amplitude, weights)
-
-
-def _surface(
-    amplitude: Tensor,
-    weights: Weights,
-    *,
-    transmittance: Tensor | float = 0.0,
-    excess: Tensor | float = 0.0,
-    refraction: Tensor | float = 0.0,
-    index: Tensor | float = 1.0,
-    attenuation: Tensor | float = 0.0,
-) -> Surface:
-    """All fields with the same rows: none, or one for each triangle."""
-    tables = [_tensor(t) for t in (amplitude, transmittance, excess, refraction)]
-    scalars = [_tensor(t) for t in (weights.diffuse, index, attenuation)]
-    shapes = [t.shape[:-1] for t in tables] + [t.shape for t in scalars]
-    row = torch.broadcast_shapes(*shapes)
-    amplitude, transmittance, excess, refraction = (t.expand(*row, ANGLE_COUNT) for t in tables)
-    diffuse, index, attenuation = (t.expand(row) for t in scalars)
     return Surface(
-        amplitude=amplitude,
-        diffuse=diffuse,
-        lobes=weights.lobes.expand(*row, -1),
-        exponents=weights.exponents.expand(*row, -1),
-        transmittance=transmittance,
-        excess=excess,
-        refraction=refraction,
-        index=index,
-        attenuation=attenuation,
+        amplitude,
+        *weights,
+        transmittance=tables.transmittance,
+        extra_length=tables.extra_length,
     )
-
-
-def _tensor(value: Tensor | float) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64)

@@ -12,10 +12,10 @@ lossy layers neither overflow nor cancel.
 
 Where the phase lives: the transmission coefficient carries the whole propagation through the
 thickness, from the entry face to the exit face. The ray's geometric length is that of the straight
-line, which crosses the same sheet of air, d cosθ of phase. What is left, the `excess`, is the group
-delay of their ratio, times c₀:
+line, which crosses the same sheet of air, d cosθ of phase. What is left, the extra length, is the
+group delay of their ratio, times c₀:
 
-    excess = −c₀ ∂(arg t)/∂ω − d cosθ,
+    extra = −c₀ ∂(arg t)/∂ω − d cosθ,
 
 at fixed θ, to first order in d over the distance of the antennas the extra length of the true,
 displaced ray (Fermat). It enters the delay, never the coefficient, so nothing is counted twice.
@@ -53,7 +53,7 @@ class SlabTables(NamedTuple):
 
     reflectance: Float64[Tensor, "*angle"]
     transmittance: Float64[Tensor, "*angle"]
-    excess: Float64[Tensor, "*angle"]
+    extra_length: Float64[Tensor, "*angle"]
 
 
 class _Response(NamedTuple):
@@ -92,10 +92,10 @@ def slab_coefficients(
 def slab_tables(
     layers: Sequence[Sheet], cos_theta: Float64[Tensor, "*angle"], frequency: float
 ) -> SlabTables:
-    """Reflectance, transmittance and excess length of a stack of layers in air.
+    """Reflectance, transmittance and extra length of a stack of layers in air.
 
-    Power coefficients are the mean of both polarisations; so is the excess, weighted by the power
-    that each lets through. Differentiable in the layers' values.
+    Power coefficients are the mean of both polarisations; so is the extra length, weighted by the
+    power that each lets through. Differentiable in the layers' values.
 
     Args:
         layers: from the side of incidence on.
@@ -109,7 +109,7 @@ def slab_tables(
     s, p = responses
     wave_number = 2 * math.pi * frequency / SPEED_OF_LIGHT
     through_air = sum(layer.thickness for layer in layers) * cos_theta
-    excess_s, excess_p = (
+    extra_s, extra_p = (
         -response.transmission_slope.imag / wave_number - through_air for response in responses
     )
     # The share of s in the power let through, from logarithms: both powers may underflow.
@@ -117,7 +117,7 @@ def slab_tables(
     return SlabTables(
         (_power(s.reflection) + _power(p.reflection)) / 2,
         (s.log_power.exp() + p.log_power.exp()) / 2,
-        share * excess_s + (1 - share) * excess_p,
+        share * extra_s + (1 - share) * extra_p,
     )
 
 

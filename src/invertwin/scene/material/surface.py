@@ -11,8 +11,8 @@ cosψ = ωi·ωo; all directions point away from the surface. The distribution i
 reflects at most what came in: each weight is the lobe's share of the power divided by its integral
 at normal incidence, where the integral is largest (the lobe and the cosine share their axis).
 
-What passes goes straight through a sheet (`transmittance`, longer by `excess`) or is refracted
-into a solid body (`refraction`, `index`, `attenuation`).
+What passes goes straight through a sheet (`transmittance`, longer by `extra_length`) or is
+refracted into a solid body (`refraction`, `index`, `attenuation`).
 
 Differs from the source: the paper leaves the scattering model open. Here the reflectance R of the
 mean plane enters as sqrt(R(θi) R(θo)), which keeps reciprocity, so that a surface sends back R on
@@ -20,7 +20,7 @@ average and R exactly where both angles agree.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import torch
@@ -31,6 +31,12 @@ ANGLE_COUNT = 256
 """Nodes of the tables over the angle of incidence, at cosθ = linspace(0, 1, 256)."""
 LOBE_COUNT = 3
 """Lobes of a surface: specular, directive, backscattering."""
+_SCALARS = ("diffuse", "index", "attenuation")  # the other fields are tables
+
+
+_NONE = torch.zeros(LOBE_COUNT, dtype=torch.float64)
+_DARK = torch.zeros(ANGLE_COUNT, dtype=torch.float64)
+_ZERO, _ONE = _DARK[0], torch.ones((), dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +44,9 @@ class Surface:
     """What the ray kernel needs to know of a material at one frequency (see the module text).
 
     Tables run over cosθ = linspace(0, 1, 256) of the angle of incidence from outside. `*row` is
-    empty for one value per object, or the number of triangles for values per triangle.
+    empty for one value per object, or the number of triangles for values per triangle; a field
+    with one value is repeated for all rows of the others. The defaults are those of a Lambertian
+    surface that lets nothing through.
 
     Attributes:
         amplitude: square root of the power reflectance, mean of both polarisations.
@@ -47,52 +55,32 @@ class Surface:
             the lobe's integral.
         exponents: their exponents.
         transmittance: share of the power that passes straight through a sheet; 0 if opaque.
-        excess: length [m] that passing adds to the straight path through air.
+        extra_length: what passing adds to the straight path through air [m].
         refraction: share of the power that one interface lets into a solid body; 0 if the surface
             is not the skin of a refracting body.
         index: real refractive index of that body, else 1.
         attenuation: power attenuation in that body [1/m], else 0.
     """
 
-    amplitude: Float64[Tensor, "*row 256"]
-    diffuse: Float64[Tensor, "*row"]
-    lobes: Float64[Tensor, "*row 3"]
-    exponents: Float64[Tensor, "*row 3"]
-    transmittance: Float64[Tensor, "*row 256"]
-    excess: Float64[Tensor, "*row 256"]
-    refraction: Float64[Tensor, "*row 256"]
-    index: Float64[Tensor, "*row"]
-    attenuation: Float64[Tensor, "*row"]
+    amplitude: Float64[Tensor, "*#row 256"]
+    diffuse: Float64[Tensor, "*#row"]
+    lobes: Float64[Tensor, "*#row 3"] = _NONE
+    exponents: Float64[Tensor, "*#row 3"] = _NONE
+    transmittance: Float64[Tensor, "*#row 256"] = _DARK
+    extra_length: Float64[Tensor, "*#row 256"] = _DARK
+    refraction: Float64[Tensor, "*#row 256"] = _DARK
+    index: Float64[Tensor, "*#row"] = _ONE
+    attenuation: Float64[Tensor, "*#row"] = _ZERO
 
-    @classmethod
-    def opaque(
-        cls,
-        amplitude: Float64[Tensor, "*row 256"],
-        diffuse: Float64[Tensor, "*row"],
-        lobes: Float64[Tensor, "*row 3"] | None = None,
-        exponents: Float64[Tensor, "*row 3"] | None = None,
-    ) -> "Surface":
-        """A surface that lets nothing through; without lobes it is Lambertian.
-
-        Args:
-            amplitude: of reflection, tabulated.
-            diffuse: weight of the Lambertian part.
-            lobes: weights of the lobes.
-            exponents: of the lobes.
-        """
-        row = diffuse.shape
-        none, dark = diffuse.new_zeros((*row, LOBE_COUNT)), torch.zeros_like(amplitude)
-        return cls(
-            amplitude=amplitude,
-            diffuse=diffuse,
-            lobes=none if lobes is None else lobes,
-            exponents=none if exponents is None else exponents,
-            transmittance=dark,
-            excess=dark,
-            refraction=dark,
-            index=diffuse.new_ones(row),
-            attenuation=diffuse.new_zeros(row),
+    def __post_init__(self) -> None:
+        """Gives all fields the same rows."""
+        given = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        widths = {n: v.shape[v.ndim - (n not in _SCALARS) :] for n, v in given.items()}
+        row = torch.broadcast_shapes(
+            *(values.shape[: values.ndim - len(widths[n])] for n, values in given.items())
         )
+        for name, values in given.items():
+            object.__setattr__(self, name, values.expand((*row, *widths[name])))
 
 
 class Material(ABC):

@@ -31,7 +31,7 @@ class Foliage(Material):
     def surface(self, frequency: float) -> Surface:
         share = torch.as_tensor(self.share, dtype=torch.float64)
         amplitude = share.sqrt() * torch.ones(256, dtype=torch.float64)
-        return Surface.opaque(amplitude, torch.ones((), dtype=torch.float64))
+        return Surface(amplitude, torch.ones((), dtype=torch.float64))
 
 
 def bush(radius: Positive, lean: Angle = 0.0) -> Mesh:

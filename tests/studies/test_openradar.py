@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.datasets.openradar import FILE, read, read_chirps
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
 from invertwin.radar.doppler import compensate_tdm, range_doppler
+from invertwin_studies.recordings.openradar import FILE, read, read_chirps
 
 META = {"f0_hz": 77e9, "slope_hz_s": 6e13, "fs_hz": 2.5e6, "idle_s": 3e-5, "ramp_end_s": 6.2e-5}
 

@@ -1,4 +1,4 @@
-"""The recording of movers from its run file to the report."""
+"""Movers, recorded and simulated, from the run file to the report."""
 
 import json
 
@@ -87,6 +87,10 @@ def test_the_run_file_holds_what_its_note_says(repository, data_folder, tmp_path
     ("change", "message"),
     [
         (
+            ('kind = "mover"', 'kind = "translation"'),
+            "data: expected a parameter of kind mover, since the recording has chirps and movers",
+        ),
+        (
             ("[optimizer]", '[starts]\nobject = "mover"\ndistance = [0.1, 0.1]\n[optimizer]'),
             "starts: ",
         ),
@@ -115,6 +119,27 @@ def test_a_mover_needs_chirps(write, monkeypatch, capsys):
     file = write(f'{head}[[parameters]]\nkind = "mover"\nobject = "plate"\n{other}')
     assert call(monkeypatch, "reconstruct", file) == 2
     assert "expected a section [chirps] for a mover in simulated data" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_simulated_mover_is_scored_against_its_truth(write, tmp_path, monkeypatch):
+    """The truth is that of the frame's start, the twin that of the middle of the chirps."""
+    scene = OPENRADAR[OPENRADAR.index("[scene.mover]") : OPENRADAR.index("[data]")]
+    sensor = RUN[RUN.index("[radar]") : RUN.index("[[parameters]]")]
+    parts = (
+        'task = "reconstruct"\nseed = 2',
+        scene.replace("0.25", "0.1"),
+        "[truth.mover]\nposition = [0.1, 0.0, 1.4]\nvelocity = [0.0, 0.0, -1.5]",
+        sensor.replace(", [0.1, 0.0, 0.0]]", "]"),
+        "[chirps]\ncount = 32\ninterval = 2.5e-4",
+        OPENRADAR[OPENRADAR.index("[[parameters]]") :],
+    )
+    assert call(monkeypatch, "reconstruct", write("\n".join(parts)), "-o", "out") == 0
+    metrics = read_metrics(tmp_path / "out")
+    assert metrics["status"] in ("budget", "converged")
+    assert metrics["position_error_m"] < 0.1
+    assert metrics["velocity_error_m_s"] < 0.5
+    assert metrics["mover_velocity_m_s"] == pytest.approx(-1.5, abs=0.1)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import torch
 from cli.small import call, read_metrics
 from invertwin.capture import Capture, calibrate, locate
 from invertwin.capture.radar_fields import labelled
-from invertwin.datasets import rail_sar
+from invertwin_studies.recordings import rail_sar
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from invertwin.capture import Capture, calibrate, locate
-from invertwin.datasets.rail_sar import FILE, read
 from invertwin.errors import InputError
+from invertwin_studies.recordings.rail_sar import FILE, read
 
 META = {"align_time_offset_s": 0.5, "align_range_bias_m": 0.2, "valid_scan_time_s": [0.1, 0.9]}
 

@@ -1,25 +1,20 @@
 """The recordings as `[data]` kinds of run files."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from invertwin.capture import Capture
 from invertwin.cli.recordings import Recording, recorded
-from invertwin.cli.registry import OneOf, Registry, registry
+from invertwin.cli.registry import OneOf, registry
 from invertwin.cli.section import InputPath, about
-from invertwin.datasets import openradar, rail_sar
 from invertwin.errors import InputError
+from invertwin_studies.recordings import openradar, rail_sar
 
 _ORIGINALS = {
     rail_sar.FILE: "github.com/jjimmykang/bwsi-backprojection, trial 6",
     openradar.FILE: "of github.com/PreSenseRadar/OpenRadar",
 }
-
-
-def register(kinds: Registry) -> None:
-    """Adds the readers."""
-    kinds.add("data", "rail_sar", rail_sar_data)
-    kinds.add("data", "openradar", openradar_data)
 
 
 def rail_sar_data(folder: InputPath) -> Capture:
@@ -43,7 +38,8 @@ def openradar_data(
     """
     with about("folder"):
         chirps = openradar.read_chirps(_holding(openradar.FILE, Path(folder)))
-    return recorded(chirps, board or registry.table("board", "name")(name="xWR1642"))
+    found = recorded(chirps, board or registry.table("board", "name")(name="xWR1642"))
+    return replace(found, moving=True)
 
 
 def _holding(file: str, folder: Path) -> Path:

@@ -1,0 +1,1 @@
+"""Two public recordings, each with its reader, and their `[data]` kinds."""
