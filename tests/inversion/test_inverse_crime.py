@@ -8,7 +8,7 @@ import pytest
 
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
-from invertwin.cli import build
+from invertwin.cli import build, sensors
 from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
@@ -94,7 +94,11 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert bins is not None
         device = build.radar(table)
         with pytest.raises(FieldsTracedError):
-            run_simulate.exact(run, build.true_scene(run), device, build.grid(bins, device))
+            scene = build.true_scene(run)
+            if run.chirps is None:
+                run_simulate.exact(run, scene, device, build.grid(bins, device))
+            else:
+                run_simulate.chirp_train(run, scene, device, sensors.chirps(run.chirps))
 
 
 @pytest.mark.parametrize("name", SOURCES)
