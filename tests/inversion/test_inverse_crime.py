@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -93,12 +94,14 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert table is not None
         assert bins is not None
         device = build.radar(table)
+        scene = build.true_scene(run)
+        if run.chirps is None:
+            simulated = partial(run_simulate.exact, run, scene, device, build.grid(bins, device))
+        else:
+            chirps = sensors.chirps(run.chirps)
+            simulated = partial(run_simulate.chirp_train, run, scene, device, chirps)
         with pytest.raises(FieldsTracedError):
-            scene = build.true_scene(run)
-            if run.chirps is None:
-                run_simulate.exact(run, scene, device, build.grid(bins, device))
-            else:
-                run_simulate.chirp_train(run, scene, device, sensors.chirps(run.chirps))
+            simulated()
 
 
 @pytest.mark.parametrize("name", SOURCES)

@@ -205,7 +205,9 @@ class SpectrumLoss:
     def _divergence(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         lit, data = self._floored(pairs)
         gain = self._likeliest(lit, data)
-        if torch._C._are_functorch_transforms_active():  # such as a second derivative
+        # torch has no public name for this question.
+        transformed = torch._C._are_functorch_transforms_active()  # pyright: ignore[reportPrivateUsage]
+        if transformed:  # such as a second derivative
             ratios = [
                 b / (gain * a.clamp_min(0.0) + self.floor)
                 for (a, _), b in zip(pairs, data, strict=True)
