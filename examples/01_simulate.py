@@ -33,7 +33,7 @@ half = chirp.wavelength / 2
 radar = iw.Radar(linear_array(2, 16 * half), linear_array(16, half), chirp, [[0.0, 0.0, 0.0]])
 grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6)
 
-# The exact chain: fields of fixed scatterers, beat signals, window, FFT, beamforming. The
+# Exact signals: fields of fixed scatterers, beat signals, window, FFT, beamforming. The
 # speckle is that of one rough surface; another seed is another surface.
 once = iw.Sampling(depth=1)  # paths of one bounce
 recorded = iw.simulate(scene, radar, grid, seed=1, sampling=once, snr_db=20.0)

@@ -20,7 +20,7 @@ class SurrogateTable(Table):
     "dirichlet" or "random_phase", before the first table.
     """
 
-    exact: bool = key("fit the exact chain instead; rough surfaces need boundary = false", False)
+    exact: bool = key("fit exact signals instead; rough surfaces need boundary = false", False)
 
     @model_validator(mode="before")
     @classmethod
@@ -49,6 +49,6 @@ def register(registry: Registry) -> None:
 def surrogate(table: Any) -> Surrogate:
     """The smooth model of the `[surrogate]` table, at its starting widths.
 
-    For the exact chain it is the "response", which is its mean over phases.
+    For exact signals it is the "response", which is their mean over phases.
     """
     return table.build()

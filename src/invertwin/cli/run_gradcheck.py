@@ -122,7 +122,7 @@ def _check(
     table = settings.parameter
     if run.surrogate.exact:
         raise InputError(
-            "surrogate.exact: expected a smooth map to differentiate, got the exact chain; remove "
+            "surrogate.exact: expected a smooth map to differentiate, got exact signals; remove "
             "it: silhouettes of single rough points have no derivative"
         )
     scene = build.scene(run)

@@ -32,7 +32,7 @@ _Outcome = tuple[torch.Tensor, dict[str, Any], Figure, str]  # signals, metrics,
 
 
 def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
-    """The exact chain with the settings of the `[data]` table.
+    """Exact signals with the settings of the `[data]` table.
 
     Raises:
         InputError: The run file's data are measured, not simulated.

@@ -35,7 +35,7 @@ TITLES = {
 
 _NOTE = (
     "The loss when one object is moved off its true place, all else true. Beat signals, complex "
-    "range profiles and MUSIC spectra: relative squared error, of the exact chain against the data "
+    "range profiles and MUSIC spectra: relative squared error, of exact signals against the data "
     "of the first frame, with the same rough points. Surrogate: the loss of the run file, against "
     "the spectra of all frames of the same data. A minimum counts if it is deeper than a "
     "thousandth of the curve's span; the true place counts as one. Wavelengths are those of "
@@ -53,7 +53,7 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
     depth = getattr(need(run, "data", "loss-scan"), "depth", 1)
     if run.surrogate.exact:
         raise InputError(
-            "surrogate.exact: expected a smooth map beside the exact signals, got the exact chain; "
+            "surrogate.exact: expected a smooth map beside the exact signals, got no surrogate; "
             "remove it"
         )
     if depth > 1:

@@ -50,8 +50,8 @@ def deposit_power(
         sampling: How many paths are drawn.
         seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
         scheme: ``rays`` from the antenna into the caps around the objects, or ``area``.
-        reference: The scene and link that fix the density (caps around objects, enlarged by a
-            tenth, or triangle areas), so that differences in θ have common random numbers.
+        reference: The scene and link that fix how samples are drawn (caps around objects, a tenth
+            larger, or triangle areas), so that differences in θ have common random numbers.
 
     Source: Eq. 7–8 of the paper in material form, derivations §2–3 and §5; interior segments
     §3.3.3.

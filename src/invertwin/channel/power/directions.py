@@ -32,9 +32,9 @@ class Directions:
         self.width = shares.shape[1]
 
     def draw(self, point: Place, back: Any, numbers: list[Any]) -> tuple[Any, Any]:
-        """A unit direction from four uniform numbers, and its density per solid angle.
+        """A unit direction from four uniform numbers, and its probability per solid angle.
 
-        Where total reflection leaves no direction, the density is infinite.
+        Where total reflection leaves no direction, that probability is infinite.
 
         Args:
             point: The vertex.

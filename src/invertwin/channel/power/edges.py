@@ -30,7 +30,7 @@ class EdgePoints:
     """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
 
     ``receiver`` says of silhouettes of two antennas whether it is the receiver's (else False).
-    ``weight`` is one over (samples × density along the edge parameter). ``transmittance`` and
+    ``weight`` is one over (samples × probability along the edge parameter). ``transmittance`` and
     ``extra`` length are those of the sheets on the way, the edge's own triangles left out; what
     these let through on the side of ``opposite`` is ``covered``, on the other side ``open`` (1
     where there is nothing, 0 where it is opaque), both with an extra length.
@@ -188,7 +188,7 @@ class EdgeSampler:
         return edge, frame, receiver, origin
 
     def draw(self, index: Any) -> Drawn:
-        """The samples of the given indices below ``size``; void are those without a shadow."""
+        """The samples of the given indices below ``size``; those without a shadow are void."""
         rays, topology = self.rays, self.rays.topology
         place, along, pmf = _along(self.choice, index, self.size, self.seed)
         edge, frame, receiver, origin = self._seen(place)
@@ -296,7 +296,7 @@ class InteriorEdgeSampler:
         return x, dr.cross(along, x)
 
     def draw(self, index: Any) -> Drawn:
-        """The samples of the given indices below ``size``; void are those that hide nothing."""
+        """The samples of the given indices below ``size``; those that hide nothing are void."""
         rays, topology = self.rays, self.rays.topology
         frame, within = index // self.per_frame, index % self.per_frame
         edge, along, pmf = _along(self.choice, within, self.per_frame, self.seeds[0], index)
@@ -331,7 +331,7 @@ class InteriorEdgeSampler:
         return Drawn(valid, (points, Behind(behind.face, b1, b2)), TwoSided)
 
     def _direction(self, index: Any, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
-        """A tangential direction and its density per solid angle."""
+        """A tangential direction and its probability per solid angle."""
         first, second = uniform_pair(index, self.seeds[1])
         if not self.weighted:
             sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(first, second))

@@ -26,7 +26,7 @@ from invertwin.errors import InputError
 
 @dataclass(frozen=True)
 class Samples:
-    """Points on surfaces (Dr.Jit arrays). ``weight`` is one over (samples × area density).
+    """Points on surfaces (Dr.Jit arrays). ``weight`` is one over (samples × probability per area).
 
     ``transmittance`` and ``extra`` length are those of the sheets between transmitter and point.
     """
@@ -118,7 +118,7 @@ class RaySampler:
 
 
 class AreaSampler:
-    """Points spread over all surfaces; the density per triangle is that of a reference scene.
+    """Points spread over all surfaces, with the probabilities per triangle of a reference scene.
 
     A reference that does not follow the parameters keeps the point set under differences
     (common random numbers) also when areas change.

@@ -46,7 +46,7 @@ class Trace:
             sampling: How many paths are drawn.
             seed: Of all random numbers.
             scheme: Where paths start, see ``deposit_power``.
-            reference: What fixes the density of the starts, see ``deposit_power``.
+            reference: What fixes how starts are drawn, see ``deposit_power``.
         """
         self.sampling, self.seed = sampling, seed
         self.rays = RayScene(geometry, link)

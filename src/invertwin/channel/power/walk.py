@@ -39,7 +39,10 @@ def start(
 ) -> State:
     """The state at the first vertex.
 
-    A state with a ``weight`` also follows one over the density of its points per area.
+    ``back`` points to where the path comes from; ``throughput`` is everything up to arriving
+    here, over the probability of the samples; ``length`` is that of the path so far.
+    ``passed`` is what lies on the first segment, for antennas that share what they see. A state
+    with a ``weight`` also follows one over the probability of its points per area.
 
     Args:
         index: Number of the path.
@@ -47,7 +50,7 @@ def start(
         face: Triangle.
         b1, b2: Barycentric coordinates.
         back: Unit direction to where the path comes from.
-        throughput: All factors up to arriving here, over the density of the samples.
+        throughput: All factors up to arriving here, over the probability of the samples.
         length: Of the path so far [m].
         passed: What lies on the first segment, for antennas that share what they see.
     """

@@ -26,7 +26,7 @@ class SurfacePaths:
 
     Attributes:
         face, b1, b2: Places, per point.
-        weight: One over (paths × density per area of all points).
+        weight: One over (paths × probability per area of all points).
         phase: Of the path's field [rad].
     """
 
@@ -90,7 +90,7 @@ def place(
 class SurfacePoints:
     """Detached points of surfaces, each seen in one frame.
 
-    ``weight`` is what the row counts: one over (samples × density), or a phase.
+    ``weight`` is what the row counts: one over (samples × probability), or a phase.
     """
 
     frame: Int64[Tensor, " n"]

@@ -43,7 +43,7 @@ class ShadowEdge:
         frame, face: Radar pose, and the triangle the shadow falls on.
         b1, b2: Where on the triangle.
         place: Where it falls, detached.
-        speed: Area newly lit per unit of θ, divided by the sampling density: attached, and
+        speed: Area newly lit per unit of θ, over the probability of the sample: attached, and
             zero in derivative where the other antenna does not see the point.
     """
 

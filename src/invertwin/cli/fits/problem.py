@@ -275,7 +275,7 @@ def sampling_of(run: RunFile) -> Sampling:
 
 
 def points_per_m2(run: RunFile) -> float:
-    """Rough points of the exact chain: those of simulated data, or enough of them."""
+    """Points per m² of rough surfaces in exact signals: those of simulated data, or enough."""
     return run.data.density if isinstance(run.data, SimulatedData) else _POINTS_PER_M2
 
 

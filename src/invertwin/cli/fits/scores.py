@@ -129,7 +129,7 @@ def sharp_maps(problem: Problem, scene: Scene, radars: Sequence[Radar]) -> list[
 
 
 def agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
-    """How well the surrogate is the mean of the exact chain, one bounce, first frame."""
+    """Correlation of the surrogate with the mean of exact spectra: one bounce, first frame."""
     if not isinstance(radar.waveform, SampledWaveform):
         return {}
     model = replace(
