@@ -91,6 +91,10 @@ class Mover(ParameterTable):
     kind: Literal["mover"]
     object: str = key("name in the scene")
     cells: Count = key("range and Doppler cells to either side of the echo that are fitted", 6)
+    free: list[Literal["place", "velocity", "spin", "size", "diffuse"]] = key(
+        "what is fitted; the rest keeps the scene's values, and a spin that is held is none",
+        ["place", "velocity", "spin", "size", "diffuse"],
+    )
 
 
 def register(registry: Registry) -> None:

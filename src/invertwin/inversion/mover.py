@@ -1,5 +1,6 @@
 """The twin of a mover: its echo is found in range, range rate and direction, then fitted there."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -126,22 +127,30 @@ def _coherence(recording: ChirpCapture, grid: Grid, rate: float, range_: float) 
 
 
 class MovingBody(nn.Module):
-    """A rigid body in motion: place, size, velocity and turn, in the plane that a row of antennas
-    sees, and how much of its echo is diffuse.
+    """A rigid body in motion: place, size, velocity, turn, and how much of its echo is diffuse.
 
-    Its axes are across the line of sight to the start, up, and along that line. It moves at the
-    height of the start. Maps a scene to the scene with the body where it is in the middle of the
+    Its axes are across the line of sight to the start, up, and along that line. It moves in the
+    plane of the first and the last, at a height that is fitted where the antennas resolve it.
+    Motion across the line of sight and a turn look much alike: hold the turn of what does not turn. Maps a scene to the scene with the body where it is in the middle of the
     frame, and with the velocity of each of its vertices.
 
     Attributes:
         place: parameter [2], of the body's nearest point from the start, across and along [m].
+        height: parameter [], the same, up [m]; fitted if the radar has several rows of antennas.
         velocity: parameter [2], across and along [m/s].
         spin: parameter [], turn about the axis up [rad/s].
         size: parameter [3], logarithms of factors on the object's size across, up and along.
         diffuse: parameter [], logit of the diffuse share of the reflected power.
     """
 
-    def __init__(self, object: str, scene: Scene, radar: Radar, echo: Echo) -> None:
+    def __init__(
+        self,
+        object: str,
+        scene: Scene,
+        radar: Radar,
+        echo: Echo,
+        free: Sequence[str] = ("place", "velocity", "spin", "size", "diffuse"),
+    ) -> None:
         """Start at an echo with the object's own size.
 
         Args:
@@ -149,9 +158,10 @@ class MovingBody(nn.Module):
             scene: With the object.
             radar: In one pose.
             echo: Where to start.
+            free: Names of the parameters that are fitted; the height goes with the place.
 
         Raises:
-            InputError: A material without a diffuse share between 0 and 1.
+            InputError: A material without a diffuse share between 0 and 1, or an unknown name.
         """
         super().__init__()
         self.object = object
@@ -173,10 +183,21 @@ class MovingBody(nn.Module):
         self._first_extent = vertices.amax(0) - vertices.amin(0)
         zeros = torch.zeros(2, dtype=torch.float64)
         self.place = nn.Parameter(zeros.clone())
+        self.height = nn.Parameter(zeros[0].clone())
         self.velocity = nn.Parameter(torch.tensor([0.0, echo.rate], dtype=torch.float64))
         self.spin = nn.Parameter(zeros[0].clone())
         self.size = nn.Parameter(torch.zeros(3, dtype=torch.float64))
         self.diffuse = nn.Parameter(torch.tensor(share, dtype=torch.float64).logit())
+        held = dict(self.named_parameters())
+        rows = len(radar.virtual_positions[:, 1].unique())
+        if set(free) - (set(held) - {"height"}):
+            raise InputError(
+                f"expected names among {', '.join(n for n in held if n != 'height')}, got "
+                f"{', '.join(free)}; name what is fitted"
+            )
+        for name, parameter in held.items():
+            of = "place" if name == "height" else name
+            parameter.requires_grad_(of in free and (name != "height" or rows > 1))
 
     def forward(self, scene: Scene, time: float = 0.0) -> Scene:
         """The scene with the body in motion, where it is at a time.
@@ -211,7 +232,7 @@ class MovingBody(nn.Module):
 
     def _center(self, time: float = 0.0) -> Float64[Tensor, "3"]:
         depth = 0.5 * self._extent[2]
-        offset = torch.stack([self.place[0], torch.zeros_like(depth), self.place[1] + depth])
+        offset = torch.stack([self.place[0], self.height, self.place[1] + depth])
         return self._start + self._axes @ (offset + self._translation * time)
 
     @property

@@ -39,10 +39,7 @@ def start(
 ) -> State:
     """The state at the first vertex.
 
-    ``back`` points to where the path comes from; ``throughput`` is everything up to arriving
-    here, over the probability of the samples; ``length`` is that of the path so far.
-    ``passed`` is what lies on the first segment, for antennas that share what they see. A state
-    with a ``weight`` also follows one over the probability of its points per area.
+    A state with a ``weight`` also follows one over the probability of its points per area.
 
     Args:
         index: Number of the path.

@@ -187,7 +187,7 @@ def _fitted(
     echo = strongest_mover(recording, model)
     begin = time.perf_counter()
     with about(f"scene.{table.object}"):
-        body = MovingBody(table.object, scene, radar, echo)
+        body = MovingBody(table.object, scene, radar, echo, table.free)
     near = model.around(echo.range, echo.rate, table.cells, radar)
     with watched(Bar(console, name, settings.steps)) as callbacks:
         found = reconstruct(
