@@ -175,7 +175,7 @@ class Task:
                 module,
                 loss=LOSS,
                 optimizer=Optimizer(rate=stage.rate, final_rate=stage.final_rate),
-                schedule=Schedule(stage.steps, ANNEALING),
+                schedule=Schedule(stage.steps, annealing=ANNEALING),
                 seed=self.seed,
             )
         return float(module.cells.detach()), float(module.beamwidths.detach())

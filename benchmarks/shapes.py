@@ -102,7 +102,7 @@ def fitted(run: RunFile) -> Car:
     with tempfile.TemporaryDirectory() as scratch:
         folder = open_run(Path(scratch) / "car", {"car": run})
         for name, mode in MODES.items():
-            row = fit(problem, start, 0, mode, folder, console, None)
+            row, _ = fit(problem, start, 0, mode, folder, console, None)
             kept = {key: row[key] for key in KEPT if key in row}
             found[name] = kept | {key: row[key] for key in ("steps", "loss", "seconds", "curve")}
     return found
@@ -121,7 +121,7 @@ def all_cars(out: Path, numbers: Sequence[int], run: RunFile) -> dict[int, Car]:
     for number in numbers:
         own = run_of(number, run)
         path, key = out / "cars" / f"{number:02d}.json", key_of(own)
-        known = json.loads(path.read_text()) if path.exists() else {}
+        known: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
         if known.get("key") != key:
             known = {"key": key, "fits": fitted(own)}
             path.write_text(json.dumps(known, indent=1) + "\n")
@@ -215,7 +215,7 @@ def measure(out: Path, count: int = CARS, run: RunFile | None = None) -> dict[st
     """All metrics and the picture; fewer cars and shorter fits in tests only."""
     start = perf_counter()
     cars = all_cars(out, range(1, count + 1), load_run(RUN) if run is None else run)
-    metrics = summary(cars) | {"count": count, "seconds": perf_counter() - start}
+    metrics: dict[str, Any] = {**summary(cars), "count": count, "seconds": perf_counter() - start}
     worst = metrics["worst"]["car"]
     picture(cars, worst, out / "shapes.png")
     text = json.dumps(_finite(metrics), indent=2, allow_nan=False)

@@ -187,7 +187,7 @@ def useful_paths(rays: int, steps: int) -> dict[str, Any]:
         "useful_paths_per_second": hits / median_time(deposited, steps),
         "useful_listed_paths_per_second": hits / median_time(listed, steps),
     }
-    theirs = sionna_calls(target, rays)
+    theirs, rate = sionna_calls(target, rays), None
     if theirs is not None:
         hits = theirs(0)
         rate = hits / median_time(theirs, steps)
@@ -196,7 +196,7 @@ def useful_paths(rays: int, steps: int) -> dict[str, Any]:
         "useful_paths_ratio_sionna": "useful_paths_per_second",
         "useful_listed_paths_ratio_sionna": "useful_listed_paths_per_second",
     }.items():
-        found[key] = found[ours] / rate if theirs is not None else None
+        found[key] = None if rate is None else found[ours] / rate
     return found
 
 

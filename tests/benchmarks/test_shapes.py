@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from invertwin.scene.geometry.vehicles import Car, car_mesh
 
 from invertwin.cli import build
 from invertwin.cli.fits.problem import varied_run
 from invertwin.cli.run_file import need
 from invertwin.scene import load_mesh
+from invertwin_studies.vehicles import Car, car_mesh
 
 
 def curve(*values):

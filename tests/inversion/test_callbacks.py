@@ -51,11 +51,13 @@ def test_a_report_gets_complete_rows_whatever_the_order(case):
 
 
 def test_watching_changes_nothing(case):
-    plain, watched = (
-        fit(
-            case.scene, case.radar, case.capture, case.parameters(), **case.settings(**FAST), **more
-        )
-        for more in ({}, {"watch": lambda scene: {"x": float(torch.rand(()))}, "watch_every": 1})
+    problem = (case.scene, case.radar, case.capture, case.parameters())
+    plain = fit(*problem, **case.settings(**FAST))
+    watched = fit(
+        *problem,
+        **case.settings(**FAST),
+        watch=lambda scene: {"x": float(torch.rand(()))},
+        watch_every=1,
     )
     for one, other in zip(plain.history, watched.history, strict=True):
         assert other["values"]["plate.translation"] == pytest.approx(

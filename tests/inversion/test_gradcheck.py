@@ -61,8 +61,8 @@ def test_a_wrong_gradient_fails():
             return theta.clone()
 
         @staticmethod
-        def jvp(ctx, tangent):
-            return 0.5 * tangent
+        def jvp(ctx, *tangents):
+            return 0.5 * tangents[0]
 
     class Wrong(Translation):
         def forward(self, scene):

@@ -2,13 +2,14 @@
 
 import ast
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
-from invertwin.cli import build
+from invertwin.cli import build, sensors
 from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
@@ -93,8 +94,14 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert table is not None
         assert bins is not None
         device = build.radar(table)
+        scene = build.true_scene(run)
+        if run.chirps is None:
+            simulated = partial(run_simulate.exact, run, scene, device, build.grid(bins, device))
+        else:
+            chirps = sensors.chirps(run.chirps)
+            simulated = partial(run_simulate.chirp_train, run, scene, device, chirps)
         with pytest.raises(FieldsTracedError):
-            run_simulate.exact(run, build.true_scene(run), device, build.grid(bins, device))
+            simulated()
 
 
 @pytest.mark.parametrize("name", SOURCES)

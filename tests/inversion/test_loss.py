@@ -119,3 +119,25 @@ def test_bad_maps_are_named(unchecked):
         SpectrumLoss()(a[:, :8], b)
     with pytest.raises(InputError, match="expected a measured map with power in it, got zeros"):
         SpectrumLoss()(a, 0 * b)
+
+
+@pytest.mark.parametrize("gain", [0.4, 1.0])
+def test_the_likelihood_has_its_derivative_in_both_modes(gain):
+    """Written out in the loss; here against differences, with bins below zero among them."""
+    a, b = maps(shape=(2, 5, 4, 3))
+    below = (gain * (a - 0.3)).requires_grad_()
+    loss = SpectrumLoss(kind="likelihood", gain="one", levels=2)
+    assert bool((below < 0).any())
+    assert torch.autograd.gradcheck(lambda x: loss(x, b), below, check_forward_ad=True)
+
+
+def test_the_gain_of_the_likelihood_is_that_of_a_long_iteration():
+    a, b = maps()
+    loss = SpectrumLoss(kind="likelihood")
+    pairs = loss._pyramid(a, b)
+    gain = 1.0
+    for _ in range(200):
+        up = sum(float((x * (y + 0.01) / (gain * x + 0.01) ** 2).mean()) for x, y in pairs)
+        down = sum(float((x / (gain * x + 0.01)).mean()) for x, _ in pairs)
+        gain *= up / down
+    assert float(loss._gain(pairs)) == pytest.approx(gain, rel=1e-5)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -62,7 +63,7 @@ def noisy(beat):
     return ChirpCapture(beat + 0.1 * noise, RADAR, CHIRPS)
 
 
-def correlation(one, other, scale="magnitude"):
+def correlation(one, other, scale: Any = "magnitude"):
     return 1 - float(CorrelationLoss(scale)(one, other))
 
 
@@ -114,7 +115,7 @@ def test_correlation_ignores_gain_and_knows_three_scales(unchecked):
     with pytest.raises(InputError, match="expected maps of one shape"):
         CorrelationLoss()(one, other[1:])
     with pytest.raises(InputError, match="'volts'"):
-        CorrelationLoss("volts")
+        correlation(one, other, "volts")
 
 
 def start(echo, **changes):

@@ -49,6 +49,7 @@ def seen() -> dict[str, Observation]:
         for name, place in PLACES.items():
             device = of_ranges(place)
             grid = device.grid(0.9, 2.0, oversample=2)
+            assert device.rotations is not None
             # Looks from places a wavelength apart: the mean over speckle.
             looks = replace(
                 device,
@@ -62,7 +63,7 @@ def seen() -> dict[str, Observation]:
     return found
 
 
-def place_of(observations: Any, kind: str = "adam", steps: int = 40, **changes: Any) -> Tensor:
+def place_of(observations: Any, kind: Any = "adam", steps: int = 40, **changes: Any) -> Tensor:
     fit = reconstruct(
         scene(),
         observations,

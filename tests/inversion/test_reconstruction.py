@@ -182,7 +182,7 @@ def test_checkpoints_of_other_fits_and_broken_ones_are_refused(case, tmp_path):
     path = tmp_path / "fit.pt"
     settings = case.settings(**FAST, checkpoint=path)
     fit(case.scene, case.radar, case.capture, case.parameters(), **settings)
-    others = (
+    others: tuple[dict[str, Any], ...] = (
         {"seed": 2},
         {"steps": 5},
         {"loss": SpectrumLoss("likelihood")},

@@ -7,7 +7,7 @@ import torch
 
 import fits
 from invertwin.errors import InputError
-from invertwin.inversion import Optimizer, Stage, Unknown
+from invertwin.inversion import Optimizer, Schedule, Stage, Unknown
 from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.regularization import Laplacian
 from invertwin.inversion.remeshing import remeshed
@@ -116,6 +116,13 @@ def test_what_is_watched_joins_the_history(case):
     found = fit(case, [Stage(4, unknowns=("place",))], watch=watch, watch_every=2)
     assert ["error" in row for row in found.history] == [False, True, False, True]
     assert found.history[-1]["error"] == watch(found.scene)["error"]
+
+
+@pytest.mark.parametrize("part", [Schedule, Stage])
+def test_steps_alone_may_come_without_a_name(part):
+    assert part(3).steps == 3
+    with pytest.raises(TypeError, match="positional"):
+        part(3, 0.5)
 
 
 @pytest.mark.parametrize(

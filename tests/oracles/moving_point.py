@@ -32,11 +32,15 @@ def moving_beat(
     )
     for frame, chirp, tx, rx in torch.cartesian_prod(*map(torch.arange, beat.shape[:-1])).tolist():
         received = starts[chirp, tx] + waveform.sample_times
-        back = torch.zeros(len(received), coefficient.numel(), dtype=torch.float64)
-        for _ in range(3):
-            points = place(received[:, None] - back / SPEED_OF_LIGHT)
+        points = place(received[:, None].expand(-1, coefficient.numel()))
+        for _ in range(2):
             back = (points - all_rx[frame, rx]).norm(dim=-1)
-        delay = ((points - all_tx[frame, tx]).norm(dim=-1) + back) / SPEED_OF_LIGHT
+            points = place(received[:, None] - back / SPEED_OF_LIGHT)
+        sent, back = (
+            (points - all_tx[frame, tx]).norm(dim=-1),
+            (points - all_rx[frame, rx]).norm(dim=-1),
+        )
+        delay = (sent + back) / SPEED_OF_LIGHT
         swept = waveform.slope * (waveform.sample_times[:, None] - 0.5 * delay)
         cycles = delay * (waveform.start_frequency + swept)
         beat[frame, chirp, tx, rx] = (torch.exp(2j * math.pi * cycles) * coefficient.conj()).sum(-1)

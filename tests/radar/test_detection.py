@@ -2,10 +2,11 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 from torch.autograd import forward_ad
 
 from invertwin.channel import Grid
@@ -70,8 +71,13 @@ def test_factor_of_one_look_is_the_closed_form(training, cell, cells, rank, plac
     def product(factor: float) -> float:
         return math.prod((cells - i) / (cells - i + factor) for i in range(place)) - rate
 
-    factor = float(brentq(product, 0.0, 1e9))
-    options = {"guard": (0, 0), "training": training, "false_alarm": rate, "rank": rank}
+    factor = root_scalar(product, bracket=(0.0, 1e9)).root
+    options: dict[str, Any] = {
+        "guard": (0, 0),
+        "training": training,
+        "false_alarm": rate,
+        "rank": rank,
+    }
     for ratio, detected in ((0.999, False), (1.001, True)):
         power = torch.ones(1, 60, 80, dtype=torch.float64)
         power[(0, *cell)] = ratio * factor

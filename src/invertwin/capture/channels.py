@@ -1,7 +1,6 @@
 """Gain and phase of every channel: estimated from a reflector, saved, taken out of the data."""
 
 import json
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
 from invertwin.scene.checks import checked_tensor
+from invertwin.scene.files import replacing
 
 _DEAD = 1e-3
 
@@ -88,15 +88,8 @@ class ChannelCalibration:
         Raises:
             InputError: the folder does not exist.
         """
-        path = Path(path)
-        if not path.parent.is_dir():
-            raise InputError(f"expected an existing folder, got {path.parent}; create it first")
-        part = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
+        with replacing(path) as part:
             part.write_text(json.dumps({"gains": torch.view_as_real(self.gains).tolist()}) + "\n")
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
 
     def apply(self, capture: Capture) -> Capture:
         """The capture with every channel divided by its gain.

@@ -1,6 +1,5 @@
 """Samples in NumPy, HDF5 or MATLAB files, described by a small TOML file beside them."""
 
-import os
 import tomllib
 import zipfile
 import zlib
@@ -18,6 +17,7 @@ from invertwin.capture.elements import elements
 from invertwin.errors import InputError
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
+from invertwin.scene.files import replacing
 
 _KEYS = {
     "data": {"file", "variable", "dimensions", "conjugate"},
@@ -179,8 +179,6 @@ def write_chirps(
         InputError: the folder does not exist, or another ending.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
     target = path.parent / file
     if target.suffix not in _ENDINGS or target.parent != path.parent:
         raise InputError(
@@ -190,8 +188,7 @@ def write_chirps(
     s = data.settings
     samples = data.samples.detach().cpu().resolve_conj().numpy()
     array = np.ascontiguousarray(np.real(samples)) if s.real else samples
-    part = target.with_name(f".{os.getpid()}.part{target.suffix}")
-    try:
+    with replacing(target) as part:
         if target.suffix == ".npy":
             np.save(part, array)
         elif target.suffix == ".npz":
@@ -201,9 +198,6 @@ def write_chirps(
         else:
             with h5py.File(part, "w") as opened:
                 opened["adc"] = array
-        os.replace(part, target)
-    finally:
-        part.unlink(missing_ok=True)
     numbers = {
         name: getattr(s, name)
         for name in sorted(_KEYS["settings"] - {"transmit_order", "receivers"})
@@ -223,7 +217,8 @@ def write_chirps(
     if arrays is not None:
         tx, rx = (array.positions.tolist() for array in arrays)
         lines += ["", "[radar]", f"tx_positions = {tx}", f"rx_positions = {rx}"]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with replacing(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _elements(positions: Any, name: str) -> AntennaArray:

@@ -1,12 +1,12 @@
 """Captures on disk: NetCDF in HDF5, written in one step."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from invertwin.errors import InputError
+from invertwin.scene.files import replacing
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
@@ -19,17 +19,11 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     Raises:
         InputError: the folder does not exist.
     """
-    if not path.parent.is_dir():
-        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    real = _split(dataset)
-    # No fill values: they would mark numbers as missing.
-    encoding = {str(variable): {"_FillValue": None} for variable in real.variables}
-    try:
+    with replacing(path) as part:
+        real = _split(dataset)
+        # No fill values: they would mark numbers as missing.
+        encoding = {str(variable): {"_FillValue": None} for variable in real.variables}
         real.to_netcdf(part, engine="h5netcdf", encoding=encoding)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def read_dataset(path: Path) -> xr.Dataset:

@@ -64,15 +64,10 @@ def _template(model: str, file: Any, height: float, spacing: float) -> BodyTempl
 
 @dataclass(frozen=True)
 class SoughtBody:
-    """A body whose joint angles are sought.
+    """A body whose joint angles are sought."""
 
-    Attributes:
-        template: The body, in the size that it has in the scene.
-        joints: Sought components of the rotation vectors by joint, such as "xz".
-    """
-
-    template: BodyTemplate
-    joints: Mapping[str, str]
+    template: BodyTemplate  # in the size that it has in the scene
+    joints: Mapping[str, str]  # sought components of the rotation vectors, such as "xz"
 
     def module(self, name: str, mesh: Mesh) -> SkinnedBody:
         """The module of an object that starts as posed as this mesh of it is."""

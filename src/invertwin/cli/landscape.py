@@ -77,19 +77,10 @@ def exact_losses(
     views: Mapping[str, Callable[[Tensor], Tensor]],
     seen: Radar | None = None,
 ) -> dict[str, np.ndarray]:
-    """Relative squared errors of what is made of the exact beat signals of scenes.
+    """Relative squared errors of what is made of the exact beat signals of scenes, by view.
 
-    Args:
-        run: Its `[data]` table says how signals are simulated.
-        truth: Where the rough points are drawn.
-        radar: Of one frame; what its phase centres see is what all channels see.
-        scenes: Along a line.
-        measured: Beat signal to compare with.
-        views: What is compared, of a beat signal.
-        seen: Only these channels of the radar.
-
-    Returns:
-        A loss for each scene, by view.
+    Rough points are drawn on the true scene. What the phase centres of the radar, of one frame,
+    see is what all channels see; `seen` chooses some of these.
     """
     data = need(run, "data", "the loss landscape")
     assert isinstance(data, SimulatedData)

@@ -147,14 +147,7 @@ def sought_values(
 def value_errors(
     parameters: Sequence[Any], twin: Scene, truth: Scene, frequency: float
 ) -> dict[str, float]:
-    """How far the sought material values are from the truth, relative to it.
-
-    Args:
-        parameters: what was sought.
-        twin: the scene that was found.
-        truth: the true scene.
-        frequency: of the radar [Hz], for values of the ITU table.
-    """
+    """How far sought material values are from the truth, relative to it, at a frequency [Hz]."""
     found: dict[str, float] = {}
     for table in parameters:
         if table.kind != "material":

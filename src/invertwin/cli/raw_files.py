@@ -77,10 +77,7 @@ def write_raw(
     beat: Complex[Tensor, "frame chirp tx rx sample"] | Complex[Tensor, "frame tx rx sample"],
     folder: RunFolder,
 ) -> dict[str, float]:
-    """Writes raw/capture.bin with .cfg, .mmwave.json and .setup.json beside it.
-
-    Returns:
-        What became of the samples, for `metrics.json`.
+    """Writes raw/capture.bin and its settings files; returns numbers for metrics.json.
 
     Raises:
         InputError: What no such file can hold.

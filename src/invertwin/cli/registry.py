@@ -209,7 +209,7 @@ class Registry:
 
         Args:
             group: Such as "material", "shape", "waveform", "pattern", "array", "board", "track",
-                "data", "parameter", "loss", "optimizer" or "model".
+                "data", "parameter", "theta", "loss", "optimizer" or "model".
             kind: Its name in run files.
             make: Its class or function, or "module:name" of it, which is imported when needed.
             without: Arguments that are no keys.

@@ -32,27 +32,16 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Checked:
-    """A gradient check that is done, for the studies that compare something with it.
-
-    Attributes:
-        run: Its run file.
-        scene: At θ = 0.
-        radar: At θ = 0.
-        grid: Bins of the map.
-        direction: θ → scene and radar.
-        step: ε of the differences.
-        report: Differences, gradient, and the gradient of the interior alone.
-        say: Takes a line of progress.
-    """
+    """A gradient check that is done, for the studies that compare something with it."""
 
     run: RunFile
-    scene: Scene
+    scene: Scene  # at θ = 0, as the radar
     radar: Radar
     grid: Grid
-    direction: Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]
-    step: float
+    direction: Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]  # of θ
+    step: float  # ε of the differences
     report: GradientReport
-    say: Callable[[str], None]
+    say: Callable[[str], None]  # takes a line of progress
 
 
 @runtime_checkable

@@ -23,14 +23,7 @@ _LOG_SECONDS = 10.0  # between lines of progress in a log
 def run_folder(
     path: Path, runs: dict[str, Any], overwrite: bool, resume: bool
 ) -> Iterator[RunFolder]:
-    """The run's folder; says where the results are, or how to resume.
-
-    Args:
-        path: The folder.
-        runs: Run files as used, by file stem.
-        overwrite: Replace the results that are there.
-        resume: Go on with the interrupted run that is there.
-    """
+    """The run's folder, as of `open_run`; says where the results are, or how to resume."""
     folder = open_run(path, runs, overwrite=overwrite, resume=resume)
     try:
         with folder:
@@ -50,11 +43,7 @@ def load_runs(
 ) -> dict[str, Any]:
     """Run files by stem, with the sections that the command cannot do without.
 
-    Args:
-        files: Where they are.
-        seed: Replaces those of the run files.
-        command: The command that is asked for; run files of other tasks are refused.
-        sections: What each run file must have.
+    A seed replaces theirs. Run files of another task than the command's are refused.
     """
     runs: dict[str, Any] = {}
     for file in files:

@@ -154,14 +154,9 @@ def register(registry: Registry) -> None:
     registry.group(Group("waveform"))
     registry.group(Group("array", base=ArrayTable))
     registry.group(Group("board", base=BoardTable))
-    points = Annotated[list[Vector], MinLen(1)]
-    registry.group(Group("track", points=points))
-    for name, waveform in (
-        ("fmcw", FMCW),
-        ("stepped", SteppedFrequency),
-        ("ofdm", OFDM),
-        ("impulse", Impulse),
-    ):
+    registry.group(Group("track", points=Annotated[list[Vector], MinLen(1)]))
+    waveforms = {"fmcw": FMCW, "stepped": SteppedFrequency, "ofdm": OFDM, "impulse": Impulse}
+    for name, waveform in waveforms.items():
         registry.add("waveform", name, waveform)
     registry.add("pattern", "isotropic", Isotropic)
     registry.add("pattern", "cosine", Cosine)
@@ -297,20 +292,14 @@ def radar(table: RadarTable) -> Radar:
         WAVEFORMS.setdefault(type(waveform).__name__, type(waveform))
         if table.board is not None:
             with about("board"):
-                transmitters, receivers = board_elements(table.board)
+                arrays = board_elements(table.board)
         else:
-            assert table.transmitters is not None
-            assert table.receivers is not None
-            with about("transmitters"):
-                transmitters = table.transmitters.build()
-            with about("receivers"):
-                receivers = table.receivers.build()
+            arrays = (_elements(table, "transmitters"), _elements(table, "receivers"))
         positions = track(table.positions)
         with about("orientation.look_at"):
             rotations = rotations_of(table.orientation, positions)
         return Radar(
-            transmitters,
-            receivers,
+            *arrays,
             waveform,
             positions,
             rotations,
@@ -320,17 +309,17 @@ def radar(table: RadarTable) -> Radar:
         )
 
 
+def _elements(table: RadarTable, name: str) -> AntennaArray:
+    with about(name):
+        return getattr(table, name).build()
+
+
 def board_elements(
     table: BoardTable,
     transmitters: Sequence[int] | None = None,
     receivers: Sequence[int] | None = None,
 ) -> Elements:
-    """TX and RX elements of a `board` table.
-
-    Args:
-        table: A preset or a table of one's own.
-        transmitters: Numbers of those that recorded, in the order of sending; None = the table's.
-        receivers: The same for RX.
+    """TX (in the order of sending) and RX of a `board` table: its own, or those that recorded.
 
     Raises:
         InputError: A missing sign, an element that the board does not have, or a choice of
@@ -401,19 +390,10 @@ def chirps(table: ChirpsTable) -> motion.Chirps:
 
 
 def impairments(table: Any, data: Any) -> Impairments:
-    """The front end of the `[impairments]` table, with the noise of the `[data]` table.
-
-    Args:
-        table: None = nothing but that noise.
-        data: Of kind "simulated".
-
-    Raises:
-        InputError: Values that no front end has.
-    """
-    if table is None:
-        return Impairments(snr_db=data.snr_db, noise_figure_db=data.noise_figure_db)
+    """The front end of the `[impairments]` table, if any, with the noise of simulated `[data]`."""
+    noise = {"snr_db": data.snr_db, "noise_figure_db": data.noise_figure_db}
     with about("impairments"):
-        return table.build(snr_db=data.snr_db, noise_figure_db=data.noise_figure_db)
+        return Impairments(**noise) if table is None else table.build(**noise)
 
 
 def _float64(values: object) -> Tensor:

@@ -270,13 +270,7 @@ def _shape(table: Any) -> str | None:
 
 
 def shape_terms(table: Any, module: nn.Module, scene: Scene) -> list[Regularizer]:
-    """What keeps a shape that is sought plausible.
-
-    Args:
-        table: The parameter.
-        module: Its module.
-        scene: Where the fit starts.
-    """
+    """What keeps a shape that is sought plausible: of its table, module and first scene."""
     if table.kind == "vertices" and table.laplacian > 0:
         return [Laplacian(scene, table.object, table.laplacian)]
     if table.kind in ("shape_space", "prior") and table.weight > 0:
@@ -287,14 +281,7 @@ def shape_terms(table: Any, module: nn.Module, scene: Scene) -> list[Regularizer
 def given_for(
     name: str, scene: Scene, bodies: Bodies, objects: Mapping[str, Any]
 ) -> dict[type, object]:
-    """What a module may ask for beside its keys.
-
-    Args:
-        name: Of its object.
-        scene: Where the fit starts.
-        bodies: Whose joints are sought.
-        objects: The `[scene.<name>]` tables.
-    """
+    """What a module of an object may ask for beside its keys, where a fit starts."""
     item, table = scene[name], objects.get(name)
     found: dict[type, object] = {Scene: scene, Object: item, Mesh: item.mesh, Bodies: bodies}
     return found if table is None else {**found, ObjectTable: table}

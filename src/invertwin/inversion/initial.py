@@ -170,7 +170,7 @@ def image_points(
     width = checked_number(step, "step of the image [m]", 0.0, open_low=True)
     counts = [max(2, round(float(side) / width) + 1) for side in size]
     nodes = Lattice.between(low, high, counts).nodes
-    if not _resolves_height(capture.radar(), grid):
+    if not _resolves_height(grid):
         # Nothing tells heights apart: the plane in the middle stands for all.
         nodes = nodes.mean(_height(capture.radar()), keepdim=True)
     image = echo_image(capture, grid, nodes)
@@ -439,7 +439,7 @@ def _incoherent(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tenso
     return total / radar.frame_count
 
 
-def _resolves_height(radar: Radar, grid: Grid) -> bool:
+def _resolves_height(grid: Grid) -> bool:
     """Whether directions are resolved along more than one axis."""
     return grid.u_count > 1 and grid.v_count > 1
 
@@ -453,6 +453,6 @@ def _height(radar: Radar) -> int:
 def _level_box(points: Tensor, box: Lattice, radar: Radar, grid: Grid) -> Tensor:
     """Points within a box; of its height only where heights are resolved."""
     inside = (points >= box.low) & (points <= box.high)
-    if not _resolves_height(radar, grid):
+    if not _resolves_height(grid):
         inside[:, _height(radar)] = True
     return points[inside.all(1)]

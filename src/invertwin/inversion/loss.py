@@ -205,6 +205,14 @@ class SpectrumLoss:
     def _divergence(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         lit, data = self._floored(pairs)
         gain = self._likeliest(lit, data)
+        # torch has no public name for this question.
+        transformed = torch._C._are_functorch_transforms_active()  # pyright: ignore[reportPrivateUsage]
+        if transformed:  # such as a second derivative
+            ratios = [
+                b / (gain * a.clamp_min(0.0) + self.floor)
+                for (a, _), b in zip(pairs, data, strict=True)
+            ]
+            return torch.stack([(q - q.log() - 1).mean() for q in ratios]).mean()
         terms = [
             _Divergence.apply(a, power, b, gain, self.floor)
             for (a, _), power, b in zip(pairs, lit, data, strict=True)

@@ -1,7 +1,7 @@
 """How long a fit lasts, and its stages: which unknowns are free when, coarse before fine."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 
 from invertwin.errors import InputError
 from invertwin.inversion.observation import Observation
@@ -22,6 +22,7 @@ class Schedule:
     """
 
     steps: int = 200
+    _: KW_ONLY
     annealing: float = 0.7
     frames_per_step: int | None = None
     tolerance: float = 0.0
@@ -32,7 +33,7 @@ class Schedule:
         return max(1.0, min(self.annealing * self.steps, self.steps - 1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Stage(Schedule):
     """A part of a fit. It goes on from where the stage before has ended.
 

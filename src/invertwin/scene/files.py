@@ -3,7 +3,8 @@
 import os
 import xml.etree.ElementTree as ElementTree
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -81,18 +82,34 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         raise InputError(
             f"expected a file name ending in .ply or .glb, got {file.name}; rename the output"
         )
+    with replacing(file) as part:
+        if file.suffix.lower() == ".glb":
+            part.write_bytes(_glb(shape))
+        else:
+            part.write_bytes(_ply(_joined(shape) if isinstance(shape, Scene) else shape))
+
+
+@contextmanager
+def replacing(path: str | Path) -> Generator[Path]:
+    """A new file beside a path, which takes its place when it is complete.
+
+    A failure leaves an existing file as it was.
+
+    Args:
+        path: the file, in an existing folder; the new one has its suffix.
+
+    Raises:
+        InputError: no such folder.
+    """
+    file = Path(path)
     if not file.parent.is_dir():
         raise InputError(f"expected an existing folder, got {file.parent}; create it first")
-    if file.suffix.lower() == ".glb":
-        content = _glb(shape)
-    else:
-        content = _ply(_joined(shape) if isinstance(shape, Scene) else shape)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.part")
+    part = file.with_name(f".{file.stem}.{os.getpid()}.part{file.suffix}")
     try:
-        temporary.write_bytes(content)
-        os.replace(temporary, file)
+        yield part
+        os.replace(part, file)
     finally:
-        temporary.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
 
 
 def read_arrays(

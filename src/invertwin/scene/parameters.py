@@ -167,10 +167,6 @@ class Scale(nn.Module):
             object: name of the object.
             initial: factor.
 
-        Args:
-            object: name of the object.
-            initial: factor.
-
         Raises:
             InputError: `initial` is not positive.
         """

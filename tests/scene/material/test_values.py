@@ -128,6 +128,7 @@ def test_gradients_per_triangle():
 
 def test_lists_become_tensors():
     material = RoughDielectric([2.0, 3.0])
+    assert isinstance(material.permittivity, torch.Tensor)
     assert torch.equal(material.permittivity, torch.tensor([2.0, 3.0], dtype=torch.float64))
     scene = Scene({"wall": Object(WALL, material)})
     rows = [RoughDielectric(value).surface(FREQUENCY).amplitude for value in (2.0, 3.0)]

@@ -12,8 +12,8 @@ from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
 from invertwin.cli.landscape import exact_losses, line_name, moved, smooth_losses
-from invertwin.cli.report import Again, Picture, Table, report_html
-from invertwin.cli.run_file import need, to_toml
+from invertwin.cli.report import Table, finish, picture
+from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile
@@ -72,22 +72,13 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
         "lowest_m": {name: _lowest(curve) for name, curve in near.items()},
         "wall_seconds": time.perf_counter() - begin,
     }
-    folder.write_json("metrics.json", metrics)
     along = line_name(settings.object, settings.axis)
     figure = scan({TITLES[name]: curve for name, curve in near.items()}, wide, along)
-    png = folder.write_figure("losses.png", figure)
-    table = _table(metrics, along)
-    folder.write_text(
-        "report.html",
-        report_html(
-            run.title or "Losses along a line",
-            f"{along}, {2 * settings.span:g} m in {settings.points} steps.",
-            run.note,
-            [table, Picture("Loss against displacement", png)],
-            Again("loss-scan run.toml", {"run.toml": to_toml(run)}),
-        ),
-    )
-    return [table]
+    drawn = picture(folder, "losses", figure, "Loss against displacement")
+    title = run.title or "Losses along a line"
+    status = f"{along}, {2 * settings.span:g} m in {settings.points} steps."
+    parts = [_table(metrics, along), drawn]
+    return finish(folder, metrics, title, status, parts, again="loss-scan", note=run.note)
 
 
 def _losses(

@@ -23,6 +23,7 @@ from invertwin.capture.ti.settings_files import read_settings, recorded_files
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
 from invertwin.scene.antenna import AntennaArray
+from invertwin.scene.files import replacing
 
 _WORD = np.dtype("<i2")
 _LANE_COUNT = 4
@@ -146,9 +147,6 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
             or settings without lanes.
     """
     settings = _with_lanes(data.settings)
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
     _check_parity(settings)
     samples = data.samples.detach().cpu().resolve_conj().numpy().astype(np.complex128)
     parts = np.stack([samples.real, samples.imag], axis=-1)
@@ -163,7 +161,8 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
             "expected samples without imaginary part from a real ADC, got some with; "
             "take their real part or set real=False"
         )
-    _joined(parts, settings).astype(_WORD).tofile(path)
+    with replacing(path) as part:
+        _joined(parts, settings).astype(_WORD).tofile(part)
 
 
 def _with_lanes(settings: ChirpSettings) -> ChirpSettings:

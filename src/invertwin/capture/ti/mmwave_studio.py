@@ -18,6 +18,7 @@ from invertwin.capture.ti.chirp_table import (
     transmit_order,
 )
 from invertwin.errors import InputError
+from invertwin.scene.files import replacing
 
 _BITS = {0: 12, 1: 14, 2: 16}
 _VARIATIONS = (
@@ -203,9 +204,7 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
     Raises:
         InputError: the folder does not exist, or settings without a number of lanes.
     """
-    path, s = Path(path), chirp_settings
-    if not path.parent.is_dir():
-        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
+    s = chirp_settings
     if s.lanes is None:
         raise InputError("expected settings with 2 or 4 lanes, got none; set lanes")
 
@@ -266,7 +265,8 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
         "rlDevLaneEnable_t": {"laneEn": f"0x{2**s.lanes - 1:X}"},
     }
     device = {"mmWaveDeviceId": 0, "rfConfig": radio, "rawDataCaptureConfig": record}
-    path.write_text(json.dumps({"mmWaveDevices": [device]}, indent=2) + "\n", encoding="utf-8")
+    with replacing(path) as part:
+        part.write_text(json.dumps({"mmWaveDevices": [device]}, indent=2) + "\n", encoding="utf-8")
 
 
 def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str | Path]) -> None:
@@ -281,19 +281,19 @@ def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str
         InputError: the folder does not exist, or a file that is not in it.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
-    for file in (settings, *recordings):
-        if not (path.parent / Path(file).name).is_file():
-            raise InputError(
-                f"expected {Path(file).name} beside {path}, got no such file; write it there first"
-            )
-    names = [{"rawFileName": Path(file).name, "processedFileName": ""} for file in recordings]
-    files = {"numFilesCollected": len(names), "fileBasePath": "", "files": names}
-    setup = {
-        "configUsed": Path(settings).name,
-        "captureHardware": "DCA1000",
-        "DCA1000Config": {"dataLoggingMode": "raw"},
-        "capturedFiles": files,
-    }
-    path.write_text(json.dumps(setup, indent=2) + "\n", encoding="utf-8")
+    with replacing(path) as part:
+        for file in (settings, *recordings):
+            if not (path.parent / Path(file).name).is_file():
+                raise InputError(
+                    f"expected {Path(file).name} beside {path}, got no such file; write it there "
+                    "first"
+                )
+        names = [{"rawFileName": Path(file).name, "processedFileName": ""} for file in recordings]
+        files = {"numFilesCollected": len(names), "fileBasePath": "", "files": names}
+        setup = {
+            "configUsed": Path(settings).name,
+            "captureHardware": "DCA1000",
+            "DCA1000Config": {"dataLoggingMode": "raw"},
+            "capturedFiles": files,
+        }
+        part.write_text(json.dumps(setup, indent=2) + "\n", encoding="utf-8")

@@ -15,6 +15,7 @@ from invertwin.capture.ti.chirp_table import (
     transmit_order,
 )
 from invertwin.errors import InputError
+from invertwin.scene.files import replacing
 
 # Fewest arguments of the commands that are read.
 _ARGUMENTS = {
@@ -160,9 +161,6 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
     Raises:
         InputError: the folder does not exist.
     """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"expected an existing folder, got {path.parent}; create it first")
     s = chirp_settings
     devices = {2: "xWR18xx", 4: "xWR1443"}
     bits = {value: key for key, value in _BITS.items()}[s.bits]
@@ -184,4 +182,5 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
         "lvdsStreamCfg -1 0 1 0",
         "sensorStart",
     ]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with replacing(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -124,7 +124,7 @@ class BoundaryPoints:
 def boundary_paths(
     rays: RayScene, inputs: Inputs, walker: Walk, points: BoundaryPoints
 ) -> Iterator[BoundaryPaths]:
-    """The boundary paths through edge points; ``inputs`` are attached, ``walker`` continues paths.
+    """The boundary paths through edge points.
 
     The first points are counted now, so that their paths are prepared while another kernel runs.
 

@@ -133,8 +133,6 @@ def pull(
 ) -> None:
     """Reverse mode: adds to the gradients of the attached inputs.
 
-    ``gather`` gives ∂loss/∂power, and power · ∂loss/∂(range, u, v)-like adjoints of paths.
-
     Args:
         rays: The scene and its antennas.
         inputs: Attached tables.

@@ -39,10 +39,7 @@ def start(
 ) -> State:
     """The state at the first vertex.
 
-    ``back`` points to where the path comes from; ``throughput`` is everything up to arriving
-    here, over the probability of the samples; ``length`` is that of the path so far.
-    ``passed`` is what lies on the first segment, for antennas that share what they see. A state
-    with a ``weight`` also follows one over the probability of its points per area.
+    A state with a ``weight`` also follows one over the probability of its points per area.
 
     Args:
         index: Number of the path.
@@ -86,9 +83,7 @@ class Walk:
         return Directions(self.rays, self.inputs.surfaces)
 
     def run(self, state: State, depth: Any, visit: Callable[[State, Place], None]) -> State:
-        """Walk up to ``depth`` vertices (a number, or one per lane); returns the last state.
-
-        ``visit`` may change what it put into the state itself.
+        """Walk to the end of all paths; returns the last state.
 
         Args:
             state: The first vertex.

@@ -75,7 +75,12 @@ def calibrated(
                 [],
                 loss=build.loss(run.loss),
                 optimizer=replace(optimizer, rate=table.rate or run.optimizer.rate),
-                schedule=Schedule(steps, stage.annealing, stage.frames_per_step, stage.tolerance),
+                schedule=Schedule(
+                    steps,
+                    annealing=stage.annealing,
+                    frames_per_step=stage.frames_per_step,
+                    tolerance=stage.tolerance,
+                ),
                 callbacks=[*shown, _checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
                 seed=run.seed,
             )

@@ -15,6 +15,7 @@ from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.recordings import measured
+from invertwin.cli.registry import registry
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.schema import RunFile, Settings, SimulatedData, Variant
@@ -182,11 +183,23 @@ def varied_run(run: RunFile, mode: str) -> RunFile:
         for stage in stages
         if not stage.parameters or any(name in kept for name in stage.parameters)
     ]
-    for section in ("reconstruct", "optimizer", "surrogate"):
+    changes["optimizer"] = _optimizer(run, given)
+    for section in ("reconstruct", "surrogate"):
         table = getattr(run, section)
         keys = set(type(table).model_fields) - {"parameters"}
         changes[section] = table.model_copy(update=_among(given, keys))
     return run.model_copy(update=changes)
+
+
+def _optimizer(run: RunFile, given: Mapping[str, Any]) -> Any:
+    """The table of the optimizer with what a variant or a stage changes."""
+    table = run.optimizer
+    made = registry.table("optimizer", given.get("kind", table.kind))
+    if isinstance(table, made):
+        return table.model_copy(update=_among(given, made.model_fields))
+    # Each kind has a table of its own.
+    values = table.model_dump(exclude_unset=True) | given
+    return made(**_among(values, made.model_fields))
 
 
 def _given(table: Settings) -> dict[str, Any]:
@@ -224,7 +237,7 @@ def _stage(run: RunFile, table: StageTable, common: dict[str, Any]) -> Stage:
         unknowns=tuple(table.parameters),
         rebuild=table.rebuild,
         remesh=remesh,
-        optimizer=build.optimizer(run.optimizer.model_copy(update=rates)) if rates else None,
+        optimizer=build.optimizer(_optimizer(run, rates)) if rates else None,
         change=partial(_changed, counts, widths) if counts or widths else None,
         **{**common, **_among(given, common)},
     )

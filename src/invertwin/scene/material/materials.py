@@ -139,8 +139,6 @@ class RoughConductor(_Values, EffectiveRoughness, Material):
         InputError: a value outside its range.
     """
 
-    coherent: ClassVar[bool] = False
-
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
@@ -164,7 +162,6 @@ class RoughDielectric(Medium, Material):
 
     diffuse: Value = 1.0
     lobe_width: Annotated[Value, RADIANS] = ROUGH_LOBE_WIDTH
-    coherent: ClassVar[bool] = False
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable in all values."""
@@ -184,8 +181,6 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     Raises:
         InputError: a value outside its range.
     """
-
-    coherent: ClassVar[bool] = False
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable in all values."""
@@ -207,8 +202,6 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
     Raises:
         InputError: a value outside its range.
     """
-
-    coherent: ClassVar[bool] = False
 
     def surface(self, frequency: float) -> Surface:
         """What one face does at `frequency` [Hz]; differentiable in all values."""
@@ -259,8 +252,6 @@ class Slab(Layer, EffectiveRoughness, Material):
         InputError: a value outside its range.
     """
 
-    coherent: ClassVar[bool] = False
-
     def surface(self, frequency: float) -> Surface:
         """What it does at `frequency` [Hz]; differentiable in all values."""
         return _slab_surface([self], self.weights(), frequency)
@@ -282,7 +273,6 @@ class Multilayer(_Values, EffectiveRoughness, Material):
     """
 
     layers: Annotated[Sequence[Layer], MinLen(1)]
-    coherent: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         layers = tuple(self.layers)

@@ -90,7 +90,7 @@ class Material(ABC):
         coherent: True if field paths follow physical optics, False if the surface is rough.
     """
 
-    coherent: ClassVar[bool]
+    coherent: ClassVar[bool] = False
 
     @property
     def faces(self) -> int | None:

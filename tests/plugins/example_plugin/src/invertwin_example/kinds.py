@@ -1,5 +1,8 @@
 """The classes and functions behind the kinds: plain users of the library."""
 
+# Fields of a waveform may be properties of another.
+# pyright: reportIncompatibleVariableOverride=false
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -110,7 +113,9 @@ class LogLoss:
 
     def __call__(self, simulated, measured):
         floor = self.floor * measured.mean()
-        return ((simulated + floor).log() - (measured + floor).log()).square().mean()
+        # A predicted power can be slightly negative.
+        levels = [(power.clamp_min(0.0) + floor).log() for power in (simulated, measured)]
+        return (levels[0] - levels[1]).square().mean()
 
 
 def npy(file: Path, bandwidth: Positive) -> Capture:
