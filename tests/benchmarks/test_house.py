@@ -120,6 +120,7 @@ def test_the_checker_of_the_tests_counts_arrows(house, package):
     assert len(house.broken_arrows(root)) == 2
 
 
+@pytest.mark.slow
 def test_the_package_is_measured(house, tmp_path, capsys):
     metrics = house.measure()
     for key in house.REQUIRED:

@@ -174,6 +174,7 @@ print(Fingerprint(made(2, {"c", "a", "b"}), {"x", "y", "z"}).content()["digest"]
 """
 
 
+@pytest.mark.slow
 def test_a_function_has_the_same_fingerprint_in_a_new_process(repository):
     """No address and no order of a set takes part."""
     found = {

@@ -18,7 +18,11 @@ from scenes import occluder, radar
 
 FEW = Sampling(depth=1, samples=1_000)
 ROOT = Path(__file__).resolve().parents[2]
-RUNS = sorted(file for file in (ROOT / "experiments").rglob("*.toml") if file.stem != "pyproject")
+RUNS = sorted(
+    file
+    for file in (ROOT / "experiments").rglob("*.toml")
+    if file.stem not in ("pyproject", "chirps")  # the latter describes a recording
+)
 PUBLIC = [
     file
     for file in RUNS

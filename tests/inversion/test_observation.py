@@ -77,6 +77,7 @@ def place_of(observations: Any, kind: Any = "adam", steps: int = 40, **changes: 
     return fit.scene["ball"].center.detach()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "steps"), [("adam", 50), ("gauss_newton", 8)])
 def test_two_ranges_find_what_each_alone_cannot(seen, kind, steps):
     """A range pins one coordinate to 0.4 cells; two at right angles pin both."""

@@ -35,7 +35,7 @@ def nearest(mesh: Mesh) -> tuple[Mesh, Mesh]:
     """The prior's closest shape and its mean shape, both where they fit a mesh best."""
     prior = load_prior()
     body = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
-    on, faces, *_ = trimesh.sample.sample_surface(body, 3000, seed=1)
+    on, faces, *_ = trimesh.sample.sample_surface(body, 1500, seed=1)
     points = torch.from_numpy(np.asarray(on))
     shifted = points + 0.05 * torch.from_numpy(np.asarray(body.face_normals[faces]))
 
@@ -48,7 +48,7 @@ def nearest(mesh: Mesh) -> tuple[Mesh, Mesh]:
         def loss() -> torch.Tensor:
             optimizer.zero_grad()
             gaps = prior.distance(torch.cat([points, shifted]) - place, latent)
-            wanted = torch.cat([torch.zeros(3000), torch.full((3000,), 0.05)])
+            wanted = torch.cat([torch.zeros(1500), torch.full((1500,), 0.05)])
             value = (gaps - wanted).square().mean() * 1e3 + 1e-3 * latent.square().sum()
             value.backward()
             return value

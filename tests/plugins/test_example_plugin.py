@@ -107,6 +107,7 @@ def call(installed, tmp_path):
     return call
 
 
+@pytest.mark.slow
 def test_a_run_file_with_kinds_of_a_plugin_is_simulated_and_fitted(call, tmp_path):
     (tmp_path / "run.toml").write_text(RUN)
     assert "3 plants per m²" in call("plants", "run.toml")
@@ -118,6 +119,7 @@ def test_a_run_file_with_kinds_of_a_plugin_is_simulated_and_fitted(call, tmp_pat
     assert again["parameters"] == metrics["parameters"]
 
 
+@pytest.mark.slow
 def test_a_reader_of_a_plugin_is_data(call, tmp_path):
     text = RUN.replace("count = [4, 4]", "count = [1, 1]").replace("falling_ramp", "fmcw")
     (tmp_path / "run.toml").write_text(text)
@@ -130,6 +132,7 @@ def test_a_reader_of_a_plugin_is_data(call, tmp_path):
     assert set(metrics["parameters"]) == {"hedge.share"}
 
 
+@pytest.mark.slow
 def test_a_capture_keeps_the_waveform_of_a_plugin(call, tmp_path):
     (tmp_path / "run.toml").write_text(RUN)
     call("simulate", "run.toml")
