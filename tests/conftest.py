@@ -27,7 +27,9 @@ install_import_hook(
 )
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("INVERTWIN_DATA", REPOSITORY.parent / "shared" / "data"))
+# What pytest-xdist starts inherits the environment as it is changed below.
+GIVEN = os.environ.get("INVERTWIN_DATA", str(REPOSITORY.parent / "shared" / "data"))
+DATA = Path(os.environ.setdefault("INVERTWIN_TEST_DATA", GIVEN))
 # A user has no measured data. A test that reads some without the fixture `data_folder` fails
 # everywhere, not only on machines without data.
 os.environ["INVERTWIN_DATA"] = str(REPOSITORY / "no measured data: ask for the fixture data_folder")
