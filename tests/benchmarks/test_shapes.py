@@ -206,7 +206,8 @@ def test_the_car_of_the_project_is_made_by_its_generator(shapes):
 def test_a_car_is_fitted(shapes, data_folder, monkeypatch):
     monkeypatch.setenv("INVERTWIN_DATA", str(data_folder))
     run = shapes.run_of(1, shapes.load_run(shapes.RUN))
-    short = run.reconstruct.model_copy(update={"steps": 3, "samples": 20_000})
+    cheap = {"steps": 3, "samples": 20_000, "boundary_samples": 4_000, "frames_per_step": 6}
+    short = run.reconstruct.model_copy(update=cheap)
     few = run.data.model_copy(update={"density": 50.0})
     every = run.measures.model_copy(update={"every": 1})
     monkeypatch.setattr(shapes, "MODES", {"prior": shapes.FULL})

@@ -272,11 +272,12 @@ class Boards:
 
 
 TWO_COLUMNS = ("xWR1642", "IWR6843AOP")
+LARGE = pytest.param("MMWCAS-RF", marks=pytest.mark.slow)
 
 
 @pytest.mark.filterwarnings("ignore:virtual elements are 0.80 wavelengths:UserWarning")
 @pytest.mark.parametrize("u", [U, 0.7])
-@pytest.mark.parametrize("name", BOARDS)
+@pytest.mark.parametrize("name", [LARGE if name == LARGE.values[0] else name for name in BOARDS])
 def test_every_board_needs_the_compensation_and_its_sign(name, u):
     """In degrees, against the beamwidth λ/D that a board has at boresight.
 
