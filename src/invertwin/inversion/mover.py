@@ -131,8 +131,9 @@ class MovingBody(nn.Module):
 
     Its axes are across the line of sight to the start, up, and along that line. It moves in the
     plane of the first and the last, at a height that is fitted where the antennas resolve it.
-    Motion across the line of sight and a turn look much alike: hold the turn of what does not turn. Maps a scene to the scene with the body where it is in the middle of the
-    frame, and with the velocity of each of its vertices.
+    Motion across the line of sight and a turn look much alike: hold the turn of what does not
+    turn. Maps a scene to the scene with the body where it is in the middle of the frame, and with
+    the velocity of each of its vertices.
 
     Attributes:
         place: parameter [2], of the body's nearest point from the start, across and along [m].
