@@ -4,7 +4,6 @@ import json
 import sys
 import warnings
 from collections.abc import Callable
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,11 +14,13 @@ from invertwin.cli.options import (
     BackendOption,
     FileArgument,
     FilesArgument,
+    Look,
     OutOption,
     OverwriteOption,
     ResumeOption,
     SeedOption,
     console,
+    with_options,
 )
 from invertwin.cli.registry import load_plugins
 from invertwin.cli.run_file import about_file
@@ -38,14 +39,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-
-
-class Method(StrEnum):
-    """How directions are told apart."""
-
-    bartlett = "bartlett"
-    capon = "capon"
-    music = "music"
 
 
 def _show_version(wanted: bool) -> bool:
@@ -113,59 +106,14 @@ def demo(
 
 
 @app.command()
-def look(
-    recording: Annotated[
-        Path,
-        typer.Argument(
-            help="Raw .bin or .setup.json, a .toml description of arrays, or a .nc capture.",
-            show_default=False,
-        ),
-    ],
-    config: Annotated[
-        Path | None,
-        typer.Option("--config", "-c", help="Settings of a .bin: .cfg or .mmwave.json."),
-    ] = None,
-    board: Annotated[
-        str | None, typer.Option("--board", "-b", help="Preset that recorded, such as xWR1843.")
-    ] = None,
-    elevation: Annotated[
-        int | None, typer.Option(help="1: rows of the board grow upwards, -1: downwards.")
-    ] = None,
-    azimuth: Annotated[
-        int | None, typer.Option(help="1: columns grow to the right, -1: to the left.")
-    ] = None,
-    lanes: Annotated[
-        int | None, typer.Option(help="2 or 4 LVDS lanes, where the settings do not say.")
-    ] = None,
-    chirp: Annotated[
-        int | None, typer.Option(min=0, help="The one that the capture keeps; default: mean.")
-    ] = None,
-    frame: Annotated[int, typer.Option(min=0, help="The one that the pictures show.")] = 0,
-    range_min: Annotated[float | None, typer.Option(help="m; default: 3 range cells.")] = None,
-    range_max: Annotated[float | None, typer.Option(help="m; default: all.")] = None,
-    method: Annotated[
-        Method, typer.Option(help="Of directions; others than bartlett are shown beside it.")
-    ] = Method.bartlett,
-    sources: Annotated[
-        int | None, typer.Option(help="For music; default: counted in each range.")
-    ] = None,
-    channels: Annotated[
-        Path | None, typer.Option(help="Channel calibration to divide out (channels.json).")
-    ] = None,
-    reflector: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(help="x y z in m of a reflector: calibrates the channels on it."),
-    ] = None,
-    out: OutOption = None,
-    overwrite: OverwriteOption = False,
-) -> None:
+@with_options(Look)
+def look(chosen: Look, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
-    given = {name: value for name, value in locals().items() if name not in ("out", "overwrite")}
-    from invertwin.cli.run_look import Look, run_look
+    from invertwin.cli.run_look import run_look
 
-    default = Path("out") / recording.name.split(".")[0]
+    default = Path("out") / chosen.recording.name.split(".")[0]
     with run_folder(out or default, {}, overwrite, False) as folder:
-        print_tables(run_look(Look(**given), folder))
+        print_tables(run_look(chosen, folder))
 
 
 @app.command()

@@ -1,10 +1,13 @@
 """Arguments and options that commands share, those of plugins too."""
 
+import inspect
 import os
 import sys
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import typer
 from rich.console import Console
@@ -51,3 +54,95 @@ SeedOption = Annotated[
 ]
 FileArgument = Annotated[Path, typer.Argument(help="Run file (TOML).", show_default=False)]
 FilesArgument = Annotated[list[Path], typer.Argument(help="Run files (TOML).", show_default=False)]
+
+
+class Method(StrEnum):
+    """How directions are told apart."""
+
+    bartlett = "bartlett"
+    capon = "capon"
+    music = "music"
+
+
+@dataclass(frozen=True)
+class Look:
+    """What to look at, as the options of `invertwin look` say it."""
+
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="Raw .bin or .setup.json, a .toml description of arrays, or a .nc capture.",
+            show_default=False,
+        ),
+    ]
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", "-c", help="Settings of a .bin: .cfg or .mmwave.json."),
+    ] = None
+    board: Annotated[
+        str | None, typer.Option("--board", "-b", help="Preset that recorded, such as xWR1843.")
+    ] = None
+    elevation: Annotated[
+        int | None, typer.Option(help="1: rows of the board grow upwards, -1: downwards.")
+    ] = None
+    azimuth: Annotated[
+        int | None, typer.Option(help="1: columns grow to the right, -1: to the left.")
+    ] = None
+    lanes: Annotated[
+        int | None, typer.Option(help="2 or 4 LVDS lanes, where the settings do not say.")
+    ] = None
+    chirp: Annotated[
+        int | None, typer.Option(min=0, help="The one that the capture keeps; default: mean.")
+    ] = None
+    frame: Annotated[int, typer.Option(min=0, help="The one that the pictures show.")] = 0
+    range_min: Annotated[float | None, typer.Option(help="m; default: 3 range cells.")] = None
+    range_max: Annotated[float | None, typer.Option(help="m; default: all.")] = None
+    method: Annotated[
+        Method, typer.Option(help="Of directions; others than bartlett are shown beside it.")
+    ] = Method.bartlett
+    sources: Annotated[
+        int | None, typer.Option(help="For music; default: counted in each range.")
+    ] = None
+    channels: Annotated[
+        Path | None, typer.Option(help="Channel calibration to divide out (channels.json).")
+    ] = None
+    reflector: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="x y z in m of a reflector: calibrates the channels on it."),
+    ] = None
+
+
+def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Gives a command the fields of a dataclass as options; it gets them as one value.
+
+    Args:
+        kind: The dataclass, whose annotations say what typer needs to know.
+
+    Returns:
+        A decorator of a function of that value and further options.
+    """
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        names = [field.name for field in fields(kind)]
+
+        def command(**given: Any) -> None:
+            function(kind(**{name: given.pop(name) for name in names}), **given)
+
+        hints = get_type_hints(kind, include_extras=True)
+        own = [
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=inspect.Parameter.empty if field.default is MISSING else field.default,
+                annotation=hints[field.name],
+            )
+            for field in fields(kind)
+        ]
+        shared = list(inspect.signature(function).parameters.values())[1:]
+        rest = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in shared]
+        command.__name__, command.__doc__ = function.__name__, function.__doc__
+        command.__annotations__ = {p.name: p.annotation for p in [*own, *rest]}
+        command.__signature__ = inspect.Signature([*own, *rest])  # type: ignore[attr-defined]
+        return command
+
+    return decorate

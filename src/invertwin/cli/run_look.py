@@ -16,6 +16,7 @@ from invertwin.capture import (
 )
 from invertwin.capture.elements import elements
 from invertwin.channel import Grid
+from invertwin.cli.options import Look
 from invertwin.cli.registry import load_plugins, registry
 from invertwin.cli.report import Table, finish, picture, quantities, texts
 from invertwin.cli.runs import RunFolder
@@ -38,26 +39,6 @@ from invertwin.scene import AntennaArray
 _ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"
 # Leakage from transmitters to receivers outshines what is nearer than this many range cells.
 _NEAREST_CELLS = 3
-
-
-@dataclass(frozen=True)
-class Look:
-    """What to look at: the options of the command, which say what they mean."""
-
-    recording: Path
-    config: Path | None = None
-    board: str | None = None
-    elevation: int | None = None
-    azimuth: int | None = None
-    lanes: int | None = None
-    chirp: int | None = None
-    frame: int = 0
-    range_min: float | None = None
-    range_max: float | None = None
-    method: str = "bartlett"
-    sources: int | None = None
-    channels: Path | None = None
-    reflector: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
