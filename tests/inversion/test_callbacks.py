@@ -51,10 +51,11 @@ def test_a_report_gets_complete_rows_whatever_the_order(case):
 
 
 def test_watching_changes_nothing(case):
-    problem = (case.scene, case.radar, case.capture, case.parameters())
-    plain = fit(*problem, **case.settings(**FAST))
+    problem = (case.scene, case.radar, case.capture)
+    plain = fit(*problem, case.parameters(), **case.settings(**FAST))
     watched = fit(
         *problem,
+        case.parameters(),
         **case.settings(**FAST),
         watch=lambda scene: {"x": float(torch.rand(()))},
         watch_every=1,

@@ -102,7 +102,7 @@ class BoundaryPoints:
             interior = InteriorEdgeSampler(rays, inputs, samples // families, seed + 2)
             self._samplers.append(interior)
         self._chunks = chunks
-        self._first = [[s.draw(index) for index in self._some(s, 0, 1)] for s in self._samplers]
+        self._first = [[s.draw(index) for index in self._some(s.size, 0, 1)] for s in self._samplers]
         for family in self._first:
             for drawn in family:
                 drawn.launch()
@@ -111,14 +111,12 @@ class BoundaryPoints:
         """``EdgePoints``, and ``TwoSided`` if there are interior segments."""
         first = [[drawn.kept() for drawn in family] for family in self._first]
         return [
-            itertools.chain(now, (s.draw(index).kept() for index in self._some(s, 1, None)))
+            itertools.chain(now, (s.draw(index).kept() for index in self._some(s.size, 1, None)))
             for now, s in zip(first, self._samplers, strict=True)
         ]
 
-    def _some(
-        self, sampler: EdgeSampler | InteriorEdgeSampler, start: int, stop: int | None
-    ) -> Iterator[Any]:
-        return itertools.islice(self._chunks(sampler.size), start, stop)
+    def _some(self, size: int, start: int, stop: int | None) -> Iterator[Any]:
+        return itertools.islice(self._chunks(size), start, stop)
 
 
 def boundary_paths(
