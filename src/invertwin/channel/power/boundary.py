@@ -102,7 +102,9 @@ class BoundaryPoints:
             interior = InteriorEdgeSampler(rays, inputs, samples // families, seed + 2)
             self._samplers.append(interior)
         self._chunks = chunks
-        self._first = [[s.draw(index) for index in self._some(s.size, 0, 1)] for s in self._samplers]
+        self._first = [
+            [s.draw(index) for index in self._some(s.size, 0, 1)] for s in self._samplers
+        ]
         for family in self._first:
             for drawn in family:
                 drawn.launch()
