@@ -12,6 +12,7 @@ from typing import Any
 from invertwin.channel.power import integrand, walk
 from invertwin.channel.power.bins import Contribution
 from invertwin.channel.power.edges import (
+    Drawn,
     EdgePoints,
     EdgeSampler,
     InteriorEdgeSampler,
@@ -103,7 +104,7 @@ class BoundaryPoints:
             self._samplers.append(interior)
         self._chunks = chunks
         self._first = [
-            [s.draw(index) for index in self._some(s.size, 0, 1)] for s in self._samplers
+            list(map(s.draw, itertools.islice(chunks(s.size), 1))) for s in self._samplers
         ]
         for family in self._first:
             for drawn in family:
@@ -112,13 +113,12 @@ class BoundaryPoints:
     def families(self) -> list[Iterator[Any]]:
         """``EdgePoints``, and ``TwoSided`` if there are interior segments."""
         first = [[drawn.kept() for drawn in family] for family in self._first]
-        return [
-            itertools.chain(now, (s.draw(index).kept() for index in self._some(s.size, 1, None)))
-            for now, s in zip(first, self._samplers, strict=True)
+        # Each sampler is bound here: a generator expression would draw all of them from the last.
+        later = [
+            map(Drawn.kept, map(s.draw, itertools.islice(self._chunks(s.size), 1, None)))
+            for s in self._samplers
         ]
-
-    def _some(self, size: int, start: int, stop: int | None) -> Iterator[Any]:
-        return itertools.islice(self._chunks(size), start, stop)
+        return [itertools.chain(*family) for family in zip(first, later, strict=True)]
 
 
 def boundary_paths(
