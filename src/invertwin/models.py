@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
@@ -292,7 +292,7 @@ class MotionMap(ForwardModel):
         paths = trace_power(scene, sensor.link(), sampling=self.sampling, seed=seed)
         assert paths.velocity is not None
         moves = (paths.velocity.detach() != 0).any(1)
-        return self.expected(_chosen(paths, moves), sensor)
+        return self.expected(paths.chosen(moves), sensor)
 
     def expected(self, paths: Paths, radar: Radar) -> Float[Tensor, "frame velocity range u v"]:
         """What moving paths look like in this map. See ``moving_power``.
@@ -338,11 +338,6 @@ class MotionMap(ForwardModel):
         start, count = float(self.grid.ranges[ranges[0]]), len(ranges)
         grid = replace(self.grid, range_start=start, range_count=count)
         return replace(self, grid=grid, rates=self.rates[rates])
-
-
-def _chosen(paths: Paths, mask: Bool[Tensor, " path"]) -> Paths:
-    rows = {name: value[mask] for name, value in vars(paths).items() if isinstance(value, Tensor)}
-    return replace(paths, **rows)
 
 
 def surrogate_correlation(

@@ -1,6 +1,6 @@
 """Frozen values that leave or enter the channel: the bins, the antennas' places, the paths."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -155,6 +155,11 @@ class Paths:
     def range(self) -> Float64[Tensor, " path"]:
         """Half the path length [m]."""
         return 0.5 * SPEED_OF_LIGHT * self.delay
+
+    def chosen(self, mask: Bool[Tensor, " path"]) -> "Paths":
+        """Only the paths that the mask marks."""
+        rows = {n: value[mask] for n, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **rows)
 
     def __add__(self, other: "Paths") -> "Paths":
         names = [f.name for f in fields(self) if f.name not in ("kind", "velocity")]

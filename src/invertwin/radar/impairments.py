@@ -8,7 +8,7 @@ errors of the channels, thermal noise, then the converter.
 
 import math
 import warnings
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -447,9 +447,7 @@ def _turn(phase: Tensor) -> Tensor:
 def _share(paths: Paths, weight: Tensor) -> Paths:
     """The paths whose weight is not zero, with their coefficients times it."""
     chosen = weight > 0
-    values = {f.name: getattr(paths, f.name) for f in fields(paths)}
-    kept = {name: value[chosen] for name, value in values.items() if isinstance(value, Tensor)}
-    part = replace(paths, **kept)
+    part = paths.chosen(chosen)
     return replace(part, coefficient=part.coefficient * weight[chosen])
 
 
