@@ -167,9 +167,11 @@ class TableOf:
     make: Any
     base: type[Table] = Table
     without: tuple[str, ...] = ()
+    checked: bool | None = None
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        return handler.generate_schema(_table_of_class(self.make, self.base, self.without))
+        found = _table_of_class(self.make, self.base, self.without, self.checked)
+        return handler.generate_schema(found)
 
 
 @dataclass(frozen=True)
@@ -238,8 +240,9 @@ class Registry:
 
         Args:
             file: Its name.
-            kind: Of the data; its constructor is given the folder alone.
-            board: Preset that recorded, unless the user names another.
+            kind: Of the data; its constructor is given the folder.
+            board: Preset that recorded, unless the user names another; the constructor then takes
+                `board`, a `Mounting`.
         """
         self.recordings[file] = (kind, board)
 
@@ -557,5 +560,10 @@ def _joined(first: type[Table], second: type[Table]) -> type[Table]:
 
 
 @cache
-def _table_of_class(kind: Any, base: type[Table] = Table, without: tuple[str, ...] = ()) -> Any:
-    return registry.table_of(kind, kind.__name__, base, without=without, checked=None)
+def _table_of_class(
+    kind: Any,
+    base: type[Table] = Table,
+    without: tuple[str, ...] = (),
+    checked: bool | None = None,
+) -> Any:
+    return registry.table_of(kind, _title(kind.__name__), base, without=without, checked=checked)
