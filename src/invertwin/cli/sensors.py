@@ -150,11 +150,11 @@ class ChirpsTable(Table):
 
 def register(registry: Registry) -> None:
     """Adds waveforms, antennas, boards and tracks."""
-    registry.group(Group("pattern", product=Pattern))
-    registry.group(Group("waveform"))
-    registry.group(Group("array", base=ArrayTable))
-    registry.group(Group("board", base=BoardTable))
-    registry.group(Group("track", points=Annotated[list[Vector], MinLen(1)]))
+    registry.groups["pattern"] = Group(product=Pattern)
+    registry.groups["waveform"] = Group()
+    registry.groups["array"] = Group(base=ArrayTable)
+    registry.groups["board"] = Group(base=BoardTable)
+    registry.groups["track"] = Group(points=Annotated[list[Vector], MinLen(1)])
     waveforms = {"fmcw": FMCW, "stepped": SteppedFrequency, "ofdm": OFDM, "impulse": Impulse}
     for name, waveform in waveforms.items():
         registry.add("waveform", name, waveform)
