@@ -66,8 +66,7 @@ def report_html(
         note=note,
         parts=parts,
         version=__version__,
-        command=f"invertwin {again} -o again"
-        + (f" --backend {backend}" if backend else ""),
+        command=f"invertwin {again} -o again" + (f" --backend {backend}" if backend else ""),
         files=files,
     )
 
