@@ -104,10 +104,10 @@ class MediumTable(Table):
 
 def register(registry: Registry) -> None:
     """Adds the materials and what can be sought of them."""
-    registry.group(Group("material"))
-    registry.form(Texture, Form(_value_type, _value))
-    registry.base(Medium, MediumTable)
-    registry.give(Mesh)
+    registry.groups["material"] = Group()
+    registry.forms[Texture] = Form(_value_type, _value)
+    registry.bases[Medium] = MediumTable
+    registry.given.add(Mesh)
     for name, kind in _KINDS.items():
         registry.add("material", name, kind)
 

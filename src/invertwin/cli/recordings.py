@@ -95,9 +95,9 @@ class ChirpTable(DataTable):
 
 def register(kinds: Registry) -> None:
     """Adds the readers; what one returns says which keys it has beside its own."""
-    kinds.group(Group("data"))
-    kinds.base(Capture, DataTable)
-    kinds.base(ChirpCapture, ChirpTable)
+    kinds.groups["data"] = Group()
+    kinds.bases[Capture] = DataTable
+    kinds.bases[ChirpCapture] = ChirpTable
     kinds.add("data", "simulated", SimulatedData)
     kinds.add("data", "capture", saved)
     kinds.add("data", "dca1000", dca1000)

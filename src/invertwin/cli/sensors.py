@@ -144,11 +144,11 @@ AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_f
 
 def register(registry: Registry) -> None:
     """Adds waveforms, antennas, boards and tracks."""
-    registry.group(Group("pattern", product=Pattern))
-    registry.group(Group("waveform", product=Waveform))
-    registry.group(Group("array", base=ArrayTable, product=AntennaArray))
-    registry.group(Group("board", base=BoardTable, product=boards.Mounting))
-    registry.group(Group("track", points=Annotated[list[Vector], MinLen(1)]))
+    registry.groups["pattern"] = Group(product=Pattern)
+    registry.groups["waveform"] = Group(product=Waveform)
+    registry.groups["array"] = Group(base=ArrayTable, product=AntennaArray)
+    registry.groups["board"] = Group(base=BoardTable, product=boards.Mounting)
+    registry.groups["track"] = Group(points=Annotated[list[Vector], MinLen(1)])
     waveforms = {"fmcw": FMCW, "stepped": SteppedFrequency, "ofdm": OFDM, "impulse": Impulse}
     for name, waveform in waveforms.items():
         registry.add("waveform", name, waveform)
