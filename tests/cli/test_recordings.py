@@ -285,7 +285,7 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
         ({"frame": 2}, r"data\.frame: expected a number below 2, got 2"),
         ({"channels": "none.json"}, r"data\.channels: .*none\.json"),
         ({"board": {"name": "xWR1642", "transmitters": [1]}}, r"data\.board: .*remove the key"),
-        ({"orientation": {"look_at": [0, 1, 0]}}, r"data\.positions: "),
+        ({"orientation": {"look_at": [0, 1, 0]}}, r"data\.orientation\.look_at: "),
     ],
 )
 def test_recordings_that_do_not_fit_are_refused(train, changes, message):
