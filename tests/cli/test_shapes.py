@@ -240,23 +240,8 @@ def test_learned_shapes_are_objects_and_parameters(tmp_path):
     scene = build.scene(run)
     assert len(scene["plate"].mesh.faces) > 200
     tables = build.named(run.parameters)
-    module = build.builders(run.parameters, build.Start(scene))["vertices"](scene)
+    module = build.builders(run.parameters)["vertices"](scene)
     assert len(shape_terms(tables["vertices"], module, scene)) == 1
-
-
-def save_vehicles(folder):
-    """A space of boxes, in the files of the public one."""
-    mean, modes = box([1.0, 2.0, 3.0]), np.random.default_rng(0).normal(size=(24, 4))
-    folder.mkdir()
-    (folder / "dodec_mean.obj").write_text(
-        "\n".join(
-            [f"v {x} {y} {z}" for x, y, z in mean.vertices.tolist()]
-            + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mean.faces.tolist()]
-        )
-    )
-    names = ("default_dodec_mean", "default_dodec_pc", "default_dodec_sv")
-    parts = (mean.vertices.numpy().ravel(), modes, np.ones(4))
-    np.savez(folder / "vehicle3d_pca.npz", **dict(zip(names, parts, strict=True)))
 
 
 def test_learned_shapes_start_as_their_object(tmp_path):
@@ -266,19 +251,6 @@ def test_learned_shapes_start_as_their_object(tmp_path):
     first, *_ = build.parameters(run.parameters, scene, objects=run.scene)
     assert isinstance(first, PriorShape)
     assert first.latent.tolist() == latent
-    save_vehicles(tmp_path / "vehicles")
-    space = f'folder = "{tmp_path}/vehicles"\nlevel = "coarse"'
-    text = learned(f'shape = "vehicle"\n{space}\ncoefficients = [0.5, -2.0]')
-    text = text.replace('kind = "prior"', f'kind = "shape_space"\n{space}\nmodes = 3')
-    run = check(text, tmp_path)
-    scene = build.scene(run)
-    first, *_ = build.parameters(run.parameters, scene, objects=run.scene)
-    assert isinstance(first, LinearShape)
-    assert first.latent.tolist() == [0.5, -2.0, 0.0]
-    torch.testing.assert_close(first(scene)["plate"].mesh.vertices, scene["plate"].mesh.vertices)
-    run = check(text.replace("modes = 3", "modes = 1"), tmp_path)
-    with pytest.raises(InputError, match=r"parameters\[0\]: expected at least as many modes as"):
-        build.parameters(run.parameters, scene, objects=run.scene)
 
 
 def test_learned_shapes_have_a_size_of_their_own(tmp_path):
