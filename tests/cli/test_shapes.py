@@ -2,9 +2,7 @@
 
 import tomllib
 
-import numpy as np
 import pytest
-import torch
 from PIL import Image
 from rich.console import Console
 
@@ -16,9 +14,9 @@ from invertwin.cli.fits.writing import Fitted, tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, box
+from invertwin.scene import Mesh
 from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry import LinearShape, PriorShape
+from invertwin.scene.geometry import PriorShape
 
 HEAD, TAIL = RUN.split("[[parameters]]")
 SHAPES = """

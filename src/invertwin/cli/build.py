@@ -22,8 +22,8 @@ from invertwin.errors import InputError
 from invertwin.inversion.tangents import Change, changes_of
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Mesh, Object, Scene, joined, rigid, rotation_angle, rotation_from_vector
-from invertwin.scene.geometry import SkinnedBody
 from invertwin.scene.files import CONCRETE, load_scene_xml
+from invertwin.scene.geometry import SkinnedBody
 
 
 def scene(run: RunFile) -> Scene:
@@ -145,8 +145,8 @@ def parameters(
     return [make(scene) for make in builders(tables, objects).values()]
 
 
-def sought_bodies(run: RunFile, scene: Scene) -> dict[str, SkinnedBody]:
-    """The bodies whose joints are sought, by object."""
+def sought_bodies(run: RunFile, scene: Scene) -> dict[str, Any]:
+    """The bodies whose joints are sought: a `SkinnedBody` each, by object."""
     return {
         table.object: _module(table, f"parameters[{i}]", run.scene, scene)
         for i, table in enumerate(run.parameters)

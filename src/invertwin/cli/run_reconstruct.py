@@ -47,9 +47,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     problem, conventional = guessed(problem, console)
     starts = [build.Start(problem.scene, build.sought_bodies(run, problem.scene))]
     if run.starts is not None:
-        starts = build.starts(
-            run.starts, problem.scene, problem.truth, run.seed, build.sought_bodies(run, problem.scene)
-        )
+        bodies = starts[0].bodies
+        starts = build.starts(run.starts, problem.scene, problem.truth, run.seed, bodies)
     check_measures(problem, without_clouds(starts[0].scene))
     modes = modes_of(run)
     single = len(starts) * len(modes) == 1

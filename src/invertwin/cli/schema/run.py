@@ -209,9 +209,9 @@ class _RunFile(Section):
 
     @model_validator(mode="after")
     def _learned_shapes_have_their_own_size(self) -> "_RunFile":
-        for parameter in self.unknowns.values():
-            if not isinstance(parameter, LearnedTable):
-                continue
+        unknowns = self.unknowns.values()
+        learned: list[Any] = [table for table in unknowns if isinstance(table, LearnedTable)]
+        for parameter in learned:
             name, why = parameter.object, f'with kind = "{parameter.kind}", which has its own size'
             scale = self.scene[name].scale if name in self.scene else 1.0
             if scale != 1:
