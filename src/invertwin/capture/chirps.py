@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -13,13 +14,15 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
+from invertwin.limits import Count, Frequency, NonNegative, Positive, Several, Usual
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import checked_count, checked_number
+from invertwin.scene.checks import check_fields, checked_number
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
+Pause = Annotated[NonNegative, Usual("seconds", 5e-6, high=1.0)]
 
 
 @dataclass(frozen=True)
@@ -49,17 +52,17 @@ class ChirpSettings:
             ends before its last sample.
     """
 
-    start_frequency: float
-    slope: float
-    sample_rate: float
-    samples: int
+    start_frequency: Frequency
+    slope: Annotated[Positive, Usual("Hz/s", 60e12, low=1.0)]
+    sample_rate: Annotated[Positive, Usual("Hz", 5e6, low=1.0)]
+    samples: Several
     transmit_order: tuple[int, ...]
     receivers: tuple[int, ...]
-    loops: int
-    frames: int | None = None
+    loops: Count
+    frames: Count | None = None
     frame_period: float | None = None
-    idle_time: float = 0.0
-    adc_start_time: float = 0.0
+    idle_time: Pause = 0.0
+    adc_start_time: Pause = 0.0
     ramp_end_time: float | None = None
     real: bool = False
     swap_iq: bool = False
@@ -67,14 +70,7 @@ class ChirpSettings:
     lanes: int | None = None
 
     def __post_init__(self) -> None:
-        for name, low in (("start_frequency", 1e6), ("slope", 1.0), ("sample_rate", 1.0)):
-            checked_number(getattr(self, name), f"{name} in SI units", low)
-        checked_count(self.samples, "samples per chirp", 2)
-        checked_count(self.loops, "loops per frame", 1)
-        if self.frames is not None:
-            checked_count(self.frames, "frames", 1)
-        for name in ("idle_time", "adc_start_time"):
-            checked_number(getattr(self, name), f"{name} [s]", 0.0, 1.0)
+        check_fields(self)
         order, receivers = tuple(self.transmit_order), tuple(self.receivers)
         object.__setattr__(self, "transmit_order", order)
         object.__setattr__(self, "receivers", receivers)

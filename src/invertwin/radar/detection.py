@@ -3,11 +3,11 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
+from scipy.ndimage import maximum_filter
 from scipy.optimize import brentq
 from scipy.special import gammaincc, gammaincinv
 from scipy.stats import beta, f
@@ -112,16 +112,13 @@ def ordered_statistics_cfar(
     _check_rates(false_alarm, looks)
     if not 0 < rank <= 1:
         raise InputError(f"expected a rank in (0, 1], got {rank:g}; 0.75 is usual")
-    place = (rank * count - 1e-9).ceil().to(torch.int64)
-    # What is no training cell is infinite, so last in order.
-    level = band.sort(-1).values.gather(-1, (place - 1).expand(band.shape[:-1])[..., None])[..., 0]
     numbers, index = count.unique(return_inverse=True)
-    factors = [
-        _ordered_factor(int(n), math.ceil(rank * float(n) - 1e-9), false_alarm, looks)
-        for n in numbers
-    ]
-    factor = torch.tensor(factors, dtype=torch.float64)[index]
-    return power > (factor * level).to(power.device)
+    places = (rank * numbers - 1e-9).ceil().long()
+    # What is no training cell is infinite, so last in order.
+    level = band.sort(-1).values.take_along_dim((places - 1)[index][..., None], -1)[..., 0]
+    pairs = zip(numbers.tolist(), places.tolist(), strict=True)
+    factors = [_ordered_factor(n, place, false_alarm, looks) for n, place in pairs]
+    return power > (torch.tensor(factors).double()[index] * level).to(power.device)
 
 
 def point_cloud(
@@ -135,8 +132,7 @@ def point_cloud(
     """One point for each local maximum over range rate and range among the detected cells.
 
     Its direction is the strongest one that exists (u² + v² ≤ 1); all are refined by the parabola
-    through the logarithms of the power at a peak and its two neighbours. The
-    ends of the axis of range rates are neighbours.
+    through the logarithms of the power at a peak and its two neighbours.
 
     Args:
         power: Of ``range_doppler_angle``.
@@ -156,10 +152,12 @@ def point_cloud(
     count = power.shape[1]
     seen = _within_sphere(power, grid).flatten(3)
     strongest = seen.amax(-1)
-    frame, velocity, place = torch.nonzero(
-        detections & (strongest == _neighbourhood_maximum(strongest)) & (strongest > 0),
-        as_tuple=True,
-    )
+    # The ends of the axis of range rates are neighbours.
+    ends = ("nearest", "wrap", "nearest")
+    around = maximum_filter(strongest.numpy(), (1, 3, 3), mode=ends)  # type: ignore[arg-type]
+    highest = strongest == torch.from_numpy(around)
+    found = detections & highest & (strongest > 0)
+    frame, velocity, place = torch.nonzero(found, as_tuple=True)
     direction = seen.argmax(-1)[frame, velocity, place]
     u, v = direction // grid.v_count, direction % grid.v_count
     cell = [frame, velocity, place, u, v]
@@ -195,7 +193,7 @@ def peaks(
     _refuse_gradients(power, "peaks")
     _check_shapes(power, detections, (radar.frame_count, *grid.shape), "frame, range, u, v")
     seen = _within_sphere(power.to("cpu", torch.float64), grid)
-    highest = torch.nn.functional.max_pool3d(seen[:, None], 3, stride=1, padding=1)[:, 0]
+    highest = torch.from_numpy(maximum_filter(seen.numpy(), (1, 3, 3, 3), mode="nearest"))
     found = detections.cpu()[..., None] & (seen == highest) & (seen > 0)
     frame, place, u, v = torch.nonzero(found, as_tuple=True)
     rates = torch.zeros(len(frame), dtype=torch.float64)
@@ -251,7 +249,7 @@ def _check_rates(false_alarm: float, looks: int) -> None:
 
 def _training_cells(
     power: Tensor, guard: tuple[int, int], training: tuple[int, int], name: str
-) -> tuple[Float64[Tensor, "*batch first second cell"], Float64[Tensor, "first second"]]:
+) -> tuple[Float64[Tensor, "*batch first second cell"], Int64[Tensor, "*batch first second"]]:
     """Power of each cell's training cells, infinite beyond the map, and their number."""
     _refuse_gradients(power, name)
     values = power.to("cpu", torch.float64)
@@ -272,23 +270,13 @@ def _training_cells(
     offsets = [(torch.arange(size) - r).abs() for size, r in zip(sizes, reach, strict=True)]
     kept = (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])
     cells = around[..., kept]
-    whole, inner = (
-        [_within(size, r) for size, r in zip(values.shape[-2:], sides, strict=True)]
-        for sides in (reach, guard)
-    )
-    count = whole[0][:, None] * whole[1] - inner[0][:, None] * inner[1]
+    count = torch.isfinite(cells).sum(-1)
     if int(count.min()) < 1:
         raise InputError(
             f"expected training cells around every cell, got none around some of a map of "
             f"{tuple(values.shape[-2:])}; use fewer guard cells or more training cells"
         )
     return cells, count
-
-
-def _within(size: int, reach: int) -> Float64[Tensor, " cell"]:
-    """How many cells of an axis are at most so far from each."""
-    place = torch.arange(size, dtype=torch.float64)
-    return (place + reach).clamp(max=size - 1) - (place - reach).clamp(min=0) + 1
 
 
 @lru_cache(maxsize=1024)
@@ -304,17 +292,7 @@ def _ordered_factor(cells: int, place: int, false_alarm: float, looks: int) -> f
     high = 1.0
     while excess(high) > 0:
         high *= 2
-    root: Any = brentq(excess, 0.0, high, xtol=1e-9 * high)
-    return float(root)
-
-
-def _neighbourhood_maximum(
-    strongest: Float64[Tensor, "frame velocity range"],
-) -> Float64[Tensor, "frame velocity range"]:
-    """Maximum over 3 × 3 cells; the axis of range rates closes on itself."""
-    wrapped = torch.cat([strongest[:, -1:], strongest, strongest[:, :1]], dim=1)
-    padded = torch.nn.functional.pad(wrapped, (1, 1), value=-math.inf)
-    return torch.nn.functional.max_pool2d(padded[:, None], 3, stride=1)[:, 0]
+    return float(brentq(excess, 0.0, high, xtol=1e-9 * high))  # type: ignore[arg-type]
 
 
 def _refinement(

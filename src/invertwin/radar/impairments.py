@@ -9,27 +9,31 @@ errors of the channels, thermal noise, then the converter.
 import math
 import warnings
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 import torch
-from annotated_types import Ge, Le, Lt
+from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Paths
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, NonNegative, Positive
+from invertwin.limits import RADIANS, NonNegative, Positive, Usual
 from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
+from invertwin.scene.checks import check_fields, checked_number
 
 # Phase of the highest offset between delays at which the residual is computed; linear between
 # them it is then off by less than 1 % there.
 _DELAY_STEP = 0.25
 # Offsets are this many times finer than one sweep resolves, so that noise does not repeat in it.
 _FINER = 4
+
+Level = Annotated[float, Gt(-400), Lt(0)]  # dB below what is sent
 
 
 @dataclass(frozen=True)
@@ -49,11 +53,11 @@ class PhaseNoise:
     """
 
     offsets: tuple[Positive, ...]
-    levels: tuple[float, ...]
+    levels: tuple[Level, ...]
 
     def __post_init__(self) -> None:
-        ascending = all(a < b for a, b in zip(self.offsets, self.offsets[1:], strict=False))
-        if not (self.offsets and self.offsets[0] > 0 and ascending):
+        check_fields(self)
+        if not self.offsets or any(a >= b for a, b in pairwise(self.offsets)):
             raise InputError(
                 f"expected ascending offsets > 0, got {self.offsets}; give them in Hz, such as "
                 "(1e5, 1e6)"
@@ -62,11 +66,6 @@ class PhaseNoise:
             raise InputError(
                 f"expected {len(self.offsets)} levels, got {len(self.levels)}; "
                 "give one level per offset"
-            )
-        if not all(-400 < level < 0 for level in self.levels):
-            raise InputError(
-                f"expected levels below 0 dBc/Hz, got {self.levels}; "
-                "give them relative to the carrier, such as -95"
             )
 
     def density(self, offset: Float64[Tensor, " offset"]) -> Float64[Tensor, " offset"]:
@@ -96,20 +95,11 @@ class Leakage:
         InputError: A delay that is not one of a board, or more received than sent.
     """
 
-    delay: NonNegative
-    level_db: Annotated[float, Lt(0)]
+    delay: Annotated[NonNegative, Usual("seconds", 1e-9, high=1e-6)]
+    level_db: Level
 
     def __post_init__(self) -> None:
-        if not 0 <= self.delay <= 1e-6:
-            raise InputError(
-                f"expected a leakage delay in seconds, at most 1e-6, got {self.delay:g}; "
-                f"did you mean {self.delay:g}e-9?"
-            )
-        if not -400 < self.level_db < 0:
-            raise InputError(
-                f"expected a leakage level below 0 dB, got {self.level_db:g}; "
-                "give received over transmitted power, such as -40"
-            )
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -129,13 +119,7 @@ class ADC:
     full_scale: Positive
 
     def __post_init__(self) -> None:
-        if not 2 <= self.bits <= 32:
-            raise InputError(f"expected 2 to 32 bits, got {self.bits}; boards have 10 to 16")
-        if not 0 < self.full_scale < math.inf:
-            raise InputError(
-                f"expected a positive full_scale, got {self.full_scale}; "
-                "give the largest amplitude of the beat signal that shall fit"
-            )
+        check_fields(self)
 
     @property
     def step(self) -> float:
@@ -166,22 +150,16 @@ class Impairments:
     gain_std_db: NonNegative = 0.0
     phase_std: Annotated[NonNegative, RADIANS] = 0.0
     snr_db: float | None = None
-    noise_figure_db: float | None = None
+    noise_figure_db: NonNegative | None = None
     transmit_power: Positive = 0.01
     adc: ADC | None = None
 
     def __post_init__(self) -> None:
-        _check_deviations(self.gain_std_db, self.phase_std)
+        check_fields(self)
         if self.snr_db is not None and self.noise_figure_db is not None:
             raise InputError(
                 f"expected snr_db or noise_figure_db, got both, {self.snr_db} and "
                 f"{self.noise_figure_db}; give one of them"
-            )
-        figure = 0.0 if self.noise_figure_db is None else self.noise_figure_db
-        if not (figure >= 0 and 0 < self.transmit_power < math.inf):
-            raise InputError(
-                f"expected noise_figure_db >= 0 and a positive transmit_power, got {figure} and "
-                f"{self.transmit_power}; give them in dB and in watts"
             )
 
     def record(
@@ -400,7 +378,8 @@ def channel_errors(
     Raises:
         InputError: A negative deviation.
     """
-    _check_deviations(gain_std_db, phase_std)
+    checked_number(gain_std_db, "gain_std_db", 0.0)
+    checked_number(phase_std, "phase_std [rad]", 0.0)
     shape = (2, len(radar.transmitters.positions), len(radar.receivers.positions))
     generator = torch.Generator().manual_seed(seed)
     gain, phase = torch.randn(shape, dtype=torch.float64, generator=generator)
@@ -459,11 +438,3 @@ def _sampled_in_time(radar: Radar) -> FMCW | SteppedFrequency:
         f"expected samples taken one after the other in time, got {type(waveform).__name__}; phase "
         "noise and converter act in time: use them with FMCW or stepped frequency"
     )
-
-
-def _check_deviations(gain_std_db: float, phase_std: float) -> None:
-    if not (0 <= gain_std_db < math.inf and 0 <= phase_std < math.inf):
-        raise InputError(
-            f"expected standard deviations >= 0, got {gain_std_db} dB and {phase_std} rad; "
-            "give 0 for channels without errors"
-        )

@@ -21,6 +21,7 @@ from invertwin.radar.nonuniform import (
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
+from invertwin.scene.checks import check_fields
 
 # Largest error of interpolating a path's phase factor between the instants of a ramp.
 _INTERPOLATION_ERROR = 1e-6
@@ -51,11 +52,7 @@ class Chirps:
     order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.count < 1 or not self.interval > 0:
-            raise InputError(
-                f"expected at least one chirp and an interval > 0, got {self.count} and "
-                f"{self.interval}; the interval is idle time + ramp time in seconds"
-            )
+        check_fields(self)
         if self.order is None:
             return
         object.__setattr__(self, "order", tuple(self.order))

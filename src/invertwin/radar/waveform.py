@@ -13,7 +13,8 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.limits import Count, Positive
+from invertwin.limits import Bandwidth, Duration, Frequency, Several, Step
+from invertwin.scene.checks import check_fields
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
@@ -121,24 +122,13 @@ class FMCW(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: Positive
-    bandwidth: Positive
-    duration: Positive
-    samples: Count
+    start_frequency: Frequency
+    bandwidth: Bandwidth
+    duration: Duration
+    samples: Several
 
     def __post_init__(self) -> None:
-        _check_frequency("start_frequency", self.start_frequency)
-        _check_frequency("bandwidth", self.bandwidth)
-        if not 0 < self.duration <= 1:
-            raise InputError(
-                f"expected a ramp duration in seconds, got {self.duration:g}; "
-                f"did you mean {self.duration:g}e-6?"
-            )
-        if self.samples < 2:
-            raise InputError(
-                f"expected at least 2 samples per ramp, got {self.samples}; "
-                "give the number of ADC samples of one chirp"
-            )
+        check_fields(self)
 
     @property
     def center_frequency(self) -> float:
@@ -185,24 +175,13 @@ class SteppedFrequency(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: Positive
-    step: Positive
-    samples: Count
-    dwell: Positive
+    start_frequency: Frequency
+    step: Step
+    samples: Several
+    dwell: Duration
 
     def __post_init__(self) -> None:
-        _check_frequency("start_frequency", self.start_frequency)
-        _check_step("step", self.step)
-        if self.samples < 2:
-            raise InputError(
-                f"expected at least 2 tones, got {self.samples}; "
-                "give the number of frequencies of one sweep"
-            )
-        if not 0 < self.dwell <= 1:
-            raise InputError(
-                f"expected a dwell time per tone in seconds, got {self.dwell:g}; "
-                f"did you mean {self.dwell:g}e-6?"
-            )
+        check_fields(self)
 
     @property
     def bandwidth(self) -> float:
@@ -242,18 +221,12 @@ class OFDM(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: Positive
-    spacing: Positive
-    subcarriers: Count
+    start_frequency: Frequency
+    spacing: Step
+    subcarriers: Several
 
     def __post_init__(self) -> None:
-        _check_frequency("start_frequency", self.start_frequency)
-        _check_step("spacing", self.spacing)
-        if self.subcarriers < 2:
-            raise InputError(
-                f"expected at least 2 subcarriers, got {self.subcarriers}; "
-                "give the number of subcarriers that carry symbols"
-            )
+        check_fields(self)
 
     @property
     def samples(self) -> int:
@@ -339,12 +312,11 @@ class Impulse(Waveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    center_frequency: Positive
-    bandwidth: Positive
+    center_frequency: Frequency
+    bandwidth: Bandwidth
 
     def __post_init__(self) -> None:
-        _check_frequency("center_frequency", self.center_frequency)
-        _check_frequency("bandwidth", self.bandwidth)
+        check_fields(self)
 
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
@@ -411,20 +383,3 @@ def gaussian_response(
     """
     sigma = SIGMA_PER_FWHM * waveform.range_resolution
     return torch.exp(-0.5 * (distance / sigma).square())
-
-
-def _check_frequency(name: str, value: float) -> None:
-    if value >= 1e6:
-        return
-    if value > 0:
-        meant = f"{value:g}e9" if value < 1e3 else f"{value:g}e6"
-        raise InputError(f"expected {name} in Hz, got {value:g}; did you mean {meant}?")
-    raise InputError(f"expected a positive {name}, got {value}; give it in Hz, such as 77e9")
-
-
-def _check_step(name: str, value: float) -> None:
-    if value >= 1e3:
-        return
-    if value > 0:
-        raise InputError(f"expected {name} in Hz, got {value:g}; did you mean {value:g}e6?")
-    raise InputError(f"expected a positive {name}, got {value}; give it in Hz, such as 1e6")

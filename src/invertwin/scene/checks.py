@@ -1,19 +1,28 @@
 """Conversion and validation of what enters the scene: the public edge of this room."""
 
 import math
+import operator
 from collections.abc import Sequence
-from typing import Annotated, Any
+from functools import cache
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 import torch
-from annotated_types import Ge, Len
+from annotated_types import Ge, Gt, Le, Len, Lt
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.limits import Usual, marks
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 Point = Annotated[ArrayLike, Len(3, 3)]
 Counts = Annotated[Sequence[Annotated[int, Ge(2)]], Len(3, 3)]
+_LIMITS: dict[type, tuple[str, str, Any]] = {
+    Gt: ("gt", "above", operator.gt),
+    Ge: ("ge", "of at least", operator.ge),
+    Lt: ("lt", "below", operator.lt),
+    Le: ("le", "of at most", operator.le),
+}
 
 
 def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: str) -> Tensor:
@@ -92,3 +101,45 @@ def checked_count(value: object, what: str, low: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
         raise InputError(f"expected {what} as an integer >= {low}, got {value!r}; give a count")
     return int(value)
+
+
+def check_fields(holder: object) -> None:
+    """Raise unless the numbers in the fields of a dataclass keep to their annotations.
+
+    Fields that are None have no limits. In a tuple every item is checked.
+
+    Raises:
+        InputError: a number that is beyond a limit, not finite, not whole where a count is
+            expected, or evidently in another unit.
+    """
+    for name, found in _marks_of_fields(type(holder)).items():
+        value = getattr(holder, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None:
+                _check_number(holder, name, number, found)
+
+
+@cache
+def _marks_of_fields(kind: type) -> dict[str, tuple[Any, ...]]:
+    found = {n: tuple(marks(h)) for n, h in get_type_hints(kind, include_extras=True).items()}
+    return {n: m for n, m in found.items() if any(type(mark) in _LIMITS for mark in m)}
+
+
+def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]) -> None:
+    usual = next((mark for mark in found if isinstance(mark, Usual)), None)
+    do = f"correct {type(holder).__name__}({name}=...)"
+    if usual is not None:
+        do = f"give it in {usual.unit}, such as {usual.value:g}"
+    if int in found and not isinstance(number, int | np.integer):
+        raise InputError(f"expected {name} as an integer, got {number!r}; give a count")
+    if isinstance(number, bool) or not isinstance(number, int | float | np.number):
+        raise InputError(f"expected {name} as a number, got {number!r}; {do}")
+    for mark in found:
+        if type(mark) in _LIMITS:
+            field, words, holds = _LIMITS[type(mark)]
+            limit = getattr(mark, field)
+            if not (math.isfinite(number) and holds(number, limit)):
+                raise InputError(f"expected {name} {words} {limit:g}, got {number}; {do}")
+    if usual and not usual.low <= number <= usual.high:
+        meant = usual.meant(float(number))
+        raise InputError(f"expected {name} in {usual.unit}, got {number:g}; did you mean {meant}?")

@@ -21,6 +21,11 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rigid, rotation_from_vector
 from invertwin.scene.scene import Object, Scene
 
+UNREADABLE = (
+    *(OSError, ValueError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error),
+    RuntimeError,  # archives that need a password or a later version
+)
+"""What reading a damaged file of arrays can raise."""
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
@@ -123,23 +128,15 @@ def read_arrays(
         wanted: names; None = all.
 
     Raises:
-        InputError: a file that is damaged, or another one, or pickled objects.
+        InputError: no such file, a damaged one, or pickled objects.
     """
+    if not path.is_file():
+        raise InputError(f"expected {path.name} in {path.parent}, got no such file; {do}")
     try:
         # Opened here: numpy leaves a damaged file open.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
             return {k: arrays[k] for k in arrays.files if wanted is None or k in wanted}
-    # The last one is of archives that need a password or a later version.
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        EOFError,
-        BadZipFile,
-        zlib.error,
-        RuntimeError,
-    ) as error:
+    except UNREADABLE as error:
         raise InputError(
             f"expected plain arrays in {path.name}, got {type(error).__name__}; {do}"
         ) from None

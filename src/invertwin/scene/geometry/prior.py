@@ -300,8 +300,6 @@ def load_prior(file: str | Path | None = None) -> ShapePrior:
 
 def _read(path: Path) -> ShapePrior:
     do = "give a file of invertwin train-prior"
-    if not path.is_file():
-        raise InputError(f"expected a shape prior, got no file {path}; {do}")
     found = read_arrays(path, do)
     try:
         if str(found.pop("format")) != _FORMAT:
