@@ -6,7 +6,7 @@ The signatures of the library state them; `scene.checks.check_fields` and run fi
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le
 
@@ -63,7 +63,8 @@ def marks(hint: Any) -> Iterator[Any]:
     """The types and the marks that an annotation is made of, also of its items and members."""
     yield from getattr(hint, "__metadata__", ())
     parts = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
-    if not parts:
+    if not parts or get_origin(hint) is Literal:
         yield hint
+        return
     for part in parts:
         yield from marks(part)

@@ -151,7 +151,7 @@ def simulate_chirps(
         check_paths(paths, radar, sampled(radar))
         return Train(paths, radar, places).ramp(start, senders)
 
-    beat = every_ramp(chirps, len(radar.transmitters.positions), ramp)
+    beat = every_ramp(chirps, radar.shape[1], ramp)
     return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
 
 

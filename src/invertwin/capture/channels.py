@@ -16,7 +16,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import replacing
+from invertwin.scene.files import existing_file, replacing
 
 _DEAD = 1e-3
 
@@ -65,9 +65,7 @@ class ChannelCalibration:
         Raises:
             InputError: no such file, or one that holds no calibration.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise InputError(f"expected a calibration, got no file {path}; check the path")
+        path = existing_file(path, "a calibration")
         try:
             parts = torch.tensor(json.loads(path.read_text())["gains"], dtype=torch.float64)
             if parts.ndim != 3 or parts.shape[2] != 2:

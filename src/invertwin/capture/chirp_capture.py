@@ -28,13 +28,8 @@ class ChirpCapture:
     chirps: Chirps
 
     def __post_init__(self) -> None:
-        device = self.device
-        expected = (
-            device.frame_count,
-            self.chirps.count,
-            len(device.transmitters.positions),
-            len(device.receivers.positions),
-        )
+        frames, *elements = self.device.shape
+        expected = (frames, self.chirps.count, *elements)
         if not self.beat.is_complex() or tuple(self.beat.shape[:-1]) != expected:
             raise InputError(
                 f"expected complex beat samples of shape {expected} × samples, got "

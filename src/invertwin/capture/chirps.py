@@ -19,7 +19,7 @@ from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import check_fields, checked_number
+from invertwin.scene.checks import check_fields, check_shape, checked_number
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
 Pause = Annotated[NonNegative, Usual("seconds", 5e-6, high=1.0)]
@@ -140,19 +140,12 @@ class ChirpData:
 
     def __post_init__(self) -> None:
         settings = self.settings
-        expected = (
-            settings.loops,
-            len(settings.transmit_order),
-            len(settings.receivers),
-            settings.samples,
-        )
-        shape = tuple(self.samples.shape)
-        if shape[1:] != expected or len(shape) != 5 or shape[0] < 1:
-            raise InputError(
-                f"expected samples (frame, chirp, tx, rx, sample) of shape (any, "
-                f"{', '.join(map(str, expected))}) as in the settings, got {shape}; "
-                "data and settings must describe the same recording"
-            )
+        elements = len(settings.transmit_order), len(settings.receivers)
+        expected = (None, settings.loops, *elements, settings.samples)
+        do = "data and settings must describe the same recording"
+        check_shape(self.samples, expected, "samples (frame, chirp, tx, rx, sample)", do)
+        if not len(self.samples):
+            raise InputError(f"expected at least one frame of samples, got none; {do}")
         if not torch.isfinite(torch.view_as_real(self.samples)).all():
             raise InputError("expected finite samples, got NaN or infinity; drop those frames")
 

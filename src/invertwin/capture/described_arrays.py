@@ -16,7 +16,7 @@ from invertwin.capture.elements import elements
 from invertwin.errors import InputError
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import UNREADABLE, replacing
+from invertwin.scene.files import UNREADABLE, existing_file, replacing
 
 _KEYS = {
     "data": {"file", "variable", "dimensions", "conjugate"},
@@ -212,8 +212,7 @@ def _elements(positions: Any, name: str) -> AntennaArray:
 
 
 def _description(path: Path) -> dict[str, dict[str, Any]]:
-    if not path.is_file():
-        raise InputError(f"expected a TOML description, got no file {path}; check the path")
+    existing_file(path, "a TOML description")
     try:
         description = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -237,8 +236,7 @@ def _description(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _array(path: Path, variable: str | None) -> np.ndarray:
-    if not path.is_file():
-        raise InputError(f"expected the data file {path}, got no such file; check [data] file")
+    existing_file(path, "the data file that [data] names")
     ending = path.suffix.lower()
     if ending not in _ENDINGS:
         raise InputError(

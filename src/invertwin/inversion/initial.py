@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float64
+from scipy.ndimage import map_coordinates
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -420,22 +421,16 @@ def _incoherent(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tenso
         to_tx, to_rx = (points - place[frame].detach() for place in (link.tx, link.rx))
         ranges = 0.5 * (to_tx.norm(dim=1) + to_rx.norm(dim=1))
         seen = (to_rx / to_rx.norm(dim=1, keepdim=True)) @ link.rotations[frame].detach()
-        axes = (
-            (seen[:, 1], grid.v_start, grid.v_step, grid.v_count),
-            (seen[:, 0], grid.u_start, grid.u_step, grid.u_count),
-            (ranges, grid.range_start, grid.range_step, grid.range_count),
+        places = (
+            (ranges - grid.range_start) / grid.range_step,
+            (seen[:, 0] - grid.u_start) / grid.u_step * (grid.u_count > 1),
+            (seen[:, 1] - grid.v_start) / grid.v_step * (grid.v_count > 1),
         )
-        # In the sampler's units: −1 at the first node, 1 at the last.
-        places = [
-            2 * (value - start) / (step * (count - 1)) - 1 if count > 1 else torch.zeros_like(value)
-            for value, start, step, count in axes
-        ]
-        sampled = torch.nn.functional.grid_sample(
-            maps[frame][None, None],
-            torch.stack(places, dim=1)[None, None, None],
-            align_corners=True,
-        ).reshape(-1)
-        total += sampled * ranges**4 * (seen[:, 2] > 0)
+        # Beyond the outer bins the map falls to zero within one bin.
+        sampled = map_coordinates(
+            maps[frame].numpy(), torch.stack(places).numpy(), order=1, mode="grid-constant"
+        )
+        total += torch.from_numpy(sampled) * ranges**4 * (seen[:, 2] > 0)
     return total / radar.frame_count
 
 

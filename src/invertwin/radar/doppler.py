@@ -54,7 +54,7 @@ def velocity_span(radar: Radar, chirps: Chirps) -> float:
         radar: Its wavelength and transmitters.
         chirps: Their interval and order.
     """
-    return 2 * chirps.max_speed(radar.waveform.wavelength, len(radar.transmitters.positions))
+    return 2 * chirps.max_speed(radar.waveform.wavelength, radar.shape[1])
 
 
 def range_doppler(
@@ -123,10 +123,10 @@ def compensate_tdm(
         InputError: Another number of transmitters in the spectrum than in the radar.
     """
     frames, count, transmitters, _, ranges = spectrum.shape
-    if transmitters != len(radar.transmitters.positions):
+    if transmitters != radar.shape[1]:
         raise InputError(
-            f"expected a spectrum of {len(radar.transmitters.positions)} transmitters, got "
-            f"{transmitters}; use the radar that recorded it"
+            f"expected a spectrum of {radar.shape[1]} transmitters, got {transmitters}; "
+            "use the radar that recorded it"
         )
     folds = torch.as_tensor(fold).cpu().expand(frames, count, ranges).to(torch.float64)
     rate = velocity_axis(radar, chirps, count)[:, None] + folds * velocity_span(radar, chirps)

@@ -319,7 +319,7 @@ def residual_phase(
         InputError: A waveform whose samples are not taken in time.
     """
     waveform = _sampled_in_time(radar)
-    transmitters, samples = len(radar.transmitters.positions), waveform.samples
+    transmitters, samples = radar.shape[1], waveform.samples
     if chirps is None:
         runs = (radar.frame_count, transmitters)
         return _oscillator(noise, waveform, delay, seed, runs, samples)[..., :samples]
@@ -380,9 +380,8 @@ def channel_errors(
     """
     checked_number(gain_std_db, "gain_std_db", 0.0)
     checked_number(phase_std, "phase_std [rad]", 0.0)
-    shape = (2, len(radar.transmitters.positions), len(radar.receivers.positions))
     generator = torch.Generator().manual_seed(seed)
-    gain, phase = torch.randn(shape, dtype=torch.float64, generator=generator)
+    gain, phase = torch.randn((2, *radar.shape[1:]), dtype=torch.float64, generator=generator)
     return torch.polar(10 ** (gain_std_db / 20 * gain), phase_std * phase)
 
 

@@ -141,7 +141,7 @@ def moving_beat(
             "simulate their motion chirp by chirp with simulate_chirps(retrace=True)"
         )
     train = Train(paths, radar, places or _uniform(paths), tolerance)
-    return every_ramp(chirps, len(radar.transmitters.positions), train.ramp)
+    return every_ramp(chirps, radar.shape[1], train.ramp)
 
 
 def every_ramp(

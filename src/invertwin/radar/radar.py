@@ -19,7 +19,7 @@ from invertwin.radar.waveform import (
     Waveform,
 )
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import checked_tensor
+from invertwin.scene.checks import check_shape, checked_tensor
 
 # Antennas closer than this see the same surfaces: one visibility test serves both.
 _SHARED_VISIBILITY_DISTANCE = 0.1
@@ -78,11 +78,10 @@ class Radar:
                     f"expected {name} to be one of {', '.join(WINDOWS)}, "
                     f"got {getattr(self, name)!r}; choose one of them"
                 )
-        if not self._shared_visibility and len(self.transmitters.positions) > 1:
+        if not self._shared_visibility and self.shape[1] > 1:
             raise InputError(
-                "expected one transmitter when TX and RX see separately, got "
-                f"{len(self.transmitters.positions)}; set shared_visibility=True "
-                "or use one transmitter"
+                f"expected one transmitter when TX and RX see separately, got {self.shape[1]}; "
+                "set shared_visibility=True or use one transmitter"
             )
         self._warn_about_spacing()
 
@@ -90,6 +89,12 @@ class Radar:
     def frame_count(self) -> int:
         """Number of poses."""
         return self.positions.shape[0]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Numbers of poses, transmitters and receivers."""
+        elements = len(self.transmitters.positions), len(self.receivers.positions)
+        return self.frame_count, *elements
 
     @property
     def virtual_positions(self) -> Float64[Tensor, "virtual 3"]:
@@ -275,13 +280,9 @@ def checked_beat(
     Raises:
         InputError: It has another shape.
     """
-    channels = len(radar.transmitters.positions), len(radar.receivers.positions)
-    expected = (radar.frame_count, *channels, sampled(radar).samples)
-    if tuple(beat.shape) != expected:
-        raise InputError(
-            f"expected a beat signal of shape {expected} (frame, tx, rx, sample), got "
-            f"{tuple(beat.shape)}; use the radar that recorded it"
-        )
+    expected = (*radar.shape, sampled(radar).samples)
+    what = "a beat signal (frame, tx, rx, sample)"
+    check_shape(beat, expected, what, "use the radar that recorded it")
     return beat
 
 

@@ -4,7 +4,7 @@ import math
 import operator
 from collections.abc import Sequence
 from functools import cache
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -37,23 +37,41 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
     Raises:
         InputError: not numbers, wrong shape, NaN or infinite.
     """
-    sizes = ", ".join("any" if size is None else str(size) for size in shape)
-    expected = f"expected {what} as numbers of shape [{sizes}]"
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
+        expected = f"expected {what} as numbers of shape {_listed(shape)}"
         raise InputError(f"{expected}, got {type(value).__name__}; {do}") from None
-    fits = len(tensor.shape) == len(shape) and all(
-        size is None or size == actual for size, actual in zip(shape, tensor.shape, strict=True)
-    )
-    if not fits:
-        raise InputError(f"{expected}, got shape {list(tensor.shape)}; {do}")
+    check_shape(tensor, shape, f"{what} as numbers", do)
     bad = int((~torch.isfinite(tensor)).sum())
     if bad:
         raise InputError(
             f"expected finite {what}, got {bad} NaN or infinite of {tensor.numel()}; {do}"
         )
     return tensor
+
+
+def check_shape(value: Tensor, shape: Sequence[int | None], what: str, do: str) -> None:
+    """Raise unless a tensor has the given shape.
+
+    Args:
+        value: the tensor.
+        shape: expected size of every dimension, None where any size will do.
+        what: what the value is, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: another shape.
+    """
+    pairs = zip(shape, value.shape, strict=False)
+    if value.ndim != len(shape) or any(size not in (None, actual) for size, actual in pairs):
+        raise InputError(
+            f"expected {what} of shape {_listed(shape)}, got shape {list(value.shape)}; {do}"
+        )
+
+
+def _listed(shape: Sequence[int | None]) -> str:
+    return f"[{', '.join('any' if size is None else str(size) for size in shape)}]"
 
 
 def checked_number(
@@ -104,25 +122,33 @@ def checked_count(value: object, what: str, low: int) -> int:
 
 
 def check_fields(holder: object) -> None:
-    """Raise unless the numbers in the fields of a dataclass keep to their annotations.
+    """Raise unless the fields of a dataclass keep to the limits in their annotations.
 
     Fields that are None have no limits. In a tuple every item is checked.
 
     Raises:
-        InputError: a number that is beyond a limit, not finite, not whole where a count is
-            expected, or evidently in another unit.
+        InputError: a word that is not one of those allowed; a number that is beyond a limit, not
+            finite, not whole where a count is expected, or evidently in another unit.
     """
     for name, found in _marks_of_fields(type(holder)).items():
         value = getattr(holder, name)
+        allowed = [word for mark in found if get_origin(mark) is Literal for word in get_args(mark)]
+        if allowed and value not in allowed:
+            listed = ", ".join(map(str, allowed))
+            raise InputError(f"expected {name} among {listed}, got {value!r}; choose one of them")
         for number in value if isinstance(value, tuple) else (value,):
-            if number is not None:
+            if number is not None and not allowed:
                 _check_number(holder, name, number, found)
 
 
 @cache
 def _marks_of_fields(kind: type) -> dict[str, tuple[Any, ...]]:
     found = {n: tuple(marks(h)) for n, h in get_type_hints(kind, include_extras=True).items()}
-    return {n: m for n, m in found.items() if any(type(mark) in _LIMITS for mark in m)}
+    return {
+        name: of
+        for name, of in found.items()
+        if any(type(mark) in _LIMITS or get_origin(mark) is Literal for mark in of)
+    }
 
 
 def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings, shortest_loop
 from invertwin.errors import InputError
+from invertwin.scene.files import existing_file
 
 # By the first two digits of the device; later ones record through several kinds of link.
 _LANES = {"12": 4, "14": 4, "16": 2, "18": 2, "68": 2}
@@ -53,8 +54,7 @@ def read_text(path: Path, what: str) -> str:
     Raises:
         InputError: no such file, or one that is no text.
     """
-    if not path.is_file():
-        raise InputError(f"expected {what}, got no file {path}; check the path")
+    existing_file(path, what)
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -23,7 +23,7 @@ from invertwin.capture.ti.settings_files import read_settings, recorded_files
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.files import replacing
+from invertwin.scene.files import existing_file, replacing
 
 _WORD = np.dtype("<i2")
 _LANE_COUNT = 4
@@ -113,8 +113,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(part) for part in path]
     settings = _with_lanes(settings)
     for part in paths:
-        if not part.is_file():
-            raise InputError(f"expected a recording, got no file {part}; check the path")
+        existing_file(part, "a recording")
     # Files are split anywhere, so only their sum counts.
     size = sum(part.stat().st_size for part in paths)
     name = paths[0].name if paths else "nothing"
