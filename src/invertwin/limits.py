@@ -28,6 +28,16 @@ class Letters:
     allowed: str
 
 
+@dataclass(frozen=True)
+class Among:
+    """Marks a text that is one of these names."""
+
+    names: tuple[str, ...]
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: Any) -> Any:
+        return handler.generate_schema(Literal[self.names])
+
+
 Axes = Annotated[str, Letters("xyz")]
 
 

@@ -36,10 +36,10 @@ class SurrogateTable(Table):
 
 def register(registry: Registry) -> None:
     """Adds losses and optimizers; forward models of one's own come from plugins."""
-    registry.group(Group("loss", default="mse"))
-    registry.group(Group("optimizer", default="adam"))
-    registry.group(Group("model"))
-    registry.give(Grid, Surrogate)
+    registry.groups["loss"] = Group(default="mse")
+    registry.groups["optimizer"] = Group(default="adam")
+    registry.groups["model"] = Group()
+    registry.given |= {Grid, Surrogate}
     registry.add("loss", "mse", SpectrumLoss, without=("floor",))
     registry.add("loss", "likelihood", SpectrumLoss)
     for name in ("adam", "sgd", "gauss_newton"):

@@ -57,7 +57,7 @@ class Theta:
 
 def register(registry: Registry) -> None:
     """Adds the kinds of θ."""
-    registry.group(Group("theta"))
+    registry.groups["theta"] = Group()
     for name, make in (
         ("translation", translation),
         ("rotation", rotation),

@@ -13,8 +13,9 @@ from pydantic import GetCoreSchemaHandler, model_validator
 from torch import Tensor
 
 from invertwin.cli.registry import Form, Group, Registry, Table, number_or_list
-from invertwin.cli.section import Among, InputPath, Section, about, fail, key
+from invertwin.cli.section import InputPath, Section, about, fail, key
 from invertwin.errors import InputError
+from invertwin.limits import Among
 from invertwin.scene import (
     Dielectric,
     Itu,
@@ -103,10 +104,10 @@ class MediumTable(Table):
 
 def register(registry: Registry) -> None:
     """Adds the materials and what can be sought of them."""
-    registry.group(Group("material"))
-    registry.form(Texture, Form(_value_type, _value))
-    registry.base(Medium, MediumTable)
-    registry.give(Mesh)
+    registry.groups["material"] = Group()
+    registry.forms[Texture] = Form(_value_type, _value)
+    registry.bases[Medium] = MediumTable
+    registry.given.add(Mesh)
     for name, kind in _KINDS.items():
         registry.add("material", name, kind)
 

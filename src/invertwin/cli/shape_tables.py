@@ -99,10 +99,10 @@ class Mover(ParameterTable):
 
 def register(registry: Registry) -> None:
     """Adds shapes, and the modules of what is sought of them."""
-    registry.group(Group("shape", tag="shape", base=Placement))
-    registry.group(Group("object", tag="shape", base=ObjectTable, includes="shape"))
-    registry.group(Group("parameter", base=ParameterTable))
-    registry.give(Scene, Mesh, Object, ObjectTable, Bodies)
+    registry.groups["shape"] = Group(tag="shape", base=Placement)
+    registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
+    registry.groups["parameter"] = Group(base=ParameterTable)
+    registry.given |= {Scene, Mesh, Object, ObjectTable, Bodies}
     for name in ("plate", "box", "sphere", "dihedral", "trihedral", "text"):
         registry.add("shape", name, getattr(shapes, name))
     registry.add("shape", "vehicle", vehicle)

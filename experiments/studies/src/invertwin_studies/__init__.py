@@ -16,13 +16,13 @@ def register(registry: Any) -> None:
     from invertwin_studies.commands import loss_scan, train_prior
     from invertwin_studies.sections import LossScan, Methods
 
-    registry.section("methods", Methods)
-    registry.section("loss_scan", LossScan)
-    registry.command("loss-scan", loss_scan)
-    registry.command("train-prior", train_prior)
+    registry.sections["methods"] = Methods
+    registry.sections["loss_scan"] = LossScan
+    registry.commands["loss-scan"] = loss_scan
+    registry.commands["train-prior"] = train_prior
     for kind, file, board in (
         ("openradar", "openradar.npz", "xWR1642"),
         ("rail_sar", "bwsi_rail_trial6.npz", None),
     ):
         registry.add("data", kind, f"invertwin_studies.recordings.kinds:{kind}_data")
-        registry.recording(file, kind, board)
+        registry.recordings[file] = (kind, board)
