@@ -48,9 +48,9 @@ def locate(
 
     Args:
         capture: range profiles.
-        center: of the square, at the known height of the target [m].
+        center: middle of the square, at the known height of the target [m].
         radius: half the side of the square [m].
-        step: of the image from which the search starts [m]; below half a resolution cell.
+        step: pixel size of the image that starts the search [m]; below half a resolution cell.
 
     Raises:
         InputError: the capture holds beat samples, a point is beyond the measured ranges, or a step

@@ -65,7 +65,7 @@ class Capture:
         Args:
             beat: complex (I/Q) samples of every virtual channel; dtype and bits are kept.
             radar: what measured them.
-            times: of each frame [s].
+            times: time of each frame [s].
 
         Raises:
             InputError: real samples, or a shape that the radar does not have.
@@ -99,9 +99,9 @@ class Capture:
             profile: analytic signal at radio frequency: an echo from R turns by 4π f/c (r − R).
             ranges: R = L/2 of its samples, uniform, the bias already subtracted [m].
             radar: what measured them.
-            times: of each frame on the radar's clock [s].
+            times: time of each frame on the radar's clock [s].
             track: what the radar's positions were read from, at ``times + clock_offset``.
-            clock_offset: of the track's clock against the radar's [s].
+            clock_offset: how far the track's clock is ahead of the radar's [s].
             range_bias: what was subtracted from the radar's own ranges [m].
             survey: known positions of targets [m].
         """
@@ -237,7 +237,7 @@ class Capture:
         """A capture of the same data with another clock offset and range bias.
 
         Args:
-            clock_offset: of the track's clock against the radar's [s].
+            clock_offset: how far the track's clock is ahead of the radar's [s].
             range_bias: what is subtracted from the radar's own ranges [m].
 
         Raises:

@@ -127,7 +127,7 @@ def estimate_channels(
 
     Args:
         capture: samples with the reflector as the strongest echo at its range.
-        reflector: where it is in the world [m].
+        reflector: its position in the world [m].
 
     Raises:
         InputError: range profiles, a place that is no position or beyond the unambiguous range,

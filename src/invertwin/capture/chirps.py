@@ -31,22 +31,22 @@ class ChirpSettings:
     """What a board was told to send and to record: one FMCW profile, transmitters in turn (TDM).
 
     Attributes:
-        start_frequency: of the ramp, before the ADC starts [Hz].
-        slope: of the ramp [Hz/s].
-        sample_rate: of the ADC's output [Hz].
-        samples: per chirp and receiver.
+        start_frequency: frequency at the start of the ramp, before the ADC starts [Hz].
+        slope: how fast the frequency rises in a ramp [Hz/s].
+        sample_rate: output rate of the ADC [Hz].
+        samples: number of samples per chirp and receiver.
         transmit_order: numbers from 1 of the transmitters, in the order of sending in one loop.
         receivers: numbers from 1 of the recorded receivers, ascending.
-        loops: per frame; every transmitter sends once per loop.
-        frames: recorded; None = until it is stopped.
-        frame_period: from frame to frame [s]; None = not known.
-        idle_time: before each ramp [s].
-        adc_start_time: from the start of the ramp to the first sample [s].
-        ramp_end_time: from the start of the ramp to its end [s]; None = with the last sample.
+        loops: number of loops per frame; every transmitter sends once per loop.
+        frames: number of frames; None = the recording goes on until it is stopped.
+        frame_period: time between the starts of two frames [s]; None = not known.
+        idle_time: pause before each ramp [s].
+        adc_start_time: time from the start of the ramp to the first sample [s].
+        ramp_end_time: duration of the ramp [s]; None = it ends with the last sample.
         real: whether the ADC records real samples instead of I and Q.
         swap_iq: whether Q comes before I in the file.
-        bits: of the ADC.
-        lanes: of the LVDS link, 2 (xWR16xx, 18xx, 68xx) or 4 (xWR12xx, 14xx); None = not known.
+        bits: resolution of the ADC: 12, 14 or 16 bits.
+        lanes: lanes of the LVDS link: 4 (xWR12xx, 14xx) or 2 (later devices); None = not known.
 
     Raises:
         InputError: a value out of range, a transmitter that sends twice per loop, or a ramp that
@@ -130,7 +130,7 @@ class ChirpData:
         samples: (frame, chirp, tx, rx, sample); chirps are loops, transmitters in the order of
             sending, receivers ascending. Real samples have no imaginary part. ADC counts where
             they come from a file.
-        settings: what they were recorded with; its `frames` is None or the number of frames.
+        settings: settings of the recording; their `frames` is None or the number of frames.
 
     Raises:
         InputError: another shape than the settings say, or NaN.
@@ -191,8 +191,8 @@ class ChirpData:
         Args:
             transmitters: elements in the order of sending.
             receivers: elements in the order of `ChirpSettings.receivers`.
-            positions: of the radar in every frame [m]; None = the origin.
-            rotations: of the radar in every frame; None = axes of the world.
+            positions: position of the radar in every frame [m]; None = the origin.
+            rotations: orientation of the radar in every frame; None = axes of the world.
 
         Raises:
             InputError: another number of elements.
@@ -227,8 +227,8 @@ class ChirpData:
             transmitters: elements in the order of sending.
             receivers: elements in the order of `ChirpSettings.receivers`.
             chirps: "mean", or the number from 0 of the chirp to take.
-            positions: of the radar in every frame [m]; None = the origin.
-            rotations: of the radar in every frame; None = axes of the world.
+            positions: position of the radar in every frame [m]; None = the origin.
+            rotations: orientation of the radar in every frame; None = axes of the world.
 
         Raises:
             InputError: another number of elements, or a chirp that does not exist.
@@ -302,15 +302,15 @@ def settings_of(
     """Settings that record this waveform with all transmitters in turn and all receivers.
 
     Args:
-        waveform: of every ramp.
-        transmitters: how many.
-        receivers: how many.
+        waveform: waveform of every ramp.
+        transmitters: number of transmitters.
+        receivers: number of receivers.
         loops: chirps of each transmitter in a frame.
-        frames: how many, if it is known.
-        frame_period: from frame to frame [s].
-        idle_time: between ramps [s].
-        lanes: of the LVDS link.
-        order: of the transmitters, counted from 0, as in `Chirps`; None = TX1, TX2, …
+        frames: number of frames; None = not known.
+        frame_period: time between the starts of two frames [s].
+        idle_time: pause between ramps [s].
+        lanes: lanes of the LVDS link.
+        order: transmitters in their order of sending, counted from 0; None = TX1, TX2, …
 
     Raises:
         InputError: see `ChirpSettings`; an order of other transmitters.

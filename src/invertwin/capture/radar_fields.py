@@ -119,8 +119,8 @@ def tensor(dataset: xr.Dataset, name: str) -> Tensor:
     """A copy of a variable as a tensor.
 
     Args:
-        dataset: of a capture.
-        name: of the variable.
+        dataset: dataset of a capture.
+        name: name of the variable.
 
     Raises:
         InputError: the variable is missing.
@@ -132,8 +132,8 @@ def attribute(attributes: Mapping[Hashable, Any], name: str) -> Any:
     """An attribute of a capture.
 
     Args:
-        attributes: of a capture.
-        name: of the attribute.
+        attributes: attributes of a capture.
+        name: name of the attribute.
 
     Raises:
         InputError: the attribute is missing.

@@ -34,7 +34,7 @@ from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, mod
 
 from invertwin.cli.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, Letters
+from invertwin.limits import RADIANS, Letters, marks
 
 BUILT_IN = (
     "invertwin.cli.sensors",
@@ -470,19 +470,12 @@ def _members(hint: Any) -> tuple[Any, ...]:
     return (hint,)
 
 
-def _marks(hint: Any) -> tuple[Any, ...]:
-    found = hint.__metadata__ if get_origin(hint) is Annotated else ()
-    if get_origin(hint) in (Union, UnionType, Annotated):
-        found += tuple(mark for part in get_args(hint) for mark in _marks(part))
-    return found
-
-
 def _is_angle(hint: Any) -> bool:
-    return RADIANS in [mark for mark in _marks(hint) if isinstance(mark, str)]
+    return RADIANS in [mark for mark in marks(hint) if isinstance(mark, str)]
 
 
 def _letters(hint: Any) -> str:
-    return next((mark.allowed for mark in _marks(hint) if isinstance(mark, Letters)), "")
+    return next((mark.allowed for mark in marks(hint) if isinstance(mark, Letters)), "")
 
 
 def _is_array(kind: Any) -> bool:

@@ -62,7 +62,7 @@ class Checkpoint(Callback):
     datum is refused, and a loss function of one's own is recognised in a new process.
 
     Attributes:
-        file: Where.
+        file: The checkpoint file.
         every: Steps from one file to the next.
         resume: Go on from the file if it is there.
     """

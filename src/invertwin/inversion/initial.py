@@ -133,7 +133,7 @@ def echo_image(
     Args:
         capture: the data.
         grid: bins of its maps.
-        points: in the world [m].
+        points: positions in the world [m].
     """
     flat = points.reshape(-1, 3)
     if grid.u_count == grid.v_count == 1:
@@ -161,7 +161,7 @@ def image_points(
         grid: bins of its maps.
         low: corner of the image in the world [m].
         high: the opposite corner [m].
-        step: of the image [m], about.
+        step: distance of neighbouring nodes, about [m].
         share: least brightness of a node, relative to the strongest.
 
     Raises:
@@ -212,7 +212,7 @@ def fit_rectangle(
     the points, since radar detections scatter.
 
     Args:
-        points: in the world [m].
+        points: positions in the world [m].
         radar: its positions tell which sides are near.
         ground: the plane.
         resolution: distance below which points are on a side [m].
@@ -320,14 +320,14 @@ def best_pose(
     Args:
         scene: with the object anywhere.
         name: the object.
-        poses: to choose from.
-        radar: of the capture.
+        poses: the poses to choose from.
+        radar: radar of the capture.
         capture: the data.
         grid: bins that are compared.
         loss: (simulated, measured) → a number.
         surrogate: kernels; extra widths make the choice robust.
-        samples: of one simulation.
-        seed: of the samples.
+        samples: number of rays of one simulation.
+        seed: seed of the samples.
 
     Raises:
         InputError: no poses.
@@ -384,7 +384,7 @@ def guess_density(
         capture: the data.
         grid: bins of its maps.
         item: the object; its pose carries the box.
-        name: of the object.
+        name: name of the object.
         low: corner of the box in the object's frame [m].
         high: the opposite corner [m].
         counts: nodes along x, y and z.

@@ -26,7 +26,7 @@ class Optimizer:
         rotation_rate: Rate of parameters named ``rotation``; None = ``rate``.
         final_rate: What ``rate`` has fallen to at the last step, along a cosine; None = ``rate`` /
             20. The rates of all parameters fall alike.
-        momentum: Of SGD.
+        momentum: Momentum of SGD.
         curvature_every: For Gauss–Newton, steps from one curvature to the next. Derivatives of the
             map with respect to every parameter cost most of a step.
     """

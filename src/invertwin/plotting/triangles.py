@@ -21,7 +21,7 @@ def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest:
     """Draws shapes as an eye far away sees them.
 
     Args:
-        axes: Where to draw.
+        axes: Matplotlib axes to draw in.
         shapes: What to draw: each with its colour.
         eye: Right, up and towards the eye, as rows [3, 3].
         longest: Sides of triangles above this are split, so that sorting by depth is right [m].

@@ -31,9 +31,9 @@ def backproject_beat(
     Source: the matched filter of the paper's eq:fmcw_if.
 
     Args:
-        beat: Of all frames.
+        beat: Beat signals of all frames.
         radar: With the pose of each frame.
-        points: In the world [m].
+        points: Positions in the world [m].
 
     Raises:
         InputError: The signal does not fit the radar, which may have none, or a point lies
@@ -89,7 +89,7 @@ def between_samples(
 
     Args:
         samples: Rows of samples.
-        index: Where in each row, in samples; fractions allowed.
+        index: Place in each row, in samples; it may have a fraction.
     """
     cell = index.detach().floor().clamp(0, samples.shape[1] - 2).long()
     before, after = samples.gather(1, cell), samples.gather(1, cell + 1)

@@ -31,8 +31,8 @@ class PointCloud:
         range: R = L/2 [m].
         velocity: Range rate, positive moves away [m/s].
         u, v: Direction cosines in the radar frame; 0 along an axis that is not resolved.
-        power: Of the strongest direction, received over transmitted.
-        position: In the world, from the middle of the phase centres [m].
+        power: Power in the strongest direction, received over transmitted.
+        position: Position in the world, seen from the middle of the phase centres [m].
     """
 
     frame: Int64[Tensor, " point"]
@@ -98,11 +98,11 @@ def ordered_statistics_cfar(
     Source: Rohling, Radar CFAR thresholding in clutter and multiple target situations, 1983.
 
     Args:
-        power: As for ``cell_averaging_cfar``, and so are the rest.
-        guard: Cells to either side that the target fills.
-        training: Cells beyond those.
+        power: Maps over the last two axes, such as range rate and range.
+        guard: Cells to either side along both axes that the target itself fills.
+        training: Cells beyond those to either side.
         false_alarm: Probability that a cell of noise is detected.
-        looks: Independent looks in a cell's power.
+        looks: Independent looks in the mean that is a cell's power.
         rank: Place of the chosen cell in ascending order, as a part of their number.
 
     Raises:
@@ -135,10 +135,10 @@ def point_cloud(
     through the logarithms of the power at a peak and its two neighbours.
 
     Args:
-        power: Of ``range_doppler_angle``.
+        power: Result of ``range_doppler_angle``.
         detections: Cells that hold targets.
         radar: With the poses of the frames.
-        grid: Of the power.
+        grid: Bins of the power.
         chirps: Timing, for the range rates.
         fold: What was given to ``range_doppler_angle``.
 
@@ -182,10 +182,10 @@ def peaks(
     direction alone. Refined by the same parabola; range rates are zero.
 
     Args:
-        power: Of ``exact_spectrum`` or ``Capture.spectrum``.
+        power: Result of ``exact_spectrum`` or ``Capture.spectrum``.
         detections: Cells of the strongest elevation that hold targets.
         radar: With the poses of the frames.
-        grid: Of the power.
+        grid: Bins of the power.
 
     Raises:
         InputError: Power with gradients, or shapes that do not fit each other.

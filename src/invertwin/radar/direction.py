@@ -28,7 +28,7 @@ class _Snapshots:
     Attributes:
         values: One row per snapshot, elements as columns.
         array: The whole virtual array.
-        x, y: Of the elements, in the radar frame [m].
+        x, y: Positions of the elements in the radar frame [m].
     """
 
     values: Complex128[Tensor, "frame range snapshot element"]
@@ -106,12 +106,12 @@ def music(
     either, and damped where the gap itself vanishes and the subspace jumps.
 
     Args:
-        profile: As for ``capon``.
+        profile: Range profiles; snapshots are chirps or Doppler bins, see ``capon``.
         radar: Its array, without window; its poses are not used.
         grid: Its directions.
         sources: How many in every bin, or the rule that counts them in each: ``mdl`` or ``aic``.
-        smoothing: As for ``capon``.
-        forward_backward: As for ``capon``.
+        smoothing: Elements of the subarrays along x and y; None = no smoothing, see ``capon``.
+        forward_backward: Average with the array read backwards, which doubles the snapshots.
 
     Raises:
         InputError: As for ``capon``; an unknown rule; more sources than elements less one or
@@ -148,7 +148,7 @@ def source_count(
     Source: Wax and Kailath, Detection of signals by information theoretic criteria, 1985.
 
     Args:
-        eigenvalues: In any order, M of them.
+        eigenvalues: M eigenvalues in any order.
         snapshots: N, independent ones in the covariance.
         rule: ``mdl`` (consistent) or ``aic`` (finds weaker sources, and some that are none).
 

@@ -40,7 +40,7 @@ def velocity_axis(
     Args:
         radar: Its transmitters and wavelength.
         chirps: Timing.
-        bins: As many as chirps (None) or more; zero is at ``bins // 2``.
+        bins: Number of bins, at least that of chirps (None); range rate 0 is at ``bins // 2``.
     """
     bins = chirps.count if bins is None else bins
     places = (torch.arange(bins, dtype=torch.float64) - bins // 2) / bins
@@ -79,7 +79,7 @@ def range_doppler(
         grid: Its ranges are used.
         chirps: Timing.
         window: Over the chirps, one of ``WINDOWS``.
-        bins: Of range rate, at least as many as chirps (None).
+        bins: Number of range rates, at least that of chirps (None).
 
     Raises:
         InputError: Signal, radar and chirps do not fit, an unknown window, or too few bins.
@@ -114,10 +114,10 @@ def compensate_tdm(
     loop to loop: ``fold`` says by how many spans of the velocity axis a bin's target is beyond it.
 
     Args:
-        spectrum: Of ``range_doppler``.
+        spectrum: Result of ``range_doppler``.
         radar: Its transmitters take turns in their order.
         chirps: Timing.
-        fold: For all bins, or for each (``resolve_fold`` finds it).
+        fold: One number for all bins, or one for each (``resolve_fold`` finds it).
 
     Raises:
         InputError: Another number of transmitters in the spectrum than in the radar.
@@ -151,7 +151,7 @@ def resolve_fold(
     take turns, candidates that differ by N cannot be told apart. A choice; no gradients.
 
     Args:
-        spectrum: Of ``range_doppler``, not compensated.
+        spectrum: Result of ``range_doppler``, not compensated.
         radar: With several transmitters.
         grid: With the directions in which to look for the peak.
         chirps: Timing.
@@ -218,7 +218,7 @@ def micro_doppler(
         radar: Its transmitters and wavelength.
         chirps: Timing; the signal may be of more or fewer of them.
         length: Chirps in a window.
-        step: From one window to the next, in chirps.
+        step: Chirps from the start of one window to that of the next.
         window: One of ``WINDOWS``.
 
     Raises:

@@ -155,7 +155,7 @@ def sharp_map(
         radar: Its array.
         grid: Directions.
         method: capon or music.
-        sources: For music; None = counted in each range.
+        sources: Number of sources for music; None = they are counted in each range.
 
     Raises:
         InputError: As ``capon`` and ``music``.

@@ -44,7 +44,7 @@ class PhaseNoise:
     first and last of several points it stays. A single point stands for −20 dB per decade.
 
     Attributes:
-        offsets: From the carrier, ascending [Hz].
+        offsets: Distances from the carrier, ascending [Hz].
         levels: Single-sideband level L(f) at them [dBc/Hz].
 
     Raises:
@@ -107,7 +107,7 @@ class ADC:
     """Converter of I and of Q: uniform steps, two's complement codes, clipped at the ends.
 
     Attributes:
-        bits: Of each of the two.
+        bits: Resolution of each of the two, 2 to 32 bits.
         full_scale: Amplitude that the most negative code stands for, in the units of the beat
             signal, √(received over transmitted power).
 
@@ -132,13 +132,13 @@ class Impairments:
     """Which impairments a recording has; with the defaults it is the plain beat signal.
 
     Attributes:
-        phase_noise: Of the common oscillator.
-        leakage: From transmitters to receivers.
+        phase_noise: Phase noise of the common oscillator.
+        leakage: Direct path from transmitters to receivers.
         gain_std_db: Standard deviation of the channels' gains [dB].
         phase_std: Standard deviation of the channels' phases [rad].
         snr_db: Thermal noise, relative to the mean power of the signal, leakage included [dB].
         noise_figure_db: Thermal noise of a receiver instead [dB].
-        transmit_power: Of one transmitter, for the noise figure [W].
+        transmit_power: Power of one transmitter, for the noise figure [W].
         adc: Converter.
 
     Raises:
@@ -174,7 +174,7 @@ class Impairments:
         Args:
             paths: Field paths.
             radar: One with samples.
-            seed: Of all that is drawn.
+            seed: Seed of all random numbers.
             chirps: Timing of a train, as for ``moving_beat``; None = one ramp a frame.
 
         Raises:
@@ -197,7 +197,7 @@ class Impairments:
         Args:
             beat: Without impairments.
             radar: What records it.
-            seed: Of all that is drawn.
+            seed: Seed of all random numbers.
 
         Raises:
             InputError: Phase noise, which each path has of its own; otherwise as ``record``.
@@ -260,7 +260,7 @@ def noisy_oscillator_beat(
         paths: Field paths.
         radar: An FMCW or stepped frequency radar.
         noise: Its level.
-        seed: Of the noise, see ``residual_phase``.
+        seed: Seed of the noise, see ``residual_phase``.
         chirps: Timing of a train; None = one ramp a frame.
 
     Raises:
@@ -312,7 +312,7 @@ def residual_phase(
         noise: Level of φ.
         radar: An FMCW or stepped frequency radar.
         delay: τ of the echo [s].
-        seed: Of φ, independent for each frame.
+        seed: Seed of φ, which is independent for each frame.
         chirps: Timing of a train; None = one ramp a frame.
 
     Raises:
@@ -373,7 +373,7 @@ def channel_errors(
         radar: Its arrays.
         gain_std_db: Standard deviation of the gain [dB].
         phase_std: Standard deviation of the phase [rad].
-        seed: Of both.
+        seed: Seed of gains and phases.
 
     Raises:
         InputError: A negative deviation.

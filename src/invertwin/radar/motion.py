@@ -36,7 +36,7 @@ class Chirps:
 
     Attributes:
         count: Chirps of each transmitter in a frame (loops).
-        interval: From one ramp's start to the next, idle time included [s].
+        interval: Time from the start of one ramp to the next, idle time included [s].
         tdm: Transmitters take turns (time-division MIMO); else they send at once, told apart
             by an ideal code.
         order: Transmitters, counted from 0, in the order of their turns; None = 0, 1, 2, …
@@ -119,12 +119,12 @@ def moving_beat(
     Differs from the source: the paper's scenes stand still.
 
     Args:
-        paths: From ``trace_field`` of a scene with velocities.
+        paths: Paths that ``trace_field`` gives for a scene with velocities.
         radar: One with samples, at rest within a frame.
         chirps: Timing.
         places: World positions of the paths' points [m] at a time [s] after the start of the
             frame, for motion that is not uniform; None = they move with their velocities.
-        tolerance: As in ``beat_signal``.
+        tolerance: Relative error of the sums, see ``beat_signal``.
 
     Raises:
         InputError: As ``beat_signal``; moving paths of several bounces; points so fast that a
@@ -172,7 +172,7 @@ def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
     Positive moves away; the Doppler frequency is 2/λ times it.
 
     Args:
-        paths: Of one bounce; zero where they carry no velocity.
+        paths: Paths of one bounce; the rate is zero where they carry no velocity.
         radar: At rest.
     """
     if paths.velocity is None:
@@ -203,7 +203,7 @@ class Train:
         paths: Their frames, coefficients, and delays at their first points.
         radar: One with samples.
         places: Positions of the first points at a time; the last ones move with them.
-        tolerance: Of the sums.
+        tolerance: Relative error of the sums.
     """
 
     paths: Paths
@@ -217,7 +217,7 @@ class Train:
         """Record one ramp with all receivers.
 
         Args:
-            start: Of the ramp [s].
+            start: Start of the ramp [s].
             senders: Transmitters that send at once.
         """
         paths, waveform = self.paths, sampled(self.radar)

@@ -42,7 +42,7 @@ def moving_power(
 
     Args:
         paths: One-bounce power paths, where the points are in the middle of the frame's chirps.
-        velocities: Of their points, in the world [m/s].
+        velocities: Velocities of their points in the world [m/s].
         radar: What records.
         grid: Ranges and directions.
         chirps: Timing.

@@ -22,7 +22,7 @@ from invertwin.radar.waveform import (
     Waveform,
 )
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import check_shape, checked_tensor
+from invertwin.scene.checks import check_fields, check_shape, checked_tensor
 
 Window = Annotated[str, Among(WINDOWS)]
 Cosine = Annotated[float, Gt(0), Le(1)]
@@ -77,12 +77,7 @@ class Radar:
         if self.rotations is not None:
             rotations = _checked_rotations(self.rotations, len(positions))
             object.__setattr__(self, "rotations", rotations)
-        for name in ("window", "array_window"):
-            if getattr(self, name) not in WINDOWS:
-                raise InputError(
-                    f"expected {name} to be one of {', '.join(WINDOWS)}, "
-                    f"got {getattr(self, name)!r}; choose one of them"
-                )
+        check_fields(self)
         if not self._shared_visibility and self.shape[1] > 1:
             raise InputError(
                 f"expected one transmitter when TX and RX see separately, got {self.shape[1]}; "

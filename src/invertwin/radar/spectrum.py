@@ -96,7 +96,7 @@ class Aperture:
 
         Args:
             cosines: Direction cosines u.
-            places: Of the elements x [m].
+            places: Positions x of the elements [m].
         """
         phase = 2 * math.pi / self.wavelength * cosines[:, None] * places[None]
         return torch.polar(torch.ones_like(phase), phase)
@@ -113,8 +113,8 @@ class Aperture:
         Args:
             u: Direction cosines along x.
             v: Direction cosines along y.
-            x: Of the elements [m].
-            y: Of the elements [m].
+            x: Positions of the elements along x [m].
+            y: Positions of the elements along y [m].
         """
         return (self.steering(u, x)[:, None] * self.steering(v, y)).flatten(0, 1)
 
@@ -141,7 +141,7 @@ def beamform(
     |a|². Along an axis that the grid does not resolve, the power of the elements is averaged.
 
     Args:
-        profile: From ``range_profile``.
+        profile: Range profiles from ``range_profile``.
         radar: What recorded it.
         grid: Bins of range and direction.
 

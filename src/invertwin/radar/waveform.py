@@ -53,7 +53,7 @@ class Waveform(ABC):
         """Power of a point target beside its range, peak 1.
 
         Args:
-            distance: From the target's range [m].
+            distance: Distance from the target's range [m].
             window: Taper of the samples.
         """
 
@@ -65,9 +65,9 @@ class SampledWaveform(Waveform):
     range transform, its windows and the surrogate's response follow from that alone.
 
     Attributes:
-        start_frequency: Of the first sample [Hz].
+        start_frequency: Frequency of the first sample [Hz].
         samples: Number of frequencies.
-        step: From one sample to the next [Hz].
+        step: Frequency step from one sample to the next [Hz].
         noise_bandwidth: Thermal noise in a sample is kT0F times this, over the transmit power
             [Hz].
     """
@@ -98,7 +98,7 @@ class SampledWaveform(Waveform):
         """Power |Σ w_n exp(2πj n d/R_max) / Σ w_n|² of a point target beside its range.
 
         Args:
-            distance: d, from the target's range [m].
+            distance: Distance d from the target's range [m].
             window: Taper w of the samples.
         """
         weight = unit_window(window, self.samples).to(torch.complex128)
@@ -114,7 +114,7 @@ class FMCW(SampledWaveform):
 
     Attributes:
         start_frequency: Frequency at t = 0 [Hz].
-        bandwidth: Swept during ``duration`` [Hz].
+        bandwidth: Bandwidth that is swept during ``duration`` [Hz].
         duration: Sampled part of the ramp [s].
         samples: Samples per ramp.
 
@@ -166,8 +166,8 @@ class SteppedFrequency(SampledWaveform):
     """Tones one after the other, each measured once its echoes have settled.
 
     Attributes:
-        start_frequency: Of the first tone [Hz].
-        step: From one tone to the next [Hz].
+        start_frequency: Frequency of the first tone [Hz].
+        step: Frequency step from one tone to the next [Hz].
         samples: Number of tones.
         dwell: Time on each tone, over which its sample is averaged [s].
 
@@ -213,9 +213,9 @@ class OFDM(SampledWaveform):
     is ``conj(H)``, so that ``range_profile`` forms the usual inverse FFT of ``Y/X``.
 
     Attributes:
-        start_frequency: Of the lowest subcarrier [Hz].
-        spacing: Between subcarriers [Hz].
-        subcarriers: How many.
+        start_frequency: Frequency of the lowest subcarrier [Hz].
+        spacing: Frequency step between neighbouring subcarriers [Hz].
+        subcarriers: Number of subcarriers.
 
     Raises:
         InputError: A value is not positive or its unit is evidently wrong.
@@ -259,7 +259,7 @@ class OFDM(SampledWaveform):
         """Y = H X: what the receiver's FFT gives for these symbols.
 
         Args:
-            beat: From ``beat_signal``.
+            beat: Signals from ``beat_signal``.
             symbols: X, sent on each subcarrier.
 
         Raises:
@@ -274,7 +274,7 @@ class OFDM(SampledWaveform):
         """conj(Y / X), the samples that ``range_profile`` takes.
 
         Args:
-            received: Y.
+            received: Y, what the receiver's FFT gives.
             symbols: X, sent on each subcarrier.
 
         Raises:
@@ -324,7 +324,7 @@ class Impulse(Waveform):
         """Power of the pulse beside the target's range, peak 1.
 
         Args:
-            distance: From the target's range [m].
+            distance: Distance from the target's range [m].
             window: Ignored: a pulse has no samples to taper.
         """
         return gaussian_response(self, distance)
@@ -363,7 +363,7 @@ def unit_window(name: str, count: int) -> Float64[Tensor, " sample"]:
 
     Args:
         name: One of ``WINDOWS``.
-        count: How many there are.
+        count: Number of samples or chirps.
 
     Raises:
         InputError: An unknown window.
@@ -378,8 +378,8 @@ def gaussian_response(
     """Gaussian whose full width at half maximum is one range cell, peak 1.
 
     Args:
-        waveform: Its range cell.
-        distance: From the peak [m].
+        waveform: Waveform whose range cell counts.
+        distance: Distance from the peak [m].
     """
     sigma = SIGMA_PER_FWHM * waveform.range_resolution
     return torch.exp(-0.5 * (distance / sigma).square())

@@ -12,7 +12,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.limits import Usual, marks
+from invertwin.limits import Among, Usual, marks
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 Point = Annotated[ArrayLike, Len(3, 3)]
@@ -132,10 +132,12 @@ def check_fields(holder: object) -> None:
     """
     for name, found in _marks_of_fields(type(holder)).items():
         value = getattr(holder, name)
-        allowed = [word for mark in found if get_origin(mark) is Literal for word in get_args(mark)]
+        allowed = [word for mark in found for word in _words(mark)]
         if allowed and value not in allowed:
-            listed = ", ".join(map(str, allowed))
-            raise InputError(f"expected {name} among {listed}, got {value!r}; choose one of them")
+            raise InputError(
+                f"expected {name} to be one of {', '.join(allowed)}, got {value!r}; "
+                "choose one of them"
+            )
         for number in value if isinstance(value, tuple) else (value,):
             if number is not None and not allowed:
                 _check_number(holder, name, number, found)
@@ -147,8 +149,14 @@ def _marks_of_fields(kind: type) -> dict[str, tuple[Any, ...]]:
     return {
         name: of
         for name, of in found.items()
-        if any(type(mark) in _LIMITS or get_origin(mark) is Literal for mark in of)
+        if any(type(mark) in _LIMITS or _words(mark) for mark in of)
     }
+
+
+def _words(mark: Any) -> tuple[str, ...]:
+    if isinstance(mark, Among):
+        return mark.names
+    return get_args(mark) if get_origin(mark) is Literal else ()
 
 
 def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]) -> None:

@@ -93,7 +93,7 @@ def look_at(
     """Rotations whose boresight (third column) points at a target, x level, y upwards.
 
     Args:
-        positions: where the radar is [m].
+        positions: positions of the radar [m].
         target: what it looks at [m].
 
     Raises:

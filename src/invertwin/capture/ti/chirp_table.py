@@ -120,7 +120,7 @@ def settings(
         order: transmitters in their order of sending.
         loops: how often the order is sent in a frame.
         frames: number of frames; 0 = endless.
-        period_ms: from frame to frame [ms].
+        period_ms: time between the starts of two frames [ms].
         values: further fields of `ChirpSettings`.
     """
     order, loops = shortest_loop(order, loops)

@@ -53,9 +53,9 @@ def read(
         elevation: sign of elevation of the preset, see `Board.arrays`.
         azimuth: sign of azimuth of the preset.
         arrays: TX and RX elements in use, instead of a preset.
-        lanes: of the LVDS link, where the settings do not say.
-        positions: of the radar in every frame [m]; None = the origin.
-        rotations: of the radar in every frame; None = axes of the world.
+        lanes: lanes of the LVDS link, where the settings do not say.
+        positions: position of the radar in every frame [m]; None = the origin.
+        rotations: orientation of the radar in every frame; None = axes of the world.
 
     Raises:
         InputError: what `read_samples` and `ChirpData.capture` raise, or no board.
@@ -76,8 +76,8 @@ def read_recording(
 
     Args:
         path: `.bin` file, or a `.setup.json` that names the files.
-        settings: as for `read`.
-        lanes: of the LVDS link, where the settings do not say.
+        settings: the settings or their file; None = those that the `.setup.json` names.
+        lanes: lanes of the LVDS link, where the settings do not say.
 
     Raises:
         InputError: other lanes than the settings say, or what `read_settings` and `read_samples`

@@ -27,7 +27,7 @@ class DensityGrid(nn.Module):
 
     Attributes:
         value: parameter [x, y, z].
-        albedo: of the cloud.
+        albedo: albedo of the cloud, see ``Cloud``.
     """
 
     def __init__(

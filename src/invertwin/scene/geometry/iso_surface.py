@@ -54,7 +54,7 @@ def surface_of(
     """Places of vertices, without derivatives, and triangles.
 
     Args:
-        field: as above.
+        field: the signed distance at points in the box.
         lattice: nodes on which the field is known.
         values: there.
 
@@ -93,7 +93,7 @@ def follow(
 
     Args:
         field: whose zero the points are on.
-        points: of the surface [m].
+        points: points of the surface [m].
         slope: the field's gradient there, where it is known already; None asks the field.
     """
     fixed = points.detach()

@@ -107,7 +107,7 @@ def tensor_product(
     Args:
         values: at the nodes.
         index: first node of each point along every axis.
-        weights: of four nodes along every axis.
+        weights: weights of four nodes along every axis.
     """
     steps = torch.arange(4)
     x, y, z = (index[:, k, None] + steps for k in range(3))

@@ -55,7 +55,7 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
 
     Args:
         height: [m].
-        spacing: of the triangles' corners [m].
+        spacing: distance of neighbouring corners of the triangles [m].
 
     Raises:
         InputError: a height or spacing out of range.

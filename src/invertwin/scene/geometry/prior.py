@@ -37,9 +37,9 @@ class Decoder(nn.Module):
 
         Args:
             latent: number of coordinates.
-            width: of the hidden layer.
+            width: size of the hidden layer.
             features: number of learned fields.
-            nodes: of half a grid.
+            nodes: number of nodes in half a grid.
         """
         super().__init__()
         self.enter = nn.Linear(latent, width)

@@ -75,7 +75,7 @@ def specular_weights(
 
     Args:
         diffuse: Lambertian part, 0 to 1.
-        exponent: of the specular lobe.
+        exponent: exponent of the specular lobe.
     """
     diffuse, exponent = torch.broadcast_tensors(diffuse, exponent)
     none = diffuse.new_zeros((*diffuse.shape, LOBE_COUNT - 1))
