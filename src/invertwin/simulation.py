@@ -1,4 +1,4 @@
-"""Exact signals on one page: scene → paths → beat signals → spectrum, as a real radar does it."""
+"""Simulate exact signals as a real radar records them: scene → paths → beat signal → spectrum."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Gain and phase of every channel: estimated from a reflector, saved, taken out of the data."""
+"""Calibration of the channels: estimate their gains from a reflector, save them, apply them."""
 
 import json
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ _DEAD = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ChannelCalibration:
-    """What every virtual channel multiplies its signal by.
+    """The complex gain of every virtual channel.
 
     Attributes:
         gains: measured over ideal signal, [tx, rx]; the mean of their squares is 1 and the sum is
@@ -116,7 +116,7 @@ class ChannelCalibration:
 def estimate_channels(
     capture: Capture, reflector: Float64[Tensor, "3"] | list[float]
 ) -> ChannelCalibration:
-    """Gains of the channels, from a reflector at a known place.
+    """Estimate the gains of the channels from a reflector at a known place.
 
     Each channel is compared with the beat signal of an ideal point there,
     ``c = Σ w_n s[n] conj(ideal[n])``, whose delays are exact to every element (so the reflector

@@ -28,7 +28,7 @@ Pause = Annotated[NonNegative, Usual("seconds", 5e-6, high=1.0)]
 
 @dataclass(frozen=True)
 class ChirpSettings:
-    """What a board was told to send and to record: one FMCW profile, transmitters in turn (TDM).
+    """Settings of a board that sends one FMCW profile with its transmitters in turn (TDM).
 
     Attributes:
         start_frequency: frequency at the start of the ramp, before the ADC starts [Hz].
@@ -115,7 +115,7 @@ class ChirpSettings:
 
     @property
     def chirps(self) -> Chirps:
-        """When the ramps of a frame start, as range-Doppler processing asks for it.
+        """When the ramps of a frame start.
 
         For the transmitters of `ChirpData`, which are in the order of sending already.
         """
@@ -156,7 +156,7 @@ class ChirpData:
         return self.samples.shape[0]
 
     def warn_if_saturated(self) -> None:
-        """Warns (`PhysicsWarning`) of samples at the ends of the ADC's range."""
+        """Warn (`PhysicsWarning`) where samples are at the ends of the ADC's range."""
         parts = torch.view_as_real(self.samples)
         top = 2 ** (self.settings.bits - 1) - 1
         count = int(((parts >= top) | (parts <= -top - 1)).any(dim=-1).sum())
@@ -242,7 +242,7 @@ def adc_counts(
     full_scale: float,
     order: Sequence[int] | None = None,
 ) -> ChirpData:
-    """Simulated samples as the counts that an ADC would have written.
+    """Convert simulated samples to the counts that an ADC writes.
 
     Amplitudes up to ``full_scale`` fit, what is beyond is clipped (and warned of). Of complex
     samples a real ADC keeps the real part.
@@ -274,7 +274,7 @@ def adc_counts(
 
 
 def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], int]:
-    """A repeated order of transmitters as its shortest period, sent that many times more often.
+    """Write a repeated order of transmitters as its shortest period and more loops.
 
     Args:
         order: transmitters in their order of sending.
@@ -299,7 +299,7 @@ def settings_of(
     lanes: int | None = None,
     order: Sequence[int] | None = None,
 ) -> ChirpSettings:
-    """Settings that record this waveform with all transmitters in turn and all receivers.
+    """Make settings for a waveform, all transmitters in turn and all receivers.
 
     Args:
         waveform: waveform of every ramp.

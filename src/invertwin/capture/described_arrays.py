@@ -47,7 +47,7 @@ def read(
     azimuth: int | None = None,
     arrays: tuple[AntennaArray, AntennaArray] | None = None,
 ) -> Capture:
-    """Described samples as a `Capture`, one beat signal per frame.
+    """Read described samples as a `Capture` with one beat signal per frame.
 
     The elements are those of the arguments or, without any, of the description's ``[radar]``:
     ``board``, ``elevation`` and ``azimuth`` of a preset, or ``tx_positions`` and ``rx_positions``
@@ -77,7 +77,7 @@ def described_elements(
     azimuth: int | None = None,
     arrays: tuple[AntennaArray, AntennaArray] | None = None,
 ) -> tuple[AntennaArray, AntennaArray]:
-    """TX and RX elements of described samples, see `read`.
+    """Find the TX and RX elements of described samples, see `read`.
 
     Args:
         path: file of the samples, beside its description.
@@ -103,7 +103,7 @@ def described_elements(
 
 
 def read_chirps(path: str | Path) -> ChirpData:
-    """Every chirp of described samples.
+    """Read every chirp of described samples.
 
     The description, in SI units::
 
@@ -161,7 +161,7 @@ def write_chirps(
     file: str,
     arrays: tuple[AntennaArray, AntennaArray] | None = None,
 ) -> None:
-    """Writes samples, bit for bit, and the description that `read_chirps` reads.
+    """Write samples, bit for bit, and the description that `read_chirps` reads.
 
     Args:
         path: the TOML file.

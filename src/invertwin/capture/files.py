@@ -10,7 +10,7 @@ from invertwin.scene.files import existing_file, replacing
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
-    """Writes to a file beside ``path`` and renames it; complex variables as two real ones.
+    """Write a dataset, complex variables as two real ones. The file is complete or not there.
 
     Args:
         dataset: what to write.

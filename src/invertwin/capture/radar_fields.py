@@ -1,4 +1,4 @@
-"""A radar as labelled arrays and attributes, and back."""
+"""Convert a radar to labelled arrays and attributes, and back."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import asdict, fields

@@ -1,4 +1,4 @@
-"""What may watch a fit: a display, numbers about a known truth, a checkpoint."""
+"""Callbacks of a fit: progress reports, metrics of a known truth, checkpoints."""
 
 import os
 from collections.abc import Callable

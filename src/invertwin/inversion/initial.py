@@ -1,7 +1,7 @@
-"""Where a fit may start: pose, size and density from what conventional processing sees.
+"""First guesses of pose, size and density by conventional processing.
 
-Detected points or backprojected echoes say where something is, a rectangle in the ground plane how
-it stands; the refinement does the rest. Nothing here is differentiable.
+Detected points or backprojected echoes tell where an object is. A rectangle in the ground plane
+tells how it stands. The fit does the rest. Nothing here is differentiable.
 """
 
 import math
@@ -68,7 +68,7 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class Rectangle:
-    """What stands on the ground, from above.
+    """An object on the ground, seen from above.
 
     Attributes:
         center: middle of the points' extents [m], world.
@@ -90,7 +90,7 @@ def detected_points(
     *,
     false_alarm: float = 1e-6,
 ) -> Float64[Tensor, "point 3"]:
-    """Where ordered-statistics CFAR and its local maxima see echoes within a box of the world.
+    """Find echoes within a box of the world by ordered-statistics CFAR and its local maxima.
 
     Along an axis that the grid does not resolve, points lie in the radar's middle plane.
 
@@ -124,7 +124,7 @@ def detected_points(
 def echo_image(
     capture: Capture, grid: Grid, points: Float64[Tensor, "*point 3"]
 ) -> Float64[Tensor, "*point"]:
-    """Backprojected power at points of the world, spreading undone.
+    """Backproject power to points of the world, with the spreading loss removed.
 
     The mean over frames of the maps at the point's range and direction, times the fourth power of
     its distance; where no direction is resolved, the coherent sum over the frames
@@ -154,7 +154,7 @@ def image_points(
     step: float,
     share: float = 0.3,
 ) -> Float64[Tensor, "point 3"]:
-    """The nodes of a backprojected image that are nearly as bright as its strongest one.
+    """Find the nodes of a backprojected image that are nearly as bright as its strongest one.
 
     Args:
         capture: the data.
@@ -181,7 +181,7 @@ def image_points(
 
 
 def largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Tensor, "part 3"]:
-    """The largest set of points that are linked by steps of at most a gap [m].
+    """Find the largest set of points that are linked by steps of at most a gap [m].
 
     Args:
         points: [m].
@@ -201,7 +201,7 @@ def fit_rectangle(
     ground: Ground | None = None,
     resolution: float = 0.1,
 ) -> Rectangle:
-    """The rectangle in the ground plane whose near sides the points lie on: an L shape.
+    """Fit a rectangle in the ground plane to points on its near sides, an L shape.
 
     Every yaw of a quarter turn is tried; the best one has most points close to the two sides
     that face the radar, Σ 1/max(distance, resolution).
@@ -244,7 +244,7 @@ def fit_rectangle(
 def principal_rectangle(
     points: Float64[Tensor, "point 3"], *, ground: Ground | None = None
 ) -> Rectangle:
-    """The rectangle along the points' principal axes in the ground plane.
+    """Fit a rectangle along the points' principal axes in the ground plane.
 
     Args:
         points: [m].
@@ -261,14 +261,14 @@ def principal_rectangle(
 
 
 def guess_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
-    """The median of points along each axis [m]: the middle of what is seen of an object."""
+    """Guess a position [m]: the median of the points along each axis."""
     return points.median(0).values
 
 
 def guess_poses(
     item: Object, found: Rectangle, radar: Radar, *, ground: Ground | None = None
 ) -> list[Float64[Tensor, "4 4"]]:
-    """The four poses in which an object of known size stands in a rectangle.
+    """List the four poses in which an object of known size stands in a rectangle.
 
     Its upright attitude and its height are kept. Each side that faces the radar is put where the
     rectangle has it, so that the hidden part of the object lies behind; along an axis on which
@@ -315,7 +315,7 @@ def best_pose(
     samples: int = 100_000,
     seed: int = 0,
 ) -> tuple[Scene, list[float]]:
-    """The scene in the pose whose simulated map is nearest to the data, and all losses.
+    """Choose the pose whose simulated map is nearest to the data; also return all losses.
 
     Args:
         scene: with the object anywhere.
@@ -352,7 +352,7 @@ def best_pose(
 
 
 def guess_scale(item: Object, found: Rectangle, *, ground: Ground | None = None) -> float:
-    """Length of a rectangle over that of an object, both along their longer side.
+    """Guess a scale: the longer side of a rectangle over that of an object.
 
     The longer side is the one that is seen from most places; the other often hides its far end.
 
@@ -378,7 +378,7 @@ def guess_density(
     *,
     depth: float = 1.0,
 ) -> DensityGrid:
-    """A density in proportion to the backprojected echoes, for an object as it stands.
+    """Guess a density in proportion to the backprojected echoes.
 
     Args:
         capture: the data.

@@ -1,4 +1,4 @@
-"""What was observed, and what is unknown: the two inputs of a fit."""
+"""The two inputs of a fit: what was observed, and what is unknown."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

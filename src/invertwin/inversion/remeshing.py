@@ -1,4 +1,4 @@
-"""New triangles for the surface of a fit: even ones between stages, and distances to it.
+"""Remesh surfaces between the stages of a fit, and measure distances to them.
 
 Remeshing is written out here because no library (in 2026) serves all platforms: gpytoolbox has
 no wheels for Linux on ARM, pymeshlab is GPL, trueform is for noncommercial use, pyacvd needs VTK

@@ -1,4 +1,4 @@
-"""How long a fit lasts, and its stages: which unknowns are free when, coarse before fine."""
+"""How long a fit lasts, and which unknowns are free in each of its stages."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field

@@ -126,7 +126,7 @@ def gradient(
     power: Float[Tensor, "frame range u v"] | None = None,
     own_scale: Mapping[str, Tensor] | None = None,
 ) -> Figure:
-    """Derivatives of a map side by side; red: power grows with θ, blue: it falls.
+    """Derivatives of a map side by side: power grows with θ where red, and falls where blue.
 
     Shown is the first frame, summed over the direction that is not shown; all frames, where the
     grid resolves no direction.

@@ -1,4 +1,4 @@
-"""Images of beat signals by coherent summation: near field, arrays and moving radars alike."""
+"""Images of beat signals by coherent summation, also in the near field and of moving radars."""
 
 import math
 
@@ -19,7 +19,7 @@ UPSAMPLING = 8
 def backproject_beat(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar, points: Float64[Tensor, "*point 3"]
 ) -> Complex128[Tensor, "*point"]:
-    """Mean over frames and channels of the windowed echo from exactly the distance of a point.
+    """Focus beat signals on points: average the echoes from each point's exact distance.
 
         I(p) = mean Σ w_n s[n] exp(−2πj (f_n τ − S τ²/2)) / Σ w_n
 
@@ -85,7 +85,7 @@ def distances(
 def between_samples(
     samples: Complex128[Tensor, "row sample"], index: Float64[Tensor, "row point"]
 ) -> Complex128[Tensor, "row point"]:
-    """Linear interpolation along each row at an index that may have a fraction.
+    """Interpolate linearly along each row at an index that may have a fraction.
 
     Args:
         samples: Rows of samples.

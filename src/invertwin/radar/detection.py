@@ -1,4 +1,4 @@
-"""Targets out of power maps: constant false-alarm rate, point clouds. Not differentiable."""
+"""Find targets in power maps by a constant false-alarm rate. Nothing here is differentiable."""
 
 import math
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ def cell_averaging_cfar(
     false_alarm: float = 1e-4,
     looks: int = 1,
 ) -> Bool[Tensor, "*batch first second"]:
-    """Cells whose power exceeds a multiple of the mean of their training cells.
+    """Detect cells whose power exceeds a multiple of the mean of their training cells.
 
     The multiple keeps the rate of false alarms exact for noise whose power is exponentially
     distributed (one look: a channel or a beam) or the mean of several such (looks: the channels,
@@ -91,7 +91,7 @@ def ordered_statistics_cfar(
     looks: int = 1,
     rank: float = 0.75,
 ) -> Bool[Tensor, "*batch first second"]:
-    """Cells whose power exceeds a multiple of one of their training cells in order of power.
+    """Detect cells whose power exceeds a multiple of one ranked training cell.
 
     Other targets among the training cells hardly raise the threshold, as they do in the mean.
 
@@ -129,7 +129,7 @@ def point_cloud(
     chirps: Chirps,
     fold: Int64[Tensor, "frame velocity range"] | None = None,
 ) -> PointCloud:
-    """One point for each local maximum over range rate and range among the detected cells.
+    """Make a point of each detected cell that is a local maximum over range rate and range.
 
     Its direction is the strongest one that exists (u² + v² ≤ 1); all are refined by the parabola
     through the logarithms of the power at a peak and its two neighbours.
@@ -175,7 +175,7 @@ def peaks(
     radar: Radar,
     grid: Grid,
 ) -> PointCloud:
-    """One point for each local maximum over range and direction among the detected cells.
+    """Make a point of each detected cell that is a local maximum over range and direction.
 
     For frames without range rates, such as maps that are compared in a fit; unlike
     ``point_cloud``, one range may hold many points, since the parts of a body at rest differ in

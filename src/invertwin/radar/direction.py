@@ -99,7 +99,7 @@ def music(
     smoothing: tuple[int, int] | None = None,
     forward_backward: bool = False,
 ) -> Float64[Tensor, "frame range u v"]:
-    """MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, E the noise subspace. At least 1, no unit.
+    """MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, with E the noise subspace. It is at least 1.
 
     Differentiable in the profile through the projector on the noise subspace, whose derivative
     depends on the gap between signal and noise only: it is finite for equal eigenvalues within
@@ -140,7 +140,7 @@ def music(
 def source_count(
     eigenvalues: Float[Tensor, "*batch element"], snapshots: int, rule: str = "mdl"
 ) -> Int64[Tensor, "*batch"]:
-    """Number of sources from the eigenvalues of a covariance matrix.
+    """Count the sources from the eigenvalues of a covariance matrix.
 
     Minimises −N (M − k) log(geometric/arithmetic mean of the M − k smallest) plus, with
     d = k (2M − k), d for ``aic`` or d log(N)/2 for ``mdl``, over k = 0 … M − 1.

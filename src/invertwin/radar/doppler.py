@@ -66,7 +66,7 @@ def range_doppler(
     window: str = "hamming",
     bins: int | None = None,
 ) -> Complex[Tensor, "frame velocity tx rx range"]:
-    """Range transform of every chirp, then windowed Fourier transform over the chirps.
+    """Transform every chirp over range, then all chirps over range rate, with a window.
 
     The bins are those of ``velocity_axis``: the beat phase of a target that moves away grows from
     chirp to chirp. Normalised by the sums of the windows: a point
@@ -107,7 +107,7 @@ def compensate_tdm(
     chirps: Chirps,
     fold: int | Int64[Tensor, "frame velocity range"] = 0,
 ) -> Complex[Tensor, "frame velocity tx rx range"]:
-    """Takes out the phase by which movers turn until a later transmitter's chirp.
+    """Remove the phase that movers gain until a later transmitter sends.
 
     A chirp that starts t later has the phase 2π f t more, f the Doppler frequency, which would
     be taken for a direction. It depends on the true f, not on that modulo one over the time from
@@ -144,7 +144,7 @@ def resolve_fold(
     chirps: Chirps,
     candidates: Sequence[int] = (0, -1, 1),
 ) -> Int64[Tensor, "frame velocity range"]:
-    """By how many spans of the velocity axis the target of each bin is beyond it.
+    """Find by how many spans each bin's target is beyond the velocity axis.
 
     The right one makes all transmitters agree with the receivers on a direction: it has the
     highest Bartlett peak; of equal ones the first candidate is taken. With N transmitters that
@@ -182,7 +182,7 @@ def range_doppler_angle(
     bins: int | None = None,
     fold: int | Int64[Tensor, "frame velocity range"] = 0,
 ) -> Float[Tensor, "frame velocity range u v"]:
-    """Power over range rate, range and direction (Bartlett), transmitters' turns compensated.
+    """Power over range rate, range and direction (Bartlett), with ``compensate_tdm``.
 
     ``range_doppler``, ``compensate_tdm``, then ``beamform``; see there.
 

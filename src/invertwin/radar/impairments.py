@@ -1,4 +1,4 @@
-"""What a real front end adds to beat signals, of frames or of trains of chirps.
+"""Impairments that a real front end adds to beat signals of frames or trains of chirps.
 
 Each impairment is off unless asked for.
 
@@ -129,7 +129,7 @@ class ADC:
 
 @dataclass(frozen=True)
 class Impairments:
-    """Which impairments a recording has; with the defaults it is the plain beat signal.
+    """The impairments of a recording. The defaults add none.
 
     Attributes:
         phase_noise: Phase noise of the common oscillator.
@@ -165,7 +165,7 @@ class Impairments:
     def record(
         self, paths: Paths, radar: Radar, *, seed: int, chirps: Chirps | None = None
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-        """The beat signal of the paths, or of a train of chirps, with these impairments.
+        """Record the paths, in single ramps or a train of chirps, with these impairments.
 
         Each impairment draws from its own stream of the seed: adding one leaves the others'
         numbers as they are. Channel errors and leakage stay from chirp to chirp, thermal noise
@@ -192,7 +192,7 @@ class Impairments:
     def apply(
         self, beat: Complex128[Tensor, "frame *chirp tx rx sample"], radar: Radar, *, seed: int
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-        """Impair a beat signal, of frames or of trains, with everything except phase noise.
+        """Add all impairments except phase noise to a beat signal of frames or trains.
 
         Args:
             beat: Without impairments.
@@ -206,7 +206,7 @@ class Impairments:
         return self._after_mixing(beat, radar, seed, None)
 
     def check_applicable(self) -> None:
-        """Raise where ``apply`` would: impairments that need the paths."""
+        """Raise if ``apply`` cannot add these impairments, because they need the paths."""
         if self.phase_noise is not None:
             raise InputError(
                 "expected impairments of a finished beat signal, got phase noise, which depends on "
@@ -248,7 +248,7 @@ def _streams(seed: int) -> list[int]:
 def noisy_oscillator_beat(
     paths: Paths, radar: Radar, noise: PhaseNoise, *, seed: int, chirps: Chirps | None = None
 ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-    """Beat signal of an oscillator with phase noise φ, which transmits and mixes.
+    """Beat signal where one oscillator with phase noise φ transmits and mixes.
 
         s'[n] = Σ s_i[n] exp(j (φ(t_n) − φ(t_n − τ_i)))
 
@@ -367,7 +367,7 @@ def leakage_signal(leakage: Leakage, radar: Radar) -> Complex128[Tensor, " sampl
 def channel_errors(
     radar: Radar, gain_std_db: float = 0.0, phase_std: float = 0.0, *, seed: int
 ) -> Complex128[Tensor, "tx rx"]:
-    """Factors of the virtual channels with normally distributed gains in dB and phases.
+    """Draw factors of the virtual channels, with normal gains in dB and normal phases.
 
     Args:
         radar: Its arrays.
@@ -388,7 +388,7 @@ def channel_errors(
 def quantize(
     beat: Complex[Tensor, "*batch sample"], radar: Radar, adc: ADC
 ) -> Complex[Tensor, "*batch sample"]:
-    """The beat signal as the converter reads it: rounded to its codes, and clipped, with a warning.
+    """Round a beat signal to the converter's codes; what it clips is warned of.
 
     Args:
         beat: Signal without a gradient.

@@ -286,7 +286,7 @@ def _length(first: Tensor, span: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
 
 
 def _instants(bend: float) -> int:
-    """How many instants of a ramp follow phases that bend by so many radians at its ends.
+    """Count the instants of a ramp that follow phases which bend by this much at its ends [rad].
 
     Of exp(jψ) with ψ of second degree over [-1, 1], the power h = (count + 1)/2 is the first that a
     polynomial through the instants misses, by ψʰ/h! · 2^(1 − count).

@@ -1,4 +1,4 @@
-"""A smooth surrogate of range-Doppler-angle processing: moving power as a radar shows it."""
+"""The smooth surrogate of range-Doppler-angle processing."""
 
 import math
 from collections.abc import Callable

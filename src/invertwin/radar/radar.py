@@ -259,7 +259,7 @@ class Radar:
 
 
 def sampled(radar: Radar) -> SampledWaveform:
-    """The radar's waveform, or the error that it has no beat signal."""
+    """Return the radar's waveform, if it has a beat signal."""
     if isinstance(radar.waveform, SampledWaveform):
         return radar.waveform
     raise InputError(
@@ -271,7 +271,7 @@ def sampled(radar: Radar) -> SampledWaveform:
 def checked_beat(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar
 ) -> Complex[Tensor, "frame tx rx sample"]:
-    """A beat signal that fits a radar.
+    """Return a beat signal, if it fits a radar.
 
     Args:
         beat: One signal per frame and channel.

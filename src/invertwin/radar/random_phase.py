@@ -1,4 +1,4 @@
-"""The paper's own surrogate: a field with a random phase per path, in place of mean power."""
+"""The paper's own surrogate: a field with a random phase per path, not mean power."""
 
 import math
 

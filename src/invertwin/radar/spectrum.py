@@ -60,7 +60,7 @@ class Aperture:
         return self.y_taper * self.counts.sum(0)
 
     def check_resolved(self, grid: Grid) -> None:
-        """Raise where one axis alone of a non-separable array is asked for."""
+        """Raise if the grid resolves only one axis of an array that is not separable."""
         if not self.separable and (grid.u_count == 1 or grid.v_count == 1):
             raise InputError(
                 f"expected a grid that resolves u and v, got {grid.u_count} × {grid.v_count} bins; "
@@ -68,7 +68,7 @@ class Aperture:
             )
 
     def check_directions(self, grid: Grid) -> None:
-        """Raise where the grid leaves out an axis along which the array extends."""
+        """Raise if the grid does not resolve an axis along which the array extends."""
         for name, places, bins in (("u", self.x, grid.u_count), ("v", self.y, grid.v_count)):
             if len(places) > 1 and bins == 1:
                 raise InputError(

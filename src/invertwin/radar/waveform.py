@@ -1,4 +1,4 @@
-"""Waveforms and the radar: what is transmitted, from where, and which bins it resolves."""
+"""Waveforms: what a radar transmits, and how it spreads a point target over range."""
 
 # Fields of the base class may be properties of a waveform.
 # pyright: reportIncompatibleVariableOverride=false
@@ -26,7 +26,7 @@ class PhysicsWarning(UserWarning):
 
 
 class Waveform(ABC):
-    """What the radar and the surrogate ask of any waveform; hashable, so that kernels are cached.
+    """What any waveform must offer. Waveforms are hashable, so that kernels are cached.
 
     Attributes:
         center_frequency: [Hz].
@@ -38,7 +38,7 @@ class Waveform(ABC):
 
     @property
     def wavelength(self) -> float:
-        """At the centre frequency [m]."""
+        """Wavelength at the centre frequency [m]."""
         return SPEED_OF_LIGHT / self.center_frequency
 
     @property
@@ -50,7 +50,7 @@ class Waveform(ABC):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """Power of a point target beside its range, peak 1.
+        """Power of a point target at a distance from its range, peak 1.
 
         Args:
             distance: Distance from the target's range [m].
@@ -84,7 +84,7 @@ class SampledWaveform(Waveform):
 
     @property
     def frequencies(self) -> Float64[Tensor, " sample"]:
-        """f_n [Hz]."""
+        """Frequencies f_n of the samples [Hz]."""
         return self.start_frequency + torch.arange(self.samples, dtype=torch.float64) * self.step
 
     @property
@@ -137,17 +137,17 @@ class FMCW(SampledWaveform):
 
     @property
     def slope(self) -> float:
-        """S = B/T [Hz/s]."""
+        """Slope of the ramp, S = B/T [Hz/s]."""
         return self.bandwidth / self.duration
 
     @property
     def residual_slope(self) -> float:
-        """S: the ramp goes on while the echo is under way."""
+        """The slope S: the ramp goes on while the echo is on its way [Hz/s]."""
         return self.slope
 
     @property
     def step(self) -> float:
-        """B/N [Hz]."""
+        """Frequency step of the samples, B/N [Hz]."""
         return self.bandwidth / self.samples
 
     @property
@@ -157,7 +157,7 @@ class FMCW(SampledWaveform):
 
     @property
     def sample_times(self) -> Float64[Tensor, " sample"]:
-        """t_n = n T/N [s]."""
+        """Times of the samples, t_n = n T/N [s]."""
         return torch.arange(self.samples, dtype=torch.float64) * (self.duration / self.samples)
 
 
@@ -185,7 +185,7 @@ class SteppedFrequency(SampledWaveform):
 
     @property
     def bandwidth(self) -> float:
-        """N · step [Hz]."""
+        """Bandwidth, N · step [Hz]."""
         return self.samples * self.step
 
     @property
@@ -195,12 +195,12 @@ class SteppedFrequency(SampledWaveform):
 
     @property
     def noise_bandwidth(self) -> float:
-        """1 / dwell [Hz]."""
+        """Noise bandwidth, 1 / dwell [Hz]."""
         return 1 / self.dwell
 
     @property
     def sample_times(self) -> Float64[Tensor, " sample"]:
-        """t_n = n · dwell [s]."""
+        """Times of the samples, t_n = n · dwell [s]."""
         return torch.arange(self.samples, dtype=torch.float64) * self.dwell
 
 
@@ -230,17 +230,17 @@ class OFDM(SampledWaveform):
 
     @property
     def samples(self) -> int:
-        """One per subcarrier."""
+        """Number of samples, one per subcarrier."""
         return self.subcarriers
 
     @property
     def step(self) -> float:
-        """The spacing [Hz]."""
+        """Frequency step of the samples: the spacing [Hz]."""
         return self.spacing
 
     @property
     def bandwidth(self) -> float:
-        """N · spacing [Hz]."""
+        """Bandwidth, N · spacing [Hz]."""
         return self.subcarriers * self.spacing
 
     @property
@@ -331,7 +331,7 @@ class Impulse(Waveform):
 
 
 def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[Tensor, " element"]:
-    """Window weights by position, so that it serves samples and any array alike.
+    """Weights of a window by position, for samples and for arrays.
 
     At ``count`` uniform positions "hamming" is the usual symmetric window; "hann" and
     "blackman" leave out their zero end points, which would switch off the outermost elements.

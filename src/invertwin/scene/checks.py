@@ -1,4 +1,4 @@
-"""Conversion and validation of what enters the scene: the public edge of this room."""
+"""Checks of values that enter the library, with errors that say what to do."""
 
 import math
 import operator
@@ -26,7 +26,7 @@ _LIMITS: dict[type, tuple[str, str, Any]] = {
 
 
 def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: str) -> Tensor:
-    """`value` as a finite float64 tensor of the given shape; gradients are kept.
+    """Convert a value to a finite float64 tensor of the given shape; gradients are kept.
 
     Args:
         value: tensor, array or nested sequence of numbers.
@@ -77,7 +77,7 @@ def _listed(shape: Sequence[int | None]) -> str:
 def checked_number(
     value: object, what: str, low: float, high: float = math.inf, *, open_low: bool = False
 ) -> float:
-    """`value` as a finite number in [low, high], or (low, high] if `open_low`.
+    """Convert a value to a finite number in [low, high], or in (low, high] if `open_low`.
 
     Args:
         value: a number, or a tensor of dimension 0.
@@ -106,7 +106,7 @@ def checked_number(
 
 
 def checked_count(value: object, what: str, low: int) -> int:
-    """`value` as an integer that is at least `low`.
+    """Convert a value to an integer that is at least `low`.
 
     Args:
         value: an integer.

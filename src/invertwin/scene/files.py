@@ -1,4 +1,4 @@
-"""Meshes and scene geometry from files, and meshes into files."""
+"""Read meshes and scene geometry from files, and write meshes to files."""
 
 import math
 import os
@@ -70,7 +70,7 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
-    """Write a mesh, or all objects of a scene in the world: PLY in float64, or GLB in float32.
+    """Write a mesh, or all objects of a scene, as PLY in float64 or as GLB in float32.
 
     A GLB file keeps the objects apart, by name.
 
@@ -98,7 +98,7 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
 
 @contextmanager
 def replacing(path: str | Path) -> Generator[Path]:
-    """A new file beside a path, which takes its place when it is complete.
+    """Write a new file beside a path; it takes its place when it is complete.
 
     A failure leaves an existing file as it was.
 
@@ -122,7 +122,7 @@ def replacing(path: str | Path) -> Generator[Path]:
 def read_arrays(
     path: Path, do: str, wanted: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` file by name; those that are wanted, if they are there.
+    """Read the arrays of an ``.npz`` file by name. Wanted arrays that are missing are left out.
 
     Args:
         path: the file.
@@ -177,7 +177,7 @@ def load_scene_xml(
 
 
 def existing_file(path: str | Path, what: str = "an existing file") -> Path:
-    """The path of a file that is there.
+    """Check that a file exists, and return its path.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""What both kinds of settings file share: numbers in other units, masks, and who sends when."""
+"""What both kinds of settings file share: numbers in other units, masks, turns of transmitters."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -72,7 +72,7 @@ def lanes_of(device: str) -> int | None:
 def transmit_order(
     chirps: Mapping[int, tuple[int, int]], first: int, last: int, profiles: Sequence[int]
 ) -> tuple[tuple[int, ...], int]:
-    """Who sends in the chirps of one loop, and in which profile.
+    """Find which transmitter sends in each chirp of a loop, and in which profile.
 
     Args:
         chirps: chirp number → profile, transmitter mask.
@@ -114,7 +114,7 @@ def transmit_order(
 def settings(
     order: tuple[int, ...], loops: int, frames: int, period_ms: Any, **values: Any
 ) -> ChirpSettings:
-    """Settings of a frame as files count: 0 frames are endless, repeated orders are loops.
+    """Make settings of a frame as files count: 0 frames are endless, repeated orders are loops.
 
     Args:
         order: transmitters in their order of sending.

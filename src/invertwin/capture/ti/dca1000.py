@@ -42,7 +42,7 @@ def read(
     positions: Float64[Tensor, "frame 3"] | None = None,
     rotations: Float64[Tensor, "frame 3 3"] | None = None,
 ) -> Capture:
-    """A DCA1000 recording as a `Capture`, one beat signal per frame.
+    """Read a DCA1000 recording as a `Capture` with one beat signal per frame.
 
     Args:
         path: `.bin` file, or a `.setup.json` that names the files.
@@ -72,7 +72,7 @@ def read_recording(
     settings: str | Path | ChirpSettings | None = None,
     lanes: int | None = None,
 ) -> ChirpData:
-    """Every chirp of a recording, with the settings it was made with.
+    """Read every chirp of a recording, with its settings.
 
     Args:
         path: `.bin` file, or a `.setup.json` that names the files.
@@ -97,7 +97,7 @@ def read_recording(
 
 
 def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSettings) -> ChirpData:
-    """Every chirp of a recording, in ADC counts.
+    """Read every chirp of a recording, in ADC counts.
 
     Warns (`PhysicsWarning`) of an incomplete last frame, which is dropped, of frames that are
     missing, and of saturated samples.
@@ -135,7 +135,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
 
 
 def write_samples(path: str | Path, data: ChirpData) -> None:
-    """Writes what `read_samples` reads, word for word.
+    """Write what `read_samples` reads, word for word.
 
     Args:
         path: `.bin` file.
@@ -195,7 +195,7 @@ def _check_parity(settings: ChirpSettings) -> None:
 
 
 def _whole_frames(size: int, settings: ChirpSettings, name: str) -> int:
-    """How many frames to read, after warnings of what is missing."""
+    """Count the frames to read, and warn of what is missing."""
     _check_parity(settings)
     frame = _frame_words(settings) * _WORD.itemsize
     frames, rest = divmod(size, frame)

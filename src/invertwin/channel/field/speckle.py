@@ -1,4 +1,4 @@
-"""What is random in a field and stays: the points and paths of rough surfaces."""
+"""Speckle: the fixed random points and paths of rough surfaces."""
 
 from dataclasses import dataclass
 
