@@ -34,7 +34,7 @@ from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, mod
 
 from invertwin.cli.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, Letters, marks
+from invertwin.limits import RADIANS, Letters
 
 BUILT_IN = (
     "invertwin.cli.sensors",
@@ -61,6 +61,7 @@ class Table(Section):
     """A table that a constructor of the library makes something of."""
 
     made_by: ClassVar[Callable[..., Any]]
+    optional: ClassVar[tuple[str, ...]] = ()  # arguments that other keys may stand in for
     made_from: ClassVar[Mapping[str, tuple[str | None, Any]]] = {}  # name → key, annotation
 
     def build(self, given: Mapping[type, object] | None = None, /, **more: Any) -> Any:
@@ -308,7 +309,8 @@ class Registry:
             place = f"{name}_deg" if _is_angle(hint) else name
             arguments[name] = (place, hint)
             if place not in base.model_fields and place not in made:
-                made[place] = self._field(hint, name, parameter.default, documents.get(name, ""))
+                default = None if name in base.optional else parameter.default
+                made[place] = self._field(hint, name, default, documents.get(name, ""))
         checked = is_dataclass(make) if checked is None else checked
         if checked and not self.forms.keys() & {m for h in hints.values() for m in _members(h)}:
             base = _joined(_Checked, base)
@@ -470,12 +472,19 @@ def _members(hint: Any) -> tuple[Any, ...]:
     return (hint,)
 
 
+def _marks(hint: Any) -> tuple[Any, ...]:
+    found = hint.__metadata__ if get_origin(hint) is Annotated else ()
+    if get_origin(hint) in (Union, UnionType, Annotated):
+        found += tuple(mark for part in get_args(hint) for mark in _marks(part))
+    return found
+
+
 def _is_angle(hint: Any) -> bool:
-    return RADIANS in [mark for mark in marks(hint) if isinstance(mark, str)]
+    return RADIANS in [mark for mark in _marks(hint) if isinstance(mark, str)]
 
 
 def _letters(hint: Any) -> str:
-    return next((mark.allowed for mark in marks(hint) if isinstance(mark, Letters)), "")
+    return next((mark.allowed for mark in _marks(hint) if isinstance(mark, Letters)), "")
 
 
 def _is_array(kind: Any) -> bool:
