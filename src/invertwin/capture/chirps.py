@@ -4,11 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-<<<<<<< HEAD
-from typing import Annotated
-=======
-from typing import Any
->>>>>>> main
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -303,24 +299,12 @@ def settings_of(
     """Make settings for a waveform, all transmitters in turn and all receivers.
 
     Args:
-<<<<<<< HEAD
-        waveform: waveform of every ramp.
-        transmitters: number of transmitters.
-        receivers: number of receivers.
-        loops: chirps of each transmitter in a frame.
-        frames: number of frames; None = not known.
-        frame_period: time between the starts of two frames [s].
-        idle_time: pause between ramps [s].
-        lanes: lanes of the LVDS link.
-        order: transmitters in their order of sending, counted from 0; None = TX1, TX2, …
-=======
-        waveform: of every ramp, as it is sampled.
-        transmitters: how many, or their numbers from 1.
-        receivers: how many, or their numbers from 1.
-        order: of the transmitters, counted from 0, as in `Chirps`; None = as they are given.
-        adc_start_time: from the start of the ramp to the first sample [s].
-        others: further fields of `ChirpSettings`; without `loops` one.
->>>>>>> main
+        waveform: waveform of every ramp, as it is sampled.
+        transmitters: number of transmitters, or their numbers from 1.
+        receivers: number of receivers, or their numbers from 1.
+        order: turns of the transmitters, counted from 0, as in `Chirps`; None = as they are given.
+        adc_start_time: time from the start of the ramp to the first sample [s].
+        others: further fields of `ChirpSettings`; one loop unless `loops` says otherwise.
 
     Raises:
         InputError: see `ChirpSettings`; an order of other transmitters.
