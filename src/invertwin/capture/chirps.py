@@ -4,11 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-<<<<<<< HEAD
-from typing import Annotated
-=======
-from typing import Any
->>>>>>> main
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -16,7 +12,6 @@ from jaxtyping import Complex, Float64
 from scipy.signal import hilbert
 from torch import Tensor
 
-from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.errors import InputError
 from invertwin.limits import Count, Frequency, NonNegative, Positive, Several, Usual
@@ -216,29 +211,6 @@ class ChirpData:
         radar = Radar(transmitters, receivers, settings.waveform, positions, rotations)
         return ChirpCapture(self.beat, radar, settings.chirps, settings.frame_period, settings.real)
 
-    def capture(
-        self,
-        transmitters: AntennaArray,
-        receivers: AntennaArray,
-        *,
-        chirps: int | str,
-        positions: Float64[Tensor, "frame 3"] | None = None,
-        rotations: Float64[Tensor, "frame 3 3"] | None = None,
-    ) -> Capture:
-        """One beat signal per frame and channel, see `ChirpCapture.capture`.
-
-        Args:
-            transmitters: elements in the order of sending.
-            receivers: elements in the order of `ChirpSettings.receivers`.
-            chirps: "mean", or the number from 0 of the chirp to take.
-            positions: position of the radar in every frame [m]; None = the origin.
-            rotations: orientation of the radar in every frame; None = axes of the world.
-
-        Raises:
-            InputError: another number of elements, or a chirp that does not exist.
-        """
-        return self.recorded(transmitters, receivers, positions, rotations).capture(chirps)
-
 
 def adc_counts(
     beat: Complex[Tensor, "frame chirp tx rx sample"] | Complex[Tensor, "frame tx rx sample"],
@@ -303,24 +275,12 @@ def settings_of(
     """Make settings for a waveform, all transmitters in turn and all receivers.
 
     Args:
-<<<<<<< HEAD
-        waveform: waveform of every ramp.
-        transmitters: number of transmitters.
-        receivers: number of receivers.
-        loops: chirps of each transmitter in a frame.
-        frames: number of frames; None = not known.
-        frame_period: time between the starts of two frames [s].
-        idle_time: pause between ramps [s].
-        lanes: lanes of the LVDS link.
-        order: transmitters in their order of sending, counted from 0; None = TX1, TX2, …
-=======
         waveform: of every ramp, as it is sampled.
         transmitters: how many, or their numbers from 1.
         receivers: how many, or their numbers from 1.
         order: of the transmitters, counted from 0, as in `Chirps`; None = as they are given.
         adc_start_time: from the start of the ramp to the first sample [s].
         others: further fields of `ChirpSettings`; without `loops` one.
->>>>>>> main
 
     Raises:
         InputError: see `ChirpSettings`; an order of other transmitters.

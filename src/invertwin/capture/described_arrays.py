@@ -10,7 +10,6 @@ import scipy.io
 import tomli_w
 import torch
 
-from invertwin.capture.capture import Capture
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
 from invertwin.capture.elements import elements
 from invertwin.errors import InputError
@@ -38,37 +37,6 @@ _ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-def read(
-    path: str | Path,
-    *,
-    chirps: int | str,
-    board: str | None = None,
-    elevation: int | None = None,
-    azimuth: int | None = None,
-    arrays: tuple[AntennaArray, AntennaArray] | None = None,
-) -> Capture:
-    """Read described samples as a `Capture` with one beat signal per frame.
-
-    The elements are those of the arguments or, without any, of the description's ``[radar]``:
-    ``board``, ``elevation`` and ``azimuth`` of a preset, or ``tx_positions`` and ``rx_positions``
-    [m].
-
-    Args:
-        path: the TOML file, see `read_chirps`.
-        chirps: "mean" or a chirp number, see `ChirpData.capture`.
-        board: preset of `invertwin.radar.boards`.
-        elevation: sign of elevation of the preset, see `Board.arrays`.
-        azimuth: sign of azimuth of the preset.
-        arrays: TX and RX elements in use, instead of a preset.
-
-    Raises:
-        InputError: what `read_chirps` and `ChirpData.capture` raise, or no elements.
-    """
-    data = read_chirps(path)
-    chosen = described_elements(path, data.settings, board, elevation, azimuth, arrays)
-    return data.capture(*chosen, chirps=chirps)
-
-
 def described_elements(
     path: str | Path,
     settings: ChirpSettings,
@@ -77,7 +45,10 @@ def described_elements(
     azimuth: int | None = None,
     arrays: tuple[AntennaArray, AntennaArray] | None = None,
 ) -> tuple[AntennaArray, AntennaArray]:
-    """Find the TX and RX elements of described samples, see `read`.
+    """Find the TX and RX elements of described samples.
+
+    They are those of the arguments or, without any, of the description's ``[radar]``: ``board``,
+    ``elevation`` and ``azimuth`` of a preset, or ``tx_positions`` and ``rx_positions`` [m].
 
     Args:
         path: file of the samples, beside its description.
