@@ -273,12 +273,12 @@ def settings_of(
     """Make settings for a waveform, all transmitters in turn and all receivers.
 
     Args:
-        waveform: of every ramp, as it is sampled.
-        transmitters: how many, or their numbers from 1.
-        receivers: how many, or their numbers from 1.
-        order: of the transmitters, counted from 0, as in `Chirps`; None = as they are given.
-        adc_start_time: from the start of the ramp to the first sample [s].
-        others: further fields of `ChirpSettings`; without `loops` one.
+        waveform: waveform of every ramp, as it is sampled.
+        transmitters: number of transmitters, or their numbers from 1.
+        receivers: number of receivers, or their numbers from 1.
+        order: turns of the transmitters, counted from 0, as in `Chirps`; None = as they are given.
+        adc_start_time: time from the start of the ramp to the first sample [s].
+        others: further fields of `ChirpSettings`; one loop unless `loops` says otherwise.
 
     Raises:
         InputError: see `ChirpSettings`; an order of other transmitters.
