@@ -13,7 +13,6 @@ from invertwin.capture import (
     described_arrays,
     ti,
 )
-from invertwin.capture.elements import elements
 from invertwin.capture.radar_fields import WAVEFORMS
 from invertwin.cli.registry import Group, Registry, Table, registry
 from invertwin.cli.section import Depth, InputPath, Section, Seed, about, fail, key
@@ -134,13 +133,13 @@ def arrays(file: InputPath, board: Mounting | None = None) -> ChirpCapture:
     if board is not None:
         return recorded(chirps, board)
     with about("board"):
-        return chirps.recorded(*described_arrays.described_elements(file, chirps.settings))
+        return chirps.recorded(described_arrays.described_board(file))
 
 
 def recorded(chirps: ChirpData, board: Mounting) -> ChirpCapture:
     """Chirps that the elements of a board have recorded, those that the settings name."""
     with about("board"):
-        return chirps.recorded(*elements(chirps.settings, board))
+        return chirps.recorded(board)
 
 
 def measured(data: Any) -> Capture:
