@@ -6,8 +6,9 @@ import torch
 from invertwin.errors import InputError
 from invertwin.inversion import compare_shapes
 from invertwin.inversion.metrics import is_watertight
-from invertwin.inversion.remeshing import closest_points, remeshed, signed_distance
+from invertwin.inversion.remeshing import closest_points, remeshed
 from invertwin.scene import Mesh, box, plate, sphere, text
+from invertwin.scene.geometry import signed_distance
 from scenes import float64
 
 

@@ -5,12 +5,15 @@ from invertwin.scene.geometry.body import BodyTemplate as BodyTemplate
 from invertwin.scene.geometry.body import SkinnedBody as SkinnedBody
 from invertwin.scene.geometry.body import articulated_template as articulated_template
 from invertwin.scene.geometry.body import load_smpl as load_smpl
+from invertwin.scene.geometry.body_models import body as body
+from invertwin.scene.geometry.body_models import body_template as body_template
 from invertwin.scene.geometry.deformation import LatticeDeformation as LatticeDeformation
 from invertwin.scene.geometry.density import DensityGrid as DensityGrid
 from invertwin.scene.geometry.density import cloud_surface as cloud_surface
 from invertwin.scene.geometry.density import without_clouds as without_clouds
 from invertwin.scene.geometry.distance import DistanceGrid as DistanceGrid
 from invertwin.scene.geometry.distance import NeuralDistance as NeuralDistance
+from invertwin.scene.geometry.distance import signed_distance as signed_distance
 from invertwin.scene.geometry.iso_surface import iso_surface as iso_surface
 from invertwin.scene.geometry.lattice import Lattice as Lattice
 from invertwin.scene.geometry.person import person as person
