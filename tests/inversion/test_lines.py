@@ -5,8 +5,7 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.inversion.lines import FieldLine, line_of
-from invertwin.scene import Scene, Translation, sphere
-from invertwin.scene.geometry import DensityGrid, DistanceGrid
+from invertwin.scene import DensityGrid, DistanceGrid, Scene, Translation, sphere
 from scenes import float64, thing
 
 SCENE = Scene({"ball": thing(sphere(0.2, 2), (0, 0, 1))})

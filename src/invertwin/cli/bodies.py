@@ -13,8 +13,16 @@ from torch import Tensor
 from invertwin.cli.section import Vector, about
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Axes, Positive
-from invertwin.scene import Mesh, rotation_angle, rotation_from_vector
-from invertwin.scene.geometry import BodyTemplate, SkinnedBody, load_anny, load_smpl, person
+from invertwin.scene import (
+    BodyTemplate,
+    Mesh,
+    SkinnedBody,
+    load_anny,
+    load_smpl,
+    person,
+    rotation_angle,
+    rotation_from_vector,
+)
 
 Angles = Annotated[dict[str, Vector], RADIANS]
 _AT_REST: dict[str, list[float]] = {}

@@ -20,17 +20,18 @@ from invertwin.inversion.remeshing import signed_distance
 from invertwin.limits import Positive
 from invertwin.radar.parameters import RadarPose
 from invertwin.radar.radar import Radar
-from invertwin.scene import Mesh, Scene
-from invertwin.scene.geometry import (
+from invertwin.scene import (
     DensityGrid,
     DistanceGrid,
-    Lattice,
     LinearShape,
+    Mesh,
     PriorShape,
+    Scene,
     SkinnedBody,
     load_prior,
     load_vehicle_space,
 )
+from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.parameters import MaterialValues, Pose, Scale
 
 

@@ -31,9 +31,8 @@ from invertwin.scene import (
     Slab,
     Texture,
 )
-from invertwin.scene.material import RANGES, Value
 from invertwin.scene.material.materials import Medium
-from invertwin.scene.material.values import evaluated
+from invertwin.scene.material.values import RANGES, Value, evaluated
 from invertwin.scene.parameters import MaterialValues
 
 MaterialValue = Annotated[str, Among(tuple(RANGES))]

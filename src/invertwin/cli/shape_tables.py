@@ -18,19 +18,24 @@ from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.radar.parameters import RadarPose
-from invertwin.scene import Mesh, Object, Scene, rigid, rotation_from_vector, shapes
-from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry import (
+from invertwin.scene import (
     DensityGrid,
     DistanceGrid,
     LatticeDeformation,
     LinearShape,
+    Mesh,
     NeuralDistance,
+    Object,
     PriorShape,
+    Scene,
     SmoothVertices,
     load_prior,
     load_vehicle_space,
+    rigid,
+    rotation_from_vector,
+    shapes,
 )
+from invertwin.scene.files import load_mesh
 from invertwin.scene.parameters import Pose, Scale, Translation, Vertices
 
 

@@ -10,8 +10,7 @@ import trimesh
 from torch.autograd import gradcheck
 
 from invertwin.errors import InputError
-from invertwin.scene import Scene, box
-from invertwin.scene.geometry import LinearShape, ShapeSpace, load_vehicle_space
+from invertwin.scene import LinearShape, Scene, ShapeSpace, box, load_vehicle_space
 from scenes import float64, thing
 
 CUBE = box(1.0)

@@ -21,7 +21,7 @@ from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Scene
-from invertwin.scene.geometry import without_clouds
+from invertwin.scene.geometry.density import without_clouds
 
 
 def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:

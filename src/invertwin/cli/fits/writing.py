@@ -16,7 +16,7 @@ from invertwin.cli.run_file import need
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.scene import Mesh, Scene
-from invertwin.scene.material import RANGES
+from invertwin.scene.material.values import RANGES
 
 _MODES = {FULL: "with boundary terms", INTERIOR: "interior only"}
 _MATERIAL = {f"{name}_error": name for name in RANGES}
