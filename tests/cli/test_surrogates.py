@@ -59,8 +59,8 @@ def test_the_exact_chain_is_fitted_where_visibility_is_fixed(tmp_path, monkeypat
 def test_no_gradient_check_of_the_exact_chain(tmp_path, monkeypatch, capsys):
     (tmp_path / "check.toml").write_text(
         named('surrogate = "exact"')
-        + '[gradcheck]\nparameter = { kind = "translation", object = "plate", axis = [1, 0, 0] }\n'
-        + "step = 1e-2\n"
+        + '[gradcheck]\nparameter = { kind = "translation", object = "plate" }\n'
+        + "tangent = { translation = [1, 0, 0] }\nstep = 1e-2\n"
     )
     assert call(monkeypatch, "gradcheck", tmp_path / "check.toml", "-o", tmp_path / "out") == 2
     assert "surrogate.exact: expected a smooth map" in " ".join(capsys.readouterr().err.split())

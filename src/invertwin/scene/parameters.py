@@ -5,18 +5,29 @@ Any torch module Scene → Scene serves as well.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any, TypeVar
 
 import torch
+from annotated_types import Ge, MinLen
 from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
-from invertwin.scene.material.values import RANGES, Texture, Value, checked_value, evaluated
+from invertwin.scene.material.itu import Itu
+from invertwin.scene.material.materials import held_by
+from invertwin.scene.material.values import (
+    RANGES,
+    MaterialValue,
+    Texture,
+    Value,
+    checked_value,
+    evaluated,
+)
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import (
     compose,
@@ -25,10 +36,27 @@ from invertwin.scene.pose import (
     rotation_from_quaternion,
     vector_from_quaternion,
 )
-from invertwin.scene.scene import Scene
+from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
 _T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Entries of a module's parameter that have a name, and perhaps a unit, of their own.
+
+    A module lists them in ``entries()``, by name. Tangents of gradient checks may use the name.
+
+    Attributes:
+        parameter: name of the parameter.
+        index: which of its entries.
+        slope: how fast the named value grows with them.
+    """
+
+    parameter: str
+    index: Any = ...
+    slope: float | Tensor = 1.0
 
 
 class ObjectModule(nn.Module):
@@ -137,6 +165,10 @@ class RigidMotion(nn.Module):
         # rate in rad serves all components.
         halves = self.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
         return _free(self.rotation, self._rotation_axes) * halves
+
+    def entries(self) -> dict[str, Entries]:
+        """The rotation vector [rad], to first order from the identity."""
+        return {"rotation": Entries("rotation", slice(1, None))}
 
     def named_values(self, name: str) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] of `name`, for progress and reports."""
@@ -265,7 +297,7 @@ class MaterialValues(nn.Module):
             object: name of the object.
             layer: of a `Multilayer`, the layer whose values are meant; None for values of the
                 material itself.
-            start: by the names of `invertwin.scene.material.values.RANGES`, inside their ranges, ends
+            start: by the names of `RANGES` of the materials, inside their ranges, ends
                 excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
                 lobe_width [rad], scattering, rms_slope, lambertian, directive, directive_exponent,
                 backscatter_exponent.
@@ -290,6 +322,32 @@ class MaterialValues(nn.Module):
                 checked = checked.image
             self.raw[name] = nn.Parameter(_unbounded(name, evaluated(checked).detach()))
 
+    @classmethod
+    def of(
+        cls,
+        object: str,
+        values: Annotated[Sequence[MaterialValue], MinLen(1)],
+        item: Object,
+        layer: Annotated[int, Ge(0)] | None = None,
+    ) -> "MaterialValues":
+        """Values of an object's material, from those that it has.
+
+        Args:
+            object: name of the object.
+            values: which are sought.
+            item: the object.
+            layer: of a multilayer, from 0: the layer whose values they are.
+
+        Raises:
+            InputError: the material has no such value or layer, a value comes from the ITU table,
+                or it starts at the end of its range.
+        """
+        try:
+            holder = held_by(item.material, layer, type(item.material).__name__)
+            return cls(object, layer=layer, **{name: _start(holder, name) for name in values})
+        except InputError as error:
+            raise InputError(str(error), f"values, material of {object}") from None
+
     def forward(self, scene: Scene) -> Scene:
         """The scene with the material's values replaced.
 
@@ -297,16 +355,19 @@ class MaterialValues(nn.Module):
             InputError: the object's material has no such value, or no such layer.
         """
         material: Any = scene[self.object].material
-        if self.layer is None:
-            return scene.replace(self.object, material=self._replaced(material))
-        layers = list(getattr(material, "layers", ()))
-        if self.layer >= len(layers):
+        holder = held_by(material, self.layer, repr(self.object))
+        where = "material" if self.layer is None else "layer"
+        if any(name not in getattr(holder, "__dataclass_fields__", {}) for name in self.raw):
             raise InputError(
-                f"expected a layer below {len(layers)} of {self.object!r}, got {self.layer}; "
-                "count layers from 0, and give `layer` for a Multilayer only"
+                f"expected a {where} with {', '.join(self.raw)} for {self.object!r}, got "
+                f"{type(holder).__name__}; give it another material"
             )
-        layers[self.layer] = self._replaced(layers[self.layer])
-        return scene.replace(self.object, material=replace(material, layers=layers))
+        changed = replace(holder, **self._bounded())
+        if self.layer is not None:
+            layers = [*material.layers]
+            layers[self.layer] = changed
+            changed = replace(material, layers=layers)
+        return scene.replace(self.object, material=changed)
 
     def values(self) -> dict[str, Tensor]:
         """Material values in their own units by name, for progress and reports.
@@ -316,17 +377,19 @@ class MaterialValues(nn.Module):
         where = self.object if self.layer is None else f"{self.object}.layers[{self.layer}]"
         return {f"{where}.{name}": _bounded(name, raw).detach() for name, raw in self.raw.items()}
 
-    def _replaced(self, holder: Any) -> Any:
-        """A material, or a layer of one, with the values replaced."""
-        if set(self.raw) - set(getattr(holder, "__dataclass_fields__", ())):
-            kind = "material" if self.layer is None else "layer"
-            raise InputError(
-                f"expected a {kind} with {', '.join(self.raw)} for {self.object!r}, "
-                f"got {type(holder).__name__}; give another {kind}"
-            )
-        values: dict[str, Any] = {name: _bounded(name, raw) for name, raw in self.raw.items()}
+    def entries(self) -> dict[str, Entries]:
+        """The values in their own units."""
+        found = {}
+        for name, raw in self.raw.items():
+            at, one = (raw.detach(),), (torch.ones_like(raw),)
+            slope = torch.func.jvp(partial(_bounded, name), at, one)[1]
+            found[name] = Entries(f"raw.{name}", slope=slope)
+        return found
+
+    def _bounded(self) -> dict[str, Tensor | Texture]:
+        values = {name: _bounded(name, raw) for name, raw in self.raw.items()}
         textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
-        return replace(holder, **{**values, **textures})
+        return {**values, **textures}
 
 
 class Compose(nn.Module):
@@ -353,6 +416,19 @@ class Compose(nn.Module):
             if values is not None:
                 merged.update(values())
         return merged
+
+
+def _start(holder: Any, name: str) -> Value:
+    """The value of a material, or of a layer, from which a fit starts."""
+    if not hasattr(holder, name):
+        raise InputError(f"expected values of {type(holder).__name__}, got {name}; remove it")
+    value = getattr(holder, name)
+    if isinstance(value, Itu):
+        raise InputError(
+            f"expected a number from which {name} starts, got that of the ITU table; "
+            f"give `{name}` beside `itu`"
+        )
+    return value
 
 
 def _bounded(name: str, raw: Tensor) -> Tensor:
