@@ -18,7 +18,7 @@ from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import GradientReport, gradcheck
+from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
 from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
@@ -28,7 +28,10 @@ _COLUMNS = (
     *("scene", "L1 full", "L1 interior", "L1 no interior edges", "ratio", "L2 full"),
     *("correlation", "noise", "steps differ", "order", "pairs"),
 )
-_NUMBERS = ("difference_noise", "step_agreement", "pairs")
+_KEPT = (
+    *("full", "interior", "no_interior_edges"),
+    *("difference_noise", "step_agreement", "pairs"),
+)
 # Units of a derivative with respect to θ, by the value that θ changes; angles are told apart.
 _UNITS = {
     **dict.fromkeys(("translation", "offsets", "value"), "1/m"),
@@ -94,9 +97,9 @@ def run_gradcheck(
     """
     begin = time.perf_counter()
     scenes: dict[str, Any] = {}
-    parts: list[Table | Picture] = []
-    studies: list[Table] = []
     compared: dict[str, Any] = {}
+    studies: list[Table] = []
+    pictures: list[Picture] = []
     for name, run in runs.items():
         part = f"{PARTS}/{name}.json"
         found = folder.read_json(part)
@@ -105,12 +108,13 @@ def run_gradcheck(
                 found = _check(name, run, folder, lambda line, name=name: say(f"{name}: {line}"))
             folder.write_json(part, found)
         scenes[name] = found
-        parts.append(_picture(folder, f"{name}_scene", run.title or name))
-        parts.append(_picture(folder, name, name, _note(run, found)))
+        shown = {f"{name}_scene": (run.title or name, ""), name: (name, _note(run, found))}
         for key, study in _studies(run).items():
             compared[key] = found[key]
             studies.append(study.table(name, found[key]))
-            parts.append(_picture(folder, f"{name}_{key}", studies[-1].title, study.picture_note))
+            shown[f"{name}_{key}"] = studies[-1].title, study.picture_note
+        for file, (title, note) in shown.items():
+            pictures.append(Picture(title, (folder.path / f"{file}.png").read_bytes(), note))
     metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
         metrics |= compared
@@ -118,15 +122,10 @@ def run_gradcheck(
     legend = texts("notes")["gradcheck"]
     table = Table("Agreement with central differences", _COLUMNS, rows, legend)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
-    parts = [table, *studies, *parts]
+    parts = [table, *studies, *pictures]
     found = finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
     folder.remove([f"{PARTS}/{name}.json" for name in runs])
     return found
-
-
-def _picture(folder: RunFolder, name: str, title: str, note: str = "") -> Picture:
-    """A picture that is in the folder, perhaps from before an interruption."""
-    return Picture(title, (folder.path / f"{name}.png").read_bytes(), note)
 
 
 def _check(
@@ -161,18 +160,15 @@ def _check(
         progress=say,
     )
     folder.write_figure(f"{name}.png", _maps(report, grid, settings))
-    moved = [settings.parameter.object] if settings.of == "scene" else []
-    folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=moved))
-    found: dict[str, Any] = {key: getattr(report, key) for key in _NUMBERS}
-    for key in ("full", "interior", "no_interior_edges"):
-        if getattr(report, key) is not None:
-            found[key] = asdict(getattr(report, key))
-    found["seconds"] = time.perf_counter() - begin
+    moved = filter(None, [getattr(settings.parameter, "object", None)])
+    folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=[*moved]))
+    kept = {key: value for key in _KEPT if (value := getattr(report, key)) is not None}
+    found = {k: asdict(v) if isinstance(v, Agreement) else v for k, v in kept.items()}
     checked = Checked(run, scene, radar, grid, check.step, report, say)
     for key, study in _studies(run).items():
         found[key], figure = study.compare(checked)
         folder.write_figure(f"{name}_{key}.png", figure)
-    return found
+    return found | {"seconds": time.perf_counter() - begin}
 
 
 def _studies(run: RunFile) -> dict[str, GradcheckStudy]:
