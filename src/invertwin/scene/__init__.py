@@ -53,6 +53,7 @@ from invertwin.scene.material.surface import Material as Material
 from invertwin.scene.material.surface import Surface as Surface
 from invertwin.scene.material.values import Texture as Texture
 from invertwin.scene.mesh import Mesh as Mesh
+from invertwin.scene.mesh import joined as joined
 from invertwin.scene.parameters import Compose as Compose
 from invertwin.scene.parameters import MaterialValues as MaterialValues
 from invertwin.scene.parameters import Pose as Pose
