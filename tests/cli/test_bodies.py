@@ -8,6 +8,7 @@ import torch
 
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
+from invertwin.cli.fits.problem import Problem, starts_of
 from invertwin.cli.gradients import theta_of
 from invertwin.cli.run_file import validate
 from invertwin.cli.schema import RunFile
@@ -41,8 +42,8 @@ def test_every_sought_joint_starts_that_far_off_and_only_these():
     run = run_file(scale=1.2)
     assert run.starts is not None
     scene, bodies = build.scene(run), sought_bodies(run)
-    starts = build.starts(run.starts, scene, scene, 1, bodies)
-    again = build.starts(run.starts, scene, scene, 1, bodies)
+    problem = Problem(run, scene, scene, frozenset())
+    starts, again = starts_of(problem), starts_of(problem)
     body = bodies["person"]
     truth = scene["person"].mesh
     true = body.template.rotations_of(truth.vertices)

@@ -13,27 +13,29 @@ from invertwin import plotting
 from invertwin.capture import Capture
 from invertwin.channel import Sampling, draw_speckle, trace_field
 from invertwin.cli import build
-from invertwin.cli.fits.problem import Sight, sampling_of
+from invertwin.cli.fits.problem import Problem, models_of
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.inversion.starts import displaced
 from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import beat_signal
 from invertwin.scene import AntennaArray, Scene
 
 
-def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[Figure, dict[str, Any]]:
+def landscape(problem: Problem) -> tuple[Figure, dict[str, Any]]:
     """The figure of the `[landscape]` table, and the local minima of every curve.
 
     For the exact signal one channel of one frame is enough to show the shape.
     """
+    run, truth, sight = problem.run, problem.truth, problem.first
     table = need(run, "landscape", "the loss landscape")
     first, beat = sight.radar.frames([0]), sight.capture.beat[:1, :1, :1]
     fine = np.linspace(-table.exact_span, table.exact_span, table.exact_points)
     wide = np.linspace(-table.span, table.span, table.points)
     along = table.object, table.axis
-    model = sight.model(sampling_of(run))
+    model = models_of(problem)[0]
     assert isinstance(model, SurrogateMap)
     models = {
         "surrogate, first widths": model,
@@ -56,8 +58,8 @@ def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[Figure, dict[st
 def moved(truth: Scene, name: str, axis: Sequence[float], offsets: Iterable[float]) -> list[Scene]:
     """Scenes in which one object is off the truth by each of the offsets [m] along an axis."""
     unit = torch.tensor(axis, dtype=torch.float64)
-    unit, still = unit / unit.norm(), torch.zeros(3, dtype=torch.float64)
-    return [build.displaced(truth, name, offset * unit, still) for offset in offsets]
+    moves = [offset * unit / unit.norm() for offset in offsets]
+    return [truth.replace(name, pose=displaced(truth[name], move).pose) for move in moves]
 
 
 def line_name(name: str, axis: Sequence[float]) -> str:

@@ -19,19 +19,19 @@ from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
-from invertwin.cli.fits.likeness import CURVE, watch_of
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
+    models_of,
     observations_of,
-    sampling_of,
-    stages_of,
+    schedule_of,
+    settings_of,
     steps_of,
     unknowns_of,
     varied,
 )
 from invertwin.cli.fits.scores import scores
-from invertwin.cli.run_file import need
+from invertwin.cli.fits.shape_scores import CURVE, watch_of
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.errors import InputError
 from invertwin.inversion import (
@@ -39,7 +39,6 @@ from invertwin.inversion import (
     Observation,
     Reconstruction,
     Report,
-    Schedule,
     Watch,
     reconstruct,
 )
@@ -65,22 +64,16 @@ def calibrated(
         capture, row = calibrate(sight.capture, target.center), {}
     else:
         bias, clock = RangeBias(), ClockOffset(sight.capture.positions)
-        stage, model = stages_of(run)[0], sight.model(sampling_of(run))
-        steps = table.steps or steps_of(run)
-        optimizer = build.optimizer(run.optimizer)
-        with watched(Bar(console, "calibration", steps)) as shown:
+        own = replace(problem, run=run.varied(table))
+        schedule, (model,) = settings_of(own.run).build(), models_of(own)
+        with watched(Bar(console, "calibration", schedule.steps)) as shown:
             found = reconstruct(
                 Scene({table.object: target}),
                 Observation(model, sight.radar, sight.capture, parameters=[bias, clock]),
                 [],
                 loss=build.loss(run.loss),
-                optimizer=replace(optimizer, rate=table.rate or run.optimizer.rate),
-                schedule=Schedule(
-                    steps,
-                    annealing=stage.annealing,
-                    frames_per_step=stage.frames_per_step,
-                    tolerance=stage.tolerance,
-                ),
+                optimizer=build.optimizer(own.run.optimizer),
+                schedule=schedule,
                 callbacks=[*shown, _checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
                 seed=run.seed,
             )
@@ -152,7 +145,7 @@ def _staged(
     checkpoint: str,
     bar: "Bar | None" = None,
 ) -> Reconstruction:
-    run, stages, watch = problem.run, stages_of(problem.run), watch_of(problem)
+    run, stages, watch = problem.run, schedule_of(problem), watch_of(problem)
     for k in range(len(stages) - 1):
         folder.file(str(stage_file(Path(checkpoint), k)))
     every = run.measures.every if run.measures else 1
@@ -175,8 +168,7 @@ def _staged(
 
 def _checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
-    every = need(problem.run, "reconstruct", "reconstruct").checkpoint_every
-    return Checkpoint(folder.file(name), every, resume=True)
+    return Checkpoint(folder.file(name), settings_of(problem.run).checkpoint_every, resume=True)
 
 
 def _values(modules: nn.ModuleList) -> dict[str, Any]:
