@@ -1,7 +1,7 @@
 """What a value may be, as annotations: the library's signatures state it, run files check it."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le
 
@@ -20,6 +20,16 @@ class Letters:
     """Marks a text that is made of some letters. In a run file it is a list of them."""
 
     allowed: str
+
+
+@dataclass(frozen=True)
+class Among:
+    """Marks a text that is one of these names."""
+
+    names: tuple[str, ...]
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: Any) -> Any:
+        return handler.generate_schema(Literal[self.names])
 
 
 Axes = Annotated[str, Letters("xyz")]

@@ -88,7 +88,7 @@ def test_the_recording_has_movers_near_three_metres(data_folder):
 
 def test_the_channels_of_the_mover_are_a_plane_wave(data_folder):
     data = read_chirps(data_folder / "openradar")
-    radar = data.radar(*board("xWR1642").arrays())
+    radar = data.recorded(*board("xWR1642").arrays()).radar()
     moving = (data.beat - data.beat.mean(1, keepdim=True)).to(torch.complex128)
     spectrum = range_doppler(moving, radar, radar.grid(2.5, 3.5), data.settings.chirps)
     spectrum = compensate_tdm(spectrum, radar, data.settings.chirps)[0]

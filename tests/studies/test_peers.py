@@ -47,7 +47,7 @@ def radar():
     one = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Isotropic())
     waveform = FMCW(76e9, 2e9, 5e-5, 64)
     place = torch.zeros(1, 3, dtype=torch.float64)
-    return Radar(one, planar_array(8, 6, 1.9e-3, 1.9e-3), waveform, place)
+    return Radar(one, planar_array((8, 6), (1.9e-3, 1.9e-3)), waveform, place)
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from invertwin.capture.range_interpolation import RangeInterpolator
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar
+from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.spectrum import exact_spectrum
 
 BEAT_DIMS = ("frame", "tx", "rx", "sample")
@@ -205,6 +205,13 @@ class Capture:
     def survey(self) -> Float64[Tensor, "target 3"] | None:
         """Known positions of targets [m]."""
         return tensor(self.dataset, "survey") if "survey" in self.dataset.variables else None
+
+    @property
+    def max_range(self) -> float:
+        """Range up to which the data mean something [m]."""
+        if "range_profile" in self.dataset:
+            return float(self.ranges[-1])
+        return sampled(self._radar).max_range
 
     def radar(self) -> Radar:
         """The radar at the poses of the frames."""

@@ -3,13 +3,14 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.capture.chirps import ChirpData
+from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.radar_fields import labelled
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -18,6 +19,7 @@ from invertwin.radar.waveform import unit_window
 from invertwin.scene.checks import checked_tensor
 from invertwin.scene.files import replacing
 
+Recorded = TypeVar("Recorded", bound=Capture | ChirpCapture)
 _DEAD = 1e-3
 
 
@@ -91,28 +93,17 @@ class ChannelCalibration:
         with replacing(path) as part:
             part.write_text(json.dumps({"gains": torch.view_as_real(self.gains).tolist()}) + "\n")
 
-    def apply(self, capture: Capture) -> Capture:
-        """The capture with every channel divided by its gain.
+    def apply(self, capture: Recorded) -> Recorded:
+        """The recording with every channel divided by its gain.
 
         Raises:
             InputError: range profiles, or another number of channels.
         """
         beat = self._corrected(capture.beat)
+        if isinstance(capture, ChirpCapture):
+            return replace(capture, beat=beat)
         variable = labelled(("frame", "tx", "rx", "sample"), beat, "1")
-        return Capture(capture.dataset.assign(beat=variable))
-
-    def apply_to_chirps(self, data: ChirpData) -> ChirpData:
-        """Calibrate every chirp of raw data. The samples are no longer whole counts.
-
-        Raises:
-            InputError: another number of channels, or real samples: a phase turns only complex
-                ones, so calibrate their `ChirpData.capture`.
-        """
-        if data.settings.real:
-            raise InputError(
-                "expected complex samples, got real ones; calibrate the capture made from them"
-            )
-        return replace(data, samples=self._corrected(data.samples))
+        return type(capture)(capture.dataset.assign(beat=variable))
 
     def _corrected(self, samples: Complex[Tensor, "*batch tx rx sample"]) -> Tensor:
         expected = tuple(self.gains.shape)

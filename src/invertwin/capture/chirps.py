@@ -12,6 +12,7 @@ from scipy.signal import hilbert
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
+from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
@@ -184,16 +185,19 @@ class ChirpData:
 
         An analytic signal holds for ranges below half of the waveform's `max_range`.
         """
-        return self._complex(self.samples)
+        if not self.settings.real:
+            return self.samples
+        analytic = np.asarray(hilbert(self.samples.real.numpy().astype(np.float64), axis=-1))
+        return torch.from_numpy(analytic)
 
-    def radar(
+    def recorded(
         self,
         transmitters: AntennaArray,
         receivers: AntennaArray,
         positions: Float64[Tensor, "frame 3"] | None = None,
         rotations: Float64[Tensor, "frame 3 3"] | None = None,
-    ) -> Radar:
-        """What recorded the samples.
+    ) -> ChirpCapture:
+        """Complex beat signals of every chirp, with the radar that recorded them.
 
         Args:
             transmitters: elements in the order of sending.
@@ -215,7 +219,9 @@ class ChirpData:
                 )
         if positions is None:
             positions = torch.zeros(self.frame_count, 3, dtype=torch.float64)
-        return Radar(transmitters, receivers, self.settings.waveform, positions, rotations)
+        settings = self.settings
+        radar = Radar(transmitters, receivers, settings.waveform, positions, rotations)
+        return ChirpCapture(self.beat, radar, settings.chirps, settings.frame_period, settings.real)
 
     def capture(
         self,
@@ -226,12 +232,7 @@ class ChirpData:
         positions: Float64[Tensor, "frame 3"] | None = None,
         rotations: Float64[Tensor, "frame 3 3"] | None = None,
     ) -> Capture:
-        """One beat signal per frame and channel, for a scene that stands still within a frame.
-
-        A static scene is the same in every chirp, so the mean over the chirps is the recording with
-        less noise; echoes that move by λ/4 or more during a frame vanish in it. One chosen chirp
-        keeps them, but its transmitters still send one after the other: what moves has phase steps
-        from TX to TX, which `invertwin.radar.compensate_tdm` takes out of whole frames.
+        """One beat signal per frame and channel, see `ChirpCapture.capture`.
 
         Args:
             transmitters: elements in the order of sending.
@@ -243,30 +244,7 @@ class ChirpData:
         Raises:
             InputError: another number of elements, or a chirp that does not exist.
         """
-        radar = self.radar(transmitters, receivers, positions, rotations)
-        beat = self._complex(self._chosen(chirps))
-        period = self.settings.frame_period
-        times = None
-        if period is not None:
-            times = torch.arange(self.frame_count, dtype=torch.float64) * period
-        return Capture.from_beat(beat, radar, times)
-
-    def _complex(self, samples: Tensor) -> Tensor:
-        if not self.settings.real:
-            return samples
-        analytic = np.asarray(hilbert(samples.real.numpy().astype(np.float64), axis=-1))
-        return torch.from_numpy(analytic)
-
-    def _chosen(self, chirps: int | str) -> Tensor:
-        if chirps == "mean":
-            return self.samples.mean(dim=1)
-        count = self.samples.shape[1]
-        if isinstance(chirps, bool) or not isinstance(chirps, int) or not 0 <= chirps < count:
-            raise InputError(
-                f'expected chirps to be "mean" or a number from 0 to {count - 1}, got {chirps!r}; '
-                "say how a frame becomes one signal"
-            )
-        return self.samples[:, chirps]
+        return self.recorded(transmitters, receivers, positions, rotations).capture(chirps)
 
 
 def adc_counts(

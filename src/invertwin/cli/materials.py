@@ -13,8 +13,9 @@ from pydantic import GetCoreSchemaHandler, model_validator
 from torch import Tensor
 
 from invertwin.cli.registry import Form, Group, Registry, Table, number_or_list
-from invertwin.cli.section import Among, InputPath, Section, about, fail, key
+from invertwin.cli.section import InputPath, Section, about, fail, key
 from invertwin.errors import InputError
+from invertwin.limits import Among
 from invertwin.scene import (
     Dielectric,
     Itu,

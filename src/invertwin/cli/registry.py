@@ -165,9 +165,11 @@ class TableOf:
     make: Any
     base: type[Table] = Table
     without: tuple[str, ...] = ()
+    checked: bool | None = None
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        return handler.generate_schema(_table_of_class(self.make, self.base, self.without))
+        found = _table_of_class(self.make, self.base, self.without, self.checked)
+        return handler.generate_schema(found)
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,8 @@ class Registry:
         sections: Of run files: dataclasses or pydantic models, by name.
         commands: Of the command line: functions as typer takes them, by name; each is a task, too.
         recordings: What `invertwin look` knows by the name of a file: the kind of its data, whose
-            constructor gets the folder alone, and the preset that recorded, if it is known.
+            constructor gets the folder, and the preset that recorded, unless the user names
+            another: the constructor then gets a `board`, too.
         groups: Of kinds, by name.
         forms: How values of a type of the library are written.
         bases: A base of the tables of all constructors of a type or of its subclasses.
@@ -533,5 +536,10 @@ def _joined(first: type[Table], second: type[Table]) -> type[Table]:
 
 
 @cache
-def _table_of_class(kind: Any, base: type[Table] = Table, without: tuple[str, ...] = ()) -> Any:
-    return registry.table_of(kind, kind.__name__, base, without=without, checked=None)
+def _table_of_class(
+    kind: Any,
+    base: type[Table] = Table,
+    without: tuple[str, ...] = (),
+    checked: bool | None = None,
+) -> Any:
+    return registry.table_of(kind, _title(kind.__name__), base, without=without, checked=checked)

@@ -6,7 +6,6 @@ Nothing here imports torch, so that the command line can say what it offers with
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
@@ -17,7 +16,6 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
-    GetCoreSchemaHandler,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -59,16 +57,6 @@ class KeyInputError(InputError):
     def __init__(self, path: str, text: str) -> None:
         super().__init__(f"{path}: {text}")
         self.path, self.text = path, text
-
-
-@dataclass(frozen=True)
-class Among:
-    """Annotates a key that holds one of these names."""
-
-    names: tuple[str, ...]
-
-    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        return handler.generate_schema(Literal[self.names])
 
 
 @contextmanager

@@ -5,13 +5,16 @@ import warnings
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Gt, Le
 from jaxtyping import Complex, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, differentiated
 from invertwin.errors import InputError
+from invertwin.limits import Among, NonNegative, Positive
 from invertwin.radar.waveform import (
     WINDOWS,
     PhysicsWarning,
@@ -21,6 +24,8 @@ from invertwin.radar.waveform import (
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
 
+Window = Annotated[str, Among(WINDOWS)]
+Cosine = Annotated[float, Gt(0), Le(1)]
 # Antennas closer than this see the same surfaces: one visibility test serves both.
 _SHARED_VISIBILITY_DISTANCE = 0.1
 # Arrays are built for λ/2 at some frequency of the band, not exactly at its centre.
@@ -58,8 +63,8 @@ class Radar:
     waveform: Waveform
     positions: Float64[Tensor, "frame 3"]
     rotations: Float64[Tensor, "frame 3 3"] | None = None
-    window: str = "hamming"
-    array_window: str = "hamming"
+    window: Window = "hamming"
+    array_window: Window = "hamming"
     shared_visibility: bool | None = None
     range_bias: float | Float64[Tensor, ""] = 0.0
 
@@ -163,11 +168,11 @@ class Radar:
 
     def grid(
         self,
-        range_min: float,
-        range_max: float,
-        u_max: float = 1.0,
-        v_max: float = 1.0,
-        oversample: float = 2,
+        range_min: NonNegative,
+        range_max: Positive,
+        u_max: Cosine = 1.0,
+        v_max: Cosine = 1.0,
+        oversample: Annotated[float, Ge(1)] = 2.0,
     ) -> Grid:
         """Bins that hold the spectrum without loss.
 
@@ -179,9 +184,9 @@ class Radar:
         Args:
             range_min: First range to cover [m].
             range_max: Last range to cover [m].
-            u_max: Direction cosines from -u_max to u_max.
-            v_max: As ``u_max``, for v.
-            oversample: Bins per range cell.
+            u_max: Direction cosine to the right; the map is as wide to the left.
+            v_max: Direction cosine up; the map is as high downwards.
+            oversample: Bins per resolution cell.
 
         Raises:
             InputError: The limits are not increasing, out of bounds, or beyond the unambiguous

@@ -14,7 +14,7 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
-from invertwin.cli import build, sensors
+from invertwin.cli import build
 from invertwin.cli.fits.fitting import Bar, watched
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
@@ -159,7 +159,7 @@ def _recorded(run: RunFile) -> ChirpCapture:
     data = need(run, "data", "a mover")
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
-        chirps = sensors.chirps(need(run, "chirps", "a mover in simulated data"))
+        chirps = need(run, "chirps", "a mover in simulated data").build()
         beat = chirp_train(run, build.true_scene(run), radar, chirps)
         recording = ChirpCapture(beat, radar, chirps)
     else:

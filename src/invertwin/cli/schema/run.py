@@ -24,11 +24,9 @@ from invertwin.cli.schema.fits import (
 )
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.section import InputPath, Section, Seed, Vector, fail, key
-from invertwin.cli.sensors import ChirpsTable, GridTable, RadarTable
+from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
-from invertwin.radar.impairments import Impairments
-from invertwin.radar.motion import Chirps
 from invertwin.radar.surrogate import Surrogate
 
 # How a run calls its own fits, and how names of its metrics end.
@@ -40,8 +38,6 @@ AnyMaterial = Annotated[Any, OneOf("material")]
 AnyModel = Annotated[Any, OneOf("model")]
 AnyData = Annotated[Any, OneOf("data")]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
-AnyChirps = Annotated[Any, TableOf(Chirps, ChirpsTable, ("order",))]
-AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_figure_db"))]
 
 
 class SceneFile(Section):
@@ -88,8 +84,8 @@ class Raw(Section):
 class ObservationTable(Section):
     """What one of several sensors has measured; without a key the section of this name counts."""
 
-    radar: RadarTable | None = key("what measures; not with a capture", None)
-    grid: GridTable | None = key("the map that is compared", None)
+    radar: AnyRadar | None = key("what measures; not with a capture", None)
+    grid: AnyGrid | None = key("the map that is compared", None)
     data: AnyData | None = key("what is fitted", None)
     surrogate: AnySurrogate | None = key("kernels of the smooth model", None)
     chirps: AnyChirps | None = key("several ramps a frame", None)
@@ -107,8 +103,8 @@ class _RunFile(Section):
     scene: dict[str, Annotated[Any, OneOf("object")]] = key("[scene.<name>]: an object each", {})
     scene_file: SceneFile | None = key("objects from a file", None)
     truth: dict[str, Truth] = key("[truth.<name>]: where an object really is", {})
-    radar: RadarTable | None = key("what measures; not with a capture", None)
-    grid: GridTable | None = key("the map that is compared", None)
+    radar: AnyRadar | None = key("what measures; not with a capture", None)
+    grid: AnyGrid | None = key("the map that is compared", None)
     chirps: AnyChirps | None = key("several ramps a frame", None)
     impairments: AnyImpairments | None = key("what the front end of simulated data adds", None)
     raw: Raw | None = key("raw files that simulate writes beside the capture", None)
