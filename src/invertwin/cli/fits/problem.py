@@ -18,7 +18,7 @@ from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import SAMPLED, Reconstruct, RunFile, SimulatedData
+from invertwin.cli.schema import SAMPLED, Measures, Reconstruct, RunFile, SimulatedData
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
@@ -32,7 +32,6 @@ from invertwin.seeds import derived_seed
 FULL, INTERIOR = "full", "interior_only"
 
 _POINTS_PER_M2 = 2_000.0
-_OWN = ("radar", "grid", "data", "surrogate", "chirps", "model")  # sections of a sensor
 
 
 @dataclass(frozen=True)
@@ -61,6 +60,18 @@ class Problem:
         """The only sensor, or the first one."""
         return next(iter(self.sights.values()))
 
+    @property
+    def sensors(self) -> list[tuple[RunFile, Sight]]:
+        """Every sensor with the run file as it is for it."""
+        runs = observed_runs(self.run)
+        return [(runs[name], sight) for name, sight in self.sights.items()]
+
+    @property
+    def measures(self) -> Measures | None:
+        """How the shape is scored, where the true one is known."""
+        table = self.run.measures
+        return table if table is not None and table.object in self.known else None
+
 
 def problem_of(run: RunFile, console: Console) -> Problem:
     """The problem of a run file; simulated data are simulated here.
@@ -79,50 +90,49 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     # Their errors come before any work.
     build.parameters(run.parameters, scene, sought_bodies(run), run.scene)
     sights, observed = {}, observed_runs(run)
-    for name, (own, weight) in observed.items():
+    for name, own in observed.items():
         with about(f"observations.{name}") if name else nullcontext():
-            sights[name] = _sight(own, weight, truth, console)
-    simulated = all(isinstance(own.data, SimulatedData) for own, _ in observed.values())
+            weight = run.observations[name].weight if name else 1.0
+            sights[name] = Sight(*_recorded(own, truth, console), weight)
+    simulated = all(isinstance(own.data, SimulatedData) for own in observed.values())
     known = frozenset(truth.names if simulated else run.truth)
     target = run.starts.object if run.starts else next(iter(sought_objects(run)), None)
     return Problem(run, scene, truth, known, sights, target)
 
 
-def observed_runs(run: RunFile) -> dict[str, tuple[RunFile, float]]:
-    """The run file with the sections of every sensor, and the sensor's weight, by name.
+def observed_runs(run: RunFile) -> dict[str, RunFile]:
+    """The run file with the sections of every sensor, by the sensor's name.
 
     The only sensor of a run file without `[observations]` has an empty name.
     """
     if not run.observations:
-        return {"": (run, 1.0)}
+        return {"": run}
     found = {}
     for number, (name, table) in enumerate(run.observations.items()):
-        keys = [key for key in _OWN if getattr(table, key) is not None]
-        own = {key: getattr(table, key) for key in keys}
+        own = {key: value for key, value in table if key != "weight" and value is not None}
         if "data" not in own and isinstance(run.data, SimulatedData):
             # The noise of one radar is not that of another.
             seed = derived_seed(run.seed if run.data.seed is None else run.data.seed, number)
             own["data"] = run.data.model_copy(update={"seed": seed})
-        found[name] = (run.model_copy(update={**own, "observations": {}}), table.weight)
+        found[name] = run.model_copy(update={**own, "observations": {}})
     return found
 
 
-def _sight(run: RunFile, weight: float, truth: Scene, console: Console) -> Sight:
+def _recorded(run: RunFile, truth: Scene, console: Console) -> tuple[Capture, Radar, Grid]:
     data, table = need(run, "data", "reconstruct"), need(run, "grid", "reconstruct")
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
         grid = build.grid(table, radar)
         console.print("simulating the exact signals of the true scene")
         capture = Capture.from_beat(exact(run, truth, radar, grid).beat, radar)
-        return Sight(capture, radar, grid, weight)
+        return capture, radar, grid
     if run.radar is not None:
         raise InputError(
             f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
             "remove it: a capture brings its radar along"
         )
     capture = measured(data)
-    radar = capture.radar()
-    return Sight(capture, radar, build.grid(table, radar), weight)
+    return capture, capture.radar(), build.grid(table, capture.radar())
 
 
 def sought_objects(run: RunFile) -> list[str]:
@@ -240,10 +250,10 @@ def points_per_m2(run: RunFile) -> float:
 
 def models_of(problem: Problem) -> list[ForwardModel]:
     """The forward models that are fitted, one for every sensor."""
-    sampling, runs = sampling_of(problem.run), observed_runs(problem.run)
+    sampling = sampling_of(problem.run)
     found: list[ForwardModel] = []
-    for name, sight in problem.sights.items():
-        run, kernels = runs[name][0], build.surrogate(runs[name][0].surrogate)
+    for run, sight in problem.sensors:
+        kernels = build.surrogate(run.surrogate)
         if run.model is not None:
             found.append(build.model(run.model, sight.grid, kernels))
         elif run.surrogate.exact:
@@ -255,12 +265,12 @@ def models_of(problem: Problem) -> list[ForwardModel]:
 
 def sharp_models(problem: Problem) -> list[SurrogateMap]:
     """The smooth model of every sensor without extra widths, mean over phases."""
-    sampling, runs, found = sampling_of(problem.run), observed_runs(problem.run), []
-    for name, sight in problem.sights.items():
-        kernels = build.surrogate(runs[name][0].surrogate)
-        sharp = replace(kernels, range_width=0.0, angle_width=0.0, phases="mean")
-        found.append(SurrogateMap(sight.grid, sharp, sampling))
-    return found
+    sharp = {"range_width": 0.0, "angle_width": 0.0, "phases": "mean"}
+    sampling = sampling_of(problem.run)
+    return [
+        SurrogateMap(sight.grid, replace(build.surrogate(run.surrogate), **sharp), sampling)
+        for run, sight in problem.sensors
+    ]
 
 
 def observations_of(problem: Problem) -> list[Observation]:
