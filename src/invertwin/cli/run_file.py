@@ -154,7 +154,7 @@ def _explain(error: ErrorDetails) -> str:
             return (
                 f"{path}.{key}".lstrip(".")
                 + f": {said}"
-                + _nearest(key, allowed, _MOVED.get(key, "remove the key"))
+                + (_MOVED.get(key) or _nearest(key, allowed, "remove the key"))
             )
         case "unknown_object":
             at = ".".join(filter(None, (path, context["path"])))

@@ -15,7 +15,7 @@ from invertwin import plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
 from invertwin.cli import build
-from invertwin.cli.fits.fitting import Bar, watched
+from invertwin.cli.fits.fitting import watched
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
 from invertwin.cli.run_file import about, need
@@ -168,7 +168,7 @@ def _fitted(
     with about(f"scene.{table.object}"):
         body = MovingBody(table.object, scene, radar, echo, table.free)
     near = model.around(echo.range, echo.rate, table.cells, radar)
-    with watched(Bar(console, name, settings.steps)) as callbacks:
+    with watched(console, name, settings.steps) as callbacks:
         found = reconstruct(
             scene,
             Observation(near, radar, recording),

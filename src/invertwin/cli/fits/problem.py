@@ -198,28 +198,20 @@ def stages_of(run: RunFile) -> list[tuple[StageTable, RunFile]]:
     return found or [(StageTable(), run)]
 
 
-def steps_of(run: RunFile) -> int:
-    """The budget of a fit."""
-    return sum(settings_of(own).steps for _, own in stages_of(run))
-
-
 def schedule_of(problem: Problem) -> list[Stage]:
     """The stages of a fit, as the library takes them."""
     sought, found = sought_of(problem.run), []
     for table, run in stages_of(problem.run):
         names = [name for name in table.parameters if name in sought]
-        meshes = [
-            t.object for n, t in sought.items() if t.kind == "vertices" and n in (names or sought)
-        ]
+        free = [sought[name] for name in names or sought]
+        finer = partial(remeshed, edge=table.remesh or 0.0)
         counts = {k: v for k, v in (table.reconstruct or {}).items() if k in SAMPLED.made_from}
         models = models_of(replace(problem, run=run))
         stage = Stage(
             **vars(settings_of(run).build()),
             unknowns=tuple(names),
             rebuild=table.rebuild,
-            remesh=dict.fromkeys(meshes, partial(remeshed, edge=table.remesh))
-            if table.remesh
-            else {},
+            remesh={t.object: finer for t in free if table.remesh and t.kind == "vertices"},
             optimizer=build.optimizer(run.optimizer),
             models=[model.sampled_by(**counts) if counts else model for model in models],
         )

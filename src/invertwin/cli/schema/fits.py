@@ -1,11 +1,10 @@
 """The tables of fits: starts, budget, stages, variants, scores."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, MinLen
-from pydantic import GetCoreSchemaHandler
-from pydantic_core import core_schema
+from pydantic import PlainSerializer, WrapValidator
 
 from invertwin.channel import Sampling
 from invertwin.cli.fit_tables import SurrogateTable
@@ -42,7 +41,10 @@ SAMPLED = registry.table_of(
     "SamplingTable",
     without=("interior_edges", "points_per_m2", "rough_paths", "memory_budget", "backend"),
 )
-Budget = registry.table_of(Schedule, "Budget", SAMPLED)
+
+
+class Budget(registry.table_of(Schedule, "Schedule", SAMPLED)):
+    """How long a fit lasts, and what it samples."""
 
 
 class Reconstruct(Budget):
@@ -57,42 +59,25 @@ class Reconstruct(Budget):
     joint_limit_deg: Positive = key("of a success, mean over the sought joints of a body", 5.0)
 
 
-@dataclass(frozen=True)
-class PartOf:
-    """Annotates a table that says only what is other than in a section; it stays as given.
-
-    The whole that it is merged into is checked. `alone` says that the part can be, too.
-    """
-
-    section: Any
-    alone: bool = False
-
-    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        def given(value: Any, check: Any) -> Any:
-            if self.alone:
-                check(value)
-            return value
-
-        return core_schema.no_info_wrap_validator_function(
-            given,
-            handler.generate_schema(self.section),
-            serialization=core_schema.plain_serializer_function_ser_schema(lambda value: value),
-        )
+def _checked(value: Any, check: Callable[[Any], Any]) -> Any:
+    check(value)
+    return value
 
 
+# A table of a part stays as given. What must be complete to be right is checked once it is merged.
+_GIVEN = WrapValidator(lambda value, _: value), PlainSerializer(lambda value: value)
+_CHECKED = WrapValidator(_checked), _GIVEN[1]
 AnyTable = dict[str, Any]
 
 
 class Part(Section):
     """A part of a run: its sections say only what is other than in those of the whole."""
 
-    reconstruct: Annotated[Any, PartOf(Budget, alone=True)] = key(
-        "what is other than in [reconstruct]", None
-    )
-    optimizer: Annotated[Any, PartOf(Annotated[Any, OneOf("optimizer")])] = key(
+    reconstruct: Annotated[Budget, *_CHECKED] = key("what is other than in [reconstruct]", None)
+    optimizer: Annotated[Any, OneOf("optimizer"), *_GIVEN] = key(
         "what is other than in [optimizer]; another `kind` replaces it", None
     )
-    surrogate: Annotated[Any, PartOf(Annotated[Any, TableOf(Surrogate, SurrogateTable)])] = key(
+    surrogate: Annotated[Any, TableOf(Surrogate, SurrogateTable), *_GIVEN] = key(
         "what is other than in [surrogate], or a name that replaces it", None
     )
 
@@ -118,7 +103,7 @@ class Stage(Part):
 class Variant(Part):
     """The same data and starts, fitted otherwise, to compare."""
 
-    reconstruct: Annotated[Any, PartOf(Reconstruct, alone=True)] = key(
+    reconstruct: Annotated[Reconstruct, *_CHECKED] = key(  # type: ignore[override]
         "what is other than in [reconstruct]", None
     )
     loss: AnyTable | None = key("what is other than in [loss]", None)
