@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -300,47 +301,44 @@ def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], in
 
 def settings_of(
     waveform: FMCW,
-    transmitters: int,
-    receivers: int,
+    transmitters: int | Sequence[int],
+    receivers: int | Sequence[int],
     *,
-    loops: int = 1,
-    frames: int | None = None,
-    frame_period: float | None = None,
-    idle_time: float = 0.0,
-    lanes: int | None = None,
     order: Sequence[int] | None = None,
+    adc_start_time: float = 0.0,
+    **others: Any,
 ) -> ChirpSettings:
     """Settings that record this waveform with all transmitters in turn and all receivers.
 
     Args:
-        waveform: of every ramp.
-        transmitters: how many.
-        receivers: how many.
-        loops: chirps of each transmitter in a frame.
-        frames: how many, if it is known.
-        frame_period: from frame to frame [s].
-        idle_time: between ramps [s].
-        lanes: of the LVDS link.
-        order: of the transmitters, counted from 0, as in `Chirps`; None = TX1, TX2, …
+        waveform: of every ramp, as it is sampled.
+        transmitters: how many, or their numbers from 1.
+        receivers: how many, or their numbers from 1.
+        order: of the transmitters, counted from 0, as in `Chirps`; None = as they are given.
+        adc_start_time: from the start of the ramp to the first sample [s].
+        others: further fields of `ChirpSettings`; without `loops` one.
 
     Raises:
         InputError: see `ChirpSettings`; an order of other transmitters.
     """
-    turns = range(transmitters) if order is None else _checked_order(order, transmitters)
+    senders, listeners = (
+        range(1, given + 1) if isinstance(given, int) else given
+        for given in (transmitters, receivers)
+    )
+    if order is not None:
+        senders = [senders[turn] for turn in _checked_order(order, len(senders))]
+    others.setdefault("loops", 1)
     rate = waveform.samples / waveform.duration
     nearest = round(rate)
     return ChirpSettings(
-        start_frequency=waveform.start_frequency,
+        start_frequency=waveform.start_frequency - waveform.slope * adc_start_time,
         slope=waveform.slope,
         sample_rate=float(nearest) if math.isclose(rate, nearest, rel_tol=1e-12) else rate,
         samples=waveform.samples,
-        transmit_order=tuple(1 + turn for turn in turns),
-        receivers=tuple(range(1, receivers + 1)),
-        loops=loops,
-        frames=frames,
-        frame_period=frame_period,
-        idle_time=idle_time,
-        lanes=lanes,
+        transmit_order=tuple(senders),
+        receivers=tuple(listeners),
+        adc_start_time=adc_start_time,
+        **others,
     )
 
 

@@ -9,7 +9,6 @@ from annotated_types import MinLen
 from torch import Tensor, nn
 
 from invertwin.cli.bodies import Bodies, body, joints
-from invertwin.cli.materials import sought_values
 from invertwin.cli.registry import Group, OneOf, Registry, Table
 from invertwin.cli.section import Counts, InputPath, Vector, about, key
 from invertwin.errors import InputError
@@ -31,7 +30,7 @@ from invertwin.scene.geometry import (
     load_prior,
     load_vehicle_space,
 )
-from invertwin.scene.parameters import Pose, Scale, Translation, Vertices
+from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
 
 
 class Placement(Table):
@@ -122,7 +121,7 @@ def register(registry: Registry) -> None:
         ("prior", prior, ()),
         ("shape_space", shape_space, ()),
         ("body", joints, ()),
-        ("material", sought_values, ()),
+        ("material", MaterialValues.of, ()),
         ("radar_pose", RadarPose, ("translation", "rotation")),
         ("mover", Mover, ()),
     ):

@@ -207,7 +207,8 @@ class Radar:
             if range_max > (1 + 1e-9) * self.waveform.max_range:
                 raise InputError(
                     f"expected range_max within the unambiguous {self.waveform.max_range:.4g} m, "
-                    f"got {range_max:g}; finer frequency steps (more samples) reach farther"
+                    f"got {range_max:g}; give metres, or finer frequency steps (more samples)",
+                    "range_max",
                 )
             step = self.waveform.max_range / round(oversample * self.waveform.samples)
         first = math.floor(range_min / step + 1e-9)

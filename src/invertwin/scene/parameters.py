@@ -5,18 +5,28 @@ Any torch module Scene → Scene serves as well.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import torch
+from annotated_types import Ge, MinLen
 from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
-from invertwin.scene.material.values import RANGES, Texture, Value, checked_value, evaluated
+from invertwin.scene.material.itu import Itu
+from invertwin.scene.material.materials import held_by
+from invertwin.scene.material.values import (
+    RANGES,
+    MaterialValue,
+    Texture,
+    Value,
+    checked_value,
+    evaluated,
+)
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import (
     compose,
@@ -25,7 +35,7 @@ from invertwin.scene.pose import (
     rotation_from_quaternion,
     vector_from_quaternion,
 )
-from invertwin.scene.scene import Scene
+from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
 _T = TypeVar("_T")
@@ -270,6 +280,32 @@ class MaterialValues(nn.Module):
                 checked = checked.image
             self.raw[name] = nn.Parameter(_unbounded(name, evaluated(checked).detach()))
 
+    @classmethod
+    def of(
+        cls,
+        object: str,
+        values: Annotated[Sequence[MaterialValue], MinLen(1)],
+        item: Object,
+        layer: Annotated[int, Ge(0)] | None = None,
+    ) -> "MaterialValues":
+        """Values of an object's material, from those that it has.
+
+        Args:
+            object: name of the object.
+            values: which are sought.
+            item: the object.
+            layer: of a multilayer, from 0: the layer whose values they are.
+
+        Raises:
+            InputError: the material has no such value or layer, a value comes from the ITU table,
+                or it starts at the end of its range.
+        """
+        try:
+            holder = held_by(item.material, layer, type(item.material).__name__)
+            return cls(object, layer=layer, **{name: _start(holder, name) for name in values})
+        except InputError as error:
+            raise InputError(str(error), f"values, material of {object}") from None
+
     def forward(self, scene: Scene) -> Scene:
         """The scene with the material's values replaced.
 
@@ -277,19 +313,19 @@ class MaterialValues(nn.Module):
             InputError: the object's material has no such value, or no such layer.
         """
         material: Any = scene[self.object].material
-        values = self._bounded()
-        if self.layer is None:
-            self._check(material, f"a material with {', '.join(self.raw)}", "the object")
-            return scene.replace(self.object, material=replace(material, **values))
-        layers = list(getattr(material, "layers", ()))
-        if self.layer >= len(layers):
+        holder = held_by(material, self.layer, repr(self.object))
+        where = "material" if self.layer is None else "layer"
+        if any(name not in getattr(holder, "__dataclass_fields__", {}) for name in self.raw):
             raise InputError(
-                f"expected a layer below {len(layers)} of {self.object!r}, got {self.layer}; "
-                "count layers from 0, and give `layer` for a Multilayer only"
+                f"expected a {where} with {', '.join(self.raw)} for {self.object!r}, got "
+                f"{type(holder).__name__}; give it another material"
             )
-        self._check(layers[self.layer], f"a layer with {', '.join(self.raw)}", "the layer")
-        layers[self.layer] = replace(layers[self.layer], **values)
-        return scene.replace(self.object, material=replace(material, layers=layers))
+        changed = replace(holder, **self._bounded())
+        if self.layer is not None:
+            layers = [*material.layers]
+            layers[self.layer] = changed
+            changed = replace(material, layers=layers)
+        return scene.replace(self.object, material=changed)
 
     def values(self) -> dict[str, Tensor]:
         """Material values in their own units by name, for progress and reports.
@@ -303,14 +339,6 @@ class MaterialValues(nn.Module):
         values = {name: _bounded(name, raw) for name, raw in self.raw.items()}
         textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
         return {**values, **textures}
-
-    def _check(self, holder: Any, what: str, where: str) -> None:
-        fields = getattr(holder, "__dataclass_fields__", {})
-        if any(name not in fields for name in self.raw):
-            raise InputError(
-                f"expected {what} for {self.object!r}, got {type(holder).__name__}; "
-                f"give {where} another material"
-            )
 
 
 class Compose(nn.Module):
@@ -337,6 +365,19 @@ class Compose(nn.Module):
             if values is not None:
                 merged.update(values())
         return merged
+
+
+def _start(holder: Any, name: str) -> Value:
+    """The value of a material, or of a layer, from which a fit starts."""
+    if not hasattr(holder, name):
+        raise InputError(f"expected values of {type(holder).__name__}, got {name}; remove it")
+    value = getattr(holder, name)
+    if isinstance(value, Itu):
+        raise InputError(
+            f"expected a number from which {name} starts, got that of the ITU table; "
+            f"give `{name}` beside `itu`"
+        )
+    return value
 
 
 def _bounded(name: str, raw: Tensor) -> Tensor:

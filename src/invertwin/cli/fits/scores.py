@@ -18,11 +18,10 @@ from invertwin.cli.fits.problem import (
     sought_of,
 )
 from invertwin.cli.fits.shape_scores import shape_scores
-from invertwin.cli.materials import value_errors
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
-from invertwin.inversion.metrics import residual
+from invertwin.inversion.metrics import residual, value_errors
 from invertwin.models import surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
@@ -65,7 +64,10 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
         rows |= {"scale_error": abs(after.scale - 1)}
     told = [table for table in sought if _made_known(problem, table)]
     frequency = problem.first.radar.waveform.center_frequency
-    return rows | shapes | value_errors(told, twin, problem.truth, frequency)
+    for table in told:
+        ends = twin[table.object].material, problem.truth[table.object].material
+        rows |= value_errors(table.values, *ends, frequency, table.layer)
+    return rows | shapes
 
 
 def _made_known(problem: Problem, parameter: Any) -> bool:

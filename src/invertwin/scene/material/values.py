@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import InitVar, dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.limits import Among
 from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh
 
@@ -135,6 +136,8 @@ RANGES: Mapping[str, Range] = {
     "backscatter_exponent": Range("exponent of the backscattering lobe", 0.0),
 }
 """Every value of the library's materials by the name of its field."""
+
+MaterialValue = Annotated[str, Among(tuple(RANGES))]
 
 
 def checked_value(value: object, name: str) -> Value:
