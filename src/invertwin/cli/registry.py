@@ -40,7 +40,6 @@ BUILT_IN = (
     "invertwin.cli.sensors",
     "invertwin.cli.materials",
     "invertwin.cli.shape_tables",
-    "invertwin.cli.gradients",
     "invertwin.cli.recordings",
     "invertwin.cli.fit_tables",
 )
@@ -222,7 +221,7 @@ class Registry:
 
         Args:
             group: Such as "material", "shape", "waveform", "pattern", "array", "board", "track",
-                "data", "parameter", "theta", "loss", "optimizer" or "model".
+                "data", "parameter", "loss", "optimizer" or "model".
             kind: Its name in run files.
             make: Its class or function, or "module:name" of it, which is imported when needed.
             without: Arguments that are no keys.

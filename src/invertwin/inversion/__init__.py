@@ -10,6 +10,8 @@ from invertwin.inversion.fit import Fit as Fit
 from invertwin.inversion.gradcheck import Agreement as Agreement
 from invertwin.inversion.gradcheck import Check as Check
 from invertwin.inversion.gradcheck import GradientReport as GradientReport
+from invertwin.inversion.lines import line_of as line_of
+from invertwin.inversion.lines import losses_along as losses_along
 from invertwin.inversion.loss import CorrelationLoss as CorrelationLoss
 from invertwin.inversion.loss import SpectrumLoss as SpectrumLoss
 from invertwin.inversion.metrics import Residual as Residual
@@ -38,3 +40,4 @@ from invertwin.inversion.schedule import Schedule as Schedule
 from invertwin.inversion.schedule import Stage as Stage
 from invertwin.inversion.starts import displaced as displaced
 from invertwin.inversion.starts import nearby as nearby
+from invertwin.inversion.tangents import Bump as Bump

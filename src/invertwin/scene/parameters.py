@@ -6,7 +6,8 @@ Any torch module Scene → Scene serves as well.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any, TypeVar
 
 import torch
@@ -39,6 +40,23 @@ from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
 _T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Entries of a module's parameter that have a name, and perhaps a unit, of their own.
+
+    A module lists them in ``entries()``, by name. Tangents of gradient checks may use the name.
+
+    Attributes:
+        parameter: name of the parameter.
+        index: which of its entries.
+        slope: how fast the named value grows with them.
+    """
+
+    parameter: str
+    index: Any = ...
+    slope: float | Tensor = 1.0
 
 
 class Translation(nn.Module):
@@ -109,6 +127,10 @@ class RigidMotion(nn.Module):
         # rate in rad serves all components.
         halves = self.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
         return _free(self.rotation, self._rotation_axes) * halves
+
+    def entries(self) -> dict[str, Entries]:
+        """The rotation vector [rad], to first order from the identity."""
+        return {"rotation": Entries("rotation", slice(1, None))}
 
     def named_values(self, name: str) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] of `name`, for progress and reports."""
@@ -334,6 +356,15 @@ class MaterialValues(nn.Module):
         """
         where = self.object if self.layer is None else f"{self.object}.layers[{self.layer}]"
         return {f"{where}.{name}": _bounded(name, raw).detach() for name, raw in self.raw.items()}
+
+    def entries(self) -> dict[str, Entries]:
+        """The values in their own units."""
+        found = {}
+        for name, raw in self.raw.items():
+            at, one = (raw.detach(),), (torch.ones_like(raw),)
+            slope = torch.func.jvp(partial(_bounded, name), at, one)[1]
+            found[name] = Entries(f"raw.{name}", slope=slope)
+        return found
 
     def _bounded(self) -> dict[str, Tensor | Texture]:
         values = {name: _bounded(name, raw) for name, raw in self.raw.items()}

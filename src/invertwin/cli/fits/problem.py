@@ -88,7 +88,7 @@ def problem_of(run: RunFile, console: Console) -> Problem:
                 f"{len(run.parameters)} parameters; leave only that"
             )
     # Their errors come before any work.
-    build.parameters(run.parameters, scene, sought_bodies(run), run.scene)
+    build.parameters(run.parameters, scene, run.scene)
     sights, observed = {}, observed_runs(run)
     for name, own in observed.items():
         with about(f"observations.{name}") if name else nullcontext():
@@ -291,9 +291,9 @@ def _nuisances(run: RunFile, sight: Sight, name: str) -> dict[str, nn.Module]:
     return {f"{name}.{kind}" if name else kind: made[kind]() for kind in kinds}
 
 
-def unknowns_of(run: RunFile, start: build.Start) -> dict[str, Unknown]:
-    """What is fitted of the scene, by name, from a start."""
-    makers = build.builders(run.parameters, start, run.scene)
+def unknowns_of(run: RunFile) -> dict[str, Unknown]:
+    """What is fitted of the scene, by name."""
+    makers = build.builders(run.parameters, run.scene)
     return {
         name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
         for name, table in sought_of(run).items()

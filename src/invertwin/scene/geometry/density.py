@@ -6,12 +6,14 @@ import torch
 from jaxtyping import Float64
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.parameters import Entries
 from invertwin.scene.scene import Scene
 
 # Starts are kept this far above zero, in units of one over a node spacing: below, softplus is so
@@ -102,7 +104,12 @@ class DensityGrid(nn.Module):
     @property
     def density(self) -> Float64[Tensor, "x y z"]:
         """Extinction at the nodes [1/m]."""
-        return nn.functional.softplus(self.value) / self._unit
+        return softplus(self.value) / self._unit
+
+    def entries(self) -> dict[str, Entries]:
+        """The logarithm of the density: its changes are relative ones of the density."""
+        value = self.value.detach()
+        return {"log_density": Entries("value", slope=value.sigmoid() / softplus(value))}
 
     @property
     def cloud(self) -> Cloud:
