@@ -8,7 +8,6 @@ from typing import Any
 from torch import nn
 
 from invertwin.channel import Grid
-from invertwin.cli.bodies import SoughtBody
 from invertwin.cli.fit_tables import surrogate as surrogate
 from invertwin.cli.registry import Table
 from invertwin.cli.run_file import about as about
@@ -16,12 +15,13 @@ from invertwin.cli.run_file import need, unknown_object
 from invertwin.cli.schema import RunFile, SceneFile
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
-from invertwin.cli.shape_tables import ObjectTable, Placement, given_for, joined
+from invertwin.cli.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.tangents import Change, changes_of
 from invertwin.radar.surrogate import Surrogate
-from invertwin.scene import Mesh, Object, Scene
+from invertwin.scene import Mesh, Object, Scene, joined
 from invertwin.scene.files import CONCRETE, load_scene_xml
+from invertwin.scene.geometry import SkinnedBody
 
 
 def scene(run: RunFile) -> Scene:
@@ -105,7 +105,7 @@ class Start:
     """Where a fit starts."""
 
     scene: Scene
-    bodies: Mapping[str, SoughtBody] = field(default_factory=dict)  # whose joints are sought
+    bodies: Mapping[str, SkinnedBody] = field(default_factory=dict)  # whose joints are sought
 
 
 def builders(
@@ -141,6 +141,15 @@ def parameters(
             the end of its range; a box that does not hold the object.
     """
     return [make(scene) for make in builders(tables, objects).values()]
+
+
+def sought_bodies(run: RunFile, scene: Scene) -> dict[str, Any]:
+    """The bodies whose joints are sought: a `SkinnedBody` each, by object."""
+    return {
+        table.object: _module(table, f"parameters[{i}]", run.scene, scene)
+        for i, table in enumerate(run.parameters)
+        if table.kind == "body"
+    }
 
 
 def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, Change]]:

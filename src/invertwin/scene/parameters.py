@@ -1,4 +1,4 @@
-"""What can be fitted of a scene: modules Scene → Scene, and their composition.
+"""Modules Scene → Scene that can be fitted, and their composition.
 
 Every module starts as the identity unless initial values are given, and composes with the others.
 Any torch module Scene → Scene serves as well.
@@ -373,7 +373,7 @@ class MaterialValues(nn.Module):
 
 
 class Compose(nn.Module):
-    """Several modules that map the same kind of thing, applied from first to last.
+    """Applies several modules of the same kind, from first to last.
 
     All map scenes, or all map radars.
     """

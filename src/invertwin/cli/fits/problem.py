@@ -14,7 +14,6 @@ from torch import nn
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import exact
@@ -142,7 +141,8 @@ def sought_objects(run: RunFile) -> list[str]:
 
 def starts_of(problem: Problem) -> list[build.Start]:
     """Where fits start: about the truth as `[starts]` says, or where the scene is."""
-    run, scene, bodies = problem.run, problem.scene, sought_bodies(problem.run)
+    run, scene = problem.run, problem.scene
+    bodies = build.sought_bodies(run, scene)
     table = run.starts
     if table is None:
         return [build.Start(scene, bodies)]

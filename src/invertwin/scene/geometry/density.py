@@ -1,4 +1,4 @@
-"""A density of soft scatterers on a grid: a shape without a surface, until it is meshed."""
+"""A density of soft scatterers on a grid: a shape that has no surface until it is meshed."""
 
 from collections.abc import Sequence
 
@@ -29,7 +29,7 @@ class DensityGrid(nn.Module):
 
     Attributes:
         value: parameter [x, y, z].
-        albedo: of the cloud.
+        albedo: albedo of the cloud, see ``Cloud``.
     """
 
     def __init__(
@@ -78,14 +78,14 @@ class DensityGrid(nn.Module):
         counts: Sequence[int],
         depth: float = 0.5,
     ) -> "DensityGrid":
-        """A grid of one density σ; a way through the box along its longest side has ∫σ ds.
+        """Make a grid of one density σ, from ∫σ ds through the box along its longest side.
 
         Args:
             object: name of the object.
             low: corner of the box in the object's frame [m].
             high: the opposite corner [m].
             counts: nodes along x, y and z.
-            depth: that ∫σ ds; faint, since what is opaque hides what lies behind it from the fit.
+            depth: that ∫σ ds. Keep it small: what is opaque hides what lies behind it from the fit.
 
         Raises:
             InputError: as above.
@@ -139,7 +139,7 @@ class DensityGrid(nn.Module):
 
 
 def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
-    """The closed surface of equal density, by marching cubes; without gradients.
+    """Mesh the closed surface of equal density by marching cubes, without gradients.
 
     Args:
         cloud: the densities.
@@ -168,7 +168,7 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
 
 
 def without_clouds(scene: Scene) -> Scene:
-    """The scene with every cloud as the surface of its usual level; for exact signals, pictures.
+    """Replace every cloud of a scene by its surface, for exact signals and pictures.
 
     An even cloud has no such surface: its object keeps the mesh that marked its place.
     """

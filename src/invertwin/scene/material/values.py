@@ -62,7 +62,7 @@ class Texture:
 
     @classmethod
     def over(cls, image: ArrayLike, mesh: Mesh) -> "Texture":
-        """The image laid over a mesh as seen along its z axis.
+        """Lay an image over a mesh, as seen along its z axis.
 
         The left and right borders are at the least and largest x of the mesh, bottom and top at
         the least and largest y, in the object's own frame.
@@ -141,7 +141,7 @@ MaterialValue = Annotated[str, Among(tuple(RANGES))]
 
 
 def checked_value(value: object, name: str) -> Value:
-    """The value of the field `name`, lists and arrays as tensors.
+    """Check the value of a field; lists and arrays become tensors.
 
     Args:
         value: a number, one per triangle, or a `Texture`.
@@ -178,7 +178,7 @@ def evaluated(value: Value) -> Float64[Tensor, "*row"]:
 
 
 def row_count(values: Mapping[str, object]) -> int | None:
-    """For how many triangles the values are, None if they hold for a whole object.
+    """Count the triangles that values are for; None if they hold for a whole object.
 
     Raises:
         InputError: values for different numbers of triangles.
