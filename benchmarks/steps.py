@@ -69,7 +69,7 @@ def fit(problem: Problem, steps: int, after_step: Callable[[dict[str, Any]], Non
     reconstruct(
         problem.scene,
         observations_of(problem),
-        unknowns_of(run, build.Start(problem.scene, {})),
+        unknowns_of(run),
         loss=build.loss(run.loss),
         optimizer=build.optimizer(run.optimizer),
         schedule=replace(stage, steps=steps),

@@ -2,9 +2,7 @@
 
 import tomllib
 
-import numpy as np
 import pytest
-import torch
 from PIL import Image
 from rich.console import Console
 
@@ -16,9 +14,9 @@ from invertwin.cli.fits.writing import Fitted, tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, box
+from invertwin.scene import Mesh
 from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry import LinearShape, PriorShape
+from invertwin.scene.geometry import PriorShape
 
 HEAD, TAIL = RUN.split("[[parameters]]")
 SHAPES = """
@@ -244,21 +242,6 @@ def test_learned_shapes_are_objects_and_parameters(tmp_path):
     assert len(shape_terms(tables["vertices"], module, scene)) == 1
 
 
-def save_vehicles(folder):
-    """A space of boxes, in the files of the public one."""
-    mean, modes = box([1.0, 2.0, 3.0]), np.random.default_rng(0).normal(size=(24, 4))
-    folder.mkdir()
-    (folder / "dodec_mean.obj").write_text(
-        "\n".join(
-            [f"v {x} {y} {z}" for x, y, z in mean.vertices.tolist()]
-            + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mean.faces.tolist()]
-        )
-    )
-    names = ("default_dodec_mean", "default_dodec_pc", "default_dodec_sv")
-    parts = (mean.vertices.numpy().ravel(), modes, np.ones(4))
-    np.savez(folder / "vehicle3d_pca.npz", **dict(zip(names, parts, strict=True)))
-
-
 def test_learned_shapes_start_as_their_object(tmp_path):
     latent = [0.5, -0.25] + [0.0] * 22
     run = check(learned(f'shape = "prior"\nlatent = {latent}'), tmp_path)
@@ -266,19 +249,6 @@ def test_learned_shapes_start_as_their_object(tmp_path):
     first, *_ = build.parameters(run.parameters, scene, objects=run.scene)
     assert isinstance(first, PriorShape)
     assert first.latent.tolist() == latent
-    save_vehicles(tmp_path / "vehicles")
-    space = f'folder = "{tmp_path}/vehicles"\nlevel = "coarse"'
-    text = learned(f'shape = "vehicle"\n{space}\ncoefficients = [0.5, -2.0]')
-    text = text.replace('kind = "prior"', f'kind = "shape_space"\n{space}\nmodes = 3')
-    run = check(text, tmp_path)
-    scene = build.scene(run)
-    first, *_ = build.parameters(run.parameters, scene, objects=run.scene)
-    assert isinstance(first, LinearShape)
-    assert first.latent.tolist() == [0.5, -2.0, 0.0]
-    torch.testing.assert_close(first(scene)["plate"].mesh.vertices, scene["plate"].mesh.vertices)
-    run = check(text.replace("modes = 3", "modes = 1"), tmp_path)
-    with pytest.raises(InputError, match=r"parameters\[0\]: expected at least as many modes as"):
-        build.parameters(run.parameters, scene, objects=run.scene)
 
 
 def test_learned_shapes_have_a_size_of_their_own(tmp_path):

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.channel import Grid
-from invertwin.cli.bodies import SoughtBody
 from invertwin.cli.fit_tables import surrogate as surrogate
 from invertwin.cli.registry import Table
 from invertwin.cli.run_file import about as about
@@ -18,12 +17,13 @@ from invertwin.cli.run_file import need, unknown_object
 from invertwin.cli.schema import RunFile, SceneFile, Starts
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
-from invertwin.cli.shape_tables import ObjectTable, Placement, given_for, joined
+from invertwin.cli.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.tangents import Change, changes_of
 from invertwin.radar.surrogate import Surrogate
-from invertwin.scene import Mesh, Object, Scene, rigid, rotation_angle, rotation_from_vector
+from invertwin.scene import Mesh, Object, Scene, joined, rigid, rotation_angle, rotation_from_vector
 from invertwin.scene.files import CONCRETE, load_scene_xml
+from invertwin.scene.geometry import SkinnedBody
 
 
 def scene(run: RunFile) -> Scene:
@@ -107,7 +107,7 @@ class Start:
     """Where a fit starts."""
 
     scene: Scene
-    bodies: Mapping[str, SoughtBody] = field(default_factory=dict)  # whose joints are sought
+    bodies: Mapping[str, SkinnedBody] = field(default_factory=dict)  # whose joints are sought
 
 
 def builders(
@@ -145,6 +145,15 @@ def parameters(
     return [make(scene) for make in builders(tables, objects).values()]
 
 
+def sought_bodies(run: RunFile, scene: Scene) -> dict[str, Any]:
+    """The bodies whose joints are sought: a `SkinnedBody` each, by object."""
+    return {
+        table.object: _module(table, f"parameters[{i}]", run.scene, scene)
+        for i, table in enumerate(run.parameters)
+        if table.kind == "body"
+    }
+
+
 def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, Change]]:
     """The module that a gradient check moves, and how its values change with θ.
 
@@ -174,7 +183,7 @@ def starts(
     scene: Scene,
     truth: Scene,
     seed: int,
-    bodies: Mapping[str, SoughtBody] | None = None,
+    bodies: Mapping[str, SkinnedBody] | None = None,
 ) -> list[Start]:
     """From where the fits of the `[starts]` table start; of its object the pose is replaced."""
     generator = torch.Generator().manual_seed(seed if table.seed is None else table.seed)

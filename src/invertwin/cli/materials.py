@@ -28,7 +28,6 @@ from invertwin.scene import (
     Texture,
 )
 from invertwin.scene.material import RANGES, Value
-from invertwin.scene.material import MaterialValue as MaterialValue
 from invertwin.scene.material.materials import Medium
 
 _KINDS: Mapping[str, type[Material]] = {

@@ -22,7 +22,7 @@ from invertwin.errors import InputError
 
 _MOST_ERRORS = 4  # in one line
 # Sections and kinds of the package in experiments/studies.
-_STUDIES = ("methods", "loss_scan", "openradar", "rail_sar")
+_STUDIES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
 _INSTALL = "install the studies: pip install -e ./experiments/studies"
 _WORDS = {
     r"a valid dictionary( or .*)?": "a table",

@@ -9,7 +9,6 @@ from typing import Any
 from rich.console import Console
 
 from invertwin.cli import build
-from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fits.fitting import calibrated, fit
 from invertwin.cli.fits.initial import guessed
 from invertwin.cli.fits.likeness import check_measures, is_shape_key
@@ -46,11 +45,10 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     need(run, "reconstruct", "reconstruct")
     problem, calibration = calibrated(problem_of(run, console), folder, console)
     problem, conventional = guessed(problem, console)
-    starts = [build.Start(problem.scene, sought_bodies(run))]
+    starts = [build.Start(problem.scene, build.sought_bodies(run, problem.scene))]
     if run.starts is not None:
-        starts = build.starts(
-            run.starts, problem.scene, problem.truth, run.seed, sought_bodies(run)
-        )
+        bodies = starts[0].bodies
+        starts = build.starts(run.starts, problem.scene, problem.truth, run.seed, bodies)
     check_measures(problem, without_clouds(starts[0].scene))
     modes = modes_of(run)
     single = len(starts) * len(modes) == 1

@@ -27,7 +27,6 @@ from invertwin.scene.geometry import iso_surface as iso_surface
 from invertwin.scene.geometry import load_anny as load_anny
 from invertwin.scene.geometry import load_prior as load_prior
 from invertwin.scene.geometry import load_smpl as load_smpl
-from invertwin.scene.geometry import load_vehicle_space as load_vehicle_space
 from invertwin.scene.geometry import person as person
 from invertwin.scene.material import ITU_MATERIALS as ITU_MATERIALS
 from invertwin.scene.material import Dielectric as Dielectric
@@ -54,6 +53,7 @@ from invertwin.scene.material import lobe_integral as lobe_integral
 from invertwin.scene.material import slab_coefficients as slab_coefficients
 from invertwin.scene.material import slope_exponent as slope_exponent
 from invertwin.scene.mesh import Mesh as Mesh
+from invertwin.scene.mesh import joined as joined
 from invertwin.scene.parameters import Compose as Compose
 from invertwin.scene.parameters import MaterialValues as MaterialValues
 from invertwin.scene.parameters import Pose as Pose

@@ -20,8 +20,8 @@ from invertwin.inversion.metrics import value_errors
 from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
-from invertwin.scene import Scene
-from invertwin.scene.geometry import without_clouds
+from invertwin.scene import Mesh, Scene
+from invertwin.scene.geometry import SkinnedBody, without_clouds
 
 
 def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
@@ -39,8 +39,8 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
         return {"position": place, **shapes}
     settings = need(problem.run, "reconstruct", "reconstruct")
     if name in start.bodies:
-        meshes = (scene[name].mesh for scene in (start.scene, twin, problem.truth))
-        angles = start.bodies[name].errors(*meshes)
+        scenes = (start.scene, twin, problem.truth)
+        angles = joint_scores(start.bodies[name], *(scene[name].mesh for scene in scenes))
         good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
         return {**angles, "success": good, "position": place, **shapes}
     rows: dict[str, Any] = {
@@ -62,6 +62,16 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
         ends = twin[p.object].material, problem.truth[p.object].material
         rows |= value_errors(p.values, *ends, frequency, p.layer)
     return rows | shapes
+
+
+def joint_scores(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> dict[str, float]:
+    """Angles [°] by which the sought joints are off, means over them and each at the end."""
+    before, after = (body.joint_errors(mesh, truth) for mesh in (start, found))
+    return {
+        "joint_error_before_deg": math.degrees(sum(before.values()) / len(before)),
+        "joint_error_after_deg": math.degrees(sum(after.values()) / len(after)),
+        **{f"joint_error_{name}_deg": math.degrees(angle) for name, angle in after.items()},
+    }
 
 
 def _made_known(problem: Problem, parameter: Any) -> bool:

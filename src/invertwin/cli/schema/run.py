@@ -23,6 +23,7 @@ from invertwin.cli.schema.fits import (
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.section import InputPath, Section, Seed, Vector, fail, key
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
+from invertwin.cli.shape_tables import LearnedTable
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
@@ -208,9 +209,9 @@ class _RunFile(Section):
 
     @model_validator(mode="after")
     def _learned_shapes_have_their_own_size(self) -> "_RunFile":
-        for parameter in self.unknowns.values():
-            if parameter.kind not in ("shape_space", "prior"):
-                continue
+        unknowns = self.unknowns.values()
+        learned: list[Any] = [table for table in unknowns if isinstance(table, LearnedTable)]
+        for parameter in learned:
             name, why = parameter.object, f'with kind = "{parameter.kind}", which has its own size'
             scale = self.scene[name].scale if name in self.scene else 1.0
             if scale != 1:

@@ -19,5 +19,4 @@ from invertwin.scene.geometry.prior import ShapePrior as ShapePrior
 from invertwin.scene.geometry.prior import load_prior as load_prior
 from invertwin.scene.geometry.shape_space import LinearShape as LinearShape
 from invertwin.scene.geometry.shape_space import ShapeSpace as ShapeSpace
-from invertwin.scene.geometry.shape_space import load_vehicle_space as load_vehicle_space
 from invertwin.scene.geometry.smooth_vertices import SmoothVertices as SmoothVertices
