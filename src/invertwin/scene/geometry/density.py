@@ -24,8 +24,8 @@ _FAINTEST = 1e-3
 class DensityGrid(ObjectModule):
     """An object seen as a cloud of soft scatterers, by densities at the nodes of a grid.
 
-    ``σ = softplus(value) / h``, h the mean spacing of the nodes: at a value of 0 one cell holds
-    back half of the power, and rates of about 0.1 suit all grids alike.
+    ``σ = softplus(value) / h``, with h the mean spacing of the nodes. At a value of 0 one cell
+    holds back half of the power. Learning rates of about 0.1 suit all grids.
 
     Attributes:
         value: parameter [x, y, z].
