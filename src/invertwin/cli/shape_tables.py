@@ -14,21 +14,26 @@ from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.radar.parameters import RadarPose
-from invertwin.scene import Mesh, Object, Scene, joined, rigid, rotation_from_vector, shapes
-from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry import (
+from invertwin.scene import (
     DensityGrid,
     DistanceGrid,
     LatticeDeformation,
     LinearShape,
+    Mesh,
     NeuralDistance,
+    Object,
     PriorShape,
+    Scene,
     SkinnedBody,
     SmoothVertices,
-    body,
-    body_template,
+    joined,
     load_prior,
+    rigid,
+    rotation_from_vector,
+    shapes,
 )
+from invertwin.scene.files import load_mesh
+from invertwin.scene.geometry.body_models import body, body_template
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
 
 
