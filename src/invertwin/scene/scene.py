@@ -41,16 +41,14 @@ class Object:
     cloud: Cloud | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.mesh, Mesh):
-            raise InputError(
-                f"expected a Mesh, got {type(self.mesh).__name__}; "
-                "build one with Mesh(vertices, faces) or load_mesh(path)"
-            )
-        if not isinstance(self.material, Material):
-            raise InputError(
-                f"expected a Material, got {type(self.material).__name__}; "
-                "give a PerfectConductor or a RoughDielectric"
-            )
+        for value, kind, do in (
+            (self.mesh, Mesh, "build one with Mesh(vertices, faces) or load_mesh(path)"),
+            (self.material, Material, "give a PerfectConductor or a RoughDielectric"),
+            (self.cloud, Cloud | None, "build one with Cloud(low, high, density)"),
+        ):
+            if not isinstance(value, kind):
+                name = getattr(kind, "__name__", "Cloud or None")
+                raise InputError(f"expected a {name}, got {type(value).__name__}; {do}")
         faces = self.material.faces
         if faces is not None and faces != len(self.mesh.faces):
             raise InputError(
@@ -60,13 +58,11 @@ class Object:
         if self.pose is not None:
             object.__setattr__(self, "pose", _checked_pose(self.pose))
         if self.velocity is not None:
-            velocity = _checked_velocity(self.velocity, len(self.mesh.vertices))
+            count = len(self.mesh.vertices)
+            do = f"give one vector [3] or one per vertex [{count}, 3]"
+            shape = (count, 3) if getattr(self.velocity, "ndim", 1) == 2 else (3,)
+            velocity = checked_tensor(self.velocity, shape, "velocity [m/s]", do)
             object.__setattr__(self, "velocity", velocity)
-        if not (self.cloud is None or isinstance(self.cloud, Cloud)):
-            raise InputError(
-                f"expected a Cloud or None, got {type(self.cloud).__name__}; "
-                "build one with Cloud(low, high, density)"
-            )
 
     @property
     def transform(self) -> Float64[Tensor, "4 4"]:
@@ -206,9 +202,3 @@ def _checked_pose(pose: object) -> Tensor:
             "and scale the mesh instead"
         )
     return matrix
-
-
-def _checked_velocity(velocity: object, vertex_count: int) -> Tensor:
-    do = f"give one vector [3] or one per vertex [{vertex_count}, 3]"
-    shape = (vertex_count, 3) if getattr(velocity, "ndim", 1) == 2 else (3,)
-    return checked_tensor(velocity, shape, "velocity [m/s]", do)
