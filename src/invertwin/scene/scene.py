@@ -41,14 +41,13 @@ class Object:
     cloud: Cloud | None = None
 
     def __post_init__(self) -> None:
-        for value, kind, do in (
-            (self.mesh, Mesh, "build one with Mesh(vertices, faces) or load_mesh(path)"),
-            (self.material, Material, "give a PerfectConductor or a RoughDielectric"),
-            (self.cloud, Cloud | None, "build one with Cloud(low, high, density)"),
+        for value, kind, what, do in (
+            (self.mesh, Mesh, "Mesh", "build one with Mesh(vertices, faces) or load_mesh(path)"),
+            (self.material, Material, "Material", "give one such as RoughDielectric(permittivity)"),
+            (self.cloud, Cloud | None, "Cloud or None", "build one with Cloud(low, high, density)"),
         ):
             if not isinstance(value, kind):
-                name = getattr(kind, "__name__", "Cloud or None")
-                raise InputError(f"expected a {name}, got {type(value).__name__}; {do}")
+                raise InputError(f"expected a {what}, got {type(value).__name__}; {do}")
         faces = self.material.faces
         if faces is not None and faces != len(self.mesh.faces):
             raise InputError(
@@ -71,7 +70,7 @@ class Object:
 
     @property
     def vertices(self) -> Float64[Tensor, "v 3"]:
-        """Vertex positions in the world [m], differentiable in the mesh and the pose."""
+        """Vertex positions in the world [m], with the gradients of the mesh and the pose."""
         return self._to_world(self.mesh.vertices)
 
     @property
