@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from invertwin.cli import build
+from invertwin.cli.fits.problem import Problem, starts_of
 from invertwin.cli.fits.scores import joint_scores
 from invertwin.cli.run_file import validate
 from invertwin.cli.schema import RunFile
@@ -41,8 +42,8 @@ def test_every_sought_joint_starts_that_far_off_and_only_these():
     assert run.starts is not None
     scene = build.scene(run)
     bodies = build.sought_bodies(run, scene)
-    starts = build.starts(run.starts, scene, scene, 1, bodies)
-    again = build.starts(run.starts, scene, scene, 1, bodies)
+    problem = Problem(run, scene, scene, frozenset())
+    starts, again = starts_of(problem), starts_of(problem)
     body = bodies["person"]
     truth = scene["person"].mesh
     true = body.template.rotations_of(truth.vertices)

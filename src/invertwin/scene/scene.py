@@ -12,7 +12,7 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number, checked_tensor
 from invertwin.scene.cloud import Cloud
-from invertwin.scene.material import Material
+from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import compose, rigid
 
