@@ -88,6 +88,9 @@ def problem_of(run: RunFile, console: Console) -> Problem:
             )
     # Their errors come before any work.
     build.parameters(run.parameters, scene, run.scene)
+    for name, variant in run.variants.items():
+        with about(f"variants.{name}"):
+            build.parameters(variant.parameters or [], scene, run.scene)
     sights, observed = {}, observed_runs(run)
     for name, own in observed.items():
         with about(f"observations.{name}") if name else nullcontext():
