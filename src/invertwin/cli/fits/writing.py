@@ -204,7 +204,7 @@ def _turntable(fitted: Fitted, name: str) -> bytes:
 
 def _curve(row: dict[str, Any]) -> list[list[float]]:
     """How the measure went, from the start on where that is scored."""
-    begun = [[0, row[_BEGUN]]] if row["curve"] and _BEGUN in row else []
+    begun: list[list[float]] = [[0, row[_BEGUN]]] if row["curve"] and _BEGUN in row else []
     return [*begun, *row["curve"]]
 
 
