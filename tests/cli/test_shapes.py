@@ -22,9 +22,8 @@ from invertwin.cli.fits.writing import Fitted, tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
-from invertwin.scene import Mesh
+from invertwin.scene import Mesh, PriorShape
 from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry import PriorShape
 
 HEAD, TAIL = RUN.split("[[parameters]]")
 SHAPES = """

@@ -11,8 +11,7 @@ import trimesh
 from cli.test_shapes import check, learned
 from invertwin.cli import build
 from invertwin.errors import InputError
-from invertwin.scene import box
-from invertwin.scene.geometry import LinearShape
+from invertwin.scene import LinearShape, box
 from invertwin_studies.vehicle_space import load_vehicle_space
 
 

@@ -19,9 +19,8 @@ from invertwin.cli.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.tangents import Change, changes_of
 from invertwin.radar.surrogate import Surrogate
-from invertwin.scene import Mesh, Object, Scene, joined
+from invertwin.scene import Mesh, Object, Scene, SkinnedBody, joined
 from invertwin.scene.files import CONCRETE, load_scene_xml
-from invertwin.scene.geometry import SkinnedBody
 
 
 def scene(run: RunFile) -> Scene:

@@ -29,7 +29,7 @@ from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.inversion import Reconstruction
 from invertwin.scene.files import save_mesh
-from invertwin.scene.geometry import without_clouds
+from invertwin.scene.geometry.density import without_clouds
 
 
 def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:

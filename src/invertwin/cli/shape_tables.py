@@ -16,24 +16,30 @@ from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import signed_distance
 from invertwin.limits import RADIANS, Axes, Count, NonNegative, Positive
 from invertwin.radar.parameters import RadarPose
-from invertwin.scene import Mesh, Object, Scene, joined, rigid, rotation_from_vector, shapes
-from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry import (
+from invertwin.scene import (
     BodyTemplate,
     DensityGrid,
     DistanceGrid,
-    Lattice,
     LatticeDeformation,
     LinearShape,
+    Mesh,
     NeuralDistance,
+    Object,
     PriorShape,
+    Scene,
     SkinnedBody,
     SmoothVertices,
+    joined,
     load_anny,
     load_prior,
     load_smpl,
     person,
+    rigid,
+    rotation_from_vector,
+    shapes,
 )
+from invertwin.scene.files import load_mesh
+from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
 
 Angles = Annotated[dict[str, Vector], RADIANS]

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from invertwin.channel import visible_points
 from invertwin.errors import InputError
+from invertwin.scene import Itu, Material
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number
-from invertwin.scene.material import Itu, Material, Value
 from invertwin.scene.material.materials import held_by
-from invertwin.scene.material.values import evaluated
+from invertwin.scene.material.values import Value, evaluated
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rotation_angle
 from invertwin.scene.scene import Object

@@ -19,7 +19,7 @@ from invertwin.radar.detection import ordered_statistics_cfar, point_cloud
 from invertwin.radar.doppler import compensate_tdm, range_doppler, velocity_axis
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import aperture
-from invertwin.scene.material import RoughDielectric
+from invertwin.scene import RoughDielectric
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Scene

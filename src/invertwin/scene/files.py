@@ -19,7 +19,8 @@ from trimesh.exchange.gltf import export_glb
 from invertwin.errors import InputError
 from invertwin.scene import shapes
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.material import Material, RoughDielectric
+from invertwin.scene.material.materials import RoughDielectric
+from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
 

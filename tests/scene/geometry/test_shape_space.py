@@ -5,8 +5,7 @@ import torch
 from torch.autograd import gradcheck
 
 from invertwin.errors import InputError
-from invertwin.scene import Scene, box
-from invertwin.scene.geometry import LinearShape, ShapeSpace
+from invertwin.scene import LinearShape, Scene, ShapeSpace, box
 from scenes import float64, thing
 
 CUBE = box(1.0)

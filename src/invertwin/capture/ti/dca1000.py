@@ -1,9 +1,9 @@
 """Samples as the DCA1000 records them: little-endian 16-bit words in the order of the LVDS lanes.
 
-Through 4 lanes (xWR12xx, xWR14xx) all receivers come side by side, RX1 to RX4 whether enabled or
-not: the four I of one sample, then its four Q. Through 2 lanes (xWR16xx, 18xx, 68xx) the enabled
-receivers come one after the other in every chirp, two samples at a time: I, I, Q, Q. Real samples
-have no Q. (TI, SWRA581, "Mmwave Radar Device ADC Raw Data Capture".)
+Devices with 4 lanes (xWR12xx, xWR14xx) send all receivers side by side, RX1 to RX4, enabled or
+not: the four I of one sample, then its four Q. Devices with 2 lanes (xWR16xx, 18xx, 68xx) send the
+enabled receivers one after the other in every chirp, two samples at a time: I, I, Q, Q. Real
+samples have no Q. (TI, SWRA581, "Mmwave Radar Device ADC Raw Data Capture".)
 """
 
 import warnings

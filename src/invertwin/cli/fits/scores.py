@@ -25,8 +25,8 @@ from invertwin.inversion.metrics import residual, value_errors
 from invertwin.models import surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
-from invertwin.scene import Mesh, Scene
-from invertwin.scene.geometry import SkinnedBody, without_clouds
+from invertwin.scene import Mesh, Scene, SkinnedBody
+from invertwin.scene.geometry.density import without_clouds
 
 
 def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:

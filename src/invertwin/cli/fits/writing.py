@@ -22,7 +22,7 @@ from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion.metrics import residual
 from invertwin.scene import Mesh, Scene
-from invertwin.scene.material import RANGES
+from invertwin.scene.material.values import RANGES
 
 _MATERIAL = {f"{name}_error": name for name in RANGES}
 _UNITS = {"translation": " [m]", "rotation": " [rad, rotation vector]", "scale": " [factor]"}
