@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -54,7 +55,7 @@ def test_only_what_a_stage_names_is_free(case):
 
 def test_a_stage_may_have_models_of_its_own(case):
     grid = case.settings()["grid"]
-    few = {"depth": 1, "samples": 500, "boundary_samples": 500}
+    few: dict[str, Any] = {"depth": 1, "samples": 500, "boundary_samples": 500}
     own = Stage(1, models=[SurrogateMap(grid, "response", Sampling(**few))])
     (row,) = fit(case, [own]).history
     (same,) = fit(case, [Stage(1)], surrogate="response", **few).history

@@ -1,6 +1,7 @@
 """Where fits start: random poses about a known one, and poses by conventional processing."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ ITEM = Object(box([0.2, 0.3, 0.4]), PerfectConductor(), rigid(translation=[1.0, 
 
 
 def drawn(seed: int = 0, **changes):
-    settings = {"distance": (0.3, 0.4), "angle": (0.2, 0.5)} | changes
+    settings: dict[str, Any] = {"distance": (0.3, 0.4), "angle": (0.2, 0.5)} | changes
     generator = torch.Generator().manual_seed(seed)
     return list(nearby(ITEM, 5, **settings, generator=generator))
 
