@@ -61,7 +61,7 @@ def test_a_stage_may_have_models_of_its_own(case):
     (same,) = fit(case, [Stage(1)], surrogate="response", **few).history
     assert row["loss"] == pytest.approx(same["loss"], rel=1e-4)
     with pytest.raises(InputError, match="a model for each of 1 observations in a stage, got 2"):
-        fit(case, [replace(own, models=2 * own.models)])
+        fit(case, [replace(own, models=[*own.models] * 2)])
 
 
 def test_rates_of_parameters_are_their_own(case):
