@@ -68,11 +68,14 @@ def test_chirps_are_calibrated_alike():
     settings = settings_of(CHIRP, 3, 4, loops=2)
     data = ChirpData(beat[:, None].expand(-1, 2, -1, -1, -1), settings)
     calibration = ChannelCalibration(errors())
-    corrected = calibration.apply_to_chirps(data)
-    torch.testing.assert_close(corrected.samples[:, 1], calibration.apply(recorded()).beat)
-    real = ChirpData(data.samples.real + 0j, replace(settings, real=True))
-    with pytest.raises(InputError, match="expected complex samples"):
-        calibration.apply_to_chirps(real)
+    device = recorded().radar()
+    arrays = (device.transmitters, device.receivers)
+    corrected = calibration.apply(data.recorded(arrays))
+    torch.testing.assert_close(corrected.beat[:, 1], calibration.apply(recorded()).beat)
+    real = ChirpData(data.samples.real + 0j, replace(settings, real=True)).recorded(arrays)
+    clean = calibration.apply(real)
+    torch.testing.assert_close(clean.beat * calibration.gains[..., None], real.beat)
+    assert clean.max_range == CHIRP.max_range / 2
 
 
 def test_a_file_keeps_every_bit(tmp_path):

@@ -23,8 +23,12 @@ def test_units_limits_and_defaults_are_shown():
     (table,) = key_tables("grid")
     rows = {row[0]: row[1:] for row in table.rows}
     assert table.title == "[grid]"
-    assert rows["range_min"] == ["number ≥ 0", "required", "m"]
-    assert rows["u_max"] == ["number > 0, ≤ 1", "1.0", "direction cosine to the right"]
+    assert rows["range_min"] == ["number ≥ 0", "required", "First range to cover [m]"]
+    assert rows["u_max"] == [
+        "number > 0, ≤ 1",
+        "1.0",
+        "Direction cosine to the right; the map is as wide to the left",
+    ]
 
 
 def test_kinds_are_listed_apart_with_what_they_share_first():

@@ -2,7 +2,7 @@
 
 import re
 
-from invertwin.cli.report import Again, Picture, Table, report_html
+from invertwin.cli.report import Picture, Table, report_html
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -18,7 +18,8 @@ def test_report_is_self_contained_and_escaped():
             ),
             Picture("Loss & steps", PNG + b"data", note="one & two"),
         ],
-        Again("reconstruct run.toml", {"run.toml": 'task = "demo"'}),
+        "reconstruct run.toml",
+        {"run.toml": 'task = "demo"'},
     )
     assert "A &lt; B" in text
     assert "&lt;letter&gt;" in text

@@ -9,7 +9,7 @@ import pytest
 
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
-from invertwin.cli import build, sensors
+from invertwin.cli import build
 from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
@@ -102,7 +102,7 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         if run.chirps is None:
             simulated = partial(run_simulate.exact, run, scene, device, build.grid(bins, device))
         else:
-            chirps = sensors.chirps(run.chirps)
+            chirps = run.chirps.build()
             simulated = partial(run_simulate.chirp_train, run, scene, device, chirps)
         with pytest.raises(FieldsTracedError):
             simulated()

@@ -49,7 +49,7 @@ def planar(waveform: FMCW) -> Radar:
     half = 0.5 * waveform.wavelength
     return Radar(
         linear_array(1, half),
-        planar_array(12, 8, half, half),
+        planar_array((12, 8), (half, half)),
         waveform,
         torch.zeros(1, 3, dtype=torch.float64),
     )

@@ -144,7 +144,7 @@ def radar() -> Radar:
     turns = [[0.0, 0.0, 0.0], [0.1, -0.5, 0.2]]
     return Radar(
         linear_array(2, 4 * half),
-        planar_array(4, 4, half, half),
+        planar_array((4, 4), (half, half)),
         WAVE,
         torch.tensor([[0.0, 0, 0], [1.0, -2, 0.5]], dtype=torch.float64),
         torch.stack([rotation_from_vector(torch.tensor(t).double()) for t in turns]),
@@ -235,7 +235,7 @@ def test_peaks_of_a_map_are_placed_in_the_world():
     turn = rotation_from_vector(torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64))
     radar = Radar(
         linear_array(1, 0.01),
-        planar_array(8, 8, 0.0019, 0.0019),
+        planar_array((8, 8), (0.0019, 0.0019)),
         FMCW(77e9, 1e9, 50e-6, 64),
         torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64),
         turn[None],

@@ -177,7 +177,7 @@ def test_arrays_are_centred():
     column = linear_array(3, 0.1, axis="y", pattern=Cosine(1.0))
     assert column.positions[:, 1].tolist() == pytest.approx([-0.1, 0.0, 0.1])
     assert column.pattern == Cosine(1.0)
-    plane = planar_array(2, 3, 1.0, 2.0)
+    plane = planar_array((2, 3), (1.0, 2.0))
     assert plane.positions.tolist() == [[x, y, 0.0] for x in (-0.5, 0.5) for y in (-2.0, 0.0, 2.0)]
 
 
@@ -204,7 +204,7 @@ def one(*numbers: float) -> Tensor:
         (lambda: AntennaArray(torch.zeros(1, 3), "isotropic"), "expected a Pattern, got str"),  # pyright: ignore[reportArgumentType]
         (lambda: linear_array(0, 0.1), "elements along x"),
         (lambda: linear_array(2, 0.0), "element spacing"),
-        (lambda: planar_array(2, 2, 0.1, -0.1), "element spacing"),
+        (lambda: planar_array((2, 2), (0.1, -0.1)), "element spacing"),
     ],
 )
 def test_bad_antennas_are_refused(make, message):

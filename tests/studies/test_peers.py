@@ -47,7 +47,7 @@ def radar():
     one = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Isotropic())
     waveform = FMCW(76e9, 2e9, 5e-5, 64)
     place = torch.zeros(1, 3, dtype=torch.float64)
-    return Radar(one, planar_array(8, 6, 1.9e-3, 1.9e-3), waveform, place)
+    return Radar(one, planar_array((8, 6), (1.9e-3, 1.9e-3)), waveform, place)
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def test_edge_sampling_refuses_what_it_cannot_do(radar, grid):
         )
 
 
-def test_music_is_differentiated_through_the_whole_chain(radar, grid):
+def test_music_is_differentiated_as_a_whole(radar, grid):
     given = scene(0.35)
     drawn = Sampling(depth=1, points_per_m2=500.0)
     speckle = draw_speckle(given, radar.link(), drawn, 1)

@@ -18,11 +18,11 @@ _BIAS_SEARCH = (0.1, 0.01)
 def backproject(
     capture: Capture, points: Float64[Tensor, "*point 3"]
 ) -> Complex128[Tensor, "*point"]:
-    """Mean over the frames (and channels) of the echo from the distance of a point.
+    """Focus the data on points: average the echoes from each point's distance over all frames.
 
-    Echoes of a target at the point add in phase, since the profiles carry their carrier: the
-    matched filter of a point target without its spreading loss. Beat samples go through
-    ``backproject_beat``.
+    Echoes of a target at the point add in phase, since the profiles keep the phase of the carrier.
+    This is the matched filter of a point target without its spreading loss. Beat samples go
+    through ``backproject_beat``.
 
     Args:
         capture: range profiles or beat samples.
@@ -44,13 +44,13 @@ def locate(
     radius: float = 0.6,
     step: float = 0.01,
 ) -> Float64[Tensor, "3"]:
-    """The brightest point of the backprojected image in a horizontal square.
+    """Find the brightest point of the backprojected image in a horizontal square.
 
     Args:
         capture: range profiles.
-        center: of the square, at the known height of the target [m].
+        center: middle of the square, at the known height of the target [m].
         radius: half the side of the square [m].
-        step: of the image from which the search starts [m]; below half a resolution cell.
+        step: pixel size of the image that starts the search [m]; below half a resolution cell.
 
     Raises:
         InputError: the capture holds beat samples, a point is beyond the measured ranges, or a step
@@ -75,11 +75,11 @@ def locate(
 
 
 def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
-    """The capture with the clock offset and range bias that focus a known target best.
+    """Find the clock offset and the range bias that focus a known target best.
 
-    Both are searched within 0.1 s and 0.1 m of the present ones. The power of the coherent sum is
-    the measure: over the bias it follows the envelope of the pulse, not its carrier, since a bias
-    turns all frames alike; over the clock offset it is as sharp as the image.
+    Both are searched within 0.1 s and 0.1 m of the present ones. The search maximises the power of
+    the coherent sum. A bias turns all frames alike, so this power follows the envelope of the
+    pulse, not its carrier. Over the clock offset the maximum is as sharp as the image.
 
     Args:
         capture: range profiles with the track of the radar.

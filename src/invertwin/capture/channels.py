@@ -1,29 +1,31 @@
-"""Gain and phase of every channel: estimated from a reflector, saved, taken out of the data."""
+"""Calibration of the channels: estimate their gains from a reflector, save them, apply them."""
 
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.capture.chirps import ChirpData
+from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.radar_fields import labelled
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import replacing
+from invertwin.scene.files import existing_file, replacing
 
+Recorded = TypeVar("Recorded", bound=Capture | ChirpCapture)
 _DEAD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelCalibration:
-    """What every virtual channel multiplies its signal by.
+    """The complex gain of every virtual channel.
 
     Attributes:
         gains: measured over ideal signal, [tx, rx]; the mean of their squares is 1 and the sum is
@@ -65,9 +67,7 @@ class ChannelCalibration:
         Raises:
             InputError: no such file, or one that holds no calibration.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise InputError(f"expected a calibration, got no file {path}; check the path")
+        path = existing_file(path, "a calibration")
         try:
             parts = torch.tensor(json.loads(path.read_text())["gains"], dtype=torch.float64)
             if parts.ndim != 3 or parts.shape[2] != 2:
@@ -91,28 +91,17 @@ class ChannelCalibration:
         with replacing(path) as part:
             part.write_text(json.dumps({"gains": torch.view_as_real(self.gains).tolist()}) + "\n")
 
-    def apply(self, capture: Capture) -> Capture:
-        """The capture with every channel divided by its gain.
+    def apply(self, capture: Recorded) -> Recorded:
+        """The recording with every channel divided by its gain.
 
         Raises:
             InputError: range profiles, or another number of channels.
         """
         beat = self._corrected(capture.beat)
+        if isinstance(capture, ChirpCapture):
+            return replace(capture, beat=beat)
         variable = labelled(("frame", "tx", "rx", "sample"), beat, "1")
-        return Capture(capture.dataset.assign(beat=variable))
-
-    def apply_to_chirps(self, data: ChirpData) -> ChirpData:
-        """Calibrate every chirp of raw data. The samples are no longer whole counts.
-
-        Raises:
-            InputError: another number of channels, or real samples: a phase turns only complex
-                ones, so calibrate their `ChirpData.capture`.
-        """
-        if data.settings.real:
-            raise InputError(
-                "expected complex samples, got real ones; calibrate the capture made from them"
-            )
-        return replace(data, samples=self._corrected(data.samples))
+        return type(capture)(capture.dataset.assign(beat=variable))
 
     def _corrected(self, samples: Complex[Tensor, "*batch tx rx sample"]) -> Tensor:
         expected = tuple(self.gains.shape)
@@ -127,18 +116,18 @@ class ChannelCalibration:
 def estimate_channels(
     capture: Capture, reflector: Float64[Tensor, "3"] | list[float]
 ) -> ChannelCalibration:
-    """Gains of the channels, from a reflector at a known place.
+    """Estimate the gains of the channels from a reflector at a known place.
 
-    Each channel is compared with the beat signal of an ideal point there,
-    ``c = Σ w_n s[n] conj(ideal[n])``, whose delays are exact to every element (so the reflector
-    may be close), which weighs down echoes from other ranges. Over several frames
-    ``c ≈ amplitude(frame) · gain(channel)``: the gains are the leading singular vector, whatever
-    phase the reflector has in each frame. Positions of the elements that are wrong count as phases;
-    they are right in the direction of this reflector only.
+    Each channel is compared with the beat signal of an ideal point at that place:
+    ``c = Σ w_n s[n] conj(ideal[n])``. The delays of the ideal point are exact to every element, so
+    the reflector may be close. The sum suppresses echoes from other ranges. Over several frames
+    ``c ≈ amplitude(frame) · gain(channel)``. The gains are the leading singular vector, whatever
+    phase the reflector has in each frame. Errors of the elements' positions end up in the phases,
+    which then are right in the direction of this reflector only.
 
     Args:
         capture: samples with the reflector as the strongest echo at its range.
-        reflector: where it is in the world [m].
+        reflector: its position in the world [m].
 
     Raises:
         InputError: range profiles, a place that is no position or beyond the unambiguous range,

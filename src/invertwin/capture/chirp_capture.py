@@ -1,13 +1,16 @@
 """A recording with every chirp of its frames, and the radar that took it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from jaxtyping import Complex
+import torch
+from jaxtyping import Complex, Float64
 from torch import Tensor
 
+from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps
-from invertwin.radar.radar import Radar
+from invertwin.radar.radar import Radar, sampled
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +21,9 @@ class ChirpCapture:
         beat: Complex samples.
         device: The radar, with one pose per frame.
         chirps: Timing of the ramps.
+        frame_period: Time between the starts of two frames [s]; None = not known.
+        real: Whether the samples were real: their analytic signal holds up to half the range.
+        moving: Whether what it shows moves, and fades in the mean of a frame's chirps.
 
     Raises:
         InputError: Samples that are not complex, or a shape that radar and timing do not have.
@@ -26,15 +32,13 @@ class ChirpCapture:
     beat: Complex[Tensor, "frame chirp tx rx sample"]
     device: Radar
     chirps: Chirps
+    frame_period: float | None = None
+    real: bool = False
+    moving: bool = False
 
     def __post_init__(self) -> None:
-        device = self.device
-        expected = (
-            device.frame_count,
-            self.chirps.count,
-            len(device.transmitters.positions),
-            len(device.receivers.positions),
-        )
+        frames, *elements = self.device.shape
+        expected = (frames, self.chirps.count, *elements)
         if not self.beat.is_complex() or tuple(self.beat.shape[:-1]) != expected:
             raise InputError(
                 f"expected complex beat samples of shape {expected} × samples, got "
@@ -46,6 +50,16 @@ class ChirpCapture:
         """The radar at the poses of the frames."""
         return self.device
 
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return self.beat.shape[0]
+
+    @property
+    def max_range(self) -> float:
+        """Range up to which the samples mean something [m]."""
+        return sampled(self.device).max_range / (2 if self.real else 1)
+
     def loops(self, first: int, count: int) -> "ChirpCapture":
         """A part of the chirps of every frame.
 
@@ -55,3 +69,72 @@ class ChirpCapture:
         """
         chirps = replace(self.chirps, count=count)
         return replace(self, beat=self.beat[:, first : first + count], chirps=chirps)
+
+    def frames(self, numbers: Sequence[int]) -> "ChirpCapture":
+        """Only these frames, counted from 0.
+
+        Raises:
+            InputError: A frame that it does not have.
+        """
+        wrong = [number for number in numbers if not 0 <= number < self.frame_count]
+        if wrong:
+            raise InputError(
+                f"expected a number below {self.frame_count}, got {wrong[0]}; count frames from 0"
+            )
+        return replace(self, beat=self.beat[list(numbers)], device=self.device.frames(numbers))
+
+    def placed(
+        self,
+        positions: Float64[Tensor, "frame 3"],
+        rotations: Float64[Tensor, "frame 3 3"] | None = None,
+    ) -> "ChirpCapture":
+        """The recording of a radar at these poses.
+
+        Args:
+            positions: Position of the radar in every frame [m].
+            rotations: Orientation of the radar in every frame; None = axes of the world.
+
+        Raises:
+            InputError: Another number of positions than of frames.
+        """
+        if len(positions) != self.frame_count:
+            raise InputError(
+                f"expected {self.frame_count} positions along frame, one for each, got "
+                f"{len(positions)}; give as many as were recorded"
+            )
+        return replace(self, device=replace(self.device, positions=positions, rotations=rotations))
+
+    def capture(self, chirp: int | str = "mean") -> Capture:
+        """One beat signal per frame and channel, for a scene that stands still within a frame.
+
+        A static scene is the same in every chirp, so the mean over the chirps is the recording with
+        less noise; echoes that move by λ/4 or more during a frame vanish in it. One chosen chirp
+        keeps them, but its transmitters still send one after the other: what moves has phase steps
+        from TX to TX, which `invertwin.radar.compensate_tdm` takes out of whole frames.
+
+        Args:
+            chirp: "mean", or the number from 0 of the chirp to take.
+
+        Raises:
+            InputError: A chirp that does not exist, or the mean of a recording of movers.
+        """
+        count = self.chirps.count
+        if chirp == "mean":
+            if self.moving:
+                raise InputError(
+                    "expected a parameter of kind mover, since the recording has chirps and "
+                    "movers, which fade in the mean of the chirps; seek a mover, or choose one "
+                    "`chirp`"
+                )
+            beat = self.beat.mean(dim=1)
+        elif isinstance(chirp, bool) or not isinstance(chirp, int) or not 0 <= chirp < count:
+            raise InputError(
+                f'expected chirps to be "mean" or a number from 0 to {count - 1}, got {chirp!r}; '
+                "say how a frame becomes one signal"
+            )
+        else:
+            beat = self.beat[:, chirp]
+        times = None
+        if self.frame_period is not None:
+            times = torch.arange(self.frame_count, dtype=torch.float64) * self.frame_period
+        return Capture.from_beat(beat, self.device, times)

@@ -4,6 +4,7 @@ import json
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,10 +16,8 @@ from invertwin.cli.options import (
     FileArgument,
     FilesArgument,
     Look,
-    OutOption,
-    OverwriteOption,
-    ResumeOption,
-    SeedOption,
+    Options,
+    Resumable,
     console,
     with_options,
 )
@@ -49,7 +48,7 @@ def _show_version(wanted: bool) -> bool:
 
 
 @app.callback()
-def options(
+def invertwin(
     version: Annotated[
         bool,
         typer.Option(
@@ -61,16 +60,11 @@ def options(
 
 
 @app.command()
-def simulate(
-    file: FileArgument,
-    out: OutOption = None,
-    overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
-    backend: BackendOption = None,
-) -> None:
+@with_options(Options)
+def simulate(options: Options, file: FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra."""
-    runs = load_runs([file], seed, "simulate", ("radar", "grid", "data"))
-    with run_folder(out or default_folder(file), runs, overwrite, False) as folder:
+    runs = load_runs([file], options, "simulate", ("radar", "grid", "data"))
+    with run_folder(options, default_folder(file), runs) as folder:
         from invertwin.cli.run_simulate import run_simulate
 
         with about_file(file):
@@ -79,56 +73,39 @@ def simulate(
 
 
 @app.command()
-def reconstruct(
-    file: FileArgument,
-    out: OutOption = None,
-    overwrite: OverwriteOption = False,
-    resume: ResumeOption = False,
-    seed: SeedOption = None,
-    backend: BackendOption = None,
-) -> None:
+@with_options(Resumable)
+def reconstruct(options: Resumable, file: FileArgument) -> None:
     """Fit the parameters of a scene to radar data."""
-    _reconstruct(file, out or default_folder(file), overwrite, resume, seed)
+    _reconstruct(file, options, default_folder(file))
 
 
 @app.command()
-def demo(
-    out: OutOption = None,
-    overwrite: OverwriteOption = False,
-    resume: ResumeOption = False,
-    seed: SeedOption = None,
-    backend: BackendOption = None,
-) -> None:
+@with_options(Resumable)
+def demo(options: Resumable) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
-    again = out is None and not resume
-    _reconstruct(_demo_file(), out or Path("out/demo"), overwrite or again, resume, seed)
+    again = options.overwrite or (options.out is None and not options.resume)
+    _reconstruct(_demo_file(), replace(options, overwrite=again), Path("out/demo"))
 
 
 @app.command()
 @with_options(Look)
-def look(chosen: Look, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+def look(options: Look) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
     from invertwin.cli.run_look import run_look
 
-    default = Path("out") / chosen.recording.name.split(".")[0]
-    with run_folder(out or default, {}, overwrite, False) as folder:
-        print_tables(run_look(chosen, folder))
+    default = Path("out") / options.recording.name.split(".")[0]
+    with run_folder(options, default) as folder:
+        print_tables(run_look(options, folder))
 
 
 @app.command()
-def gradcheck(
-    files: FilesArgument,
-    out: OutOption = None,
-    overwrite: OverwriteOption = False,
-    resume: ResumeOption = False,
-    seed: SeedOption = None,
-    backend: BackendOption = None,
-) -> None:
+@with_options(Resumable)
+def gradcheck(options: Resumable, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
-    runs = load_runs(files, seed, "gradcheck", ("gradcheck", "radar", "grid"))
+    runs = load_runs(files, options, "gradcheck", ("gradcheck", "radar", "grid"))
     default = default_folder(files[0]) if len(files) == 1 else Path("out/gradcheck")
-    with run_folder(out or default, runs, overwrite, resume) as folder:
+    with run_folder(options, default, runs) as folder:
         if folder.complete:
             return
         from invertwin.cli.run_gradcheck import run_gradcheck
@@ -183,9 +160,9 @@ def main() -> None:
         sys.exit(2)
 
 
-def _reconstruct(file: Path, out: Path, overwrite: bool, resume: bool, seed: int | None) -> None:
-    runs = load_runs([file], seed, "reconstruct", ("reconstruct", "data", "grid", "parameters"))
-    with run_folder(out, runs, overwrite, resume) as folder:
+def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
+    runs = load_runs([file], options, "reconstruct", ("reconstruct", "data", "grid", "parameters"))
+    with run_folder(options, default, runs) as folder:
         if folder.complete:
             return
         from invertwin.cli.run_reconstruct import run_reconstruct

@@ -31,15 +31,15 @@ class SurrogateTable(Table):
             chosen = chosen_surrogate(data)
         except InputError as error:
             fail(str(error))
-        return {"exact": True} if chosen is None else dict(vars(chosen))
+        return {"exact": True} if chosen is None else {"exact": False, **vars(chosen)}
 
 
 def register(registry: Registry) -> None:
     """Adds losses and optimizers; forward models of one's own come from plugins."""
-    registry.group(Group("loss", default="mse"))
-    registry.group(Group("optimizer", default="adam"))
-    registry.group(Group("model"))
-    registry.give(Grid, Surrogate)
+    registry.groups["loss"] = Group(default="mse")
+    registry.groups["optimizer"] = Group(default="adam")
+    registry.groups["model"] = Group()
+    registry.given |= {Grid, Surrogate}
     registry.add("loss", "mse", SpectrumLoss, without=("floor",))
     registry.add("loss", "likelihood", SpectrumLoss)
     for name in ("adam", "sgd", "gauss_newton"):

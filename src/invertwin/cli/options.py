@@ -39,21 +39,41 @@ BackendOption = Annotated[
         show_default=False,
     ),
 ]
-OutOption = Annotated[
-    Path | None,
-    typer.Option("-o", "--out", help="Folder for the results; default: out/<file stem>."),
-]
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace the results that are in the folder.")
-]
-ResumeOption = Annotated[
-    bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")
-]
-SeedOption = Annotated[
-    int | None, typer.Option("--seed", min=0, max=2**31 - 1, help="Replaces the run file's seed.")
-]
 FileArgument = Annotated[Path, typer.Argument(help="Run file (TOML).", show_default=False)]
 FilesArgument = Annotated[list[Path], typer.Argument(help="Run files (TOML).", show_default=False)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Where:
+    """Where the results of a command go."""
+
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="Folder for the results; default: out/<file stem>."),
+    ] = None
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results that are in the folder.")
+    ] = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Where):
+    """What commands with run files have in common."""
+
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, max=2**31 - 1, help="Replaces the run file's seed."),
+    ] = None
+    backend: BackendOption = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resumable(Options):
+    """What commands have whose work is kept when it is interrupted."""
+
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")
+    ] = False
 
 
 class Method(StrEnum):
@@ -64,8 +84,8 @@ class Method(StrEnum):
     music = "music"
 
 
-@dataclass(frozen=True)
-class Look:
+@dataclass(frozen=True, kw_only=True)
+class Look(Where):
     """What to look at, as the options of `invertwin look` say it."""
 
     recording: Annotated[

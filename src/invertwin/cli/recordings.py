@@ -1,11 +1,9 @@
-"""Data of run files: simulated, captures, and raw chirps with their elements and poses."""
+"""Data of run files: simulated, captures, and recordings with every chirp."""
 
-from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
 from pydantic import model_validator
-from torch import Tensor, float64, zeros
 
 from invertwin.capture import (
     Capture,
@@ -16,22 +14,12 @@ from invertwin.capture import (
     ti,
 )
 from invertwin.capture.radar_fields import WAVEFORMS
-from invertwin.cli.registry import Group, OneOf, Registry, Table, registry
+from invertwin.cli.registry import Group, Registry, Table, registry
 from invertwin.cli.section import Depth, InputPath, Section, Seed, about, fail, key
-from invertwin.cli.sensors import (
-    BoardTable,
-    Elements,
-    Orientation,
-    Track,
-    board_elements,
-    rotations_of,
-    track,
-)
+from invertwin.cli.sensors import Posed
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
-from invertwin.radar.radar import Radar
-
-_Board = Annotated[Any, OneOf("board")]
+from invertwin.radar.boards import Mounting
 
 
 class SimulatedData(Section):
@@ -53,39 +41,6 @@ class SimulatedData(Section):
         return self
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Every chirp of a recording, and what recorded it. Readers return it, or a `Capture`."""
-
-    chirps: ChirpData
-    elements: Elements  # of TX in the order of sending, of RX
-    positions: Tensor | None = None  # of the radar in every frame [m]; None = the origin
-    rotations: Tensor | None = None  # None = axes of the world
-    moving: bool = False  # what it shows moves, and fades in the mean of a frame's chirps
-
-    def radar(self) -> Radar:
-        """What recorded it, one frame per position."""
-        return self.chirps.radar(*self.elements, self.positions, self.rotations)
-
-    def capture(self, chirp: int | None = None) -> Capture:
-        """One signal per frame and channel: of one chirp, counted from 0, or the mean.
-
-        Raises:
-            InputError: The mean of a recording of movers.
-        """
-        if self.moving and chirp is None:
-            raise InputError(
-                "expected a parameter of kind mover, since the recording has chirps and movers, "
-                "which fade in the mean of the chirps; seek a mover, or choose one `chirp`"
-            )
-        return self.chirps.capture(
-            *self.elements,
-            chirps="mean" if chirp is None else chirp,
-            positions=self.positions,
-            rotations=self.rotations,
-        )
-
-
 class DataTable(Table):
     """Measured data."""
 
@@ -93,8 +48,16 @@ class DataTable(Table):
         "channel calibration that `invertwin look --reflector` wrote; divided out", None
     )
 
+    def build(self, given: Any = None, /, **more: Any) -> Capture | ChirpCapture:
+        """The recording with its channels calibrated."""
+        found = super().build(given, **more)
+        if self.channels is None:
+            return found
+        with about("channels"):
+            return ChannelCalibration.load(self.channels).apply(found)
 
-class ChirpTable(DataTable):
+
+class ChirpTable(DataTable, Posed):
     """Raw chirps of a board, made one signal per frame."""
 
     chirp: Annotated[int, Ge(0)] | None = key(
@@ -103,35 +66,22 @@ class ChirpTable(DataTable):
     frame: Annotated[int, Ge(0)] | None = key(
         "number from 0 of the only one that is used; without it all", None
     )
-    positions: Track | None = key(
-        "m, of the radar in every frame, or one for all; without it the origin", None
-    )
-    orientation: Orientation | None = key(
-        "look_at or rotation_deg; without it the axes of the world", None
-    )
 
-    def build(self, given: Any = None, /, **more: Any) -> Recording:
+    def build(self, given: Any = None, /, **more: Any) -> ChirpCapture:
         """The recording with its poses."""
-        found: Recording = super().build(given, **more)
+        found = super().build(given, **more)
+        assert isinstance(found, ChirpCapture)
         if self.frame is not None:
             with about("frame"):
-                found = replace(found, chirps=_frame(found.chirps, self.frame))
-        if self.positions is None and self.orientation is None:
-            return found
-        with about("positions"):
-            positions = zeros(1, 3, dtype=float64)
-            positions = positions if self.positions is None else track(self.positions)
-            if len(positions) == 1:
-                positions = positions.expand(found.chirps.frame_count, 3).clone()
-            rotations = self.orientation and rotations_of(self.orientation, positions)
-        return replace(found, positions=positions, rotations=rotations)
+                found = found.frames([self.frame])
+        return found.placed(*self.poses(found.frame_count))
 
 
 def register(kinds: Registry) -> None:
     """Adds the readers; what one returns says which keys it has beside its own."""
-    kinds.group(Group("data"))
-    kinds.base(Capture, DataTable)
-    kinds.base(Recording, ChirpTable)
+    kinds.groups["data"] = Group()
+    kinds.bases[Capture] = DataTable
+    kinds.bases[ChirpCapture] = ChirpTable
     kinds.add("data", "simulated", SimulatedData)
     kinds.add("data", "capture", saved)
     kinds.add("data", "dca1000", dca1000)
@@ -154,10 +104,10 @@ def saved(file: InputPath) -> Capture:
 
 def dca1000(
     file: InputPath,
-    board: _Board,
+    board: Mounting,
     settings: InputPath | None = None,
     lanes: Literal[2, 4] | None = None,
-) -> Recording:
+) -> ChirpCapture:
     """A recording of a TI board through the DCA1000.
 
     Args:
@@ -171,7 +121,7 @@ def dca1000(
     return recorded(chirps, board)
 
 
-def arrays(file: InputPath, board: _Board | None = None) -> Recording:
+def arrays(file: InputPath, board: Mounting | None = None) -> ChirpCapture:
     """Samples in a NumPy, HDF5 or MATLAB file with a TOML description beside it.
 
     Args:
@@ -183,61 +133,39 @@ def arrays(file: InputPath, board: _Board | None = None) -> Recording:
     if board is not None:
         return recorded(chirps, board)
     with about("board"):
-        return Recording(chirps, described_arrays.described_elements(file, chirps.settings))
+        return chirps.recorded(described_arrays.described_board(file))
 
 
-def recorded(chirps: ChirpData, board: BoardTable) -> Recording:
-    """Chirps and the elements of the board that were in use."""
-    settings = chirps.settings
+def recorded(chirps: ChirpData, board: Mounting) -> ChirpCapture:
+    """Chirps that the elements of a board have recorded, those that the settings name."""
     with about("board"):
-        elements = board_elements(board, settings.transmit_order, settings.receivers)
-    return Recording(chirps, elements)
+        return chirps.recorded(board)
 
 
-def _frame(chirps: ChirpData, number: int) -> ChirpData:
-    if number >= chirps.frame_count:
-        raise InputError(
-            f"expected a number below {chirps.frame_count}, got {number}; count frames from 0"
-        )
-    one = replace(chirps.settings, frames=1)
-    return ChirpData(chirps.samples[number : number + 1], one)
-
-
-def measured(data: Any, path: str = "data") -> Capture:
+def measured(data: Any) -> Capture:
     """The capture of a `[data]` table that names a recording.
 
     Raises:
         InputError: Files that are missing, damaged or contradict each other.
     """
-    found = _built(data, path)
-    with about(path):
-        capture = found.capture(data.chirp) if isinstance(found, Recording) else found
-        if data.channels is None:
-            return capture
-        with about("channels"):
-            return ChannelCalibration.load(data.channels).apply(capture)
+    with about("data"):
+        found = data.build()
+        if isinstance(found, Capture):
+            return found
+        return found.capture("mean" if data.chirp is None else data.chirp)
 
 
-def chirp_capture(data: Any, path: str = "data") -> ChirpCapture:
+def chirp_capture(data: Any) -> ChirpCapture:
     """The recording of a `[data]` table with every chirp of its frames.
 
     Raises:
         InputError: Data without chirps, or files that are missing or damaged.
     """
-    found = None if data.kind == "simulated" else _built(data, path)
-    if not isinstance(found, Recording):
+    with about("data"):
+        found = None if data.kind == "simulated" else data.build()
+    if not isinstance(found, ChirpCapture):
         raise InputError(
-            f'{path}.kind: expected data with chirps, got "{data.kind}"; give dca1000, arrays, or '
+            f'data.kind: expected data with chirps, got "{data.kind}"; give dca1000, arrays, or '
             "simulated with [chirps]"
         )
-    with about(path):
-        radar, chirps = found.radar(), found.chirps
-        if data.channels is not None:
-            with about("channels"):
-                chirps = ChannelCalibration.load(data.channels).apply_to_chirps(chirps)
-    return ChirpCapture(chirps.beat, radar, chirps.settings.chirps)
-
-
-def _built(data: Any, path: str) -> Capture | Recording:
-    with about(path):
-        return data.build()
+    return found

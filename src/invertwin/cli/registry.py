@@ -40,7 +40,6 @@ BUILT_IN = (
     "invertwin.cli.sensors",
     "invertwin.cli.materials",
     "invertwin.cli.shape_tables",
-    "invertwin.cli.gradients",
     "invertwin.cli.recordings",
     "invertwin.cli.fit_tables",
 )
@@ -61,6 +60,7 @@ class Table(Section):
     """A table that a constructor of the library makes something of."""
 
     made_by: ClassVar[Callable[..., Any]]
+    optional: ClassVar[tuple[str, ...]] = ()  # arguments that other keys may stand in for
     made_from: ClassVar[Mapping[str, tuple[str | None, Any]]] = {}  # name → key, annotation
 
     def build(self, given: Mapping[type, object] | None = None, /, **more: Any) -> Any:
@@ -130,7 +130,6 @@ class Group:
     """The kinds of one thing, such as materials.
 
     Attributes:
-        name: Of the group.
         tag: The key that names the kind.
         base: Keys that all of its tables have.
         product: The type that its constructors make; annotations with it mean the group.
@@ -139,7 +138,6 @@ class Group:
         includes: Another group, whose kinds it has, too.
     """
 
-    name: str
     tag: str = "kind"
     base: type[Table] = Table
     product: Any = None
@@ -167,9 +165,11 @@ class TableOf:
     make: Any
     base: type[Table] = Table
     without: tuple[str, ...] = ()
+    checked: bool | None = None
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        return handler.generate_schema(_table_of_class(self.make, self.base, self.without))
+        found = _table_of_class(self.make, self.base, self.without, self.checked)
+        return handler.generate_schema(found)
 
 
 @dataclass(frozen=True)
@@ -183,16 +183,28 @@ class NameOf:
 
 
 class Registry:
-    """All that a run file may name. `register` functions get it and add to it."""
+    """All that a run file may name. `register` functions get it and add to it.
+
+    Attributes:
+        sections: Of run files: dataclasses or pydantic models, by name.
+        commands: Of the command line: functions as typer takes them, by name; each is a task, too.
+        recordings: What `invertwin look` knows by the name of a file: the kind of its data, whose
+            constructor gets the folder, and the preset that recorded, unless the user names
+            another: the constructor then gets a `board`, too.
+        groups: Of kinds, by name.
+        forms: How values of a type of the library are written.
+        bases: A base of the tables of all constructors of a type or of its subclasses.
+        given: Arguments of these types are no keys: they are handed over when a table is built.
+    """
 
     def __init__(self) -> None:
         self.sections: dict[str, Any] = {}
         self.commands: dict[str, Callable[..., Any]] = {}
         self.recordings: dict[str, tuple[str, str | None]] = {}
-        self._groups: dict[str, Group] = {}
-        self._forms: dict[Any, Form] = {}
-        self._bases: dict[type, type[Table]] = {}
-        self._given: set[Any] = set()
+        self.groups: dict[str, Group] = {}
+        self.forms: dict[Any, Form] = {}
+        self.bases: dict[type, type[Table]] = {}
+        self.given: set[Any] = set()
         self._waiting: list[tuple[str, str, _Kind]] | None = []
 
     def add(
@@ -209,7 +221,7 @@ class Registry:
 
         Args:
             group: Such as "material", "shape", "waveform", "pattern", "array", "board", "track",
-                "data", "parameter", "theta", "loss", "optimizer" or "model".
+                "data", "parameter", "loss", "optimizer" or "model".
             kind: Its name in run files.
             make: Its class or function, or "module:name" of it, which is imported when needed.
             without: Arguments that are no keys.
@@ -224,40 +236,6 @@ class Registry:
             self._waiting.append((group, kind, entry))
         else:
             self._enter(group, kind, entry)
-
-    def section(self, name: str, model: Any) -> None:
-        """Adds a section to run files: a dataclass or a pydantic model."""
-        self.sections[name] = model
-
-    def command(self, name: str, function: Callable[..., Any]) -> None:
-        """Adds a command to the command line, as typer takes it, and a task of its name."""
-        self.commands[name] = function
-
-    def recording(self, file: str, kind: str, board: str | None = None) -> None:
-        """Lets `invertwin look` know a recording by the name of its file.
-
-        Args:
-            file: Its name.
-            kind: Of the data; its constructor is given the folder alone.
-            board: Preset that recorded, unless the user names another.
-        """
-        self.recordings[file] = (kind, board)
-
-    def group(self, group: Group) -> None:
-        """Adds a group."""
-        self._groups[group.name] = group
-
-    def form(self, kind: Any, form: Form) -> None:
-        """States how values of a type of the library are written."""
-        self._forms[kind] = form
-
-    def base(self, kind: type, base: type[Table]) -> None:
-        """States a base of the tables of all constructors of a type or its subclasses."""
-        self._bases[kind] = base
-
-    def give(self, *kinds: Any) -> None:
-        """Arguments of these types are no keys: they are handed over when a table is built."""
-        self._given |= set(kinds)
 
     def names(self, group: str) -> list[str]:
         """The kinds of a group, or of "task"."""
@@ -316,7 +294,7 @@ class Registry:
         arguments: dict[str, tuple[str | None, Any]] = {}
         product = make if isinstance(make, type) else hints.get("return")
         if isinstance(product, type):
-            own = next((b for kind, b in self._bases.items() if issubclass(product, kind)), base)
+            own = next((b for kind, b in self.bases.items() if issubclass(product, kind)), base)
             base = base if issubclass(base, own) else _joined(own, base)
         for name, parameter in inspect.signature(make).parameters.items():
             if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
@@ -324,15 +302,16 @@ class Registry:
             if name in without:
                 continue
             hint = hints[name]
-            if self._given & set(_members(hint)):
+            if self.given & set(_members(hint)):
                 arguments[name] = (None, hint)
                 continue
             place = f"{name}_deg" if _is_angle(hint) else name
             arguments[name] = (place, hint)
             if place not in base.model_fields and place not in made:
-                made[place] = self._field(hint, name, parameter.default, documents.get(name, ""))
+                default = None if name in base.optional else parameter.default
+                made[place] = self._field(hint, name, default, documents.get(name, ""))
         checked = is_dataclass(make) if checked is None else checked
-        if checked and not self._forms.keys() & {m for h in hints.values() for m in _members(h)}:
+        if checked and not self.forms.keys() & {m for h in hints.values() for m in _members(h)}:
             base = _joined(_Checked, base)
         words = (inspect.getdoc(make) or "").split("\n\n")[0]
         # Fields of the constructor come first, those of the base after them, but for the tag.
@@ -356,12 +335,13 @@ class Registry:
     def read_type(self, hint: Any, name: str) -> Any:
         """What a run file may say for an argument with this annotation."""
         origin, arguments, members = get_origin(hint), get_args(hint), _members(hint)
-        form = next((self._forms[member] for member in members if member in self._forms), None)
-        group = next((g for g in self._groups.values() if g.product in members), None)
+        form = next((self.forms[member] for member in members if member in self.forms), None)
+        products = {found.product: name for name, found in self.groups.items() if found.product}
+        group = next((products[member] for member in members if member in products), None)
         if form is not None:
             return form.table(name, _is_angle(hint))
-        if group is not None and group.product is not None:
-            return Annotated[Any, OneOf(group.name)]
+        if group is not None:
+            return Annotated[Any, OneOf(group)]
         if origin is Annotated:
             letters = _letters(hint)
             if letters:
@@ -396,7 +376,7 @@ class Registry:
         """What the constructor gets for a value of the run file."""
         if isinstance(value, Table):
             return value.build(given)
-        form = next((self._forms[m] for m in _members(hint) if m in self._forms), None)
+        form = next((self.forms[m] for m in _members(hint) if m in self.forms), None)
         if form is not None:
             return form.value(value, name, _is_angle(hint), given)
         if _letters(hint):
@@ -428,12 +408,12 @@ class Registry:
         return told | own | included
 
     def _enter(self, group: str, kind: str, entry: _Kind) -> None:
-        if group not in self._groups:
-            known = ", ".join(self._groups)
+        if group not in self.groups:
+            known = ", ".join(self.groups)
             raise InputError(f"expected a group among {known}, got {group}; choose one")
-        if kind in self._groups[group].kinds:
+        if kind in self.groups[group].kinds:
             raise InputError(f"expected a new name of a {group}, got {kind}; choose another")
-        self._groups[group].kinds[kind] = entry
+        self.groups[group].kinds[kind] = entry
 
     def _complete(self) -> dict[str, Group]:
         """The groups, the library's own kinds before those of plugins."""
@@ -443,7 +423,7 @@ class Registry:
                 pkgutil.resolve_name(f"{module}:register")(self)
             for entry in waiting:
                 self._enter(*entry)
-        return self._groups
+        return self.groups
 
 
 registry = Registry()
@@ -557,5 +537,10 @@ def _joined(first: type[Table], second: type[Table]) -> type[Table]:
 
 
 @cache
-def _table_of_class(kind: Any, base: type[Table] = Table, without: tuple[str, ...] = ()) -> Any:
-    return registry.table_of(kind, kind.__name__, base, without=without, checked=None)
+def _table_of_class(
+    kind: Any,
+    base: type[Table] = Table,
+    without: tuple[str, ...] = (),
+    checked: bool | None = None,
+) -> Any:
+    return registry.table_of(kind, _title(kind.__name__), base, without=without, checked=checked)

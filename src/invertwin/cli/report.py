@@ -39,21 +39,13 @@ class Picture:
     note: str = ""
 
 
-@dataclass(frozen=True)
-class Again:
-    """How a run is done again: a command in the run's own folder, and its run files.
-
-    Attributes:
-        command: The command with its file, such as ``simulate run.toml``.
-        files: Run files as used, by their path in the folder.
-    """
-
-    command: str
-    files: Mapping[str, str]
-
-
 def report_html(
-    title: str, status: str, note: str, parts: Sequence[Table | Picture], again: Again
+    title: str,
+    status: str,
+    note: str,
+    parts: Sequence[Table | Picture],
+    again: str,
+    files: Mapping[str, str],
 ) -> str:
     """The report as one HTML text that loads nothing from elsewhere.
 
@@ -62,7 +54,8 @@ def report_html(
         status: What came out, in a sentence.
         note: What the run file says about the run; blank lines part paragraphs.
         parts: Tables and pictures in reading order.
-        again: How the run is done again.
+        again: The command that does it again, in the run's own folder.
+        files: Run files as used, by their path in the folder.
     """
     pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     pages.filters |= {"shown": shown, "base64": _base64}
@@ -73,9 +66,8 @@ def report_html(
         note=note,
         parts=parts,
         version=__version__,
-        command=f"invertwin {again.command} -o again"
-        + (f" --backend {backend}" if backend else ""),
-        files=again.files,
+        command=f"invertwin {again} -o again" + (f" --backend {backend}" if backend else ""),
+        files=files,
     )
 
 
@@ -104,7 +96,7 @@ def finish(
     files = folder.run_files
     if files:
         again += " run.toml" if len(files) == 1 else " runs/*.toml"
-    html = report_html(title, status, note, parts, Again(again, files))
+    html = report_html(title, status, note, parts, again, files)
     folder.write_text("report.html", html)
     return [part for part in parts if isinstance(part, Table)]
 

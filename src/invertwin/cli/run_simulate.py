@@ -128,7 +128,7 @@ def _chirps(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: G
     """Several ramps a frame, between which objects move."""
     table = need(run, "chirps", "several ramps a frame")
     begin = time.perf_counter()
-    chirps = sensors.chirps(table)
+    chirps = table.build()
     beat = chirp_train(run, scene, radar, chirps)
     seconds = time.perf_counter() - begin
     maps = doppler_maps(beat, radar, grid, chirps)

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from invertwin.cli.options import console
+from invertwin.cli.options import Options, Where, console
 from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.run_file import about_file, load_run, need
 from invertwin.cli.runs import RunFolder, open_run
@@ -21,10 +21,17 @@ _LOG_SECONDS = 10.0  # between lines of progress in a log
 
 @contextmanager
 def run_folder(
-    path: Path, runs: dict[str, Any], overwrite: bool, resume: bool
+    options: Where, default: Path, runs: Mapping[str, Any] | None = None
 ) -> Iterator[RunFolder]:
-    """The run's folder, as of `open_run`; says where the results are, or how to resume."""
-    folder = open_run(path, runs, overwrite=overwrite, resume=resume)
+    """The run's folder, as of `open_run`; says where the results are, or how to resume.
+
+    Args:
+        options: What the user has chosen.
+        default: The folder if the user has chosen none.
+        runs: Run files by stem.
+    """
+    path, resume = options.out or default, getattr(options, "resume", False)
+    folder = open_run(path, runs or {}, overwrite=options.overwrite, resume=resume)
     try:
         with folder:
             yield folder
@@ -39,11 +46,11 @@ def run_folder(
 
 
 def load_runs(
-    files: list[Path], seed: int | None, command: str, sections: Sequence[str]
+    files: Sequence[Path], options: Options, command: str, sections: Sequence[str]
 ) -> dict[str, Any]:
     """Run files by stem, with the sections that the command cannot do without.
 
-    A seed replaces theirs. Run files of another task than the command's are refused.
+    A seed of the options replaces theirs. Run files of another task than the command's are refused.
     """
     runs: dict[str, Any] = {}
     for file in files:
@@ -59,7 +66,8 @@ def load_runs(
         with about_file(file):
             for section in sections:
                 need(run, section, command, cure)
-        runs[file.stem] = run if seed is None else run.model_copy(update={"seed": seed})
+        seeded = {} if options.seed is None else {"seed": options.seed}
+        runs[file.stem] = run.model_copy(update=seeded)
     return runs
 
 

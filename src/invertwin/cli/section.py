@@ -6,7 +6,6 @@ Nothing here imports torch, so that the command line can say what it offers with
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
@@ -17,7 +16,6 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
-    GetCoreSchemaHandler,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -61,16 +59,6 @@ class KeyInputError(InputError):
         self.path, self.text = path, text
 
 
-@dataclass(frozen=True)
-class Among:
-    """Annotates a key that holds one of these names."""
-
-    names: tuple[str, ...]
-
-    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        return handler.generate_schema(Literal[self.names])
-
-
 @contextmanager
 def about(path: str) -> Iterator[None]:
     """Errors of the library with the key of the run file that they are about."""
@@ -79,7 +67,7 @@ def about(path: str) -> Iterator[None]:
     except KeyInputError as error:
         raise KeyInputError(f"{path}.{error.path}", error.text) from None
     except InputError as error:
-        raise KeyInputError(path, str(error)) from None
+        raise KeyInputError(f"{path}.{error.at}" if error.at else path, str(error)) from None
 
 
 def key(description: str, default: Any = ..., **limits: Any) -> Any:

@@ -1,41 +1,25 @@
-"""Radars of run files: waveforms, antennas, boards, tracks, grids, chirp trains, front ends."""
+"""Radars of run files: waveforms, antennas, boards, tracks, poses, grids."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import torch
-from annotated_types import Ge, Gt, Le, Len, MinLen
+from annotated_types import Ge, MinLen
 from pydantic import Tag, model_validator
 from torch import Tensor
 
 from invertwin.capture.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
-from invertwin.cli.registry import Group, OneOf, Registry, Table
-from invertwin.cli.section import (
-    TAG_MARK,
-    Among,
-    Section,
-    Vector,
-    about,
-    check_presence,
-    key,
-    tag_by,
-)
+from invertwin.cli.registry import Group, OneOf, Registry, Table, TableOf
+from invertwin.cli.section import TAG_MARK, Section, Vector, about, check_presence, key, tag_by
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, Angle, Count, NonNegative, Positive
-from invertwin.radar import boards, motion
+from invertwin.limits import Count, Positive
+from invertwin.radar import boards, tracks
 from invertwin.radar.impairments import Impairments
+from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
-from invertwin.radar.waveform import (
-    FMCW,
-    OFDM,
-    WINDOWS,
-    Impulse,
-    SampledWaveform,
-    SteppedFrequency,
-)
+from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
 from invertwin.scene import (
     AntennaArray,
     Cosine,
@@ -50,8 +34,6 @@ from invertwin.scene import Table as PatternTable
 
 _MOST_BINS = 1e9  # 4 GB a map
 Numbers = Annotated[list[Count], MinLen(1)]
-Window = Annotated[str, Among(tuple(WINDOWS))]
-Elements = tuple[AntennaArray, AntennaArray]
 
 
 class ArrayTable(Table):
@@ -80,13 +62,16 @@ class BoardTable(Table):
     )
     pattern: Annotated[Any, OneOf("pattern")] | None = key("of every element; else isotropic", None)
 
-    def board(self) -> boards.Board:
-        """The board."""
-        return super().build()
-
-    def build(self, given: Any = None, /, **more: Any) -> "BoardTable":
-        """Itself: which of its elements are in use may be up to a recording."""
-        return self
+    def build(self, given: Any = None, /, **more: Any) -> boards.Mounting:
+        """The board as it is mounted."""
+        return boards.Mounting(
+            super().build(given, **more),
+            self.elevation,
+            self.azimuth,
+            self.transmitters,
+            self.receivers,
+            None if self.pattern is None else self.pattern.build(),
+        )
 
 
 class LookAt(Section):
@@ -105,20 +90,41 @@ Orientation = Annotated[
 ]
 
 
-class RadarTable(Section):
+class Posed(Table):
+    """Where a radar is in every frame."""
+
+    positions: Track = key(
+        "m, one for each frame: a list of points or a track; for a recording also one for all",
+        [[0.0, 0.0, 0.0]],
+    )
+    orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
+
+    def poses(self, frames: int) -> tuple[Tensor, Tensor]:
+        """Positions [frame, 3]; columns are the radar's right, up and boresight axes [frame, 3, 3].
+
+        Args:
+            frames: How many there are, where one position holds for all.
+
+        Raises:
+            InputError: A target straight above a position.
+        """
+        listed = isinstance(self.positions, list)
+        places = _float64(self.positions) if listed else self.positions.build()
+        if len(places) == 1:
+            places = places.expand(frames, 3).clone()
+        if isinstance(self.orientation, LookAt):
+            with about("orientation.look_at"):
+                return places, look_at(places, self.orientation.look_at)
+        turn = rotation_from_vector(_float64(self.orientation.rotation_deg).deg2rad())
+        return places, turn.expand(len(places), 3, 3).clone()
+
+
+class RadarTable(Posed):
     """Arrays, waveform and poses; one frame per position."""
 
-    waveform: Annotated[Any, OneOf("waveform")] = key("what is sent")
     board: Annotated[Any, OneOf("board")] | None = key("antenna elements of a board, or:", None)
     transmitters: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
     receivers: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
-    window: Window = key("over the samples of a ramp", "hamming")
-    array_window: Window = key("over the elements", "hamming")
-    positions: Track = key("m, one frame each: a list of points or a track", [[0.0, 0.0, 0.0]])
-    orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
-    shared_visibility: bool | None = key(
-        "what the transmitter sees, the receiver sees; default: when both are within 0.1 m", None
-    )
 
     @model_validator(mode="after")
     def _elements(self) -> "RadarTable":
@@ -127,15 +133,16 @@ class RadarTable(Section):
         check_presence(self, wanted, f"with{'out' if arrays else ''} `board`")
         return self
 
-
-class GridTable(Section):
-    """The map that is compared: metres of range, direction cosines."""
-
-    range_min: NonNegative = key("m")
-    range_max: Positive = key("m")
-    u_max: Annotated[float, Gt(0), Le(1)] = key("direction cosine to the right", 1.0)
-    v_max: Annotated[float, Gt(0), Le(1)] = key("direction cosine up", 1.0)
-    oversample: Positive = key("bins per resolution cell", 2.0)
+    def build(self, given: Any = None, /, **more: Any) -> Radar:
+        """The radar, one frame per position."""
+        if self.board is not None:
+            with about("board"):
+                arrays = self.board.build().arrays()
+            more |= {"transmitters": arrays[0], "receivers": arrays[1]}
+        more["positions"], more["rotations"] = self.poses(1)
+        found = super().build(given, **more)
+        WAVEFORMS.setdefault(type(found.waveform).__name__, type(found.waveform))
+        return found
 
 
 class ChirpsTable(Table):
@@ -148,81 +155,37 @@ class ChirpsTable(Table):
     )
 
 
+AnyRadar = Annotated[Any, TableOf(Radar, RadarTable, ("rotations", "range_bias"), checked=False)]
+AnyGrid = Annotated[Any, TableOf(Radar.grid, without=("self",))]
+AnyChirps = Annotated[Any, TableOf(Chirps, ChirpsTable, ("order",))]
+AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_figure_db"))]
+
+
 def register(registry: Registry) -> None:
     """Adds waveforms, antennas, boards and tracks."""
-    registry.group(Group("pattern", product=Pattern))
-    registry.group(Group("waveform"))
-    registry.group(Group("array", base=ArrayTable))
-    registry.group(Group("board", base=BoardTable))
-    registry.group(Group("track", points=Annotated[list[Vector], MinLen(1)]))
+    registry.groups["pattern"] = Group(product=Pattern)
+    registry.groups["waveform"] = Group(product=Waveform)
+    registry.groups["array"] = Group(base=ArrayTable, product=AntennaArray)
+    registry.groups["board"] = Group(base=BoardTable, product=boards.Mounting)
+    registry.groups["track"] = Group(points=Annotated[list[Vector], MinLen(1)])
     waveforms = {"fmcw": FMCW, "stepped": SteppedFrequency, "ofdm": OFDM, "impulse": Impulse}
     for name, waveform in waveforms.items():
         registry.add("waveform", name, waveform)
     registry.add("pattern", "isotropic", Isotropic)
     registry.add("pattern", "cosine", Cosine)
-    registry.add("pattern", "table", measured_pattern, checked=True)
-    registry.add("array", "planar", planar)
+    registry.add("pattern", "table", PatternTable.of_decibels, checked=True)
+    registry.add("array", "planar", planar_array)
     registry.add("array", "linear", linear_array)
     registry.add("array", "positions", AntennaArray)
-    registry.add("board", "name", preset, untagged=True)
+    registry.add("board", "name", boards.board, untagged=True)
     registry.add("board", "tx_places", own_board, untagged=True)
-    for track_kind in (line, arc, grid_track):
-        registry.add("track", track_kind.__name__.removesuffix("_track"), track_kind)
+    for curve in (tracks.line, tracks.arc, tracks.grid):
+        registry.add("track", curve.__name__, curve)
 
 
-def measured_pattern(
-    theta: Annotated[Sequence[float], MinLen(2), RADIANS],
-    gain_db: Sequence[Sequence[float]],
-    phi: Annotated[Sequence[float], MinLen(1), RADIANS] = (0.0,),
-) -> PatternTable:
-    """A measured power pattern: one row per theta, from 0 at boresight, one column per phi.
-
-    Args:
-        theta: from 0 at boresight.
-        gain_db: one row per theta, one column per phi.
-        phi: one: symmetric about boresight.
-    """
-    rows, columns = len(theta), len(phi)
-    if len(gain_db) != rows or any(len(row) != columns for row in gain_db):
-        lengths = sorted({len(row) for row in gain_db})
-        raise InputError(
-            f"expected gain_db with {rows} rows of {columns}, got {len(gain_db)} rows of "
-            f"{' or '.join(map(str, lengths))}; give one row per theta and one column per phi"
-        )
-    return PatternTable(_float64(theta), _float64(phi), 10 ** (_float64(gain_db) / 10))
-
-
-def planar(
-    count: tuple[Count, Count], spacing: tuple[Positive, Positive], pattern: Pattern | None = None
-) -> AntennaArray:
-    """Elements on a grid, y runs fastest.
-
-    Args:
-        count: elements along x, y.
-        spacing: m, along x, y.
-        pattern: of every element, isotropic by default.
-    """
-    return planar_array(*count, *spacing, pattern=pattern)
-
-
-def preset(
-    name: Annotated[str, Among(tuple(boards.BOARDS))],
-    design_frequency: Positive | None = None,
+def own_board(
+    tx_places: boards.Places, rx_places: boards.Places, design_frequency: Positive
 ) -> boards.Board:
-    """A board that the library knows.
-
-    Args:
-        name: of a preset; xWR serves AWR and IWR.
-        design_frequency: Hz, whose half wavelength is the unit; without it the preset's.
-    """
-    found = boards.board(name)
-    return found if design_frequency is None else replace(found, design_frequency=design_frequency)
-
-
-_Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
-
-
-def own_board(tx_places: _Places, rx_places: _Places, design_frequency: Positive) -> boards.Board:
     """A board of one's own: a table of places.
 
     Args:
@@ -230,163 +193,35 @@ def own_board(tx_places: _Places, rx_places: _Places, design_frequency: Positive
         rx_places: column, row of RX1, RX2, … in half wavelengths.
         design_frequency: Hz, whose half wavelength is the unit.
     """
-    tx, rx = (tuple((x, y) for x, y in places) for places in (tx_places, rx_places))
-    return boards.Board("the board", tx, rx, design_frequency)
+    return boards.Board("the board", tx_places, rx_places, design_frequency)
 
 
-def line(start: Vector, stop: Vector, count: Count) -> Tensor:
-    """Positions at even distances on a line.
-
-    Args:
-        start: m.
-        stop: m.
-        count: positions.
-    """
-    first, last = _float64(start), _float64(stop)
-    return first + torch.linspace(0, 1, count, dtype=torch.float64)[:, None] * (last - first)
-
-
-def arc(center: Vector, radius: Positive, start: Angle, stop: Angle, count: Count) -> Tensor:
-    """A level arc about `center`; 0° is on its −z side, 90° on its +x side.
-
-    Args:
-        center: m.
-        radius: m.
-        start: 0 is on the −z side of the centre.
-        stop: 90 is on its +x side.
-        count: positions.
-    """
-    angle = torch.linspace(start, stop, count, dtype=torch.float64)
-    around = torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
-    return _float64(center) + radius * around
-
-
-def grid_track(
-    center: Vector, size: tuple[NonNegative, NonNegative], count: tuple[Count, Count]
-) -> Tensor:
-    """An upright rectangle of positions in the x-y plane through `center`.
-
-    Args:
-        center: m.
-        size: m along x, y.
-        count: positions along x, y.
-    """
-    x, y = (
-        (torch.linspace(-0.5, 0.5, n, dtype=torch.float64) if n > 1 else torch.zeros(1)) * length
-        for n, length in zip(count, size, strict=True)
-    )
-    across, up = torch.meshgrid(x.double(), y.double(), indexing="ij")
-    offsets = torch.stack([across, up, torch.zeros_like(up)], dim=-1)
-    return _float64(center) + offsets.reshape(-1, 3)
-
-
-def radar(table: RadarTable) -> Radar:
+def radar(table: Any) -> Radar:
     """The radar of a `[radar]` table, one frame per position.
 
     Raises:
         InputError: Values the radar refuses, or a target straight above a position.
     """
     with about("radar"):
-        with about("waveform"):
-            waveform = table.waveform.build()
-        WAVEFORMS.setdefault(type(waveform).__name__, type(waveform))
-        if table.board is not None:
-            with about("board"):
-                arrays = board_elements(table.board)
-        else:
-            arrays = (_elements(table, "transmitters"), _elements(table, "receivers"))
-        positions = track(table.positions)
-        with about("orientation.look_at"):
-            rotations = rotations_of(table.orientation, positions)
-        return Radar(
-            *arrays,
-            waveform,
-            positions,
-            rotations,
-            window=table.window,
-            array_window=table.array_window,
-            shared_visibility=table.shared_visibility,
-        )
+        return table.build()
 
 
-def _elements(table: RadarTable, name: str) -> AntennaArray:
-    with about(name):
-        return getattr(table, name).build()
-
-
-def board_elements(
-    table: BoardTable,
-    transmitters: Sequence[int] | None = None,
-    receivers: Sequence[int] | None = None,
-) -> Elements:
-    """TX (in the order of sending) and RX of a `board` table: its own, or those that recorded.
-
-    Raises:
-        InputError: A missing sign, an element that the board does not have, or a choice of
-            elements both in the table and by a recording.
-    """
-    for name, recorded in (("transmitters", transmitters), ("receivers", receivers)):
-        given = getattr(table, name)
-        if recorded is not None and given is not None:
-            raise InputError(
-                f"expected no `{name}` with a recording, got {given}; remove the key: the "
-                f"recording's settings say {list(recorded)}"
-            )
-    return table.board().arrays(
-        elevation=table.elevation,
-        azimuth=table.azimuth,
-        transmitters=transmitters or table.transmitters,
-        receivers=receivers or table.receivers,
-        pattern=None if table.pattern is None else table.pattern.build(),
-    )
-
-
-def track(table: Any) -> Tensor:
-    """Positions [frame, 3] of a track or of a list of points."""
-    return _float64(table) if isinstance(table, list) else table.build()
-
-
-def rotations_of(table: Any, positions: Tensor) -> Tensor:
-    """Columns are the radar's right, up and boresight axes in the world [frame, 3, 3].
-
-    Raises:
-        InputError: A target straight above a position.
-    """
-    if isinstance(table, Turned):
-        turn = rotation_from_vector(torch.deg2rad(_float64(table.rotation_deg)))
-        return turn.expand(len(positions), 3, 3).clone()
-    return look_at(positions, table.look_at)
-
-
-def grid(table: GridTable, radar: Radar) -> Grid:
+def grid(table: Any, radar: Radar) -> Grid:
     """The bins of a `[grid]` table for a radar.
 
     Raises:
         InputError: Limits that the radar refuses or does not reach, or a map of a size that only
             a wrong unit explains.
     """
-    wave = radar.waveform
-    if isinstance(wave, SampledWaveform) and table.range_max > wave.max_range:
-        raise InputError(
-            f"grid.range_max: expected at most the waveform's unambiguous range, "
-            f"{wave.max_range:.4g} m, got {table.range_max:g}; give metres, or more samples"
-        )
     with about("grid"):
-        found = radar.grid(
-            table.range_min, table.range_max, table.u_max, table.v_max, oversample=table.oversample
-        )
-    bins = math.prod(found.shape) * radar.frame_count
-    if bins > _MOST_BINS:
-        raise InputError(
-            f"grid: expected a map of at most {_MOST_BINS:g} bins over all frames, got {bins:.3g}; "
-            "give limits in metres and direction cosines, or less oversampling"
-        )
+        found = table.build(self=radar)
+        bins = math.prod(found.shape) * radar.frame_count
+        if bins > _MOST_BINS:
+            raise InputError(
+                f"expected a map of at most {_MOST_BINS:g} bins over all frames, got {bins:.3g}; "
+                "give limits in metres and direction cosines, or less oversampling"
+            )
     return found
-
-
-def chirps(table: ChirpsTable) -> motion.Chirps:
-    """Timing of the `[chirps]` table."""
-    return table.build()
 
 
 def impairments(table: Any, data: Any) -> Impairments:

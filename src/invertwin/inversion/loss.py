@@ -22,6 +22,16 @@ Maps = Sequence[tuple[Tensor, Tensor]]
 """The predicted and the observed map of every observation."""
 
 
+def relative_error(simulated: Tensor, measured: Tensor) -> Tensor:
+    """``mean|a − b|² / mean|b|²``, of maps of any form: also of complex signals.
+
+    Args:
+        simulated: a.
+        measured: b.
+    """
+    return (simulated - measured).abs().square().mean() / measured.abs().square().mean()
+
+
 @dataclass(frozen=True)
 class SpectrumLoss:
     """Multiscale difference of power maps.
@@ -286,6 +296,9 @@ class _Known(torch.autograd.Function):
         return (slope * tangents[0]).sum()
 
 
+Scale = Literal["magnitude", "power", "level"]
+
+
 @dataclass(frozen=True)
 class CorrelationLoss:
     """One minus Pearson's correlation of two power maps; no gain or offset changes it.
@@ -298,7 +311,7 @@ class CorrelationLoss:
         InputError: An unknown scale.
     """
 
-    scale: Literal["magnitude", "power", "level"] = "magnitude"
+    scale: Scale = "magnitude"
 
     def __post_init__(self) -> None:
         if self.scale not in _SCALES:

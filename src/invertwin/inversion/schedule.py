@@ -1,11 +1,15 @@
-"""How long a fit lasts, and its stages: which unknowns are free when, coarse before fine."""
+"""How long a fit lasts, and which unknowns are free in each of its stages."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from typing import Annotated
+
+from annotated_types import Gt, Le
 
 from invertwin.errors import InputError
-from invertwin.inversion.observation import Observation
 from invertwin.inversion.optimizer import Optimizer
+from invertwin.limits import Count, NonNegative
+from invertwin.models import ForwardModel
 from invertwin.scene.mesh import Mesh
 
 
@@ -21,11 +25,11 @@ class Schedule:
             this share over 20 steps; 0 = it uses the whole budget.
     """
 
-    steps: int = 200
+    steps: Count = 200
     _: KW_ONLY
-    annealing: float = 0.7
-    frames_per_step: int | None = None
-    tolerance: float = 0.0
+    annealing: Annotated[float, Gt(0), Le(1)] = 0.7
+    frames_per_step: Count | None = None
+    tolerance: NonNegative = 0.0
 
     @property
     def widths_end(self) -> float:
@@ -43,15 +47,15 @@ class Stage(Schedule):
             for another kind of shape, or a finer mesh.
         remesh: For every object named here, a function of its mesh that is applied before modules
             are made anew.
-        optimizer: In place of the optimizer of the whole fit.
-        change: What the stage changes of every observation, such as its model's sampling.
+        optimizer: Optimizer of this stage; None = that of the whole fit.
+        models: Of the observations in this stage, in their order; empty = their own.
     """
 
     unknowns: tuple[str, ...] = ()
     rebuild: bool = False
     remesh: Mapping[str, Callable[[Mesh], Mesh]] = field(default_factory=dict)
     optimizer: Optimizer | None = None
-    change: Callable[[Observation], Observation] | None = None
+    models: Sequence[ForwardModel] = ()
 
     @property
     def renews(self) -> bool:
@@ -66,7 +70,7 @@ def checked_stages(
 
     Args:
         schedule: One part or several; None = one with the defaults.
-        names: Of all unknowns of the scene.
+        names: Names of all unknowns of the scene.
 
     Raises:
         InputError: No stages, an unknown name, or an unknown that an earlier stage has dropped.

@@ -6,18 +6,22 @@ fractions of a millimetre: estimate that from a reflector (`invertwin.capture.es
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Annotated
 
 import torch
+from annotated_types import Len, MinLen
 from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import Among, Positive
 from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern
 from invertwin.scene.checks import checked_number
 
-Places = tuple[tuple[float, float], ...]
+Elements = tuple[AntennaArray, AntennaArray]  # TX and RX
+Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ class Board:
         transmitters: Sequence[int] | None = None,
         receivers: Sequence[int] | None = None,
         pattern: Pattern | None = None,
-    ) -> tuple[AntennaArray, AntennaArray]:
+    ) -> Elements:
         """TX and RX elements in the radar frame (x right, y up, z boresight).
 
         Public sources disagree which way is up, for the xWR1843's middle transmitter for one, and
@@ -138,7 +142,58 @@ class Board:
         return torch.tensor(numbers) - 1
 
 
-def _row(*columns: float) -> Places:
+@dataclass(frozen=True)
+class Mounting:
+    """A board as it is mounted, and which of its elements are in use.
+
+    Attributes:
+        board: where its elements are, or the name of a preset.
+        elevation: as in `Board.arrays`.
+        azimuth: as in `Board.arrays`.
+        transmitters: numbers from 1 in the order of sending; None = all, or those of a recording.
+        receivers: numbers from 1, ascending; None = all, or those of a recording.
+        pattern: gain of every element; None = isotropic.
+    """
+
+    board: Board | str
+    elevation: int | None = None
+    azimuth: int = 1
+    transmitters: Sequence[int] | None = None
+    receivers: Sequence[int] | None = None
+    pattern: Pattern | None = None
+
+    def arrays(
+        self,
+        transmitters: Sequence[int] | None = None,
+        receivers: Sequence[int] | None = None,
+    ) -> Elements:
+        """TX (in the order of sending) and RX elements in use: its own, or those that recorded.
+
+        Args:
+            transmitters: numbers of those that recorded, in the order of sending.
+            receivers: numbers of those that recorded, ascending.
+
+        Raises:
+            InputError: what `Board.arrays` refuses, or elements both of its own and of a recording.
+        """
+        for name, recorded in (("transmitters", transmitters), ("receivers", receivers)):
+            given = getattr(self, name)
+            if recorded is not None and given is not None:
+                raise InputError(
+                    f"expected no `{name}` with a recording, got {list(given)}; remove the key: "
+                    f"the recording's settings say {list(recorded)}"
+                )
+        found = board(self.board) if isinstance(self.board, str) else self.board
+        return found.arrays(
+            elevation=self.elevation,
+            azimuth=self.azimuth,
+            transmitters=transmitters or self.transmitters,
+            receivers=receivers or self.receivers,
+            pattern=self.pattern,
+        )
+
+
+def _row(*columns: float) -> tuple[tuple[float, float], ...]:
     return tuple((column, 0.0) for column in columns)
 
 
@@ -225,8 +280,14 @@ BOARDS: Mapping[str, Board] = MappingProxyType(
 """Name → preset. xWR boards serve the AWR and the IWR of that number."""
 
 
-def board(name: str) -> Board:
-    """A preset of `BOARDS`.
+def board(
+    name: Annotated[str, Among(tuple(BOARDS))], design_frequency: Positive | None = None
+) -> Board:
+    """A board that the library knows: a preset of `BOARDS`.
+
+    Args:
+        name: of a preset; xWR serves AWR and IWR.
+        design_frequency: Hz, whose half wavelength is the unit; without it the preset's.
 
     Raises:
         InputError: an unknown name.
@@ -236,4 +297,5 @@ def board(name: str) -> Board:
             f"expected a board of {', '.join(BOARDS)}, got {name!r}; "
             "describe another one as a Board with its own table"
         )
-    return BOARDS[name]
+    found = BOARDS[name]
+    return found if design_frequency is None else replace(found, design_frequency=design_frequency)

@@ -1,4 +1,4 @@
-"""A smooth surrogate of range-Doppler-angle processing: moving power as a radar shows it."""
+"""The smooth surrogate of range-Doppler-angle processing."""
 
 import math
 from collections.abc import Callable
@@ -9,12 +9,12 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Paths
-from invertwin.errors import InputError
 from invertwin.radar.doppler import velocity_span
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import aperture
 from invertwin.radar.waveform import FMCW, SteppedFrequency, Waveform, unit_window
+from invertwin.scene.checks import check_shape
 
 _TABLE = 32  # entries per cell of a tabulated response
 
@@ -31,18 +31,18 @@ def moving_power(
 ) -> Float64[Tensor, "frame velocity range u v"]:
     """Expected power over range rate, range and direction, as ``range_doppler_angle`` shows it.
 
-    Every path is spread by what exact signals show of a point in motion: the power responses of
-    the samples' window over range and of the chirps' window over range rate, and Bartlett
+    Every path is spread as exact signals spread a point in motion: by the power response of the
+    samples' window over range, by that of the chirps' window over range rate, and by Bartlett
     beamforming of its plane wave. Transmitters in turn are compensated for the rate of the bin, not
-    for that of the point, and a range rate shifts the range that a ramp shows. For independent
-    random phases, the mean of the exact power is therefore this one. Differentiable in paths and
-    velocities; a range rate is that of half the way from transmitters to receivers.
+    for that of the point. A range rate shifts the range that a ramp shows. For independent random
+    phases, the mean of the exact power therefore equals this power. It is differentiable with
+    respect to paths and velocities. A range rate is that of half the length of the path.
 
     Source: derivations §5 and §6.
 
     Args:
         paths: One-bounce power paths, where the points are in the middle of the frame's chirps.
-        velocities: Of their points, in the world [m/s].
+        velocities: Velocities of their points in the world [m/s].
         radar: What records.
         grid: Ranges and directions.
         chirps: Timing.
@@ -53,11 +53,12 @@ def moving_power(
         InputError: Velocities that do not fit the paths, an unknown window, or a grid that the
             array does not resolve.
     """
-    if velocities.shape != paths.first.shape:
-        raise InputError(
-            f"expected velocities of shape {tuple(paths.first.shape)}, one per path, got "
-            f"{tuple(velocities.shape)}; evaluate them at the paths' points"
-        )
+    check_shape(
+        velocities,
+        paths.first.shape,
+        "velocities, one per path,",
+        "evaluate them at the paths' points",
+    )
     direction, own_rates = _seen(paths, velocities, radar)
     off = own_rates - rates[:, None]
     doppler = _doppler_response(off / velocity_span(radar, chirps), chirps, window)
@@ -149,6 +150,6 @@ def _steered(
     toward = array.beams(grid.u, grid.v, x, y) * array.weight
     waves = -2 * math.pi / radar.waveform.wavelength * direction[:, :2] @ torch.stack([x, y])
     arriving = torch.polar(torch.ones_like(waves), waves)
-    elements = len(radar.receivers.positions)
-    pairs = zip(arriving.split(elements, 1), toward.split(elements, 1), strict=True)
+    receivers = radar.shape[2]
+    pairs = zip(arriving.split(receivers, 1), toward.split(receivers, 1), strict=True)
     return torch.stack([wave @ beam.T for wave, beam in pairs])

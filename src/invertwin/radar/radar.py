@@ -5,13 +5,16 @@ import warnings
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Gt, Le
 from jaxtyping import Complex, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, differentiated
 from invertwin.errors import InputError
+from invertwin.limits import Among, NonNegative, Positive
 from invertwin.radar.waveform import (
     WINDOWS,
     PhysicsWarning,
@@ -19,8 +22,10 @@ from invertwin.radar.waveform import (
     Waveform,
 )
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import checked_tensor
+from invertwin.scene.checks import check_fields, check_shape, checked_tensor
 
+Window = Annotated[str, Among(WINDOWS)]
+Cosine = Annotated[float, Gt(0), Le(1)]
 # Antennas closer than this see the same surfaces: one visibility test serves both.
 _SHARED_VISIBILITY_DISTANCE = 0.1
 # Arrays are built for λ/2 at some frequency of the band, not exactly at its centre.
@@ -58,8 +63,8 @@ class Radar:
     waveform: Waveform
     positions: Float64[Tensor, "frame 3"]
     rotations: Float64[Tensor, "frame 3 3"] | None = None
-    window: str = "hamming"
-    array_window: str = "hamming"
+    window: Window = "hamming"
+    array_window: Window = "hamming"
     shared_visibility: bool | None = None
     range_bias: float | Float64[Tensor, ""] = 0.0
 
@@ -72,17 +77,11 @@ class Radar:
         if self.rotations is not None:
             rotations = _checked_rotations(self.rotations, len(positions))
             object.__setattr__(self, "rotations", rotations)
-        for name in ("window", "array_window"):
-            if getattr(self, name) not in WINDOWS:
-                raise InputError(
-                    f"expected {name} to be one of {', '.join(WINDOWS)}, "
-                    f"got {getattr(self, name)!r}; choose one of them"
-                )
-        if not self._shared_visibility and len(self.transmitters.positions) > 1:
+        check_fields(self)
+        if not self._shared_visibility and self.shape[1] > 1:
             raise InputError(
-                "expected one transmitter when TX and RX see separately, got "
-                f"{len(self.transmitters.positions)}; set shared_visibility=True "
-                "or use one transmitter"
+                f"expected one transmitter when TX and RX see separately, got {self.shape[1]}; "
+                "set shared_visibility=True or use one transmitter"
             )
         self._warn_about_spacing()
 
@@ -90,6 +89,12 @@ class Radar:
     def frame_count(self) -> int:
         """Number of poses."""
         return self.positions.shape[0]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Numbers of poses, transmitters and receivers."""
+        elements = len(self.transmitters.positions), len(self.receivers.positions)
+        return self.frame_count, *elements
 
     @property
     def virtual_positions(self) -> Float64[Tensor, "virtual 3"]:
@@ -163,11 +168,11 @@ class Radar:
 
     def grid(
         self,
-        range_min: float,
-        range_max: float,
-        u_max: float = 1.0,
-        v_max: float = 1.0,
-        oversample: float = 2,
+        range_min: NonNegative,
+        range_max: Positive,
+        u_max: Cosine = 1.0,
+        v_max: Cosine = 1.0,
+        oversample: Annotated[float, Ge(1)] = 2.0,
     ) -> Grid:
         """Bins that hold the spectrum without loss.
 
@@ -179,9 +184,9 @@ class Radar:
         Args:
             range_min: First range to cover [m].
             range_max: Last range to cover [m].
-            u_max: Direction cosines from -u_max to u_max.
-            v_max: As ``u_max``, for v.
-            oversample: Bins per range cell.
+            u_max: Direction cosine to the right; the map is as wide to the left.
+            v_max: Direction cosine up; the map is as high downwards.
+            oversample: Bins per resolution cell.
 
         Raises:
             InputError: The limits are not increasing, out of bounds, or beyond the unambiguous
@@ -202,7 +207,8 @@ class Radar:
             if range_max > (1 + 1e-9) * self.waveform.max_range:
                 raise InputError(
                     f"expected range_max within the unambiguous {self.waveform.max_range:.4g} m, "
-                    f"got {range_max:g}; finer frequency steps (more samples) reach farther"
+                    f"got {range_max:g}; give metres, or finer frequency steps (more samples)",
+                    "range_max",
                 )
             step = self.waveform.max_range / round(oversample * self.waveform.samples)
         first = math.floor(range_min / step + 1e-9)
@@ -254,7 +260,7 @@ class Radar:
 
 
 def sampled(radar: Radar) -> SampledWaveform:
-    """The radar's waveform, or the error that it has no beat signal."""
+    """Return the radar's waveform, if it has a beat signal."""
     if isinstance(radar.waveform, SampledWaveform):
         return radar.waveform
     raise InputError(
@@ -266,7 +272,7 @@ def sampled(radar: Radar) -> SampledWaveform:
 def checked_beat(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar
 ) -> Complex[Tensor, "frame tx rx sample"]:
-    """A beat signal that fits a radar.
+    """Return a beat signal, if it fits a radar.
 
     Args:
         beat: One signal per frame and channel.
@@ -275,13 +281,9 @@ def checked_beat(
     Raises:
         InputError: It has another shape.
     """
-    channels = len(radar.transmitters.positions), len(radar.receivers.positions)
-    expected = (radar.frame_count, *channels, sampled(radar).samples)
-    if tuple(beat.shape) != expected:
-        raise InputError(
-            f"expected a beat signal of shape {expected} (frame, tx, rx, sample), got "
-            f"{tuple(beat.shape)}; use the radar that recorded it"
-        )
+    expected = (*radar.shape, sampled(radar).samples)
+    what = "a beat signal (frame, tx, rx, sample)"
+    check_shape(beat, expected, what, "use the radar that recorded it")
     return beat
 
 

@@ -7,15 +7,16 @@ points away from the antenna; θ is its angle to z, φ = atan2(y, x).
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from annotated_types import MinLen
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.limits import Count, NonNegative, Positive
+from invertwin.limits import RADIANS, Count, NonNegative, Positive
 from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 
 COSINE_COUNT = 2049
@@ -127,6 +128,35 @@ class Table(Pattern):
             object.__setattr__(self, name, value)
         object.__setattr__(self, "_grid", _resampled(theta, phi, gains))
 
+    @classmethod
+    def of_decibels(
+        cls,
+        theta: Annotated[Sequence[float], MinLen(2), RADIANS],
+        gain_db: Sequence[Sequence[float]],
+        phi: Annotated[Sequence[float], MinLen(1), RADIANS] = (0.0,),
+    ) -> "Table":
+        """A measured power pattern in decibels.
+
+        Args:
+            theta: from 0 at boresight.
+            gain_db: one row per theta, one column per phi.
+            phi: one: symmetric about boresight.
+
+        Raises:
+            InputError: as the pattern itself, or rows of other lengths.
+        """
+        rows, columns = len(theta), len(phi)
+        if len(gain_db) != rows or any(len(row) != columns for row in gain_db):
+            lengths = sorted({len(row) for row in gain_db})
+            raise InputError(
+                f"expected gain_db with {rows} rows of {columns}, got {len(gain_db)} rows of "
+                f"{' or '.join(map(str, lengths))}; give one row per theta and one column per phi"
+            )
+        angles, around, levels = (
+            torch.tensor(values, dtype=torch.float64) for values in (theta, phi, gain_db)
+        )
+        return cls(angles, around, 10 ** (levels / 10))
+
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Linear power gain, bilinear between the nodes of `table`."""
         grid = self._grid.to(direction)
@@ -201,28 +231,25 @@ def linear_array(
     """
     if axis not in ("x", "y"):
         raise InputError(f"expected axis x or y, got {axis!r}; arrays lie in the x-y plane")
-    if axis == "x":
-        return planar_array(count, 1, spacing, spacing, pattern)
-    return planar_array(1, count, spacing, spacing, pattern)
+    counts = (count, 1) if axis == "x" else (1, count)
+    return planar_array(counts, (spacing, spacing), pattern)
 
 
 def planar_array(
-    nx: int, ny: int, dx: float, dy: float, pattern: Pattern | None = None
+    count: tuple[Count, Count], spacing: tuple[Positive, Positive], pattern: Pattern | None = None
 ) -> AntennaArray:
     """Elements on a grid, centred at the origin of the radar frame; y runs fastest.
 
     Args:
-        nx: number of columns, along x.
-        ny: number of rows, along y.
-        dx: distance between columns [m].
-        dy: distance between rows [m].
+        count: elements along x, y.
+        spacing: distance between neighbours along x, y [m].
         pattern: gain of every element, isotropic by default.
 
     Raises:
         InputError: no elements, or a spacing that is not positive.
     """
-    x = _centred(nx, dx, "elements along x")
-    y = _centred(ny, dy, "elements along y")
+    x = _centred(count[0], spacing[0], "elements along x")
+    y = _centred(count[1], spacing[1], "elements along y")
     plane = torch.cartesian_prod(x, y)
     positions = torch.cat([plane, torch.zeros_like(plane[:, :1])], dim=1)
     return AntennaArray(positions, Isotropic() if pattern is None else pattern)

@@ -1,22 +1,33 @@
-"""What can be fitted of a scene: modules Scene → Scene, and their composition.
+"""Modules Scene → Scene that can be fitted, and their composition.
 
 Every module starts as the identity unless initial values are given, and composes with the others.
 Any torch module Scene → Scene serves as well.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any, TypeVar
 
 import torch
+from annotated_types import Ge, MinLen
 from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
-from invertwin.scene.material.values import RANGES, Texture, Value, checked_value, evaluated
+from invertwin.scene.material.itu import Itu
+from invertwin.scene.material.materials import held_by
+from invertwin.scene.material.values import (
+    RANGES,
+    MaterialValue,
+    Texture,
+    Value,
+    checked_value,
+    evaluated,
+)
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import (
     compose,
@@ -25,18 +36,64 @@ from invertwin.scene.pose import (
     rotation_from_quaternion,
     vector_from_quaternion,
 )
-from invertwin.scene.scene import Scene
+from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
 _T = TypeVar("_T")
 
 
-class Translation(nn.Module):
+@dataclass(frozen=True)
+class Entries:
+    """Entries of a module's parameter that have a name, and perhaps a unit, of their own.
+
+    A module lists them in ``entries()``, by name. Tangents of gradient checks may use the name.
+
+    Attributes:
+        parameter: name of the parameter.
+        index: which of its entries.
+        slope: how fast the named value grows with them.
+    """
+
+    parameter: str
+    index: Any = ...
+    slope: float | Tensor = 1.0
+
+
+class ObjectModule(nn.Module):
+    """A module Scene → Scene that changes one object, its mesh unless it says otherwise.
+
+    Attributes:
+        object: name of the object.
+        reported: names of the attributes that `values` returns.
+    """
+
+    reported: tuple[str, ...] = ()
+
+    def __init__(self, object: str) -> None:
+        super().__init__()
+        self.object = object
+
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The object's new mesh, given the one that it has before."""
+        raise NotImplementedError
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object's mesh replaced."""
+        return scene.replace(self.object, mesh=self.reshaped(scene[self.object].mesh))
+
+    def values(self) -> dict[str, Tensor]:
+        """What is fitted by name, in SI units, for progress and reports."""
+        return {f"{self.object}.{n}": getattr(self, n).detach().clone() for n in self.reported}
+
+
+class Translation(ObjectModule):
     """Moves an object along the world axes.
 
     Attributes:
         translation: parameter [3], metres.
     """
+
+    reported = ("translation",)
 
     def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: Axes = "xyz") -> None:
         """Move `object`, by `initial` [m] at the start.
@@ -49,8 +106,7 @@ class Translation(nn.Module):
         Raises:
             InputError: `initial` is not three finite numbers, or an unknown axis.
         """
-        super().__init__()
-        self.object = object
+        super().__init__(object)
         self.translation = nn.Parameter(_vector(initial, "initial translation [m]"))
         self._axes = _checked_axes(axes)
 
@@ -59,24 +115,34 @@ class Translation(nn.Module):
         motion = rigid(translation=_free(self.translation, self._axes))
         return scene.replace(self.object, pose=compose(scene[self.object].transform, motion))
 
-    def values(self) -> dict[str, Tensor]:
-        """Translation [m] by name, for progress and reports."""
-        return {f"{self.object}.translation": self.translation.detach().clone()}
-
 
 class RigidMotion(nn.Module):
-    """A translation and a rotation without singularities: quaternion ∝ (w, r/2)."""
+    """A translation and a rotation without singularities: quaternion ∝ (w, r/2).
+
+    Attributes:
+        translation: parameter [3], metres.
+        rotation: parameter [4], q = (w, r) with the quaternion ∝ (w, r/2); near the identity
+            (1, 0, 0, 0), r is the rotation vector in the world [rad]. Any q but zero is a
+            rotation, and its derivative is finite everywhere.
+    """
 
     def __init__(
-        self, translation: ArrayLike, rotation: ArrayLike, axes: str, rotation_axes: str
+        self,
+        translation: ArrayLike = ORIGIN,
+        rotation: ArrayLike = ORIGIN,
+        axes: Axes = "xyz",
+        rotation_axes: Axes = "xyz",
     ) -> None:
         """Move from these values at the start.
 
         Args:
             translation: [m].
             rotation: rotation vector of any angle [3] (rad), or q itself [4].
-            axes: world axes along which the fit may move.
+            axes: world axes along which the fit may move it.
             rotation_axes: components of the rotation vector that the fit may change.
+
+        Raises:
+            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
         """
         super().__init__()
         self.translation = nn.Parameter(_vector(translation, "initial translation [m]"))
@@ -100,6 +166,10 @@ class RigidMotion(nn.Module):
         halves = self.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
         return _free(self.rotation, self._rotation_axes) * halves
 
+    def entries(self) -> dict[str, Entries]:
+        """The rotation vector [rad], to first order from the identity."""
+        return {"rotation": Entries("rotation", slice(1, None))}
+
     def named_values(self, name: str) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] of `name`, for progress and reports."""
         return {
@@ -109,14 +179,7 @@ class RigidMotion(nn.Module):
 
 
 class Pose(RigidMotion):
-    """Turns an object about its centre, then moves it along the world axes.
-
-    Attributes:
-        translation: parameter [3], metres.
-        rotation: parameter [4], q = (w, r) with the quaternion ∝ (w, r/2); near the identity
-            (1, 0, 0, 0), r is the rotation vector in the world [rad]. Any q but zero is a
-            rotation, and its derivative is finite everywhere.
-    """
+    """Turns an object about its centre, then moves it along the world axes."""
 
     def __init__(
         self,
@@ -126,17 +189,10 @@ class Pose(RigidMotion):
         axes: Axes = "xyz",
         rotation_axes: Axes = "xyz",
     ) -> None:
-        """Move `object`, from these values at the start.
+        """Move an object. `RigidMotion` tells what the other arguments mean.
 
         Args:
             object: name of the object.
-            translation: [m].
-            rotation: rotation vector of any angle [3] (rad), or q itself [4].
-            axes: world axes along which the fit may move it.
-            rotation_axes: components of the rotation vector that the fit may change.
-
-        Raises:
-            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
         """
         super().__init__(translation, rotation, axes, rotation_axes)
         self.object = object
@@ -153,12 +209,14 @@ class Pose(RigidMotion):
         return self.named_values(self.object)
 
 
-class Scale(nn.Module):
+class Scale(ObjectModule):
     """Scales an object about its centre.
 
     Attributes:
         log_scale: parameter, natural logarithm of the factor.
     """
+
+    reported = ("scale",)
 
     def __init__(self, object: str, initial: float = 1.0) -> None:
         """Scale `object`, from this size at the start.
@@ -170,28 +228,28 @@ class Scale(nn.Module):
         Raises:
             InputError: `initial` is not positive.
         """
-        super().__init__()
+        super().__init__(object)
         factor = checked_number(initial, "initial scale", 0.0, open_low=True)
-        self.object = object
         self.log_scale = nn.Parameter(torch.tensor(math.log(factor), dtype=torch.float64))
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the object scaled."""
-        mesh = scene[self.object].mesh
-        vertices = mesh.center + (mesh.vertices - mesh.center) * self.log_scale.exp()
-        return scene.replace(self.object, mesh=Mesh(vertices, mesh.faces))
+    @property
+    def scale(self) -> Float64[Tensor, ""]:
+        """The factor."""
+        return self.log_scale.exp()
 
-    def values(self) -> dict[str, Tensor]:
-        """Scale factor by name, for progress and reports."""
-        return {f"{self.object}.scale": self.log_scale.detach().exp()}
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The mesh in its new size."""
+        return Mesh(mesh.center + (mesh.vertices - mesh.center) * self.scale, mesh.faces)
 
 
-class Vertices(nn.Module):
+class Vertices(ObjectModule):
     """Moves every vertex of an object freely.
 
     Attributes:
         offsets: parameter [v, 3] in the object's frame, metres.
     """
+
+    reported = ("offsets",)
 
     def __init__(self, object: str, count: int) -> None:
         """Move the `count` vertices of `object`, by zero at the start.
@@ -203,28 +261,22 @@ class Vertices(nn.Module):
         Raises:
             InputError: no vertices.
         """
-        super().__init__()
-        self.object = object
+        super().__init__(object)
         rows = checked_count(count, "number of vertices", 1)
         self.offsets = nn.Parameter(torch.zeros(rows, 3, dtype=torch.float64))
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the vertices moved.
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The mesh with its vertices moved.
 
         Raises:
-            InputError: the object has another number of vertices.
+            InputError: another number of vertices.
         """
-        mesh = scene[self.object].mesh
         if mesh.vertices.shape != self.offsets.shape:
             raise InputError(
                 f"expected {len(self.offsets)} vertices in {self.object!r}, "
                 f"got {len(mesh.vertices)}; create Vertices with the mesh's count"
             )
-        return scene.replace(self.object, mesh=Mesh(mesh.vertices + self.offsets, mesh.faces))
-
-    def values(self) -> dict[str, Tensor]:
-        """Vertex offsets [m] by name, for progress and reports."""
-        return {f"{self.object}.offsets": self.offsets.detach().clone()}
+        return Mesh(mesh.vertices + self.offsets, mesh.faces)
 
 
 class MaterialValues(nn.Module):
@@ -245,7 +297,7 @@ class MaterialValues(nn.Module):
             object: name of the object.
             layer: of a `Multilayer`, the layer whose values are meant; None for values of the
                 material itself.
-            start: by the names of `invertwin.scene.material.RANGES`, inside their ranges, ends
+            start: by the names of `RANGES` of the materials, inside their ranges, ends
                 excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
                 lobe_width [rad], scattering, rms_slope, lambertian, directive, directive_exponent,
                 backscatter_exponent.
@@ -270,6 +322,32 @@ class MaterialValues(nn.Module):
                 checked = checked.image
             self.raw[name] = nn.Parameter(_unbounded(name, evaluated(checked).detach()))
 
+    @classmethod
+    def of(
+        cls,
+        object: str,
+        values: Annotated[Sequence[MaterialValue], MinLen(1)],
+        item: Object,
+        layer: Annotated[int, Ge(0)] | None = None,
+    ) -> "MaterialValues":
+        """Values of an object's material, from those that it has.
+
+        Args:
+            object: name of the object.
+            values: which are sought.
+            item: the object.
+            layer: of a multilayer, from 0: the layer whose values they are.
+
+        Raises:
+            InputError: the material has no such value or layer, a value comes from the ITU table,
+                or it starts at the end of its range.
+        """
+        try:
+            holder = held_by(item.material, layer, type(item.material).__name__)
+            return cls(object, layer=layer, **{name: _start(holder, name) for name in values})
+        except InputError as error:
+            raise InputError(str(error), f"values, material of {object}") from None
+
     def forward(self, scene: Scene) -> Scene:
         """The scene with the material's values replaced.
 
@@ -277,19 +355,19 @@ class MaterialValues(nn.Module):
             InputError: the object's material has no such value, or no such layer.
         """
         material: Any = scene[self.object].material
-        values = self._bounded()
-        if self.layer is None:
-            self._check(material, f"a material with {', '.join(self.raw)}", "the object")
-            return scene.replace(self.object, material=replace(material, **values))
-        layers = list(getattr(material, "layers", ()))
-        if self.layer >= len(layers):
+        holder = held_by(material, self.layer, repr(self.object))
+        where = "material" if self.layer is None else "layer"
+        if any(name not in getattr(holder, "__dataclass_fields__", {}) for name in self.raw):
             raise InputError(
-                f"expected a layer below {len(layers)} of {self.object!r}, got {self.layer}; "
-                "count layers from 0, and give `layer` for a Multilayer only"
+                f"expected a {where} with {', '.join(self.raw)} for {self.object!r}, got "
+                f"{type(holder).__name__}; give it another material"
             )
-        self._check(layers[self.layer], f"a layer with {', '.join(self.raw)}", "the layer")
-        layers[self.layer] = replace(layers[self.layer], **values)
-        return scene.replace(self.object, material=replace(material, layers=layers))
+        changed = replace(holder, **self._bounded())
+        if self.layer is not None:
+            layers = [*material.layers]
+            layers[self.layer] = changed
+            changed = replace(material, layers=layers)
+        return scene.replace(self.object, material=changed)
 
     def values(self) -> dict[str, Tensor]:
         """Material values in their own units by name, for progress and reports.
@@ -299,22 +377,23 @@ class MaterialValues(nn.Module):
         where = self.object if self.layer is None else f"{self.object}.layers[{self.layer}]"
         return {f"{where}.{name}": _bounded(name, raw).detach() for name, raw in self.raw.items()}
 
+    def entries(self) -> dict[str, Entries]:
+        """The values in their own units."""
+        found = {}
+        for name, raw in self.raw.items():
+            at, one = (raw.detach(),), (torch.ones_like(raw),)
+            slope = torch.func.jvp(partial(_bounded, name), at, one)[1]
+            found[name] = Entries(f"raw.{name}", slope=slope)
+        return found
+
     def _bounded(self) -> dict[str, Tensor | Texture]:
         values = {name: _bounded(name, raw) for name, raw in self.raw.items()}
         textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
         return {**values, **textures}
 
-    def _check(self, holder: Any, what: str, where: str) -> None:
-        fields = getattr(holder, "__dataclass_fields__", {})
-        if any(name not in fields for name in self.raw):
-            raise InputError(
-                f"expected {what} for {self.object!r}, got {type(holder).__name__}; "
-                f"give {where} another material"
-            )
-
 
 class Compose(nn.Module):
-    """Several modules that map the same kind of thing, applied from first to last.
+    """Applies several modules of the same kind, from first to last.
 
     All map scenes, or all map radars.
     """
@@ -337,6 +416,19 @@ class Compose(nn.Module):
             if values is not None:
                 merged.update(values())
         return merged
+
+
+def _start(holder: Any, name: str) -> Value:
+    """The value of a material, or of a layer, from which a fit starts."""
+    if not hasattr(holder, name):
+        raise InputError(f"expected values of {type(holder).__name__}, got {name}; remove it")
+    value = getattr(holder, name)
+    if isinstance(value, Itu):
+        raise InputError(
+            f"expected a number from which {name} starts, got that of the ITU table; "
+            f"give `{name}` beside `itu`"
+        )
+    return value
 
 
 def _bounded(name: str, raw: Tensor) -> Tensor:

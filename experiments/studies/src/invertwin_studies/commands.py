@@ -5,28 +5,17 @@ from typing import Annotated
 
 import typer
 
-from invertwin.cli.options import (
-    BackendOption,
-    FileArgument,
-    OutOption,
-    OverwriteOption,
-    SeedOption,
-)
+from invertwin.cli.options import FileArgument, Options, Where, with_options
 
 
-def loss_scan(
-    file: FileArgument,
-    out: OutOption = None,
-    overwrite: OverwriteOption = False,
-    seed: SeedOption = None,
-    backend: BackendOption = None,
-) -> None:
+@with_options(Options)
+def loss_scan(options: Options, file: FileArgument) -> None:
     """Show the losses of signals and of the surrogate along a line."""
     from invertwin.cli.run_file import about_file
     from invertwin.cli.running import default_folder, load_runs, print_tables, run_folder
 
-    runs = load_runs([file], seed, "loss-scan", ("loss_scan", "radar", "grid", "data"))
-    with run_folder(out or default_folder(file), runs, overwrite, False) as folder:
+    runs = load_runs([file], options, "loss-scan", ("loss_scan", "radar", "grid", "data"))
+    with run_folder(options, default_folder(file), runs) as folder:
         from invertwin_studies.loss_scan import run_loss_scan
 
         with about_file(file):
@@ -34,14 +23,14 @@ def loss_scan(
         print_tables(tables)
 
 
+@with_options(Where)
 def train_prior(
+    options: Where,
     cars: Annotated[int, typer.Option(min=100, help="Cars that are drawn for it.")] = 3000,
     latent: Annotated[int, typer.Option(min=1, max=64, help="Coordinates of a shape.")] = 24,
     epochs: Annotated[int, typer.Option(min=1, help="Times that every car is seen.")] = 40,
     wheels: Annotated[bool, typer.Option("--wheels", help="Cars with wheels.")] = False,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
-    out: OutOption = None,
-    overwrite: OverwriteOption = False,
 ) -> None:
     """Train a shape prior on cars of the generator; the packaged one by default."""
     from invertwin.cli.running import now_and_then, print_tables, run_folder
@@ -51,6 +40,6 @@ def train_prior(
     settings = Training(cars=cars, latent=latent, epochs=epochs, wheels=wheels, seed=seed)
     again = f"train-prior --cars {cars} --latent {latent} --epochs {epochs} --seed {seed}"
     again += " --wheels" if wheels else ""
-    with run_folder(out or Path("out/train_prior"), {}, overwrite, False) as folder:
+    with run_folder(options, Path("out/train_prior")) as folder:
         tables = training.run_train_prior(settings, folder, again, now_and_then())
         print_tables(tables)

@@ -27,7 +27,7 @@ class SurfacePaths:
     Attributes:
         face, b1, b2: Places, per point.
         weight: One over (paths × probability per area of all points).
-        phase: Of the path's field [rad].
+        phase: Phase of the path's field [rad].
     """
 
     face: Int64[Tensor, "n k"]
@@ -53,7 +53,7 @@ class Place:
     Attributes:
         position, normal: Attached [m].
         jacobian: Area of the triangle over that area detached: one in value.
-        row: Of the surface.
+        row: Row of the surface in the tables.
     """
 
     position: Float64[Tensor, "n 3"]
@@ -119,7 +119,7 @@ class Echo:
     Attributes:
         power: Received over transmitted power per m² of every point; Jacobians included.
         spread: Gains and 1/R² alone: the power without scattering, over (λ/4π)².
-        length: From antenna to antenna [m].
+        length: Length from antenna to antenna [m].
         ending: Scattering at the last point, gain and 1/R² of the last segment; detached.
         first, last: World positions of the ends [m].
     """
@@ -216,9 +216,9 @@ def scattered(
 
     Args:
         geometry: The scene.
-        point: Where.
-        back: Where paths come from.
-        on: Where they go on.
+        point: Points on surfaces.
+        back: Unit directions from which paths come.
+        on: Unit directions in which they go on.
     """
     surfaces, row, normal = geometry.surfaces, point.row, point.normal
     first, second, between = ((a * b).sum(1) for a, b in ((normal, back), (normal, on), (back, on)))

@@ -42,7 +42,7 @@ class ShadowEdge:
     Attributes:
         frame, face: Radar pose, and the triangle the shadow falls on.
         b1, b2: Where on the triangle.
-        place: Where it falls, detached.
+        place: Place where the shadow falls, detached.
         speed: Area newly lit per unit of θ, over the probability of the sample: attached, and
             zero in derivative where the other antenna does not see the point.
     """
@@ -64,7 +64,7 @@ def silhouette_points(
         rays: The scene and its antennas.
         centres: Antennas.
         samples: Points over all antennas and frames.
-        seed: Of the points.
+        seed: Seed of the points.
     """
     sampler = EdgeSampler(rays, Inputs.of(rays), centres, samples, seed)
     if not sampler.size:
@@ -90,7 +90,7 @@ def shadow_edge(rays: RayScene, points: SilhouettePoints, centre: str) -> Shadow
 
     Args:
         rays: The scene and its antennas.
-        points: On edges.
+        points: Points on silhouettes.
         centre: The antenna from which the shadows are cast.
     """
     geometry, link = rays.geometry, rays.link
@@ -133,7 +133,7 @@ def boundary_rows(
     Args:
         rays: The scene and its antennas.
         samples: Silhouette points over all antennas and frames.
-        seed: Of the points.
+        seed: Seed of the points.
         row: Makes paths of shadow points and of the radar equation there.
     """
     centres = ("tx",) if rays.link.shared_visibility else ("tx", "rx")

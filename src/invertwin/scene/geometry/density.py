@@ -1,4 +1,4 @@
-"""A density of soft scatterers on a grid: a shape without a surface, until it is meshed."""
+"""A density of soft scatterers on a grid: a shape that has no surface until it is meshed."""
 
 from collections.abc import Sequence
 
@@ -6,12 +6,14 @@ import torch
 from jaxtyping import Float64
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.scene.checks import ArrayLike, checked_number
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.parameters import Entries, ObjectModule
 from invertwin.scene.scene import Scene
 
 # Starts are kept this far above zero, in units of one over a node spacing: below, softplus is so
@@ -19,15 +21,15 @@ from invertwin.scene.scene import Scene
 _FAINTEST = 1e-3
 
 
-class DensityGrid(nn.Module):
+class DensityGrid(ObjectModule):
     """An object seen as a cloud of soft scatterers, by densities at the nodes of a grid.
 
-    ``σ = softplus(value) / h``, h the mean spacing of the nodes: at a value of 0 one cell holds
-    back half of the power, and rates of about 0.1 suit all grids alike.
+    ``σ = softplus(value) / h``, with h the mean spacing of the nodes. At a value of 0 one cell
+    holds back half of the power. Learning rates of about 0.1 suit all grids.
 
     Attributes:
         value: parameter [x, y, z].
-        albedo: of the cloud.
+        albedo: albedo of the cloud, see ``Cloud``.
     """
 
     def __init__(
@@ -51,18 +53,10 @@ class DensityGrid(nn.Module):
         Raises:
             InputError: wrong shapes, NaN, a negative density, or a box without volume.
         """
-        super().__init__()
-        given = checked_tensor(
-            density, (None, None, None), "densities [1/m]", "give one for each node"
-        ).detach()
-        if bool((given < 0).any()):
-            raise InputError(
-                f"expected densities of at least 0, got a least of {float(given.min()):.3g}; "
-                "the density is an extinction [1/m]"
-            )
-        self.object = object
-        self.lattice = Lattice.between(low, high, tuple(given.shape))
+        super().__init__(object)
         self.albedo = checked_number(albedo, "albedo", 0.0, open_low=True)
+        self.lattice = Lattice.between(low, high, density.shape)
+        given = Cloud(self.lattice.low, self.lattice.high, density, albedo).density.detach()
         scaled = (given * self._unit).clamp_min(_FAINTEST)
         # log(exp(s) − 1), the inverse of softplus, without overflow.
         self.value = nn.Parameter(scaled + torch.log(-torch.expm1(-scaled)))
@@ -76,24 +70,22 @@ class DensityGrid(nn.Module):
         counts: Sequence[int],
         depth: float = 0.5,
     ) -> "DensityGrid":
-        """A grid of one density σ; a way through the box along its longest side has ∫σ ds.
+        """Make a grid of one density σ, from ∫σ ds through the box along its longest side.
 
         Args:
             object: name of the object.
             low: corner of the box in the object's frame [m].
             high: the opposite corner [m].
             counts: nodes along x, y and z.
-            depth: that ∫σ ds; faint, since what is opaque hides what lies behind it from the fit.
+            depth: that ∫σ ds. Keep it small: what is opaque hides what lies behind it from the fit.
 
         Raises:
             InputError: as above.
         """
         lattice = Lattice.between(low, high, counts)
-        density = checked_number(depth, "optical depth", 0.0, open_low=True) / float(
-            (lattice.high - lattice.low).max()
-        )
-        filled = torch.full(lattice.counts, density, dtype=torch.float64)
-        return cls(object, low, high, filled)
+        whole = checked_number(depth, "optical depth", 0.0, open_low=True)
+        density = whole / (lattice.high - lattice.low).max()
+        return cls(object, low, high, density.expand(lattice.counts))
 
     @property
     def _unit(self) -> float:
@@ -102,7 +94,12 @@ class DensityGrid(nn.Module):
     @property
     def density(self) -> Float64[Tensor, "x y z"]:
         """Extinction at the nodes [1/m]."""
-        return nn.functional.softplus(self.value) / self._unit
+        return softplus(self.value) / self._unit
+
+    def entries(self) -> dict[str, Entries]:
+        """The logarithm of the density: its changes are relative ones of the density."""
+        value = self.value.detach()
+        return {"log_density": Entries("value", slope=value.sigmoid() / softplus(value))}
 
     @property
     def cloud(self) -> Cloud:
@@ -132,7 +129,7 @@ class DensityGrid(nn.Module):
 
 
 def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
-    """The closed surface of equal density, by marching cubes; without gradients.
+    """Mesh the closed surface of equal density by marching cubes, without gradients.
 
     Args:
         cloud: the densities.
@@ -161,7 +158,7 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
 
 
 def without_clouds(scene: Scene) -> Scene:
-    """The scene with every cloud as the surface of its usual level; for exact signals, pictures.
+    """Replace every cloud of a scene by its surface, for exact signals and pictures.
 
     An even cloud has no such surface: its object keeps the mesh that marked its place.
     """

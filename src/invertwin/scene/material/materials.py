@@ -6,7 +6,7 @@ gradients; permittivity and conductivity may also follow the ITU table (`Itu`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Annotated, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import torch
 from annotated_types import MinLen
@@ -105,6 +105,28 @@ class Medium(_Values):
         return epsilon, dispersion
 
 
+def held_by(material: Any, layer: int | None, name: str) -> Any:
+    """What holds the values: the material, or one of its layers.
+
+    Args:
+        material: such as a `Multilayer`.
+        layer: from 0; None = the material itself.
+        name: what the material is called in the error.
+
+    Raises:
+        InputError: no such layer.
+    """
+    if layer is None:
+        return material
+    layers = getattr(material, "layers", ())
+    if layer >= len(layers):
+        raise InputError(
+            f"expected a layer below {len(layers)} of {name}, got {layer}; "
+            "count layers from 0, and give `layer` for a Multilayer only"
+        )
+    return layers[layer]
+
+
 @dataclass(frozen=True)
 class PerfectConductor(_Values, Material):
     """A smooth perfect conductor: nothing is absorbed, nothing is scattered diffusely.
@@ -164,7 +186,7 @@ class RoughDielectric(Medium, Material):
     lobe_width: Annotated[Value, RADIANS] = ROUGH_LOBE_WIDTH
 
     def surface(self, frequency: float) -> Surface:
-        """The reflectance at `frequency` [Hz]; differentiable in all values."""
+        """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
         weights = specular_weights(evaluated(self.diffuse), lobe_exponent(self.lobe_width))
         return Surface(fresnel_amplitude(epsilon[..., None], _cosines()), *weights)
@@ -183,7 +205,7 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     """
 
     def surface(self, frequency: float) -> Surface:
-        """The reflectance at `frequency` [Hz]; differentiable in all values."""
+        """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
         return Surface(fresnel_amplitude(epsilon[..., None], _cosines()), *self.weights())
 
@@ -204,7 +226,7 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
     """
 
     def surface(self, frequency: float) -> Surface:
-        """What one face does at `frequency` [Hz]; differentiable in all values."""
+        """What one face does at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon, cosine = self.complex_permittivity(frequency), _cosines()
         return Surface(
             fresnel_amplitude(epsilon[..., None], cosine),
@@ -253,7 +275,7 @@ class Slab(Layer, EffectiveRoughness, Material):
     """
 
     def surface(self, frequency: float) -> Surface:
-        """What it does at `frequency` [Hz]; differentiable in all values."""
+        """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
         return _slab_surface([self], self.weights(), frequency)
 
 
@@ -293,7 +315,7 @@ class Multilayer(_Values, EffectiveRoughness, Material):
         return row_count(named)
 
     def surface(self, frequency: float) -> Surface:
-        """What it does at `frequency` [Hz]; differentiable in all values."""
+        """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
         return _slab_surface(self.layers, self.weights(), frequency)
 
 

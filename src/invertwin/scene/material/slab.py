@@ -78,7 +78,7 @@ def slab_coefficients(
     The transmission is from the entry face to the exit face, at the same place along them.
 
     Args:
-        layers: from the side of incidence on.
+        layers: the layers in the order in which the wave meets them.
         cos_theta: cosine of the angle of incidence, in [0, 1].
         frequency: [Hz].
 
@@ -95,10 +95,10 @@ def slab_tables(
     """Reflectance, transmittance and extra length of a stack of layers in air.
 
     Power coefficients are the mean of both polarisations; so is the extra length, weighted by the
-    power that each lets through. Differentiable in the layers' values.
+    power that each lets through. Differentiable with respect to the layers' values.
 
     Args:
-        layers: from the side of incidence on.
+        layers: the layers in the order in which the wave meets them.
         cos_theta: cosine of the angle of incidence, in [0, 1].
         frequency: [Hz].
 

@@ -2,13 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
 
-from invertwin.capture import Capture
-from invertwin.cli.recordings import Recording, recorded
-from invertwin.cli.registry import OneOf, registry
+from invertwin.capture import Capture, ChirpCapture
+from invertwin.cli.recordings import recorded
 from invertwin.cli.section import InputPath, about
 from invertwin.errors import InputError
+from invertwin.radar.boards import Mounting
 from invertwin_studies.recordings import openradar, rail_sar
 
 _ORIGINALS = {
@@ -27,9 +26,7 @@ def rail_sar_data(folder: InputPath) -> Capture:
         return rail_sar.read(_holding(rail_sar.FILE, Path(folder)))
 
 
-def openradar_data(
-    folder: InputPath, board: Annotated[Any, OneOf("board")] | None = None
-) -> Recording:
+def openradar_data(folder: InputPath, board: Mounting | None = None) -> ChirpCapture:
     """The public 77 GHz recording of movers, with every chirp.
 
     Args:
@@ -38,8 +35,7 @@ def openradar_data(
     """
     with about("folder"):
         chirps = openradar.read_chirps(_holding(openradar.FILE, Path(folder)))
-    found = recorded(chirps, board or registry.table("board", "name")(name="xWR1642"))
-    return replace(found, moving=True)
+    return replace(recorded(chirps, board or Mounting("xWR1642")), moving=True)
 
 
 def _holding(file: str, folder: Path) -> Path:

@@ -41,5 +41,5 @@ def register(registry) -> None:
     registry.add("parameter", "thickness", f"{kinds}:Thickness")
     registry.add("loss", "log", f"{kinds}:LogLoss")
     registry.add("data", "npy", f"{kinds}:npy")
-    registry.section("survey", Survey)
-    registry.command("plants", plants)
+    registry.sections["survey"] = Survey
+    registry.commands["plants"] = plants

@@ -1,0 +1,63 @@
+"""Tracks of a radar: positions [frame, 3] along simple curves, one frame each."""
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.limits import Angle, Count, NonNegative, Positive
+from invertwin.scene.checks import Point, checked_tensor
+
+
+def line(start: Point, stop: Point, count: Count) -> Float64[Tensor, "frame 3"]:
+    """Positions at even distances on a line.
+
+    Args:
+        start: m.
+        stop: m.
+        count: positions.
+    """
+    first, last = _point(start), _point(stop)
+    return first + _linspace(0.0, 1.0, count)[:, None] * (last - first)
+
+
+def arc(
+    center: Point, radius: Positive, start: Angle, stop: Angle, count: Count
+) -> Float64[Tensor, "frame 3"]:
+    """A level arc about `center`; 0° is on its −z side, 90° on its +x side.
+
+    Args:
+        center: m.
+        radius: m.
+        start: 0 is on the −z side of the centre.
+        stop: 90° is on its +x side.
+        count: positions.
+    """
+    angle = _linspace(start, stop, count)
+    around = torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
+    return _point(center) + radius * around
+
+
+def grid(
+    center: Point, size: tuple[NonNegative, NonNegative], count: tuple[Count, Count]
+) -> Float64[Tensor, "frame 3"]:
+    """An upright rectangle of positions in the x-y plane through `center`; y runs fastest.
+
+    Args:
+        center: m.
+        size: m along x, y.
+        count: positions along x, y.
+    """
+    x, y = (
+        (_linspace(-0.5, 0.5, n) if n > 1 else torch.zeros(1, dtype=torch.float64)) * length
+        for n, length in zip(count, size, strict=True)
+    )
+    across = torch.cartesian_prod(x, y)
+    return _point(center) + torch.nn.functional.pad(across, (0, 1))
+
+
+def _point(value: Point) -> Tensor:
+    return checked_tensor(value, (3,), "a point [m]", "give x, y and z")
+
+
+def _linspace(first: float, last: float, count: int) -> Tensor:
+    return torch.linspace(first, last, count, dtype=torch.float64)
