@@ -289,7 +289,7 @@ class _Kernel:
         # At these sizes a Toeplitz matrix per axis is some 30 times faster than a padded FFT.
         (dim,), (count,) = self.dims, self.counts
         taps = torch.fft.irfft(transfer, _padded(count)).to(power)
-        lags = torch.cat([taps[1 - count :], taps[:count]]) if count > 1 else taps[:1]
+        lags = taps.roll(count - 1)[: 2 * count - 1]
         matrix = lags.flip(0).unfold(0, count, 1).flip(0)
         if dim == power.ndim - 1:
             return power @ matrix.T
