@@ -142,13 +142,12 @@ def sought_objects(run: RunFile) -> list[str]:
     return [p.object for p in run.parameters if getattr(p, "object", None)]
 
 
-def starts_of(problem: Problem) -> list[build.Start]:
+def starts_of(problem: Problem) -> list[Scene]:
     """Where fits start: about the truth as `[starts]` says, or where the scene is."""
-    run, scene = problem.run, problem.scene
-    bodies = build.sought_bodies(run, scene)
-    table = run.starts
+    run, scene, table = problem.run, problem.scene, problem.run.starts
     if table is None:
-        return [build.Start(scene, bodies)]
+        return [scene]
+    body = build.body_of(run, scene, table.object)
     name, truth, found = table.object, problem.truth[table.object], []
     seed = run.seed if table.seed is None else table.seed
     generator = torch.Generator().manual_seed(seed)
@@ -156,10 +155,10 @@ def starts_of(problem: Problem) -> list[build.Start]:
         # The object as known may have another size: it is its centre that is placed.
         turn = moved.transform[:3, :3]
         begun = scene.replace(name, pose=rigid(turn, moved.center - turn @ scene[name].mesh.center))
-        if name in bodies and table.joint_deg > 0:
-            mesh = bodies[name].turned(truth.mesh, math.radians(table.joint_deg), generator)
+        if body is not None and table.joint_deg > 0:
+            mesh = body.turned(truth.mesh, math.radians(table.joint_deg), generator)
             begun = begun.replace(name, mesh=mesh, pose=moved.transform)
-        found.append(build.Start(begun, bodies))
+        found.append(begun)
     return found
 
 
