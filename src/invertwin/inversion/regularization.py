@@ -47,6 +47,27 @@ class Laplacian:
         return 0.5 * self.weight * (self.weights * jump.square().sum(1)).sum()
 
 
+class LatentNorm:
+    """The term ½ weight |z|²: the negative logarithm of a latent's prior probability.
+
+    Args:
+        module: It has the parameter ``latent``, such as `PriorShape` or `LinearShape`.
+        weight: Factor of ½ |z|².
+    """
+
+    def __init__(self, module: nn.Module, weight: float) -> None:
+        if not isinstance(getattr(module, "latent", None), nn.Parameter):
+            raise InputError(
+                f"expected a module with a latent, got {type(module).__name__}; "
+                "give a PriorShape or a LinearShape"
+            )
+        self.module, self.weight = module, weight
+
+    def __call__(self, scene: Scene) -> Float64[Tensor, ""]:
+        """The term at the module's present latent."""
+        return 0.5 * self.weight * self.module.latent.square().sum()  # type: ignore[union-attr]
+
+
 def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float]:
     """Edges, their cotangent weights (at least 0.01), and the mean edge length [m]."""
     positions = mesh.vertices.detach()
@@ -63,25 +84,3 @@ def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float
     total = torch.zeros(len(edges), dtype=torch.float64).index_add(0, group, torch.cat(weights))
     lengths = (positions[edges[:, 0]] - positions[edges[:, 1]]).norm(dim=1)
     return edges, total.clamp_min(0.01), float(lengths.mean())
-
-
-class LatentNorm:
-    """The term ½ weight |z|²: the negative logarithm of a latent's prior probability."""
-
-    def __init__(self, module: nn.Module, weight: float) -> None:
-        """Regularise the parameter `latent` of a module, such as `PriorShape` or `LinearShape`.
-
-        Args:
-            module: It has the latent.
-            weight: Factor of ½ |z|².
-        """
-        if not isinstance(getattr(module, "latent", None), nn.Parameter):
-            raise InputError(
-                f"expected a module with a latent, got {type(module).__name__}; "
-                "give a PriorShape or a LinearShape"
-            )
-        self.module, self.weight = module, weight
-
-    def __call__(self, scene: Scene) -> Float64[Tensor, ""]:
-        """The term at the module's present latent."""
-        return 0.5 * self.weight * self.module.latent.square().sum()  # type: ignore[union-attr]
