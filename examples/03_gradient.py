@@ -40,7 +40,7 @@ sampling = iw.Sampling(depth=1, samples=1_000_000, boundary_samples=250_000)
 model = iw.SurrogateMap(grid, sampling=sampling)
 # θ moves the letter to the right. The differences are the truth: two maps, 8 mm apart.
 report = iw.gradcheck(
-    model, Translation("letter"), torch.tensor([1.0, 0.0, 0.0]), scene=scene, sensor=radar,
+    model, Translation("letter"), {"translation": [1.0, 0.0, 0.0]}, scene=scene, sensor=radar,
     check=Check(repeats=2, difference_samples=2_000_000, max_pairs=4),
 )  # fmt: skip
 

@@ -50,7 +50,7 @@ def fit(
         capture: What was recorded.
         parameters: Unknowns of the scene.
         grid: Bins that are compared.
-        surrogate: A surrogate or its name; "exact" = the exact chain.
+        surrogate: A surrogate or its name; "exact" = the exact simulation.
         of_radar: Unknowns of the radar.
         stages: In place of the settings of one schedule.
         checkpoint: File of the checkpoints; None = none.

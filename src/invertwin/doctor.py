@@ -69,6 +69,7 @@ print("passed")
 
 _SELF_TEST = """
 import json, sys, time
+import numpy as np
 import drjit as dr
 import mitsuba as mi
 backend = sys.argv[1]
@@ -76,16 +77,15 @@ if backend == "auto":
     backend = "cuda" if dr.has_backend(dr.JitBackend.CUDA) else "cpu"
 mi.set_variant({"cpu": "llvm", "cuda": "cuda"}[backend] + "_ad_mono_polarized")
 n = 100
-u, v = dr.meshgrid(dr.linspace(mi.Float, -1, 1, n), dr.linspace(mi.Float, -1, 1, n))
-mesh = mi.Mesh("relief", vertex_count=n * n, face_count=2 * (n - 1) ** 2)
+places = np.linspace(-1, 1, n)
+u, v = np.meshgrid(places, places)
+index = np.arange(n * n).reshape(n, n)
+a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+faces = np.stack([a, b, c, b, d, c], -1).ravel()
+mesh = mi.Mesh("relief", vertex_count=n * n, face_count=len(faces) // 3)
 p = mi.traverse(mesh)
-p["vertex_positions"] = dr.ravel(mi.Point3f(u, v, 0.1 * dr.sin(9 * u) * dr.sin(9 * v)))
-k = dr.arange(mi.UInt32, (n - 1) ** 2)
-a = k // (n - 1) * n + k % (n - 1)
-faces = dr.zeros(mi.UInt32, 6 * (n - 1) ** 2)
-for slot, offset in enumerate((0, 1, n, 1, n + 1, n)):
-    dr.scatter(faces, a + offset, 6 * k + slot)
-p["faces"] = faces
+points = np.stack([u, v, 0.1 * np.sin(9 * u) * np.sin(9 * v)], -1).ravel()
+p["vertex_positions"], p["faces"] = mi.Float(points), mi.UInt32(faces)
 p.update()
 scene = mi.load_dict({"type": "scene", "relief": mesh})
 rays = 1_000_000 if backend == "cpu" else 16_000_000
@@ -193,20 +193,12 @@ def candidates(folders: Iterable[Path] | None = None) -> list[Candidate]:
     """Every libLLVM in the given folders (default: system, conda, Homebrew), newest first."""
     found = {}
     for folder in _search_path() if folders is None else folders:
-        try:
-            names = os.listdir(folder)
-        except OSError:
-            continue
-        for name in filter(_LIBRARY.match, names):
-            path = os.path.realpath(os.path.join(folder, name))
-            if os.path.isfile(path):
-                version = _version(path) or _version(os.path.join(folder, name))
-                found[path] = max(found.get(path, ()), version)
-    return sorted(
-        (Candidate(path, version) for path, version in found.items()),
-        key=lambda candidate: (candidate.version, candidate.path),
-        reverse=True,
-    )
+        for file in Path(folder).glob("libLLVM*"):
+            if _LIBRARY.match(file.name) and file.is_file():
+                path = os.path.realpath(file)
+                found[path] = max(found.get(path, ()), _version(path) or _version(str(file)))
+    newest = sorted(((version, path) for path, version in found.items()), reverse=True)
+    return [Candidate(path, version) for version, path in newest]
 
 
 def probe_library(path: str) -> Verdict:
@@ -282,18 +274,17 @@ def report() -> dict[str, Any]:
         or None. Plain values that JSON can hold.
     """
     requested = os.environ.get(BACKEND_VARIABLE, "auto")
-    examined = []
     prepare()
-    for candidate in _with_explicit(candidates()):
-        verdict = _remembered(candidate.path, probe_library)
-        examined.append(
-            {
-                "path": candidate.path,
-                "version": ".".join(map(str, candidate.version)),
-                "usable": verdict.usable,
-                "verdict": verdict.reason,
-            }
-        )
+    examined = [
+        {
+            "path": candidate.path,
+            "version": ".".join(map(str, candidate.version)),
+            "usable": verdict.usable,
+            "verdict": verdict.reason,
+        }
+        for candidate in _with_explicit(candidates())
+        for verdict in (_remembered(candidate.path, probe_library),)
+    ]
     gpu, fix = gpu_name(), None
     try:
         require(requested)
@@ -431,16 +422,10 @@ def _remembered(path: str, probe: Callable[[str], Verdict]) -> Verdict:
         status = os.stat(path)
     except OSError:
         return probe(path)
-    key = "|".join(
-        (
-            os.path.realpath(path),
-            str(status.st_mtime_ns),
-            str(status.st_size),
-            f"drjit {_package_version('drjit')}",
-            f"python {platform.python_version()} {platform.machine()}",
-            f"probe {zlib.crc32(_PROBE.encode())}",
-        )
-    )
+    library = f"{os.path.realpath(path)}|{status.st_mtime_ns}|{status.st_size}"
+    python = f"python {platform.python_version()} {platform.machine()}"
+    probed = f"drjit {_package_version('drjit')}|{python}|probe {zlib.crc32(_PROBE.encode())}"
+    key = f"{library}|{probed}"
     known = _read_cache()
     if key in known:
         return known[key]
@@ -458,17 +443,14 @@ def _cache_file() -> Path:
 def _read_cache() -> dict[str, Verdict]:
     try:
         entries = json.loads(_cache_file().read_text(encoding="utf-8"))
-        return {
-            key: Verdict(bool(entry["usable"]), str(entry["reason"]))
-            for key, entry in entries.items()
-        }
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return {key: Verdict(**entry) for key, entry in entries.items()}
+    except (OSError, ValueError, TypeError, AttributeError):
         return {}  # missing, or spoilt: the verdicts are simply found again
 
 
 def _write_cache(verdicts: dict[str, Verdict]) -> None:
     file = _cache_file()
-    entries = {key: {"usable": v.usable, "reason": v.reason} for key, v in verdicts.items()}
+    entries = {key: vars(verdict) for key, verdict in verdicts.items()}
     # Without a place to write, the next import probes again: slower, not wrong.
     with contextlib.suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -6,3 +6,13 @@ class InputError(ValueError):
 
     The command line prints it without a traceback and exits with code 2.
     """
+
+    def __init__(self, text: str, at: str = "") -> None:
+        """Say what is wrong.
+
+        Args:
+            text: The line.
+            at: The argument that it is about: the key of a run file.
+        """
+        super().__init__(text)
+        self.at = at

@@ -1,7 +1,12 @@
-"""What a value may be, as annotations: the library's signatures state it, run files check it."""
+"""Limits of values as annotations.
 
+The signatures of the library state them; `scene.checks.check_fields` and run files apply them.
+"""
+
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le
 
@@ -9,6 +14,7 @@ Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Share = Annotated[float, Ge(0), Le(1)]
 Count = Annotated[int, Ge(1)]
+Several = Annotated[int, Ge(2)]
 
 RADIANS = "rad"
 """Marks a value in radians. Its key in a run file ends in `_deg` and is in degrees."""
@@ -33,3 +39,42 @@ class Among:
 
 
 Axes = Annotated[str, Letters("xyz")]
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Marks a number with its SI unit and a usual value, so that another unit is noticed.
+
+    Attributes:
+        unit: Such as "Hz".
+        value: A usual number in this unit.
+        low: Smaller numbers are taken to be in another unit.
+        high: Larger numbers are taken to be in another unit.
+    """
+
+    unit: str
+    value: float
+    low: float = 0.0
+    high: float = math.inf
+
+    def meant(self, number: float) -> str:
+        """The number times the power of ten that brings it nearest to the usual value."""
+        decades = math.log10(self.value / number)
+        return f"{number:g}e{min((9, 6, 3, -3, -6, -9, -12), key=lambda e: abs(e - decades))}"
+
+
+Frequency = Annotated[Positive, Usual("Hz", 77e9, low=1e6)]
+Bandwidth = Annotated[Positive, Usual("Hz", 1e9, low=1e6)]
+Step = Annotated[Positive, Usual("Hz", 1e6, low=1e3)]
+Duration = Annotated[Positive, Usual("seconds", 4e-5, high=1.0)]
+
+
+def marks(hint: Any) -> Iterator[Any]:
+    """The types and the marks that an annotation is made of, also of its items and members."""
+    yield from getattr(hint, "__metadata__", ())
+    parts = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
+    if not parts or get_origin(hint) is Literal:
+        yield hint
+        return
+    for part in parts:
+        yield from marks(part)

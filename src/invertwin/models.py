@@ -16,12 +16,13 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_power
+from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field, trace_power
 from invertwin.errors import InputError
 from invertwin.radar.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.motion import Chirps
 from invertwin.radar.moving_power import moving_power
 from invertwin.radar.radar import Radar
+from invertwin.radar.range_profile import beat_signal
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
 from invertwin.scene.scene import Scene
 from invertwin.simulation import simulate
@@ -222,6 +223,28 @@ class ExactMap(ForwardModel):
         if self.speckle is not None:
             return self
         return replace(self, speckle=draw_speckle(scene, sensor.link(), self.sampling, seed))
+
+
+@dataclass(frozen=True)
+class BeatMap(ExactMap):
+    """The exact beat signals themselves, before any spectrum. They are complex.
+
+    Attributes:
+        channels: Transmitters and receivers whose signals are shown.
+    """
+
+    channels: tuple[slice, slice] = (slice(None), slice(None))
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Tensor:
+        """The beat signals [frame, tx, rx, sample]. See ``ForwardModel.predict``."""
+        paths = trace_field(
+            scene, sensor.link(), sampling=self.sampling, seed=seed, speckle=self.speckle
+        )
+        return beat_signal(paths, sensor, channels=self.channels)
+
+    def observe(self, recording: Capture) -> Tensor:
+        """The recorded beat signals of these channels."""
+        return recording.beat[(slice(None), *self.channels)]
 
 
 @dataclass(frozen=True, eq=False)

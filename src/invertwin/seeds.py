@@ -7,7 +7,7 @@ def derived_seed(seed: int, *key: int) -> int:
     """A seed of its own for every key, independent of the seeds of all other keys.
 
     Args:
-        seed: Of the whole.
+        seed: The seed from which others are derived.
         key: Numbers ≥ 0 that say what the seed is for, such as stage, step and observation.
 
     Returns:

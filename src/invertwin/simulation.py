@@ -1,4 +1,4 @@
-"""Exact signals on one page: scene → paths → beat signals → spectrum, as a real radar does it."""
+"""Simulate exact signals as a real radar records them: scene → paths → beat signal → spectrum."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -61,12 +61,12 @@ def simulate(
         scene: What is seen.
         radar: Arrays, waveform and poses.
         grid: Bins, see ``Radar.grid``.
-        seed: Of places, phases and noise.
+        seed: Seed of places, phases and noise.
         sampling: How paths are sampled; None = ``Sampling()``.
         speckle: Rough points and paths to use again, so that speckle stays while the scene moves.
         snr_db: Noise relative to the mean signal power per sample.
         noise_figure_db: Thermal noise of a receiver instead.
-        impairments: Of the front end; it has a noise level of its own.
+        impairments: Impairments of the front end; they have a noise level of their own.
 
     Raises:
         InputError: An object in motion: a frame is one instant. Two noise levels.
@@ -125,7 +125,7 @@ def simulate_chirps(
         retrace: Trace visibility and amplitudes anew at every ramp, instead of moving the
             points seen at the start of the frame. A function of time always does.
         speckle: Rough points to use again.
-        impairments: Of the front end, drawn from the seed too; phase noise only without retracing.
+        impairments: Impairments of the front end; phase noise only without retracing.
 
     Raises:
         InputError: See ``trace_field`` and ``moving_beat``; a function of time whose objects
@@ -151,7 +151,7 @@ def simulate_chirps(
         check_paths(paths, radar, sampled(radar))
         return Train(paths, radar, places).ramp(start, senders)
 
-    beat = every_ramp(chirps, len(radar.transmitters.positions), ramp)
+    beat = every_ramp(chirps, radar.shape[1], ramp)
     return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
 
 

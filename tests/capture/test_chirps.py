@@ -132,12 +132,12 @@ def test_the_range_of_the_adc_is_that_of_its_bits():
         ({"receivers": ()}, "ascending receiver"),
         ({"lanes": 3}, "2 or 4 LVDS lanes, got 3"),
         ({"bits": 10}, "12, 14 or 16 bits"),
-        ({"samples": 1}, "samples per chirp"),
-        ({"loops": 0}, "loops per frame"),
-        ({"frames": 0}, "frames"),
-        ({"start_frequency": 77.0}, "start_frequency in SI"),
-        ({"slope": 0.0}, "slope in SI"),
-        ({"idle_time": 10.0}, "idle_time"),
+        ({"samples": 1}, "samples of at least 2, got 1"),
+        ({"loops": 0}, "loops of at least 1, got 0"),
+        ({"frames": 0}, "frames of at least 1, got 0"),
+        ({"start_frequency": 77.0}, "start_frequency in Hz, got 77; did you mean 77e9"),
+        ({"slope": 0.0}, "slope above 0, got 0"),
+        ({"idle_time": 10.0}, "idle_time in seconds, got 10; did you mean 10e-6"),
         ({"ramp_end_time": 12e-6}, "ramp of at least 1.24e-05 s"),
     ],
 )
@@ -147,7 +147,9 @@ def test_settings_that_cannot_be_are_refused(change, message):
 
 
 def test_data_must_fit_the_settings(unchecked):
-    with pytest.raises(InputError, match=r"shape \(any, 4, 3, 4, 32\) .* got \(2, 4, 3, 4, 31\)"):
+    with pytest.raises(
+        InputError, match=r"shape \[any, 4, 3, 4, 32\], got shape \[2, 4, 3, 4, 31\]"
+    ):
         ChirpData(samples()[..., 1:], SETTINGS)
     bad = samples()
     bad[0, 0, 0, 0, 0] = torch.nan

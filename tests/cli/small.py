@@ -75,7 +75,8 @@ distance = [0.05, 0.08]
 """
 GRADCHECK = """
 [gradcheck]
-parameter = { kind = "translation", object = "plate", axis = [1.0, 0.0, 0.0] }
+parameter = { kind = "translation", object = "plate" }
+tangent = { translation = [1.0, 0.0, 0.0] }
 depth = 2
 step = 1e-2
 samples = 50_000

@@ -8,7 +8,6 @@ import torch
 
 from invertwin.cli import build
 from invertwin.cli.bodies import sought_bodies
-from invertwin.cli.gradients import theta_of
 from invertwin.cli.run_file import validate
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
@@ -57,7 +56,7 @@ def test_every_sought_joint_starts_that_far_off_and_only_these():
         assert torch.allclose(found[hinge, [0, 2]], torch.zeros(2).double(), atol=1e-6)
         moved = (found - true).abs().amax(1) > 1e-6
         assert {body.template.names[int(k)] for k in moved.nonzero()[:, 0]} == set(LEFT)
-        (module,) = build.parameters(run.parameters, start.scene, bodies)
+        (module,) = build.parameters(run.parameters, start.scene, run.scene)
         assert torch.allclose(module(start.scene)["person"].mesh.vertices, mesh.vertices, atol=1e-9)
     first, second = (start.scene["person"].mesh.vertices for start in starts)
     assert not torch.allclose(first, second, atol=1e-3)
@@ -88,29 +87,25 @@ def test_bad_bodies(changes, message):
         sought_bodies(run_file(**changes))
 
 
-def checked(parameter: dict[str, Any], name: str = "person") -> tuple[Scene, Scene]:
+def checked(
+    parameter: dict[str, Any], tangent: dict[str, Any], name: str = "person"
+) -> tuple[Scene, Scene]:
     """The scene at θ = 0 and at 0.01."""
     given = {"object": name, **parameter}
-    key = "step_deg" if given["kind"] == "joint" else "step"
-    run = run_file(gradcheck={"parameter": given, key: 0.1})
-    assert run.gradcheck is not None
+    key = "step_deg" if given["kind"] == "body" else "step"
+    run = run_file(gradcheck={"parameter": given, "tangent": tangent, key: 0.1})
     scene = build.scene(run)
-    theta = theta_of(run.gradcheck.parameter, run, scene)
-    line = line_of(theta.module, theta.tangent, scene)
+    line = line_of(*build.tangent(run, scene), scene)
     return line.at(torch.zeros((), dtype=torch.float64)), line.end(0.01)
 
 
-BUMP = {
-    "center": [0.5, 0.0, 0.0],
-    "width": 0.1,
-    "low": [-0.8] * 3,
-    "high": [0.8] * 3,
-    "counts": [17] * 3,
-}
+BUMP = {"center": [0.5, 0.0, 0.0], "width": 0.1}
+BOX = {"low": [-0.8] * 3, "high": [0.8] * 3, "counts": [17] * 3}
+ELBOW = {"kind": "body", "joints": {"left_elbow": ["y"]}}
 
 
 def test_theta_turns_a_joint():
-    start, moved = checked({"kind": "joint", "joint": "left_elbow", "axis": [0.0, 2.0, 0.0]})
+    start, moved = checked(ELBOW, {"left_elbow": [0.0, 1.0, 0.0]})
     body = sought_bodies(run_file())["person"].template
     before, after = (body.rotations_of(s["person"].mesh.vertices) for s in (start, moved))
     assert float((after - before)[body.joint("left_elbow"), 1]) == pytest.approx(0.01, abs=1e-9)
@@ -118,7 +113,8 @@ def test_theta_turns_a_joint():
 
 
 def test_theta_moves_a_surface_outwards_in_a_bump():
-    start, moved = checked({"kind": "distance", **BUMP}, "box")
+    falls = {"value": {**BUMP, "height": -1.0}}
+    start, moved = checked({"kind": "distance_grid", **BOX}, falls, "box")
     way = (moved["box"].mesh.vertices - start["box"].mesh.vertices)[:, 0]
     assert float(way.max()) == pytest.approx(0.01, rel=0.15)
     far = start["box"].mesh.vertices[:, 0] < 0
@@ -126,7 +122,8 @@ def test_theta_moves_a_surface_outwards_in_a_bump():
 
 
 def test_theta_thickens_a_cloud():
-    start, moved = checked({"kind": "density", "extinction": 5.0, **BUMP}, "box")
+    cloud = {"kind": "density", "extinction": 5.0, **BOX}
+    start, moved = checked(cloud, {"log_density": BUMP}, "box")
     clouds = start["box"].cloud, moved["box"].cloud
     assert clouds[0] is not None
     assert clouds[1] is not None
@@ -137,23 +134,36 @@ def test_theta_thickens_a_cloud():
 
 
 @pytest.mark.parametrize(
-    ("parameter", "message"),
+    ("parameter", "tangent", "message"),
     [
+        ({"kind": "body"}, {"left_elbow": 1.0}, "parameter.joints: expected a value, got"),
         (
-            {"kind": "joint", "axis": [0.0, 1.0, 0.0]},
-            "parameter.joint: expected a value, got",
+            {"kind": "distance_grid", **BOX},
+            {"value": {"center": [0.0] * 3}},
+            "tangent.value.width: expected a value, got",
         ),
         (
-            {"kind": "distance", "center": [0.0] * 3},
-            "parameter.width: expected a value, got",
+            {"kind": "prior"},
+            {"latent": [1.0] * 25},
+            r"gradcheck.tangent: .* \(latent \(24,\)\), got latent \(25,\)",
         ),
-        ({"kind": "latent", "index": 0}, 'shape = "vehicle" without max_edge, or "prior"'),
-        ({"kind": "joint", "joint": "wing", "axis": [0.0, 1.0, 0.0]}, "got 'wing'; choose one"),
+        (
+            {"kind": "pose"},
+            {"translation": BUMP},
+            "gradcheck.tangent: expected numbers, got a bump",
+        ),
+        (ELBOW, {"neck": 1.0}, r"gradcheck.tangent: .*left_elbow \(3,\)\), got neck"),
+        (ELBOW, {"left_elbow": [[1.0], [1.0, 0.0]]}, "gradcheck.tangent: .* rows of one length"),
+        (
+            {"kind": "body", "joints": {"wing": ["x"]}},
+            {"wing": 1.0},
+            "gradcheck.parameter: .* got 'wing'; choose one",
+        ),
     ],
 )
-def test_bad_directions(parameter, message):
+def test_bad_tangents(parameter, tangent, message):
     with pytest.raises(InputError, match=message):
-        checked(parameter)
+        checked(parameter, tangent)
 
 
 def test_joints_that_nobody_seeks_are_not_turned():

@@ -10,9 +10,9 @@ import torch
 
 from invertwin.cli import build
 from invertwin.cli.keys import key_tables
-from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import load_run, to_toml, validate
 from invertwin.errors import InputError
+from invertwin.inversion.metrics import value_errors
 from invertwin.scene import (
     Dielectric,
     Itu,
@@ -200,9 +200,10 @@ def test_truth_may_be_of_another_material_and_the_error_is_told():
     scene, truth = build.scene(run), build.true_scene(run)
     assert truth["wall"].material.faces == 2
     assert torch.equal(truth["wall"].vertices, scene["wall"].vertices)
-    errors = value_errors(run.parameters, scene, truth, 77e9)
+    found, true = (whole["wall"].material for whole in (scene, truth))
+    errors = value_errors(run.parameters[0].values, found, true, 77e9)
     assert errors == pytest.approx({"permittivity_error": 0.27 / 2.73, "thickness_error": 0.2})
-    assert value_errors(run.parameters, truth, truth, 77e9)["thickness_error"] == 0
+    assert value_errors(["thickness"], true, true, 77e9) == {"thickness_error": 0}
     with pytest.raises(InputError, match=r"truth\.wall\.material: expected a material of ITU"):
         build.true_scene(read(known, truth={"wall": {"material": real | {"itu": "woood"}}}))
 

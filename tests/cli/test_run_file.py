@@ -13,6 +13,8 @@ STUDIES = REPOSITORY / "experiments" / "studies" / "pyproject.toml"
 RECORDING = REPOSITORY / "experiments" / "mover_arrays" / "chirps.toml"
 ROUGH = {"kind": "rough_dielectric", "permittivity": 4.0}
 SCALE = {"kind": "scale", "object": "letter"}
+MOVER = {"kind": "mover", "object": "letter"}
+SIZE = {"log_scale": 1.0}
 
 
 def letter(**changes):
@@ -102,12 +104,16 @@ def radar(**changes):
             ["data: ", "got both"],
         ),
         (
-            run(gradcheck={"parameter": {"kind": "translation", "object": "letter"}, "step": 1e-3}),
-            ["gradcheck.parameter.axis: ", "expected a value, got nothing", "add the key `axis`"],
+            run(gradcheck={"parameter": {"kind": "scale", "object": "letter"}, "step": 1e-3}),
+            ["gradcheck.tangent: ", "expected a value, got nothing", "add the key `tangent`"],
         ),
         (
-            run(gradcheck={"parameter": SCALE, "step_deg": 1.0}),
+            run(gradcheck={"parameter": SCALE, "tangent": SIZE, "step_deg": 1.0}),
             ["gradcheck: ", "no `step_deg` with kind = scale", "remove it"],
+        ),
+        (
+            run(gradcheck={"parameter": MOVER, "tangent": {"place": 1.0}, "step": 1e-3}),
+            ["gradcheck: ", "got a mover", "choose another kind"],
         ),
         (
             run(reconstruct={"steps": 3, "depth": 0}),
@@ -118,7 +124,7 @@ def radar(**changes):
             ["data.depth: ", "less than or equal to 16", "got 17"],
         ),
         (
-            run(gradcheck={"parameter": SCALE, "step": 1e-3, "depth": 2.5}),
+            run(gradcheck={"parameter": SCALE, "tangent": SIZE, "step": 1e-3, "depth": 2.5}),
             ["gradcheck.depth: ", "an integer", "got 2.5"],
         ),
         (

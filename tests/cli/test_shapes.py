@@ -240,7 +240,7 @@ def test_learned_shapes_are_objects_and_parameters(tmp_path):
     scene = build.scene(run)
     assert len(scene["plate"].mesh.faces) > 200
     tables = build.named(run.parameters)
-    module = build.builders(run.parameters, build.Start(scene))["vertices"](scene)
+    module = build.builders(run.parameters)["vertices"](scene)
     assert len(shape_terms(tables["vertices"], module, scene)) == 1
 
 

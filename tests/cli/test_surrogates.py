@@ -42,7 +42,7 @@ def test_a_wrong_one_is_named(line, message, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_exact_chain_is_fitted_where_visibility_is_fixed(tmp_path, monkeypatch, capsys):
+def test_the_exact_model_is_fitted_where_visibility_is_fixed(tmp_path, monkeypatch, capsys):
     text = named('surrogate = "exact"').replace("steps = 8", "steps = 3")
     (tmp_path / "exact.toml").write_text(text)
     out = tmp_path / "out"
@@ -56,11 +56,11 @@ def test_the_exact_chain_is_fitted_where_visibility_is_fixed(tmp_path, monkeypat
     assert metrics["surrogate_correlation"] >= 0.9
 
 
-def test_no_gradient_check_of_the_exact_chain(tmp_path, monkeypatch, capsys):
+def test_no_gradient_check_of_exact_signals(tmp_path, monkeypatch, capsys):
     (tmp_path / "check.toml").write_text(
         named('surrogate = "exact"')
-        + '[gradcheck]\nparameter = { kind = "translation", object = "plate", axis = [1, 0, 0] }\n'
-        + "step = 1e-2\n"
+        + '[gradcheck]\nparameter = { kind = "translation", object = "plate" }\n'
+        + "tangent = { translation = [1, 0, 0] }\nstep = 1e-2\n"
     )
     assert call(monkeypatch, "gradcheck", tmp_path / "check.toml", "-o", tmp_path / "out") == 2
     assert "surrogate.exact: expected a smooth map" in " ".join(capsys.readouterr().err.split())

@@ -1,12 +1,10 @@
 """Gradient checks of run files, with sampling and a map of the test's own."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
 from invertwin.channel import Sampling
 from invertwin.cli import build
-from invertwin.cli.gradients import theta_of
 from invertwin.cli.run_file import load_run
 from invertwin.inversion.gradcheck import Check, GradientReport, gradcheck
 from invertwin.models import SurrogateMap
@@ -42,15 +40,15 @@ def check_run(
         bins = run.grid
         grid = radar.grid(bins.range_min, bins.range_max, bins.u_max, oversample=oversample)
     drawn = Sampling(depth=settings.depth, samples=samples, boundary_samples=boundary_samples)
-    step = math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0
-    theta = theta_of(settings.parameter, run, scene)
+    told = settings.build()
+    module, tangent = build.tangent(run, scene)
     return gradcheck(
         SurrogateMap(grid, surrogate or build.surrogate(run.surrogate), drawn),
-        theta.module,
-        theta.tangent,
+        module,
+        tangent,
         scene=scene,
         sensor=radar,
-        of="sensor" if theta.of_radar else "scene",
-        check=replace(check, step=step, scheme=settings.sampling),
+        of=settings.of,
+        check=replace(check, step=told.step, scheme=told.scheme),
         seed=1,
     )

@@ -138,11 +138,11 @@ CORNERS = float64([[1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0,
 ASIDE = {"translation": float64([0.9, 0.3, 0.1])}
 MOVES: dict[str, Move] = {
     "translation": Move(Translation("occluder"), ASIDE),
-    "pose": Move(Pose("occluder"), {"rotation": float64([0.0, 0.2, 0.9, 0.6])}),
+    "pose": Move(Pose("occluder"), {"rotation": float64([0.2, 0.9, 0.6])}),
     "scale": Move(Scale("occluder"), {"log_scale": float64(1.0)}),
     "vertices": Move(Vertices("occluder", 4), {"offsets": CORNERS}),
     "radar position": Move(RadarPose(), ASIDE, "sensor"),
-    "radar rotation": Move(RadarPose(), {"rotation": float64([0.0, 0.2, 0.9, 0.1])}, "sensor"),
+    "radar rotation": Move(RadarPose(), {"rotation": float64([0.2, 0.9, 0.1])}, "sensor"),
     "permittivity": material("permittivity", 4.0),
     # As lossy as it is dense, so that the derivative is no small difference of two angles.
     "conductivity": material("conductivity", 10.0),

@@ -1,4 +1,4 @@
-"""A plate off its place before a wall, and what a radar recorded of it, by the exact chain."""
+"""A plate off its place before a wall, and what a radar recorded of it, by the exact simulation."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -127,11 +127,11 @@ def test_models_without_a_mean_derivative_are_refused():
     ("module", "tangent"),
     [
         (Translation("occluder"), SLIDE),
-        (Pose("occluder"), {"rotation": float64([0.0, 0.0, 2.0, 0.0])}),
+        (Pose("occluder"), {"rotation": float64([0.0, 2.0, 0.0])}),
         (Scale("occluder"), {"log_scale": float64(1.0)}),
         (MaterialValues("wall", permittivity=4.0), {"raw.permittivity": float64(1.0)}),
         (RadarPose(), SLIDE),
-        (RadarPose(), {"rotation": float64([0.0, 0.0, 1.0, 0.0])}),
+        (RadarPose(), {"rotation": float64([0.0, 1.0, 0.0])}),
     ],
     ids=["translation", "rotation", "scale", "material", "radar translation", "radar rotation"],
 )

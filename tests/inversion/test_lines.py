@@ -3,13 +3,23 @@
 import pytest
 import torch
 
+from invertwin.capture import Capture
+from invertwin.channel import Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.lines import FieldLine, line_of
-from invertwin.scene import Scene, Translation, sphere
-from invertwin.scene.geometry import DensityGrid, DistanceGrid
-from scenes import float64, thing
+from invertwin.inversion import Observation
+from invertwin.inversion.lines import FieldLine, line_of, losses_along
+from invertwin.inversion.loss import relative_error
+from invertwin.inversion.tangents import Bump, changes_of
+from invertwin.models import BeatMap, SurrogateMap
+from invertwin.radar import Surrogate
+from invertwin.scene import Pose, Scene, Translation, rotation_from_vector, sphere
+from invertwin.scene.geometry import DensityGrid, DistanceGrid, LatticeDeformation
+from invertwin.scene.parameters import MaterialValues
+from invertwin.simulation import simulate
+from scenes import float64, radar, thing
 
 SCENE = Scene({"ball": thing(sphere(0.2, 2), (0, 0, 1))})
+AHEAD = float64([0.0, 0.0, 1.0])
 THETA = torch.tensor(0.03, dtype=torch.float64)
 
 
@@ -61,6 +71,59 @@ def test_a_density_changes_where_the_tangent_is():
     # softplus' = 1 − exp(−σ h): the spacing of two nodes 2 m apart is 2 m.
     slope = (1 - torch.exp(-3.0 * module.lattice.spacing.mean())) / module.lattice.spacing.mean()
     assert torch.allclose(found.density[1], 3.0 + 0.06 * slope, atol=1e-4)
+
+
+def test_a_list_may_leave_out_the_end_of_a_row():
+    found = changes_of(Translation("ball"), {"translation": [2.0]})
+    assert found["translation"].tolist() == [2.0, 0.0, 0.0]
+
+
+def test_rotations_are_vectors():
+    turn = [0.0, 3e-6, 4e-6]
+    found = line_of(Pose("ball"), {"rotation": turn}, SCENE).end(1.0)["ball"].transform[:3, :3]
+    assert torch.allclose(found, rotation_from_vector(float64(turn)), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(("name", "start"), [("permittivity", 3.0), ("diffuse", 0.2)])
+def test_material_values_change_in_their_own_units(name, start):
+    line = line_of(MaterialValues("ball", **{name: start}), {name: 2.0}, SCENE)
+    ends = [getattr(line.end(theta)["ball"].material, name) for theta in (-1e-6, 1e-6)]
+    assert float(ends[1] - ends[0]) / 2e-6 == pytest.approx(2.0, abs=1e-6)
+
+
+def test_a_bump_covers_control_points_beyond_the_box():
+    module = LatticeDeformation("ball", [-0.3] * 3, [0.3] * 3, (4, 4, 4))
+    wide = Bump([0.0, 0.0, 0.0], width=100.0, height=[0.0, 1.0, 0.0])
+    found = line_of(module, {"offsets": wide}, SCENE).end(0.1)["ball"].vertices
+    assert torch.allclose(found, SCENE["ball"].vertices + float64([0.0, 0.1, 0.0]), atol=1e-5)
+    narrow = Bump([0.5, 0.3, -0.3], width=0.02, height=[1.0, 1.0, 1.0])
+    change = changes_of(module, {"offsets": narrow})["offsets"]
+    # Nodes are 0.2 m apart; the last but one along x and y, and the first but one along z.
+    assert torch.equal(change[5, 4, 1], float64([1.0, 1.0, 1.0]))
+    assert float(change.sum()) == pytest.approx(3.0, abs=1e-9)
+
+
+def test_losses_along_a_line_are_least_at_the_truth():
+    """Of the smooth map, and of exact signals, which have the points of the data."""
+    device = radar(receivers=4)
+    grid = device.grid(0.5, 1.5, 0.6, oversample=1)
+    line, offsets = line_of(Translation("ball"), AHEAD, SCENE), [-0.2, -0.1, 0.0, 0.1, 0.2]
+    drawn = Sampling(depth=1, samples=20_000, points_per_m2=2e3, boundary=False)
+    model = SurrogateMap(grid, Surrogate("gaussian", range_width=3.0, angle_width=2.0), drawn)
+    sharp = model.narrowed(0.0).predict(SCENE, device, 1)
+    losses = losses_along(line, offsets, Observation(model, device, sharp), seed=2)
+    assert (losses.diff() > 0).tolist() == [False, False, True, True]
+    assert float(losses[2]) < 0.02 * float(losses.max())
+    data = simulate(SCENE, device, grid, seed=3, sampling=drawn)
+    for channels in ((slice(None), slice(None)), (slice(1), slice(1, 3))):
+        exact, beat = BeatMap(grid, drawn, channels=channels), data.beat[:, *channels]
+        assert beat.shape[2] == (2 if channels[1].start else 4)
+        seen = Observation(exact, device, beat, loss=relative_error)
+        losses = losses_along(line, offsets, seen, seed=3)
+        assert float(losses[2]) < 1e-20
+        assert float(losses[[0, 1, 3, 4]].min()) > 0.5
+    capture = Capture.from_beat(data.beat, device)
+    assert torch.allclose(exact.observe(capture), beat)
 
 
 def test_a_line_leaves_its_module_alone():

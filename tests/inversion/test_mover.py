@@ -1,4 +1,4 @@
-"""The moving twin: detection, the body, and its fit to the exact chain."""
+"""The moving twin: detection, the body, and its fit to the exact simulation."""
 
 import math
 from dataclasses import replace

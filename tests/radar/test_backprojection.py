@@ -147,7 +147,7 @@ def test_wrong_input(linear):
     far = torch.tensor([[0.0, 0.0, 9.7]], dtype=torch.float64)
     with pytest.raises(InputError, match="unambiguous range"):
         backproject_beat(beat, linear, far)
-    with pytest.raises(InputError, match="beat signal of shape"):
+    with pytest.raises(InputError, match=r"beat signal \(frame, tx, rx, sample\) of shape"):
         backproject_beat(beat[:, :, :3], linear, far)
     with pytest.raises(InputError, match="no beat signal"):
         backproject_beat(beat, replace(linear, waveform=Impulse(77e9, 1e9)), far)

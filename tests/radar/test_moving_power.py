@@ -1,4 +1,4 @@
-"""Power in motion against the exact chain: the same maps, point by point."""
+"""Power in motion against the exact simulation: the same maps, point by point."""
 
 from dataclasses import replace
 

@@ -425,7 +425,7 @@ def test_wrong_input(point_paths, linear):
         beat_signal(replace(paths, frame=paths.frame + 1), linear)
     with pytest.raises(InputError, match="no beat signal"):
         beat_signal(paths, replace(linear, waveform=Impulse(77e9, 1e9)))
-    with pytest.raises(InputError, match="beat signal of shape"):
+    with pytest.raises(InputError, match=r"beat signal \(frame, tx, rx, sample\) of shape"):
         range_profile(torch.zeros(1, 1, 16, 65, dtype=torch.complex128), linear, Grid(1, 0.1, 9))
 
 

@@ -133,7 +133,7 @@ def test_gradient(linear):
 
 def test_wrong_input(planar):
     grid = planar.grid(4, 5)
-    with pytest.raises(InputError, match="profile of shape"):
+    with pytest.raises(InputError, match=r"profile \(frame, tx, rx, range\) of shape"):
         beamform(torch.zeros(1, 1, 96, 3, dtype=torch.complex128), planar, grid)
     profile = torch.zeros(1, 1, 96, grid.range_count, dtype=torch.complex128)
     places = planar.receivers.positions.clone()

@@ -1,4 +1,4 @@
-"""The surrogate against the exact chain, and the shape of each kernel."""
+"""The surrogate against the exact simulation, and the shape of each kernel."""
 
 import math
 from dataclasses import dataclass, replace
@@ -88,7 +88,7 @@ def test_the_surrogate_follows_every_waveform(chosen, window, oversample, linear
 
 
 def test_the_surrogate_follows_a_waveform_of_ones_own(linear, point_paths):
-    """Frequencies are all it takes: the exact chain and the kernel come with them."""
+    """Frequencies are all it takes: the exact simulation and the kernel come with them."""
 
     @dataclass(frozen=True)
     class Falling(SampledWaveform):
@@ -158,7 +158,7 @@ def test_the_windows_are_part_of_the_kernel(planar, point_paths):
 
 
 def test_dirichlet_is_the_response_without_a_window(linear, point_paths):
-    """Whatever the radar's window is: the exact chain of the same paths, untapered."""
+    """Whatever the radar's window is: the exact simulation of the same paths, untapered."""
     points, power = cloud(40)
     bare = replace(linear, window="rectangular")
     grid = linear.grid(3, 6, 0.7, oversample=3)
@@ -379,7 +379,7 @@ def test_both_chains_of_a_scene_agree(mimo):
 
 
 def test_annealing_ends_at_the_exact_response(linear, point_paths):
-    """The last stage of a fit: no extra width, and the mean of the exact chain."""
+    """The last stage of a fit: no extra width, and the mean of the exact simulation."""
     radar = linear
     points, power = cloud(40)
     grid = radar.grid(3, 6, 0.7)

@@ -324,7 +324,7 @@ def to_world(content: str) -> str:
         (to_world('<rotate angle="3"/>'), "expected a rotation axis"),
         (to_world('<rotate x="1"/>'), "1 numbers, got ''"),
         (to_world('<translate value="1 2"/>'), "1 or 3 numbers, got '1 2'"),
-        (to_world('<translate x="nan"/>'), "finite translation"),
+        (to_world('<translate x="nan"/>'), "finite translate, got 1 NaN"),
         (
             "<scene><shape type='cube' id='a'/><shape type='cube' id='a'/></scene>",
             "different shape ids, got 'a' twice",

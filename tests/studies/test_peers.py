@@ -112,7 +112,7 @@ def test_edge_sampling_refuses_what_it_cannot_do(radar, grid):
         )
 
 
-def test_music_is_differentiated_through_the_whole_chain(radar, grid):
+def test_music_is_differentiated_as_a_whole(radar, grid):
     given = scene(0.35)
     drawn = Sampling(depth=1, points_per_m2=500.0)
     speckle = draw_speckle(given, radar.link(), drawn, 1)

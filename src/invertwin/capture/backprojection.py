@@ -18,7 +18,7 @@ _BIAS_SEARCH = (0.1, 0.01)
 def backproject(
     capture: Capture, points: Float64[Tensor, "*point 3"]
 ) -> Complex128[Tensor, "*point"]:
-    """Mean over the frames (and channels) of the echo from the distance of a point.
+    """Focus the data on points: average the echoes from each point's distance over all frames.
 
     Echoes of a target at the point add in phase, since the profiles carry their carrier: the
     matched filter of a point target without its spreading loss. Beat samples go through
@@ -44,13 +44,13 @@ def locate(
     radius: float = 0.6,
     step: float = 0.01,
 ) -> Float64[Tensor, "3"]:
-    """The brightest point of the backprojected image in a horizontal square.
+    """Find the brightest point of the backprojected image in a horizontal square.
 
     Args:
         capture: range profiles.
-        center: of the square, at the known height of the target [m].
+        center: middle of the square, at the known height of the target [m].
         radius: half the side of the square [m].
-        step: of the image from which the search starts [m]; below half a resolution cell.
+        step: pixel size of the image that starts the search [m]; below half a resolution cell.
 
     Raises:
         InputError: the capture holds beat samples, a point is beyond the measured ranges, or a step
@@ -75,7 +75,7 @@ def locate(
 
 
 def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
-    """The capture with the clock offset and range bias that focus a known target best.
+    """Find the clock offset and the range bias that focus a known target best.
 
     Both are searched within 0.1 s and 0.1 m of the present ones. The power of the coherent sum is
     the measure: over the bias it follows the envelope of the pulse, not its carrier, since a bias

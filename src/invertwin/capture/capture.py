@@ -31,7 +31,7 @@ PROFILE_DIMS = ("frame", "range")
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Radar data as labelled arrays: an `xarray.Dataset` that has been checked.
+    """Radar data as labelled arrays, in an `xarray.Dataset` that has been checked.
 
     It holds either ``beat`` (frame, tx, rx, sample), the raw samples of an FMCW radar, or
     ``range_profile`` (frame, range), analytic signals at radio frequency; beside it the radar's
@@ -60,12 +60,12 @@ class Capture:
         radar: Radar,
         times: Float64[Tensor, " frame"] | None = None,
     ) -> "Capture":
-        """Raw samples of an FMCW radar.
+        """Make a capture of the raw samples of an FMCW radar.
 
         Args:
             beat: complex (I/Q) samples of every virtual channel; dtype and bits are kept.
             radar: what measured them.
-            times: of each frame [s].
+            times: time of each frame [s].
 
         Raises:
             InputError: real samples, or a shape that the radar does not have.
@@ -93,15 +93,15 @@ class Capture:
         range_bias: float = 0.0,
         survey: Float64[Tensor, "target 3"] | None = None,
     ) -> "Capture":
-        """Range profiles of one channel.
+        """Make a capture of the range profiles of one channel.
 
         Args:
             profile: analytic signal at radio frequency: an echo from R turns by 4π f/c (r − R).
             ranges: R = L/2 of its samples, uniform, the bias already subtracted [m].
             radar: what measured them.
-            times: of each frame on the radar's clock [s].
+            times: time of each frame on the radar's clock [s].
             track: what the radar's positions were read from, at ``times + clock_offset``.
-            clock_offset: of the track's clock against the radar's [s].
+            clock_offset: how far the track's clock is ahead of the radar's [s].
             range_bias: what was subtracted from the radar's own ranges [m].
             survey: known positions of targets [m].
         """
@@ -186,19 +186,19 @@ class Capture:
 
     @property
     def track(self) -> Track | None:
-        """What the positions were read from."""
+        """The track that the positions were read from; None where it is not known."""
         if "track_time" not in self.dataset.variables:
             return None
         return Track(tensor(self.dataset, "track_time"), tensor(self.dataset, "track_position"))
 
     @property
     def clock_offset(self) -> float:
-        """Positions are those of the track at ``times`` + this [s]."""
+        """How far the track's clock is ahead of the radar's [s]."""
         return float(self.dataset.attrs.get("clock_offset", 0.0))
 
     @property
     def range_bias(self) -> float:
-        """What has been subtracted from the radar's own ranges [m]."""
+        """Range that has been subtracted from the radar's own ranges [m]."""
         return float(self.dataset.attrs.get("range_bias", 0.0))
 
     @property
@@ -218,7 +218,7 @@ class Capture:
         return self._radar
 
     def positions(self, clock_shift: Float64[Tensor, ""]) -> Float64[Tensor, "frame 3"]:
-        """Radar positions if the clock offset were larger by ``clock_shift`` [s].
+        """The radar's positions for a clock offset that is larger by ``clock_shift`` [s].
 
         Differentiable, so that a clock offset can be fitted.
 
@@ -237,7 +237,7 @@ class Capture:
         """A capture of the same data with another clock offset and range bias.
 
         Args:
-            clock_offset: of the track's clock against the radar's [s].
+            clock_offset: how far the track's clock is ahead of the radar's [s].
             range_bias: what is subtracted from the radar's own ranges [m].
 
         Raises:
@@ -305,7 +305,7 @@ def _check_sizes(variables: dict[str, xr.DataArray]) -> None:
 
 
 def _checked(dataset: xr.Dataset) -> Radar:
-    """The radar of a capture, if all is as it should be."""
+    """Check a dataset, and return its radar."""
     held = [name for name in ("beat", "range_profile") if name in dataset]
     if len(held) != 1:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Gain and phase of every channel: estimated from a reflector, saved, taken out of the data."""
+"""Calibration of the channels: estimate their gains from a reflector, save them, apply them."""
 
 import json
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import replacing
+from invertwin.scene.files import existing_file, replacing
 
 Recorded = TypeVar("Recorded", bound=Capture | ChirpCapture)
 _DEAD = 1e-3
@@ -25,7 +25,7 @@ _DEAD = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ChannelCalibration:
-    """What every virtual channel multiplies its signal by.
+    """The complex gain of every virtual channel.
 
     Attributes:
         gains: measured over ideal signal, [tx, rx]; the mean of their squares is 1 and the sum is
@@ -67,9 +67,7 @@ class ChannelCalibration:
         Raises:
             InputError: no such file, or one that holds no calibration.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise InputError(f"expected a calibration, got no file {path}; check the path")
+        path = existing_file(path, "a calibration")
         try:
             parts = torch.tensor(json.loads(path.read_text())["gains"], dtype=torch.float64)
             if parts.ndim != 3 or parts.shape[2] != 2:
@@ -118,7 +116,7 @@ class ChannelCalibration:
 def estimate_channels(
     capture: Capture, reflector: Float64[Tensor, "3"] | list[float]
 ) -> ChannelCalibration:
-    """Gains of the channels, from a reflector at a known place.
+    """Estimate the gains of the channels from a reflector at a known place.
 
     Each channel is compared with the beat signal of an ideal point there,
     ``c = Σ w_n s[n] conj(ideal[n])``, whose delays are exact to every element (so the reflector
@@ -129,7 +127,7 @@ def estimate_channels(
 
     Args:
         capture: samples with the reflector as the strongest echo at its range.
-        reflector: where it is in the world [m].
+        reflector: its position in the world [m].
 
     Raises:
         InputError: range profiles, a place that is no position or beyond the unambiguous range,

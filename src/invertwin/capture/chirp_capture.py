@@ -21,7 +21,7 @@ class ChirpCapture:
         beat: Complex samples.
         device: The radar, with one pose per frame.
         chirps: Timing of the ramps.
-        frame_period: From frame to frame [s]; None = not known.
+        frame_period: Time between the starts of two frames [s]; None = not known.
         real: Whether the samples were real: their analytic signal holds up to half the range.
         moving: Whether what it shows moves, and fades in the mean of a frame's chirps.
 
@@ -37,13 +37,8 @@ class ChirpCapture:
     moving: bool = False
 
     def __post_init__(self) -> None:
-        device = self.device
-        expected = (
-            device.frame_count,
-            self.chirps.count,
-            len(device.transmitters.positions),
-            len(device.receivers.positions),
-        )
+        frames, *elements = self.device.shape
+        expected = (frames, self.chirps.count, *elements)
         if not self.beat.is_complex() or tuple(self.beat.shape[:-1]) != expected:
             raise InputError(
                 f"expected complex beat samples of shape {expected} × samples, got "
@@ -96,8 +91,8 @@ class ChirpCapture:
         """The recording of a radar at these poses.
 
         Args:
-            positions: Of the radar in every frame [m].
-            rotations: Of the radar in every frame; None = axes of the world.
+            positions: Position of the radar in every frame [m].
+            rotations: Orientation of the radar in every frame; None = axes of the world.
 
         Raises:
             InputError: Another number of positions than of frames.

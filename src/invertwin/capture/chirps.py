@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,53 +15,55 @@ from torch import Tensor
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.errors import InputError
+from invertwin.limits import Count, Frequency, NonNegative, Positive, Several, Usual
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import checked_count, checked_number
+from invertwin.scene.checks import check_fields, check_shape, checked_number
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
+Pause = Annotated[NonNegative, Usual("seconds", 5e-6, high=1.0)]
 
 
 @dataclass(frozen=True)
 class ChirpSettings:
-    """What a board was told to send and to record: one FMCW profile, transmitters in turn (TDM).
+    """Settings of a board that sends one FMCW profile with its transmitters in turn (TDM).
 
     Attributes:
-        start_frequency: of the ramp, before the ADC starts [Hz].
-        slope: of the ramp [Hz/s].
-        sample_rate: of the ADC's output [Hz].
-        samples: per chirp and receiver.
+        start_frequency: frequency at the start of the ramp, before the ADC starts [Hz].
+        slope: how fast the frequency rises in a ramp [Hz/s].
+        sample_rate: output rate of the ADC [Hz].
+        samples: number of samples per chirp and receiver.
         transmit_order: numbers from 1 of the transmitters, in the order of sending in one loop.
         receivers: numbers from 1 of the recorded receivers, ascending.
-        loops: per frame; every transmitter sends once per loop.
-        frames: recorded; None = until it is stopped.
-        frame_period: from frame to frame [s]; None = not known.
-        idle_time: before each ramp [s].
-        adc_start_time: from the start of the ramp to the first sample [s].
-        ramp_end_time: from the start of the ramp to its end [s]; None = with the last sample.
+        loops: number of loops per frame; every transmitter sends once per loop.
+        frames: number of frames; None = the recording goes on until it is stopped.
+        frame_period: time between the starts of two frames [s]; None = not known.
+        idle_time: pause before each ramp [s].
+        adc_start_time: time from the start of the ramp to the first sample [s].
+        ramp_end_time: duration of the ramp [s]; None = it ends with the last sample.
         real: whether the ADC records real samples instead of I and Q.
         swap_iq: whether Q comes before I in the file.
-        bits: of the ADC.
-        lanes: of the LVDS link, 2 (xWR16xx, 18xx, 68xx) or 4 (xWR12xx, 14xx); None = not known.
+        bits: resolution of the ADC: 12, 14 or 16 bits.
+        lanes: lanes of the LVDS link: 4 (xWR12xx, 14xx) or 2 (later devices); None = not known.
 
     Raises:
         InputError: a value out of range, a transmitter that sends twice per loop, or a ramp that
             ends before its last sample.
     """
 
-    start_frequency: float
-    slope: float
-    sample_rate: float
-    samples: int
+    start_frequency: Frequency
+    slope: Annotated[Positive, Usual("Hz/s", 60e12, low=1.0)]
+    sample_rate: Annotated[Positive, Usual("Hz", 5e6, low=1.0)]
+    samples: Several
     transmit_order: tuple[int, ...]
     receivers: tuple[int, ...]
-    loops: int
-    frames: int | None = None
+    loops: Count
+    frames: Count | None = None
     frame_period: float | None = None
-    idle_time: float = 0.0
-    adc_start_time: float = 0.0
+    idle_time: Pause = 0.0
+    adc_start_time: Pause = 0.0
     ramp_end_time: float | None = None
     real: bool = False
     swap_iq: bool = False
@@ -68,14 +71,7 @@ class ChirpSettings:
     lanes: int | None = None
 
     def __post_init__(self) -> None:
-        for name, low in (("start_frequency", 1e6), ("slope", 1.0), ("sample_rate", 1.0)):
-            checked_number(getattr(self, name), f"{name} in SI units", low)
-        checked_count(self.samples, "samples per chirp", 2)
-        checked_count(self.loops, "loops per frame", 1)
-        if self.frames is not None:
-            checked_count(self.frames, "frames", 1)
-        for name in ("idle_time", "adc_start_time"):
-            checked_number(getattr(self, name), f"{name} [s]", 0.0, 1.0)
+        check_fields(self)
         order, receivers = tuple(self.transmit_order), tuple(self.receivers)
         object.__setattr__(self, "transmit_order", order)
         object.__setattr__(self, "receivers", receivers)
@@ -119,7 +115,7 @@ class ChirpSettings:
 
     @property
     def chirps(self) -> Chirps:
-        """When the ramps of a frame start, as range-Doppler processing asks for it.
+        """When the ramps of a frame start.
 
         For the transmitters of `ChirpData`, which are in the order of sending already.
         """
@@ -134,7 +130,7 @@ class ChirpData:
         samples: (frame, chirp, tx, rx, sample); chirps are loops, transmitters in the order of
             sending, receivers ascending. Real samples have no imaginary part. ADC counts where
             they come from a file.
-        settings: what they were recorded with; its `frames` is None or the number of frames.
+        settings: settings of the recording; their `frames` is None or the number of frames.
 
     Raises:
         InputError: another shape than the settings say, or NaN.
@@ -145,19 +141,12 @@ class ChirpData:
 
     def __post_init__(self) -> None:
         settings = self.settings
-        expected = (
-            settings.loops,
-            len(settings.transmit_order),
-            len(settings.receivers),
-            settings.samples,
-        )
-        shape = tuple(self.samples.shape)
-        if shape[1:] != expected or len(shape) != 5 or shape[0] < 1:
-            raise InputError(
-                f"expected samples (frame, chirp, tx, rx, sample) of shape (any, "
-                f"{', '.join(map(str, expected))}) as in the settings, got {shape}; "
-                "data and settings must describe the same recording"
-            )
+        elements = len(settings.transmit_order), len(settings.receivers)
+        expected = (None, settings.loops, *elements, settings.samples)
+        do = "data and settings must describe the same recording"
+        check_shape(self.samples, expected, "samples (frame, chirp, tx, rx, sample)", do)
+        if not len(self.samples):
+            raise InputError(f"expected at least one frame of samples, got none; {do}")
         if not torch.isfinite(torch.view_as_real(self.samples)).all():
             raise InputError("expected finite samples, got NaN or infinity; drop those frames")
 
@@ -167,7 +156,7 @@ class ChirpData:
         return self.samples.shape[0]
 
     def warn_if_saturated(self) -> None:
-        """Warns (`PhysicsWarning`) of samples at the ends of the ADC's range."""
+        """Warn (`PhysicsWarning`) where samples are at the ends of the ADC's range."""
         parts = torch.view_as_real(self.samples)
         top = 2 ** (self.settings.bits - 1) - 1
         count = int(((parts >= top) | (parts <= -top - 1)).any(dim=-1).sum())
@@ -202,8 +191,8 @@ class ChirpData:
         Args:
             transmitters: elements in the order of sending.
             receivers: elements in the order of `ChirpSettings.receivers`.
-            positions: of the radar in every frame [m]; None = the origin.
-            rotations: of the radar in every frame; None = axes of the world.
+            positions: position of the radar in every frame [m]; None = the origin.
+            rotations: orientation of the radar in every frame; None = axes of the world.
 
         Raises:
             InputError: another number of elements.
@@ -238,8 +227,8 @@ class ChirpData:
             transmitters: elements in the order of sending.
             receivers: elements in the order of `ChirpSettings.receivers`.
             chirps: "mean", or the number from 0 of the chirp to take.
-            positions: of the radar in every frame [m]; None = the origin.
-            rotations: of the radar in every frame; None = axes of the world.
+            positions: position of the radar in every frame [m]; None = the origin.
+            rotations: orientation of the radar in every frame; None = axes of the world.
 
         Raises:
             InputError: another number of elements, or a chirp that does not exist.
@@ -253,7 +242,7 @@ def adc_counts(
     full_scale: float,
     order: Sequence[int] | None = None,
 ) -> ChirpData:
-    """Simulated samples as the counts that an ADC would have written.
+    """Convert simulated samples to the counts that an ADC writes.
 
     Amplitudes up to ``full_scale`` fit, what is beyond is clipped (and warned of). Of complex
     samples a real ADC keeps the real part.
@@ -285,7 +274,7 @@ def adc_counts(
 
 
 def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], int]:
-    """A repeated order of transmitters as its shortest period, sent that many times more often.
+    """Write a repeated order of transmitters as its shortest period and more loops.
 
     Args:
         order: transmitters in their order of sending.
@@ -300,47 +289,44 @@ def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], in
 
 def settings_of(
     waveform: FMCW,
-    transmitters: int,
-    receivers: int,
+    transmitters: int | Sequence[int],
+    receivers: int | Sequence[int],
     *,
-    loops: int = 1,
-    frames: int | None = None,
-    frame_period: float | None = None,
-    idle_time: float = 0.0,
-    lanes: int | None = None,
     order: Sequence[int] | None = None,
+    adc_start_time: float = 0.0,
+    **others: Any,
 ) -> ChirpSettings:
-    """Settings that record this waveform with all transmitters in turn and all receivers.
+    """Make settings for a waveform, all transmitters in turn and all receivers.
 
     Args:
-        waveform: of every ramp.
-        transmitters: how many.
-        receivers: how many.
-        loops: chirps of each transmitter in a frame.
-        frames: how many, if it is known.
-        frame_period: from frame to frame [s].
-        idle_time: between ramps [s].
-        lanes: of the LVDS link.
-        order: of the transmitters, counted from 0, as in `Chirps`; None = TX1, TX2, …
+        waveform: waveform of every ramp, as it is sampled.
+        transmitters: number of transmitters, or their numbers from 1.
+        receivers: number of receivers, or their numbers from 1.
+        order: turns of the transmitters, counted from 0, as in `Chirps`; None = as they are given.
+        adc_start_time: time from the start of the ramp to the first sample [s].
+        others: further fields of `ChirpSettings`; one loop unless `loops` says otherwise.
 
     Raises:
         InputError: see `ChirpSettings`; an order of other transmitters.
     """
-    turns = range(transmitters) if order is None else _checked_order(order, transmitters)
+    senders, listeners = (
+        range(1, given + 1) if isinstance(given, int) else given
+        for given in (transmitters, receivers)
+    )
+    if order is not None:
+        senders = [senders[turn] for turn in _checked_order(order, len(senders))]
+    others.setdefault("loops", 1)
     rate = waveform.samples / waveform.duration
     nearest = round(rate)
     return ChirpSettings(
-        start_frequency=waveform.start_frequency,
+        start_frequency=waveform.start_frequency - waveform.slope * adc_start_time,
         slope=waveform.slope,
         sample_rate=float(nearest) if math.isclose(rate, nearest, rel_tol=1e-12) else rate,
         samples=waveform.samples,
-        transmit_order=tuple(1 + turn for turn in turns),
-        receivers=tuple(range(1, receivers + 1)),
-        loops=loops,
-        frames=frames,
-        frame_period=frame_period,
-        idle_time=idle_time,
-        lanes=lanes,
+        transmit_order=tuple(senders),
+        receivers=tuple(listeners),
+        adc_start_time=adc_start_time,
+        **others,
     )
 
 

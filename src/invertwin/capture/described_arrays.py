@@ -1,14 +1,13 @@
 """Samples in NumPy, HDF5 or MATLAB files, described by a small TOML file beside them."""
 
 import tomllib
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import scipy.io
+import tomli_w
 import torch
 
 from invertwin.capture.capture import Capture
@@ -17,7 +16,7 @@ from invertwin.capture.elements import elements
 from invertwin.errors import InputError
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import replacing
+from invertwin.scene.files import UNREADABLE, existing_file, replacing
 
 _KEYS = {
     "data": {"file", "variable", "dimensions", "conjugate"},
@@ -36,10 +35,6 @@ _KEYS = {
     "radar": {"board", "elevation", "azimuth", "tx_positions", "rx_positions"},
 }
 _ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")
-_UNREADABLE = (
-    *(OSError, ValueError, TypeError, EOFError),
-    *(zipfile.BadZipFile, zlib.error, scipy.io.matlab.MatReadError),
-)
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -52,7 +47,7 @@ def read(
     azimuth: int | None = None,
     arrays: tuple[AntennaArray, AntennaArray] | None = None,
 ) -> Capture:
-    """Described samples as a `Capture`, one beat signal per frame.
+    """Read described samples as a `Capture` with one beat signal per frame.
 
     The elements are those of the arguments or, without any, of the description's ``[radar]``:
     ``board``, ``elevation`` and ``azimuth`` of a preset, or ``tx_positions`` and ``rx_positions``
@@ -82,7 +77,7 @@ def described_elements(
     azimuth: int | None = None,
     arrays: tuple[AntennaArray, AntennaArray] | None = None,
 ) -> tuple[AntennaArray, AntennaArray]:
-    """TX and RX elements of described samples, see `read`.
+    """Find the TX and RX elements of described samples, see `read`.
 
     Args:
         path: file of the samples, beside its description.
@@ -108,7 +103,7 @@ def described_elements(
 
 
 def read_chirps(path: str | Path) -> ChirpData:
-    """Every chirp of described samples.
+    """Read every chirp of described samples.
 
     The description, in SI units::
 
@@ -166,7 +161,7 @@ def write_chirps(
     file: str,
     arrays: tuple[AntennaArray, AntennaArray] | None = None,
 ) -> None:
-    """Writes samples, bit for bit, and the description that `read_chirps` reads.
+    """Write samples, bit for bit, and the description that `read_chirps` reads.
 
     Args:
         path: the TOML file.
@@ -198,27 +193,17 @@ def write_chirps(
         else:
             with h5py.File(part, "w") as opened:
                 opened["adc"] = array
-    numbers = {
-        name: getattr(s, name)
-        for name in sorted(_KEYS["settings"] - {"transmit_order", "receivers"})
-        if getattr(s, name) is not None
+    named = {} if target.suffix == ".npy" else {"variable": "adc"}
+    settings = {name: getattr(s, name) for name in sorted(_KEYS["settings"])}
+    description: dict[str, Any] = {
+        "data": {"file": file, **named, "dimensions": CHIRP_DIMS},
+        "settings": {name: value for name, value in settings.items() if value is not None},
     }
-    lines = [
-        "[data]",
-        f'file = "{file}"',
-        *([] if target.suffix == ".npy" else ['variable = "adc"']),
-        f"dimensions = {list(CHIRP_DIMS)!r}",
-        "",
-        "[settings]",
-        *(f"{name} = {value!r}" for name, value in numbers.items()),
-        f"transmit_order = {list(s.transmit_order)}",
-        f"receivers = {list(s.receivers)}",
-    ]
     if arrays is not None:
         tx, rx = (array.positions.tolist() for array in arrays)
-        lines += ["", "[radar]", f"tx_positions = {tx}", f"rx_positions = {rx}"]
+        description["radar"] = {"tx_positions": tx, "rx_positions": rx}
     with replacing(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        part.write_text(tomli_w.dumps(description), encoding="utf-8")
 
 
 def _elements(positions: Any, name: str) -> AntennaArray:
@@ -227,8 +212,7 @@ def _elements(positions: Any, name: str) -> AntennaArray:
 
 
 def _description(path: Path) -> dict[str, dict[str, Any]]:
-    if not path.is_file():
-        raise InputError(f"expected a TOML description, got no file {path}; check the path")
+    existing_file(path, "a TOML description")
     try:
         description = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -252,8 +236,7 @@ def _description(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _array(path: Path, variable: str | None) -> np.ndarray:
-    if not path.is_file():
-        raise InputError(f"expected the data file {path}, got no such file; check [data] file")
+    existing_file(path, "the data file that [data] names")
     ending = path.suffix.lower()
     if ending not in _ENDINGS:
         raise InputError(
@@ -267,17 +250,16 @@ def _array(path: Path, variable: str | None) -> np.ndarray:
         raise InputError(
             f"expected a variable {variable!r} in {path.name}, got none; check its spelling"
         ) from error
-    except _UNREADABLE as error:
+    except (*UNREADABLE, scipy.io.matlab.MatReadError) as error:
         raise InputError(
             f"expected a whole {ending} file, got {path}, which cannot be read "
             f"({type(error).__name__}); it is damaged or of another kind"
         ) from error
     if array.dtype.names is not None and len(array.dtype.names) == 2:
-        # Complex numbers as MATLAB 7.3 stores them.
-        real, imaginary = (array[name] for name in array.dtype.names)
-        parts = np.stack([real, imaginary], axis=-1)
-        array = parts.astype(np.float64 if parts.dtype.itemsize > 4 else np.float32)
-        array = array.view(np.complex128 if array.itemsize == 8 else np.complex64)[..., 0]
+        # Complex numbers as MATLAB 7.3 stores them: pairs of a real and an imaginary part.
+        pairs = np.stack([array[name] for name in array.dtype.names], axis=-1)
+        wide = pairs.dtype.itemsize > 4
+        array = pairs.astype("f8" if wide else "f4").view("c16" if wide else "c8")[..., 0]
     if array.dtype.kind not in "iufc":
         raise InputError(
             f"expected numbers in {path.name}, got {array.dtype}; name the variable of the samples"
@@ -322,10 +304,8 @@ def _arranged(array: np.ndarray, order: Any, transmitters: int | None) -> np.nda
         shape = (*array.shape[:axis], transmitters, size // transmitters, *array.shape[axis + 1 :])
         array = array.reshape(shape)
         order = [*order[:axis], "tx", "rx", *order[axis + 1 :]]
+    missing = tuple(axis for axis, name in enumerate(CHIRP_DIMS) if name not in order)
     array = array.transpose([order.index(name) for name in CHIRP_DIMS if name in order])
-    for axis, name in enumerate(CHIRP_DIMS):
-        if name not in order:
-            array = np.expand_dims(array, axis)
     double = array.dtype.itemsize > (8 if array.dtype.kind == "c" else 4)
     kind = np.complex128 if double or array.dtype == np.int32 else np.complex64
-    return np.ascontiguousarray(array, dtype=kind)
+    return np.ascontiguousarray(np.expand_dims(array, missing), dtype=kind)

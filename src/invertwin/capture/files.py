@@ -6,11 +6,11 @@ import numpy as np
 import xarray as xr
 
 from invertwin.errors import InputError
-from invertwin.scene.files import replacing
+from invertwin.scene.files import existing_file, replacing
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
-    """Writes to a file beside ``path`` and renames it; complex variables as two real ones.
+    """Write a dataset, complex variables as two real ones. The file is complete or not there.
 
     Args:
         dataset: what to write.
@@ -32,8 +32,7 @@ def read_dataset(path: Path) -> xr.Dataset:
     Raises:
         InputError: no such file, or one that is damaged or no NetCDF.
     """
-    if not path.is_file():
-        raise InputError(f"expected a capture file, got no file {path}; check the path")
+    existing_file(path, "a capture file")
     try:
         # Nothing is decoded: seconds stay numbers, and every bit stays what it was.
         dataset = xr.load_dataset(path, engine="h5netcdf", decode_cf=False)

@@ -1,4 +1,4 @@
-"""A radar as labelled arrays and attributes, and back."""
+"""Convert a radar to labelled arrays and attributes, and back."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import asdict, fields
@@ -119,36 +119,35 @@ def tensor(dataset: xr.Dataset, name: str) -> Tensor:
     """A copy of a variable as a tensor.
 
     Args:
-        dataset: of a capture.
-        name: of the variable.
+        dataset: dataset of a capture.
+        name: name of the variable.
 
     Raises:
         InputError: the variable is missing.
     """
-    if name not in dataset.variables:
-        raise InputError(
-            f"expected a capture with a variable {name!r}, got none; "
-            "the file is no capture or was written by another program"
-        )
-    return torch.from_numpy(np.array(dataset[name].values))
+    return torch.from_numpy(np.array(_held(dataset.variables, name, "a variable").values))
 
 
 def attribute(attributes: Mapping[Hashable, Any], name: str) -> Any:
     """An attribute of a capture.
 
     Args:
-        attributes: of a capture.
-        name: of the attribute.
+        attributes: attributes of a capture.
+        name: name of the attribute.
 
     Raises:
         InputError: the attribute is missing.
     """
-    if name not in attributes:
+    return _held(attributes, name, "an attribute")
+
+
+def _held(entries: Mapping[Any, Any], name: str, what: str) -> Any:
+    if name not in entries:
         raise InputError(
-            f"expected a capture with an attribute {name!r}, got none; "
+            f"expected a capture with {what} {name!r}, got none; "
             "the file is no capture or was written by another program"
         )
-    return attributes[name]
+    return entries[name]
 
 
 def _named(attributes: Mapping[Hashable, Any], name: str, choices: Mapping[str, Any]) -> Any:

@@ -21,7 +21,7 @@ class RangeInterpolator:
     Args:
         profile: complex amplitude at ``ranges``.
         ranges: uniform, ascending [m].
-        center_frequency: of the radar [Hz].
+        center_frequency: centre frequency of the radar [Hz].
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Where the radar was over time, measured by a clock of its own."""
+"""Tracks: where the radar was over time, by the clock of the tracking system."""
 
 from dataclasses import dataclass
 
@@ -38,7 +38,7 @@ class Track:
             raise InputError("expected ascending track times, got others; sort the track by time")
 
     def at(self, times: Float64[Tensor, " frame"]) -> Float64[Tensor, "frame 3"]:
-        """Position at these times, linear between the samples; differentiable in the times.
+        """Interpolate positions linearly at these times; differentiable with respect to the times.
 
         Raises:
             InputError: a time before the first or after the last sample.

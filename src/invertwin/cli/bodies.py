@@ -3,16 +3,16 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from annotated_types import MinLen
 from torch import Tensor
 
 from invertwin.cli.section import Vector, about
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, Axes, Positive
+from invertwin.limits import RADIANS, Positive
 from invertwin.scene import Mesh, rotation_angle, rotation_from_vector
 from invertwin.scene.geometry import BodyTemplate, SkinnedBody, load_anny, load_smpl, person
 
@@ -47,15 +47,7 @@ def body(
     return Mesh(found.posed(turns)[0], found.faces)
 
 
-def template(table: Any) -> BodyTemplate:
-    """The template of a table with shape = "body", in its own size.
-
-    Raises:
-        InputError: A file is missing or broken, or the extra `anny` is not installed.
-    """
-    return _template(table.model, table.file, table.height, table.spacing)
-
-
+@cache
 def _template(model: str, file: Any, height: float, spacing: float) -> BodyTemplate:
     if file is not None:
         return load_smpl(file)
@@ -113,44 +105,39 @@ class SoughtBody:
         return torch.stack([rotation_from_vector(turn) for turn in chosen])
 
 
-class Bodies(dict[str, SoughtBody]):
-    """The bodies whose joints are sought, by object."""
-
-
-def joints(
-    object: str,
-    joints: Annotated[Mapping[str, Axes], MinLen(1)],
-    mesh: Mesh,
-    bodies: Bodies,
-) -> SkinnedBody:
-    """Joint angles of an object with shape = "body", from those it has.
+def sought_body(name: str, table: Any, joints: Mapping[str, str]) -> SoughtBody:
+    """The body of an object whose joints are sought.
 
     Args:
-        joints: by name: the components of the rotation vector that are sought, such as ["y"].
-    """
-    return bodies[object].module(object, mesh)
-
-
-def sought_bodies(run: Any) -> Bodies:
-    """The bodies of the `[[parameters]]` tables with kind = "body", by object.
+        name: Of the object.
+        table: Of the scene.
+        joints: By name, the components of the rotation vector that are sought.
 
     Raises:
         InputError: The object is no body, or has no such joint.
     """
-    found = Bodies()
+    if getattr(table, "shape", None) != "body":
+        raise InputError(
+            f'expected an object with shape = "body", got {name}; give it this shape, or use '
+            'kind = "pose"'
+        )
+    found = _template(table.model, table.file, table.height, table.spacing).scaled(table.scale)
+    for joint in joints:
+        found.joint(joint)
+    return SoughtBody(found, joints)
+
+
+def sought_bodies(run: Any) -> dict[str, SoughtBody]:
+    """The bodies of the `[[parameters]]` tables with kind = "body", by object.
+
+    Raises:
+        InputError: As above.
+    """
+    found = {}
     for i, parameter in enumerate(run.parameters):
-        if parameter.kind != "body":
-            continue
-        table = run.scene.get(parameter.object)
-        with about(f"parameters[{i}]"):
-            if getattr(table, "shape", None) != "body":
-                raise InputError(
-                    f'expected an object with shape = "body", got {parameter.object}; '
-                    'give it this shape, or use kind = "pose"'
-                )
-            scaled = template(table).scaled(table.scale)
-            for name in parameter.joints:
-                scaled.joint(name)
-        axes = {name: "".join(axes) for name, axes in parameter.joints.items()}
-        found[parameter.object] = SoughtBody(scaled, axes)
+        if parameter.kind == "body":
+            name = parameter.object
+            axes = {joint: "".join(axes) for joint, axes in parameter.joints.items()}
+            with about(f"parameters[{i}]"):
+                found[name] = sought_body(name, run.scene.get(name), axes)
     return found

@@ -10,15 +10,17 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.channel import Grid
-from invertwin.cli.bodies import Bodies, SoughtBody
+from invertwin.cli.bodies import SoughtBody
 from invertwin.cli.fit_tables import surrogate as surrogate
+from invertwin.cli.registry import Table
 from invertwin.cli.run_file import about as about
-from invertwin.cli.run_file import unknown_object
+from invertwin.cli.run_file import need, unknown_object
 from invertwin.cli.schema import RunFile, SceneFile, Starts
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
 from invertwin.cli.shape_tables import ObjectTable, Placement, given_for, joined
 from invertwin.errors import InputError
+from invertwin.inversion.tangents import Change, changes_of
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Mesh, Object, Scene, rigid, rotation_angle, rotation_from_vector
 from invertwin.scene.files import CONCRETE, load_scene_xml
@@ -109,14 +111,14 @@ class Start:
 
 
 def builders(
-    tables: Sequence[Any], start: Start, objects: Mapping[str, ObjectTable] | None = None
+    tables: Sequence[Any], objects: Mapping[str, ObjectTable] | None = None
 ) -> dict[str, Callable[[Scene], nn.Module]]:
     """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order.
 
-    Learned shapes start from the coordinates of their `[scene.<name>]` tables, the objects.
+    Bodies and learned shapes are those of their `[scene.<name>]` tables, the objects.
     """
     return {
-        name: partial(_module, table, f"parameters[{i}]", start, objects or {})
+        name: partial(_module, table, f"parameters[{i}]", objects or {})
         for i, (name, table) in enumerate(named(tables).items())
     }
 
@@ -132,7 +134,6 @@ def named(tables: Sequence[Any]) -> dict[str, Any]:
 def parameters(
     tables: Sequence[Any],
     scene: Scene,
-    bodies: Mapping[str, SoughtBody] | None = None,
     objects: Mapping[str, ObjectTable] | None = None,
 ) -> list[nn.Module]:
     """The modules of the `[[parameters]]` tables; each starts as the object is, or as it says.
@@ -141,17 +142,29 @@ def parameters(
         InputError: A material value that the object's material does not have, or that starts at
             the end of its range; a box that does not hold the object.
     """
-    makers = builders(tables, Start(scene, bodies or {}), objects)
-    return [make(scene) for make in makers.values()]
+    return [make(scene) for make in builders(tables, objects).values()]
 
 
-def _module(
-    table: Any, path: str, start: Start, objects: Mapping[str, ObjectTable], scene: Scene
-) -> nn.Module:
+def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, Change]]:
+    """The module that a gradient check moves, and how its values change with θ.
+
+    Args:
+        run: With a `[gradcheck]` table.
+        scene: At θ = 0.
+    """
+    table = need(run, "gradcheck", "a gradient check")
+    module = _module(table.parameter, "gradcheck.parameter", run.scene, scene)
+    changes = {n: c.build() if isinstance(c, Table) else c for n, c in table.tangent.items()}
+    with about("gradcheck.tangent"):
+        changes_of(module, changes)
+    return module, changes
+
+
+def _module(table: Any, path: str, objects: Mapping[str, ObjectTable], scene: Scene) -> nn.Module:
     name = getattr(table, "object", None)
     given: dict[type, object] = {Scene: scene}
     if name is not None:
-        given = given_for(name, scene, Bodies(start.bodies), objects)
+        given = given_for(name, scene, objects)
     with about(path):
         return table.build(given)
 

@@ -45,29 +45,17 @@ def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
                 f"chirps.interval: expected at least the ramp's {ramp:g} s, got "
                 f"{run.chirps.interval:g}; idle time comes on top"
             )
+    board = None if run.radar is None else run.radar.board
     with about("raw"):
-        found = settings_of(
+        return settings_of(
             radar.waveform,
-            len(radar.transmitters.positions),
-            len(radar.receivers.positions),
+            (board and board.transmitters) or len(radar.transmitters.positions),
+            (board and board.receivers) or len(radar.receivers.positions),
             loops=1 if run.chirps is None else run.chirps.count,
             frames=radar.frame_count,
-            frame_period=raw.frame_period,
             # To the nanosecond, as settings files have it.
             idle_time=round(max(idle, 0.0), 9),
-            lanes=raw.lanes,
-        )
-        board = None if run.radar is None else run.radar.board
-        if board is not None and board.transmitters is not None:
-            found = replace(found, transmit_order=tuple(board.transmitters))
-        if board is not None and board.receivers is not None:
-            found = replace(found, receivers=tuple(board.receivers))
-        return replace(
-            found,
-            start_frequency=found.start_frequency - found.slope * raw.adc_start_time,
-            adc_start_time=raw.adc_start_time,
-            real=raw.real,
-            bits=raw.bits,
+            **raw.model_dump(exclude={"full_scale"}),
         )
 
 

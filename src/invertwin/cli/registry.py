@@ -40,7 +40,6 @@ BUILT_IN = (
     "invertwin.cli.sensors",
     "invertwin.cli.materials",
     "invertwin.cli.shape_tables",
-    "invertwin.cli.gradients",
     "invertwin.cli.recordings",
     "invertwin.cli.fit_tables",
 )
@@ -61,6 +60,7 @@ class Table(Section):
     """A table that a constructor of the library makes something of."""
 
     made_by: ClassVar[Callable[..., Any]]
+    optional: ClassVar[tuple[str, ...]] = ()  # arguments that other keys may stand in for
     made_from: ClassVar[Mapping[str, tuple[str | None, Any]]] = {}  # name → key, annotation
 
     def build(self, given: Mapping[type, object] | None = None, /, **more: Any) -> Any:
@@ -221,7 +221,7 @@ class Registry:
 
         Args:
             group: Such as "material", "shape", "waveform", "pattern", "array", "board", "track",
-                "data", "parameter", "theta", "loss", "optimizer" or "model".
+                "data", "parameter", "loss", "optimizer" or "model".
             kind: Its name in run files.
             make: Its class or function, or "module:name" of it, which is imported when needed.
             without: Arguments that are no keys.
@@ -308,7 +308,8 @@ class Registry:
             place = f"{name}_deg" if _is_angle(hint) else name
             arguments[name] = (place, hint)
             if place not in base.model_fields and place not in made:
-                made[place] = self._field(hint, name, parameter.default, documents.get(name, ""))
+                default = None if name in base.optional else parameter.default
+                made[place] = self._field(hint, name, default, documents.get(name, ""))
         checked = is_dataclass(make) if checked is None else checked
         if checked and not self.forms.keys() & {m for h in hints.values() for m in _members(h)}:
             base = _joined(_Checked, base)

@@ -1,6 +1,5 @@
 """`invertwin gradcheck`: the derivative of a map against central differences, scene by scene."""
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -13,13 +12,14 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.gradients import theta_of
 from invertwin.cli.report import Picture, Table, finish, texts
-from invertwin.cli.run_file import about, about_file, need
+from invertwin.cli.run_file import about_file, need
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import RunFile
+from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Check, GradientReport, gradcheck
+from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
+from invertwin.inversion.lines import line_of
 from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
@@ -28,6 +28,18 @@ _COLUMNS = (
     *("scene", "L1 full", "L1 interior", "L1 no interior edges", "ratio", "L2 full"),
     *("correlation", "noise", "steps differ", "order", "pairs"),
 )
+_KEPT = (
+    *("full", "interior", "no_interior_edges"),
+    *("difference_noise", "step_agreement", "pairs"),
+)
+# Units of a derivative with respect to θ, by the value that θ changes; angles are told apart.
+_UNITS = {
+    **dict.fromkeys(("translation", "offsets", "value"), "1/m"),
+    "log_scale": "per relative size",
+    "log_density": "per relative density",
+}
+# Kinds whose objects keep their triangles.
+_MOVES = ("translation", "pose", "scale", "material", "radar_pose")
 
 
 @dataclass(frozen=True)
@@ -38,10 +50,16 @@ class Checked:
     scene: Scene  # at θ = 0, as the radar
     radar: Radar
     grid: Grid
-    direction: Callable[[Scene, Radar, Tensor], tuple[Scene, Radar]]  # of θ
     step: float  # ε of the differences
     report: GradientReport
     say: Callable[[str], None]  # takes a line of progress
+
+    def direction(self, scene: Scene, radar: Radar, theta: Tensor) -> tuple[Scene, Radar]:
+        """Scene and radar, moved by θ."""
+        module, tangent = build.tangent(self.run, scene)
+        if need(self.run, "gradcheck", "gradcheck").of == "sensor":
+            return scene, line_of(module, tangent, radar).at(theta)
+        return line_of(module, tangent, scene).at(theta), radar
 
 
 @runtime_checkable
@@ -79,9 +97,9 @@ def run_gradcheck(
     """
     begin = time.perf_counter()
     scenes: dict[str, Any] = {}
-    parts: list[Table | Picture] = []
-    studies: list[Table] = []
     compared: dict[str, Any] = {}
+    studies: list[Table] = []
+    pictures: list[Picture] = []
     for name, run in runs.items():
         part = f"{PARTS}/{name}.json"
         found = folder.read_json(part)
@@ -90,12 +108,13 @@ def run_gradcheck(
                 found = _check(name, run, folder, lambda line, name=name: say(f"{name}: {line}"))
             folder.write_json(part, found)
         scenes[name] = found
-        parts.append(_picture(folder, f"{name}_scene", run.title or name))
-        parts.append(_picture(folder, name, name, _note(run, found)))
+        shown = {f"{name}_scene": (run.title or name, ""), name: (name, _note(run, found))}
         for key, study in _studies(run).items():
             compared[key] = found[key]
             studies.append(study.table(name, found[key]))
-            parts.append(_picture(folder, f"{name}_{key}", studies[-1].title, study.picture_note))
+            shown[f"{name}_{key}"] = studies[-1].title, study.picture_note
+        for file, (title, note) in shown.items():
+            pictures.append(Picture(title, (folder.path / f"{file}.png").read_bytes(), note))
     metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
         metrics |= compared
@@ -103,15 +122,10 @@ def run_gradcheck(
     legend = texts("notes")["gradcheck"]
     table = Table("Agreement with central differences", _COLUMNS, rows, legend)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
-    parts = [table, *studies, *parts]
+    parts = [table, *studies, *pictures]
     found = finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
     folder.remove([f"{PARTS}/{name}.json" for name in runs])
     return found
-
-
-def _picture(folder: RunFolder, name: str, title: str, note: str = "") -> Picture:
-    """A picture that is in the folder, perhaps from before an interruption."""
-    return Picture(title, (folder.path / f"{name}.png").read_bytes(), note)
 
 
 def _check(
@@ -119,7 +133,6 @@ def _check(
 ) -> dict[str, Any]:
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
-    table = settings.parameter
     if run.surrogate.exact:
         raise InputError(
             "surrogate.exact: expected a smooth map to differentiate, got exact signals; remove "
@@ -128,55 +141,34 @@ def _check(
     scene = build.scene(run)
     radar = build.radar(need(run, "radar", "gradcheck"))
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
-    with about("gradcheck.parameter"):
-        theta = theta_of(table, run, scene)
-    for key in _studies(run) if theta.shape else ():
+    module, tangent = build.tangent(run, scene)
+    for key in _studies(run) if settings.parameter.kind not in _MOVES else ():
         raise InputError(
             f"{key}: expected a parameter that moves something, got one of a shape; remove it"
         )
-    sampling = Sampling(
-        depth=settings.depth,
-        samples=settings.samples,
-        boundary_samples=settings.boundary_samples,
-    )
-    check = Check(
-        repeats=settings.repeats,
-        step=math.radians(settings.step_deg) if settings.step_deg else settings.step or 0.0,
-        difference_samples=settings.difference_samples,
-        noise=settings.noise,
-        max_pairs=settings.max_pairs,
-        scheme=settings.sampling,
-    )
+    drawn = {key: getattr(settings, key) for key in ("depth", "samples", "boundary_samples")}
+    check = settings.build()
     report = gradcheck(
-        SurrogateMap(grid, build.surrogate(run.surrogate), sampling),
-        theta.module,
-        theta.tangent,
+        SurrogateMap(grid, build.surrogate(run.surrogate), Sampling(**drawn)),
+        module,
+        tangent,
         scene=scene,
         sensor=radar,
-        of="sensor" if theta.of_radar else "scene",
+        of=settings.of,
         check=check,
         seed=run.seed,
         progress=say,
     )
-    outer = report.no_interior_edges
-    folder.write_figure(f"{name}.png", _maps(report, grid, theta.unit))
-    moved = [table.object] if hasattr(table, "object") else []
-    folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=moved))
-    others = {}
-    checked = Checked(run, scene, radar, grid, theta.direction(), check.step, report, say)
+    folder.write_figure(f"{name}.png", _maps(report, grid, settings))
+    moved = filter(None, [getattr(settings.parameter, "object", None)])
+    folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=[*moved]))
+    kept = {key: value for key in _KEPT if (value := getattr(report, key)) is not None}
+    found = {k: asdict(v) if isinstance(v, Agreement) else v for k, v in kept.items()}
+    checked = Checked(run, scene, radar, grid, check.step, report, say)
     for key, study in _studies(run).items():
-        others[key], figure = study.compare(checked)
+        found[key], figure = study.compare(checked)
         folder.write_figure(f"{name}_{key}.png", figure)
-    return {
-        "full": asdict(report.full),
-        "interior": asdict(report.interior),
-        **({} if outer is None else {"no_interior_edges": asdict(outer)}),
-        "difference_noise": report.difference_noise,
-        "step_agreement": report.step_agreement,
-        "pairs": report.pairs,
-        "seconds": time.perf_counter() - begin,
-        **others,
-    }
+    return found | {"seconds": time.perf_counter() - begin}
 
 
 def _studies(run: RunFile) -> dict[str, GradcheckStudy]:
@@ -185,36 +177,30 @@ def _studies(run: RunFile) -> dict[str, GradcheckStudy]:
     return {key: value for key, value in values.items() if isinstance(value, GradcheckStudy)}
 
 
-def _maps(report: GradientReport, grid: Grid, unit: str) -> Figure:
+def _maps(report: GradientReport, grid: Grid, settings: Gradcheck) -> Figure:
     maps = {
         "differences": report.difference,
         "full": report.gradient,
         "interior only": report.interior_gradient,
     }
     error = {"full − differences, own scale": report.gradient - report.difference}
+    name = next(iter(settings.tangent))
+    unit = "1/rad" if settings.turns else _UNITS.get(name, f"per unit of {name}")
     label = f"∂ power (received/sent) [{unit}]"
     return plotting.gradient(maps, grid, label=label, own_scale=error)
 
 
 def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
-    full, interior = found["full"], found["interior"]
-    return [
-        name,
-        full["relative_l1"],
-        interior["relative_l1"],
-        found.get("no_interior_edges", {}).get("relative_l1"),
-        interior["relative_l1"] / full["relative_l1"] if full["relative_l1"] else None,
-        full["relative_l2"],
-        full["correlation"],
-        found["difference_noise"],
-        found["step_agreement"],
-        full["order"],
-        found["pairs"],
-    ]
+    full, interior = found["full"], found["interior"]["relative_l1"]
+    outer = found.get("no_interior_edges", {}).get("relative_l1")
+    ratio = interior / full["relative_l1"] if full["relative_l1"] else None
+    errors = [full["relative_l1"], interior, outer, ratio, full["relative_l2"]]
+    differences = [found["difference_noise"], found["step_agreement"], full["order"]]
+    return [name, *errors, full["correlation"], *differences, found["pairs"]]
 
 
 def _note(run: RunFile, found: Mapping[str, Any]) -> str:
-    parameter = need(run, "gradcheck", "gradcheck").parameter
-    what = f"{parameter.kind} of {getattr(parameter, 'object', 'the radar')}"
-    what = f"{getattr(parameter, 'joint', '')} {what}".strip()
-    return f"Derivative with respect to the {what}; {found['seconds']:.0f} s. {run.note}"
+    settings = need(run, "gradcheck", "gradcheck")
+    names = ", ".join(name.replace("_", " ") for name in settings.tangent)
+    of = getattr(settings.parameter, "object", "the radar")
+    return f"Derivative with respect to the {names} of {of}; {found['seconds']:.0f} s. {run.note}"

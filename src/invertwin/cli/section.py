@@ -67,7 +67,7 @@ def about(path: str) -> Iterator[None]:
     except KeyInputError as error:
         raise KeyInputError(f"{path}.{error.path}", error.text) from None
     except InputError as error:
-        raise KeyInputError(path, str(error)) from None
+        raise KeyInputError(f"{path}.{error.at}" if error.at else path, str(error)) from None
 
 
 def key(description: str, default: Any = ..., **limits: Any) -> Any:

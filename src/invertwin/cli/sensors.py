@@ -19,14 +19,7 @@ from invertwin.radar import boards, tracks
 from invertwin.radar.impairments import Impairments
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
-from invertwin.radar.waveform import (
-    FMCW,
-    OFDM,
-    Impulse,
-    SampledWaveform,
-    SteppedFrequency,
-    Waveform,
-)
+from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
 from invertwin.scene import (
     AntennaArray,
     Cosine,
@@ -211,20 +204,14 @@ def grid(table: Any, radar: Radar) -> Grid:
         InputError: Limits that the radar refuses or does not reach, or a map of a size that only
             a wrong unit explains.
     """
-    wave = radar.waveform
-    if isinstance(wave, SampledWaveform) and table.range_max > wave.max_range:
-        raise InputError(
-            f"grid.range_max: expected at most the waveform's unambiguous range, "
-            f"{wave.max_range:.4g} m, got {table.range_max:g}; give metres, or more samples"
-        )
     with about("grid"):
         found = table.build(self=radar)
-    bins = math.prod(found.shape) * radar.frame_count
-    if bins > _MOST_BINS:
-        raise InputError(
-            f"grid: expected a map of at most {_MOST_BINS:g} bins over all frames, got {bins:.3g}; "
-            "give limits in metres and direction cosines, or less oversampling"
-        )
+        bins = math.prod(found.shape) * radar.frame_count
+        if bins > _MOST_BINS:
+            raise InputError(
+                f"expected a map of at most {_MOST_BINS:g} bins over all frames, got {bins:.3g}; "
+                "give limits in metres and direction cosines, or less oversampling"
+            )
     return found
 
 

@@ -8,30 +8,31 @@ import torch
 from annotated_types import MinLen
 from torch import Tensor, nn
 
-from invertwin.cli.bodies import Bodies, body, joints
-from invertwin.cli.materials import sought_values
+from invertwin.cli.bodies import body, sought_body
 from invertwin.cli.registry import Group, OneOf, Registry, Table
 from invertwin.cli.section import Counts, InputPath, Vector, about, key
 from invertwin.errors import InputError
 from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
 from invertwin.inversion.remeshing import remeshed, signed_distance
-from invertwin.limits import Count, NonNegative, Positive
+from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.radar.parameters import RadarPose
 from invertwin.scene import Mesh, Object, Scene, rigid, rotation_from_vector, shapes
 from invertwin.scene.files import load_mesh
 from invertwin.scene.geometry import (
     DensityGrid,
     DistanceGrid,
+    Lattice,
     LatticeDeformation,
     LinearShape,
     NeuralDistance,
     PriorShape,
+    SkinnedBody,
     SmoothVertices,
     load_prior,
     load_vehicle_space,
 )
-from invertwin.scene.parameters import Pose, Scale, Translation, Vertices
+from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
 
 
 class Placement(Table):
@@ -102,7 +103,7 @@ def register(registry: Registry) -> None:
     registry.groups["shape"] = Group(tag="shape", base=Placement)
     registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
     registry.groups["parameter"] = Group(base=ParameterTable)
-    registry.given |= {Scene, Mesh, Object, ObjectTable, Bodies}
+    registry.given |= {Scene, Mesh, Object, ObjectTable}
     for name in ("plate", "box", "sphere", "dihedral", "trihedral", "text"):
         registry.add("shape", name, getattr(shapes, name))
     registry.add("shape", "vehicle", vehicle)
@@ -122,7 +123,7 @@ def register(registry: Registry) -> None:
         ("prior", prior, ()),
         ("shape_space", shape_space, ()),
         ("body", joints, ()),
-        ("material", sought_values, ()),
+        ("material", MaterialValues.of, ()),
         ("radar_pose", RadarPose, ("translation", "rotation")),
         ("mover", Mover, ()),
     ):
@@ -206,14 +207,30 @@ def distance_grid(
     return DistanceGrid.sampled(object, low, high, counts, distance, smooth)
 
 
-def density(object: str, low: Vector, high: Vector, counts: Counts, item: Object) -> DensityGrid:
-    """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else faint and
-    even. Rates of about 0.1 suit it; measures and pictures show the surface of its usual level.
+def density(
+    object: str,
+    low: Vector,
+    high: Vector,
+    counts: Counts,
+    item: Object,
+    extinction: Positive | None = None,
+) -> DensityGrid:
+    """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else as
+    `extinction` says. Rates of about 0.1 suit it; measures and pictures show the surface of its
+    usual level.
+
+    Args:
+        extinction: 1/m, of a cloud that fills the object's mesh; without it the whole box is faint.
     """
     if item.cloud is not None:
         cloud = item.cloud
         return DensityGrid(object, cloud.low, cloud.high, cloud.density.detach())
-    return DensityGrid.even(object, low, high, counts)
+    if extinction is None:
+        return DensityGrid.even(object, low, high, counts)
+    lattice = Lattice.between(low, high, counts)
+    inside = -signed_distance(item.mesh, lattice.nodes.reshape(-1, 3)) / lattice.spacing.mean()
+    filled = extinction * torch.sigmoid(4 * inside).reshape(lattice.counts)
+    return DensityGrid(object, low, high, filled)
 
 
 def shape_space(
@@ -269,6 +286,20 @@ def prior(
     return PriorShape(object, load_prior(file), known.latent if same else None, counts)
 
 
+def joints(
+    object: str,
+    joints: Annotated[Mapping[str, Axes], MinLen(1)],
+    mesh: Mesh,
+    table: ObjectTable | None = None,
+) -> SkinnedBody:
+    """Joint angles of an object with shape = "body", from those it has.
+
+    Args:
+        joints: by name: the components of the rotation vector that are sought, such as ["y"].
+    """
+    return sought_body(object, table, joints).module(object, mesh)
+
+
 def _shape(table: Any) -> str | None:
     return getattr(table, "shape", None)
 
@@ -282,10 +313,8 @@ def shape_terms(table: Any, module: nn.Module, scene: Scene) -> list[Regularizer
     return []
 
 
-def given_for(
-    name: str, scene: Scene, bodies: Bodies, objects: Mapping[str, Any]
-) -> dict[type, object]:
+def given_for(name: str, scene: Scene, objects: Mapping[str, Any]) -> dict[type, object]:
     """What a module of an object may ask for beside its keys, where a fit starts."""
     item, table = scene[name], objects.get(name)
-    found: dict[type, object] = {Scene: scene, Object: item, Mesh: item.mesh, Bodies: bodies}
+    found: dict[type, object] = {Scene: scene, Object: item, Mesh: item.mesh}
     return found if table is None else {**found, ObjectTable: table}

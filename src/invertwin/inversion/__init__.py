@@ -8,6 +8,8 @@ from invertwin.inversion.fit import Fit as Fit
 from invertwin.inversion.gradcheck import Agreement as Agreement
 from invertwin.inversion.gradcheck import Check as Check
 from invertwin.inversion.gradcheck import GradientReport as GradientReport
+from invertwin.inversion.lines import line_of as line_of
+from invertwin.inversion.lines import losses_along as losses_along
 from invertwin.inversion.loss import CorrelationLoss as CorrelationLoss
 from invertwin.inversion.loss import SpectrumLoss as SpectrumLoss
 from invertwin.inversion.metrics import ShapeMetrics as ShapeMetrics
@@ -31,3 +33,4 @@ from invertwin.inversion.remeshing import remeshed as remeshed
 from invertwin.inversion.remeshing import signed_distance as signed_distance
 from invertwin.inversion.schedule import Schedule as Schedule
 from invertwin.inversion.schedule import Stage as Stage
+from invertwin.inversion.tangents import Bump as Bump

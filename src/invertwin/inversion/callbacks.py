@@ -1,4 +1,4 @@
-"""What may watch a fit: a display, numbers about a known truth, a checkpoint."""
+"""Callbacks of a fit: progress reports, metrics of a known truth, checkpoints."""
 
 import os
 from collections.abc import Callable
@@ -62,7 +62,7 @@ class Checkpoint(Callback):
     datum is refused, and a loss function of one's own is recognised in a new process.
 
     Attributes:
-        file: Where.
+        file: The checkpoint file.
         every: Steps from one file to the next.
         resume: Go on from the file if it is there.
     """

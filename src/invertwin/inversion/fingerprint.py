@@ -1,4 +1,4 @@
-"""What a fit is, as a short fingerprint: equal in every process, different for every change."""
+"""Fingerprints of fits: equal in every process, different after every change."""
 
 import hashlib
 import inspect

@@ -1,4 +1,4 @@
-"""Gauss–Newton for few parameters: one derivative of the map in forward mode for each."""
+"""Gauss–Newton for few parameters, each with a forward-mode derivative of the map."""
 
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -92,7 +92,7 @@ class GaussNewton:
         self._age = 0  # steps that H has served
 
     def step(self, maps: Callable[[], Maps], penalty: Callable[[], Tensor] | None = None) -> float:
-        """One step, and the loss before it.
+        """Do one step, and return the loss before it.
 
         Args:
             maps: gives the predicted and the observed map of every observation under the present
@@ -240,7 +240,7 @@ def _value(
 
 
 def without_effect(module: nn.Module, name: str) -> InputError:
-    """What is wrong with a parameter that the loss does not depend on."""
+    """Make the error for a parameter that the loss does not depend on."""
     return InputError(
         f"expected parameters that change the map, got {name} of {type(module).__name__}, which "
         "has no gradient; probably a later module overwrites this mesh: give one shape of each "

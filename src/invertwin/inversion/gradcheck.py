@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.inversion.lines import line_of
+from invertwin.inversion.tangents import Change
+from invertwin.limits import Count, NonNegative, Positive
 from invertwin.models import ForwardModel
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derived_seed
@@ -27,16 +29,16 @@ class Check:
         repeats: Derivatives averaged, with different seeds.
         step: ε of the differences; ε/2 is evaluated too, and 4ε and 8ε for the order.
         difference_samples: Samples of one end of a pair.
-        noise: Pairs are added until the relative standard error (L1) is below this.
+        noise: ‖standard error‖₁/‖g_FD‖₁ below which no more pairs are added.
         max_pairs: Most pairs; the report says what was reached.
         scheme: How the differences sample surfaces: "rays" from the antenna, or by "area".
     """
 
-    repeats: int = 4
-    step: float = 4e-3
-    difference_samples: int = 8_000_000
-    noise: float = 0.007
-    max_pairs: int = 64
+    repeats: Count = 4
+    step: Positive = 4e-3
+    difference_samples: Count = 8_000_000
+    noise: NonNegative = 0.007
+    max_pairs: Count = 64
     scheme: Literal["rays", "area"] = "rays"
 
 
@@ -88,7 +90,7 @@ class GradientReport:
 def gradcheck(
     model: ForwardModel,
     module: nn.Module,
-    tangent: Mapping[str, Tensor] | Tensor,
+    tangent: Mapping[str, Change] | Tensor,
     *,
     scene: Scene,
     sensor: Any,
@@ -107,7 +109,8 @@ def gradcheck(
     Args:
         model: What predicts the map; its ``sampling`` is that of one derivative.
         module: A module that could be fitted; θ = 0 is the module as it is.
-        tangent: Changes of its parameters by name, or of its only parameter.
+        tangent: Changes of its values by name, such as ``{"rotation": [0, 1, 0]}``, or of its only
+            parameter; see ``invertwin.inversion.tangents.changes_of``.
         scene: What the module is applied to, or sees.
         sensor: What sees the scene.
         of: Whether the module maps the scene or the sensor.

@@ -1,7 +1,7 @@
-"""Where a fit may start: pose, size and density from what conventional processing sees.
+"""First guesses of pose, size and density by conventional processing.
 
-Detected points or backprojected echoes say where something is, a rectangle in the ground plane how
-it stands; the refinement does the rest. Nothing here is differentiable.
+Detected points or backprojected echoes tell where an object is. A rectangle in the ground plane
+tells how it stands. The fit does the rest. Nothing here is differentiable.
 """
 
 import math
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float64
+from scipy.ndimage import map_coordinates
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -67,7 +68,7 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class Rectangle:
-    """What stands on the ground, from above.
+    """An object on the ground, seen from above.
 
     Attributes:
         center: middle of the points' extents [m], world.
@@ -89,7 +90,7 @@ def detected_points(
     *,
     false_alarm: float = 1e-6,
 ) -> Float64[Tensor, "point 3"]:
-    """Where ordered-statistics CFAR and its local maxima see echoes within a box of the world.
+    """Find echoes within a box of the world by ordered-statistics CFAR and its local maxima.
 
     Along an axis that the grid does not resolve, points lie in the radar's middle plane.
 
@@ -123,7 +124,7 @@ def detected_points(
 def echo_image(
     capture: Capture, grid: Grid, points: Float64[Tensor, "*point 3"]
 ) -> Float64[Tensor, "*point"]:
-    """Backprojected power at points of the world, spreading undone.
+    """Backproject power to points of the world, with the spreading loss removed.
 
     The mean over frames of the maps at the point's range and direction, times the fourth power of
     its distance; where no direction is resolved, the coherent sum over the frames
@@ -132,7 +133,7 @@ def echo_image(
     Args:
         capture: the data.
         grid: bins of its maps.
-        points: in the world [m].
+        points: positions in the world [m].
     """
     flat = points.reshape(-1, 3)
     if grid.u_count == grid.v_count == 1:
@@ -153,14 +154,14 @@ def image_points(
     step: float,
     share: float = 0.3,
 ) -> Float64[Tensor, "point 3"]:
-    """The nodes of a backprojected image that are nearly as bright as its strongest one.
+    """Find the nodes of a backprojected image that are nearly as bright as its strongest one.
 
     Args:
         capture: the data.
         grid: bins of its maps.
         low: corner of the image in the world [m].
         high: the opposite corner [m].
-        step: of the image [m], about.
+        step: distance of neighbouring nodes, about [m].
         share: least brightness of a node, relative to the strongest.
 
     Raises:
@@ -180,7 +181,7 @@ def image_points(
 
 
 def largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Tensor, "part 3"]:
-    """The largest set of points that are linked by steps of at most a gap [m].
+    """Find the largest set of points that are linked by steps of at most a gap [m].
 
     Args:
         points: [m].
@@ -200,7 +201,7 @@ def fit_rectangle(
     ground: Ground | None = None,
     resolution: float = 0.1,
 ) -> Rectangle:
-    """The rectangle in the ground plane whose near sides the points lie on: an L shape.
+    """Fit a rectangle in the ground plane to points on its near sides, an L shape.
 
     Every yaw of a quarter turn is tried; the best one has most points close to the two sides
     that face the radar, Σ 1/max(distance, resolution).
@@ -211,7 +212,7 @@ def fit_rectangle(
     the points, since radar detections scatter.
 
     Args:
-        points: in the world [m].
+        points: positions in the world [m].
         radar: its positions tell which sides are near.
         ground: the plane.
         resolution: distance below which points are on a side [m].
@@ -243,7 +244,7 @@ def fit_rectangle(
 def principal_rectangle(
     points: Float64[Tensor, "point 3"], *, ground: Ground | None = None
 ) -> Rectangle:
-    """The rectangle along the points' principal axes in the ground plane.
+    """Fit a rectangle along the points' principal axes in the ground plane.
 
     Args:
         points: [m].
@@ -260,14 +261,14 @@ def principal_rectangle(
 
 
 def guess_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
-    """The median of points along each axis [m]: the middle of what is seen of an object."""
+    """Guess a position [m]: the median of the points along each axis."""
     return points.median(0).values
 
 
 def guess_poses(
     item: Object, found: Rectangle, radar: Radar, *, ground: Ground | None = None
 ) -> list[Float64[Tensor, "4 4"]]:
-    """The four poses in which an object of known size stands in a rectangle.
+    """List the four poses in which an object of known size stands in a rectangle.
 
     Its upright attitude and its height are kept. Each side that faces the radar is put where the
     rectangle has it, so that the hidden part of the object lies behind; along an axis on which
@@ -314,19 +315,19 @@ def best_pose(
     samples: int = 100_000,
     seed: int = 0,
 ) -> tuple[Scene, list[float]]:
-    """The scene in the pose whose simulated map is nearest to the data, and all losses.
+    """Choose the pose whose simulated map is nearest to the data; also return all losses.
 
     Args:
         scene: with the object anywhere.
         name: the object.
-        poses: to choose from.
-        radar: of the capture.
+        poses: the poses to choose from.
+        radar: radar of the capture.
         capture: the data.
         grid: bins that are compared.
         loss: (simulated, measured) → a number.
         surrogate: kernels; extra widths make the choice robust.
-        samples: of one simulation.
-        seed: of the samples.
+        samples: number of rays of one simulation.
+        seed: seed of the samples.
 
     Raises:
         InputError: no poses.
@@ -351,7 +352,7 @@ def best_pose(
 
 
 def guess_scale(item: Object, found: Rectangle, *, ground: Ground | None = None) -> float:
-    """Length of a rectangle over that of an object, both along their longer side.
+    """Guess a scale: the longer side of a rectangle over that of an object.
 
     The longer side is the one that is seen from most places; the other often hides its far end.
 
@@ -377,13 +378,13 @@ def guess_density(
     *,
     depth: float = 1.0,
 ) -> DensityGrid:
-    """A density in proportion to the backprojected echoes, for an object as it stands.
+    """Guess a density in proportion to the backprojected echoes.
 
     Args:
         capture: the data.
         grid: bins of its maps.
         item: the object; its pose carries the box.
-        name: of the object.
+        name: name of the object.
         low: corner of the box in the object's frame [m].
         high: the opposite corner [m].
         counts: nodes along x, y and z.
@@ -420,22 +421,16 @@ def _incoherent(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tenso
         to_tx, to_rx = (points - place[frame].detach() for place in (link.tx, link.rx))
         ranges = 0.5 * (to_tx.norm(dim=1) + to_rx.norm(dim=1))
         seen = (to_rx / to_rx.norm(dim=1, keepdim=True)) @ link.rotations[frame].detach()
-        axes = (
-            (seen[:, 1], grid.v_start, grid.v_step, grid.v_count),
-            (seen[:, 0], grid.u_start, grid.u_step, grid.u_count),
-            (ranges, grid.range_start, grid.range_step, grid.range_count),
+        places = (
+            (ranges - grid.range_start) / grid.range_step,
+            (seen[:, 0] - grid.u_start) / grid.u_step * (grid.u_count > 1),
+            (seen[:, 1] - grid.v_start) / grid.v_step * (grid.v_count > 1),
         )
-        # In the sampler's units: −1 at the first node, 1 at the last.
-        places = [
-            2 * (value - start) / (step * (count - 1)) - 1 if count > 1 else torch.zeros_like(value)
-            for value, start, step, count in axes
-        ]
-        sampled = torch.nn.functional.grid_sample(
-            maps[frame][None, None],
-            torch.stack(places, dim=1)[None, None, None],
-            align_corners=True,
-        ).reshape(-1)
-        total += sampled * ranges**4 * (seen[:, 2] > 0)
+        # Beyond the outer bins the map falls to zero within one bin.
+        sampled = map_coordinates(
+            maps[frame].numpy(), torch.stack(places).numpy(), order=1, mode="grid-constant"
+        )
+        total += torch.from_numpy(sampled) * ranges**4 * (seen[:, 2] > 0)
     return total / radar.frame_count
 
 

@@ -1,12 +1,16 @@
 """A line through the parameters of a module: what a gradient check moves along."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from invertwin.channel import Sampling
 from invertwin.errors import InputError
+from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.observation import Observation
+from invertwin.inversion.tangents import Change, changes_of
 from invertwin.scene.mesh import Mesh
 
 _NEWTON = 8  # steps along a normal, onto the zero of the changed field
@@ -16,27 +20,20 @@ _ON = 1e-9  # m, how near a point is to that zero
 class Line:
     """The parameters of a module, moved by θ times a tangent."""
 
-    def __init__(self, module: nn.Module, tangent: Mapping[str, Tensor], target: Any) -> None:
+    def __init__(self, module: nn.Module, tangent: Mapping[str, Change], target: Any) -> None:
         """Move the parameters of a module.
 
         Args:
             module: Maps the target.
-            tangent: Changes of parameters by name.
+            tangent: Changes of its values by name, see ``changes_of``.
             target: The scene or the sensor that the module maps.
 
         Raises:
-            InputError: A name or a shape that the module's parameters do not have.
+            InputError: A name or a shape that the module does not have.
         """
-        self._module, self._tangent, self._target = module, dict(tangent), target
+        self._module, self._target = module, target
+        self._tangent = changes_of(module, tangent)
         self._start = {name: value.detach() for name, value in module.named_parameters()}
-        for name, change in self._tangent.items():
-            expected = self._start.get(name)
-            if expected is None or expected.shape != change.shape:
-                shapes = ", ".join(f"{n} {tuple(v.shape)}" for n, v in self._start.items())
-                raise InputError(
-                    f"expected changes of parameters of {type(module).__name__} ({shapes}), got "
-                    f"{name} {tuple(change.shape)}; give tensors of these shapes"
-                )
 
     def at(self, theta: Tensor) -> Any:
         """The module's result at θ, which may carry a derivative.
@@ -64,7 +61,7 @@ class FieldLine(Line):
     Derivatives go through the module as it is, its marching cubes included.
     """
 
-    def __init__(self, module: nn.Module, tangent: Mapping[str, Tensor], target: Any) -> None:
+    def __init__(self, module: nn.Module, tangent: Mapping[str, Change], target: Any) -> None:
         """See ``Line``; the module has an ``object`` and its ``distance`` at points."""
         super().__init__(module, tangent, target)
         self._field, self._object = _Field(module), str(module.object)
@@ -101,12 +98,12 @@ class FieldLine(Line):
         return found.detach(), slope
 
 
-def line_of(module: nn.Module, tangent: Mapping[str, Tensor] | Tensor, target: Any) -> Line:
+def line_of(module: nn.Module, tangent: Mapping[str, Change] | Tensor, target: Any) -> Line:
     """The line of a module's parameters along a tangent.
 
     Args:
         module: Maps the target.
-        tangent: Changes of parameters by name, or of its only parameter.
+        tangent: Changes of its values by name, see ``changes_of``, or of its only parameter.
         target: The scene or the sensor that the module maps.
 
     Raises:
@@ -122,6 +119,34 @@ def line_of(module: nn.Module, tangent: Mapping[str, Tensor] | Tensor, target: A
         tangent = {names[0]: tangent}
     meshed_anew = hasattr(module, "distance") and hasattr(module, "object")
     return (FieldLine if meshed_anew else Line)(module, tangent, target)
+
+
+def losses_along(
+    line: Line, offsets: Iterable[float], observation: Observation, *, seed: int = 0
+) -> Tensor:
+    """The loss of one observation along a line of scenes: its loss landscape.
+
+    All scenes have the random numbers of the line's start: the same points on surfaces, and the
+    same rough points where the model has them.
+
+    Args:
+        line: Of a module that maps the scene, see ``line_of``.
+        offsets: θ of every scene.
+        observation: Its loss may return several numbers; without one it is ``SpectrumLoss``.
+        seed: Of all random numbers.
+
+    Returns:
+        Losses [offset], or [offset, number].
+    """
+    sensor, loss = observation.sensor, observation.loss or SpectrumLoss()
+    with torch.no_grad():
+        observed, start = observation.observed(), line.end(0.0)
+        observed = observation.model.blurred(observed, sensor)
+        model = observation.model.prepared(start, sensor, seed)
+        samples = getattr(model, "sampling", Sampling()).samples
+        model = model.for_differences(start, sensor, samples, "area")
+        maps = (model.predict(line.end(float(offset)), sensor, seed) for offset in offsets)
+        return torch.stack([loss(predicted, observed) for predicted in maps])
 
 
 class _Field(nn.Module):

@@ -21,6 +21,16 @@ Maps = Sequence[tuple[Tensor, Tensor]]
 """The predicted and the observed map of every observation."""
 
 
+def relative_error(simulated: Tensor, measured: Tensor) -> Tensor:
+    """``mean|a − b|² / mean|b|²``, of maps of any form: also of complex signals.
+
+    Args:
+        simulated: a.
+        measured: b.
+    """
+    return (simulated - measured).abs().square().mean() / measured.abs().square().mean()
+
+
 @dataclass(frozen=True)
 class SpectrumLoss:
     """Multiscale difference of power maps.

@@ -15,6 +15,9 @@ from torch import Tensor
 from invertwin.channel import visible_points
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number
+from invertwin.scene.material import Itu, Material, Value
+from invertwin.scene.material.materials import held_by
+from invertwin.scene.material.values import evaluated
 from invertwin.scene.mesh import Mesh
 
 POINTS = 20_000  # of each surface
@@ -165,6 +168,39 @@ def topology(mesh: Mesh) -> Topology:
     solid = _solid(mesh)
     parts = trimesh.graph.connected_components(solid.edges_unique)
     return Topology(len(parts), int(solid.euler_number))
+
+
+def value_errors(
+    values: Sequence[str],
+    found: Material,
+    truth: Material,
+    frequency: float,
+    layer: int | None = None,
+) -> dict[str, float]:
+    """How far material values are from the true ones, relative to these, as ``<name>_error``.
+
+    Args:
+        values: their names; what one of the materials does not have is left out.
+        found: the result.
+        truth: what it should be.
+        frequency: at which values of the ITU table are compared [Hz].
+        layer: of multilayers, from 0; None = values of the materials themselves.
+
+    Raises:
+        InputError: no such layer.
+    """
+    ends = [held_by(end, layer, type(end).__name__) for end in (found, truth)]
+    errors = {}
+    for name in values:
+        if all(hasattr(end, name) for end in ends):
+            value, true = (_at(getattr(end, name), name, frequency) for end in ends)
+            errors[f"{name}_error"] = float((value - true).abs().mean() / true.abs().mean())
+    return errors
+
+
+def _at(value: Value | Itu, name: str, frequency: float) -> Tensor:
+    found = getattr(value, name)(frequency) if isinstance(value, Itu) else value
+    return evaluated(found).detach()
 
 
 def surface_points(

@@ -1,4 +1,4 @@
-"""What was observed, and what is unknown: the two inputs of a fit."""
+"""The two inputs of a fit: what was observed, and what is unknown."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -68,7 +68,7 @@ class Observation:
             ``ForwardModel``.
         sensor: What recorded the data, such as a ``Radar``.
         data: A recording that ``model.observe`` understands, or its map.
-        weight: Of its loss in the weighted mean over all observations.
+        weight: Weight of its loss in the mean over all observations.
         parameters: Unknowns of the sensor: modules sensor → sensor, such as ``RangeBias``.
         loss: How maps are compared, in place of the loss of the fit.
 

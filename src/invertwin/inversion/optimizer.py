@@ -9,10 +9,10 @@ import torch
 from annotated_types import Ge, Lt
 from torch import nn
 
-from invertwin.errors import InputError
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.loss import Objective
 from invertwin.limits import Count, NonNegative, Positive
+from invertwin.scene.checks import check_fields
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Optimizer:
         rotation_rate: Rate of parameters named ``rotation``; None = ``rate``.
         final_rate: What ``rate`` has fallen to at the last step, along a cosine; None = ``rate`` /
             20. The rates of all parameters fall alike.
-        momentum: Of SGD.
+        momentum: Momentum of SGD.
         curvature_every: For Gauss–Newton, steps from one curvature to the next. Derivatives of the
             map with respect to every parameter cost most of a step.
     """
@@ -39,12 +39,7 @@ class Optimizer:
     curvature_every: Count = 1
 
     def __post_init__(self) -> None:
-        if self.kind not in ("adam", "sgd", "gauss_newton") or not self.rate > 0:
-            raise InputError(
-                "expected kind 'adam', 'sgd' or 'gauss_newton' and rate > 0, "
-                f"got {self.kind!r} and {self.rate}; "
-                "Adam at 0.03 suits metres and radians"
-            )
+        check_fields(self)
 
     def build(
         self,

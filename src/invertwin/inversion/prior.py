@@ -1,4 +1,4 @@
-"""What a prior of shapes says about a latent: a regulariser."""
+"""A regulariser that keeps a latent likely under its prior of shapes."""
 
 from jaxtyping import Float64
 from torch import Tensor, nn
@@ -8,7 +8,7 @@ from invertwin.scene.scene import Scene
 
 
 class LatentNorm:
-    """½ weight |z|²: what a prior knows about a latent before any signal."""
+    """The term ½ weight |z|²: the negative logarithm of a latent's prior probability."""
 
     def __init__(self, module: nn.Module, weight: float) -> None:
         """Regularise the parameter `latent` of a module, such as `PriorShape` or `LinearShape`.

@@ -70,7 +70,7 @@ def reconstruct(
         schedule: A ``Schedule``, or stages that follow each other.
         regularizers: Functions Scene → number, added to the loss.
         callbacks: What watches the fit: ``Report``, ``Watch``, ``Checkpoint``.
-        seed: Of all random numbers; the same seed gives the same fit.
+        seed: Seed of all random numbers; the same seed gives the same fit.
 
     Source: §4.2 of the paper.
     Differs from the source: Adam and Gauss–Newton beside SGD; annealed widths; several sensors.

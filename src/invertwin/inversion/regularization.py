@@ -1,4 +1,4 @@
-"""What is known about a shape before any signal: neighbours move alike."""
+"""A regulariser that lets neighbouring vertices move alike."""
 
 from collections.abc import Callable
 

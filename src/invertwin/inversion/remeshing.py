@@ -1,4 +1,4 @@
-"""New triangles for the surface of a fit: even ones between stages, and distances to it.
+"""Remesh surfaces between the stages of a fit, and measure distances to them.
 
 Remeshing is written out here because no library (in 2026) serves all platforms: gpytoolbox has
 no wheels for Linux on ARM, pymeshlab is GPL, trueform is for noncommercial use, pyacvd needs VTK
@@ -62,7 +62,7 @@ def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tenso
 
     Args:
         mesh: the surface.
-        points: in the mesh's frame [m].
+        points: positions in the mesh's frame [m].
     """
     if not len(points):
         return torch.zeros(0, dtype=torch.float64)
@@ -77,7 +77,7 @@ def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 
     Args:
         mesh: the surface.
-        points: in the mesh's frame [p, 3], metres.
+        points: positions in the mesh's frame [p, 3], metres.
     """
     return np.asarray(igl.point_mesh_squared_distance(points, *_arrays(mesh))[2])
 

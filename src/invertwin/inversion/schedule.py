@@ -1,4 +1,4 @@
-"""How long a fit lasts, and its stages: which unknowns are free when, coarse before fine."""
+"""How long a fit lasts, and which unknowns are free in each of its stages."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -43,7 +43,7 @@ class Stage(Schedule):
             for another kind of shape, or a finer mesh.
         remesh: For every object named here, a function of its mesh that is applied before modules
             are made anew.
-        optimizer: In place of the optimizer of the whole fit.
+        optimizer: Optimizer of this stage; None = that of the whole fit.
         change: What the stage changes of every observation, such as its model's sampling.
     """
 
@@ -66,7 +66,7 @@ def checked_stages(
 
     Args:
         schedule: One part or several; None = one with the defaults.
-        names: Of all unknowns of the scene.
+        names: Names of all unknowns of the scene.
 
     Raises:
         InputError: No stages, an unknown name, or an unknown that an earlier stage has dropped.

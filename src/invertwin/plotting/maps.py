@@ -54,7 +54,7 @@ def spectrum(
         grid: Bins of all maps.
         relative: Show each map below its own peak. False shows received over transmitted power,
             all maps on one scale.
-        dynamic_range: From the darkest to the brightest colour [dB].
+        dynamic_range: Level of the brightest colour above the darkest [dB].
     """
     columns = {title: _views(power, grid) for title, power in _titled(spectra).items()}
     rows = len(next(iter(columns.values())))
@@ -76,7 +76,7 @@ def panels(shown: Mapping[str, Panel], *, dynamic_range: float = 40.0) -> Figure
 
     Args:
         shown: The maps, by title.
-        dynamic_range: From the darkest to the brightest colour [dB].
+        dynamic_range: Level of the brightest colour above the darkest [dB].
     """
     figure = Figure(figsize=(3.9 * len(shown), 3.6), layout="constrained")
     cells = figure.subplots(1, len(shown), squeeze=False)[0]
@@ -105,7 +105,7 @@ def direction_panels(title: str, power: Float[Tensor, "range u v"], grid: Grid) 
     """Range × azimuth and range × elevation, the strongest over the other direction.
 
     Args:
-        title: Of the first panel.
+        title: Title of the first panel.
         power: Map.
         grid: Its bins; directions that it does not resolve have no panel.
     """
@@ -126,7 +126,7 @@ def gradient(
     power: Float[Tensor, "frame range u v"] | None = None,
     own_scale: Mapping[str, Tensor] | None = None,
 ) -> Figure:
-    """Derivatives of a map side by side; red: power grows with θ, blue: it falls.
+    """Derivatives of a map side by side: power grows with θ where red, and falls where blue.
 
     Shown is the first frame, summed over the direction that is not shown; all frames, where the
     grid resolves no direction.

@@ -75,7 +75,7 @@ class _View:
     """A look along a world axis.
 
     Attributes:
-        title: Where from.
+        title: From where the view looks.
         axes: World axes that run across, up and in depth.
         signs: Whether the first two grow to the right and up, and the third towards the eye.
     """

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import trimesh
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest:
     """Draws shapes as an eye far away sees them.
 
     Args:
-        axes: Where to draw.
+        axes: Matplotlib axes to draw in.
         shapes: What to draw: each with its colour.
         eye: Right, up and towards the eye, as rows [3, 3].
         longest: Sides of triangles above this are split, so that sorting by depth is right [m].
@@ -69,16 +70,7 @@ def small_triangles(triangles: NDArray, longest: float) -> NDArray:
 
 def sharp_edges(vertices: NDArray, faces: NDArray) -> NDArray:
     """Vertex pairs [e, 2] of open edges and of edges that bend by more than 30°."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    normals = np.cross(b - a, c - a)
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    owner = np.tile(np.arange(len(faces)), 3)
-    edges, index = np.unique(pairs, axis=0, return_inverse=True)
-    index = index.reshape(-1)
-    total = np.zeros((len(edges), 3))
-    np.add.at(total, index, normals[owner])
-    count = np.bincount(index, minlength=len(edges))
-    # The sum of two unit normals at angle a has length 2·cos(a/2).
-    flat = (count == 2) & (np.linalg.norm(total, axis=1) > 2 * math.cos(math.radians(15)))
-    return edges[~flat]
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    bent = mesh.face_adjacency_edges[mesh.face_adjacency_angles > math.radians(30)]
+    alone = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+    return np.concatenate([bent, mesh.edges_sorted[alone]])

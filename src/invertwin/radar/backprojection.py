@@ -1,4 +1,4 @@
-"""Images of beat signals by coherent summation: near field, arrays and moving radars alike."""
+"""Images of beat signals by coherent summation, also in the near field and of moving radars."""
 
 import math
 
@@ -19,7 +19,7 @@ UPSAMPLING = 8
 def backproject_beat(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar, points: Float64[Tensor, "*point 3"]
 ) -> Complex128[Tensor, "*point"]:
-    """Mean over frames and channels of the windowed echo from exactly the distance of a point.
+    """Focus beat signals on points: average the echoes from each point's exact distance.
 
         I(p) = mean Σ w_n s[n] exp(−2πj (f_n τ − S τ²/2)) / Σ w_n
 
@@ -31,9 +31,9 @@ def backproject_beat(
     Source: the matched filter of the paper's eq:fmcw_if.
 
     Args:
-        beat: Of all frames.
+        beat: Beat signals of all frames.
         radar: With the pose of each frame.
-        points: In the world [m].
+        points: Positions in the world [m].
 
     Raises:
         InputError: The signal does not fit the radar, which may have none, or a point lies
@@ -85,11 +85,11 @@ def distances(
 def between_samples(
     samples: Complex128[Tensor, "row sample"], index: Float64[Tensor, "row point"]
 ) -> Complex128[Tensor, "row point"]:
-    """Linear interpolation along each row at an index that may have a fraction.
+    """Interpolate linearly along each row at an index that may have a fraction.
 
     Args:
         samples: Rows of samples.
-        index: Where in each row, in samples; fractions allowed.
+        index: Place in each row, in samples; it may have a fraction.
     """
     cell = index.detach().floor().clamp(0, samples.shape[1] - 2).long()
     before, after = samples.gather(1, cell), samples.gather(1, cell + 1)

@@ -1,13 +1,13 @@
-"""Targets out of power maps: constant false-alarm rate, point clouds. Not differentiable."""
+"""Find targets in power maps by a constant false-alarm rate. Nothing here is differentiable."""
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
+from scipy.ndimage import maximum_filter
 from scipy.optimize import brentq
 from scipy.special import gammaincc, gammaincinv
 from scipy.stats import beta, f
@@ -31,8 +31,8 @@ class PointCloud:
         range: R = L/2 [m].
         velocity: Range rate, positive moves away [m/s].
         u, v: Direction cosines in the radar frame; 0 along an axis that is not resolved.
-        power: Of the strongest direction, received over transmitted.
-        position: In the world, from the middle of the phase centres [m].
+        power: Power in the strongest direction, received over transmitted.
+        position: Position in the world, seen from the middle of the phase centres [m].
     """
 
     frame: Int64[Tensor, " point"]
@@ -55,7 +55,7 @@ def cell_averaging_cfar(
     false_alarm: float = 1e-4,
     looks: int = 1,
 ) -> Bool[Tensor, "*batch first second"]:
-    """Cells whose power exceeds a multiple of the mean of their training cells.
+    """Detect cells whose power exceeds a multiple of the mean of their training cells.
 
     The multiple keeps the rate of false alarms exact for noise whose power is exponentially
     distributed (one look: a channel or a beam) or the mean of several such (looks: the channels,
@@ -91,18 +91,18 @@ def ordered_statistics_cfar(
     looks: int = 1,
     rank: float = 0.75,
 ) -> Bool[Tensor, "*batch first second"]:
-    """Cells whose power exceeds a multiple of one of their training cells in order of power.
+    """Detect cells whose power exceeds a multiple of one ranked training cell.
 
     Other targets among the training cells hardly raise the threshold, as they do in the mean.
 
     Source: Rohling, Radar CFAR thresholding in clutter and multiple target situations, 1983.
 
     Args:
-        power: As for ``cell_averaging_cfar``, and so are the rest.
-        guard: Cells to either side that the target fills.
-        training: Cells beyond those.
+        power: Maps over the last two axes, such as range rate and range.
+        guard: Cells to either side along both axes that the target itself fills.
+        training: Cells beyond those to either side.
         false_alarm: Probability that a cell of noise is detected.
-        looks: Independent looks in a cell's power.
+        looks: Independent looks in the mean that is a cell's power.
         rank: Place of the chosen cell in ascending order, as a part of their number.
 
     Raises:
@@ -112,16 +112,13 @@ def ordered_statistics_cfar(
     _check_rates(false_alarm, looks)
     if not 0 < rank <= 1:
         raise InputError(f"expected a rank in (0, 1], got {rank:g}; 0.75 is usual")
-    place = (rank * count - 1e-9).ceil().to(torch.int64)
-    # What is no training cell is infinite, so last in order.
-    level = band.sort(-1).values.gather(-1, (place - 1).expand(band.shape[:-1])[..., None])[..., 0]
     numbers, index = count.unique(return_inverse=True)
-    factors = [
-        _ordered_factor(int(n), math.ceil(rank * float(n) - 1e-9), false_alarm, looks)
-        for n in numbers
-    ]
-    factor = torch.tensor(factors, dtype=torch.float64)[index]
-    return power > (factor * level).to(power.device)
+    places = (rank * numbers - 1e-9).ceil().long()
+    # What is no training cell is infinite, so last in order.
+    level = band.sort(-1).values.take_along_dim((places - 1)[index][..., None], -1)[..., 0]
+    pairs = zip(numbers.tolist(), places.tolist(), strict=True)
+    factors = [_ordered_factor(n, place, false_alarm, looks) for n, place in pairs]
+    return power > (torch.tensor(factors).double()[index] * level).to(power.device)
 
 
 def point_cloud(
@@ -132,17 +129,16 @@ def point_cloud(
     chirps: Chirps,
     fold: Int64[Tensor, "frame velocity range"] | None = None,
 ) -> PointCloud:
-    """One point for each local maximum over range rate and range among the detected cells.
+    """Make a point of each detected cell that is a local maximum over range rate and range.
 
     Its direction is the strongest one that exists (u² + v² ≤ 1); all are refined by the parabola
-    through the logarithms of the power at a peak and its two neighbours. The
-    ends of the axis of range rates are neighbours.
+    through the logarithms of the power at a peak and its two neighbours.
 
     Args:
-        power: Of ``range_doppler_angle``.
+        power: Result of ``range_doppler_angle``.
         detections: Cells that hold targets.
         radar: With the poses of the frames.
-        grid: Of the power.
+        grid: Bins of the power.
         chirps: Timing, for the range rates.
         fold: What was given to ``range_doppler_angle``.
 
@@ -156,10 +152,12 @@ def point_cloud(
     count = power.shape[1]
     seen = _within_sphere(power, grid).flatten(3)
     strongest = seen.amax(-1)
-    frame, velocity, place = torch.nonzero(
-        detections & (strongest == _neighbourhood_maximum(strongest)) & (strongest > 0),
-        as_tuple=True,
-    )
+    # The ends of the axis of range rates are neighbours.
+    ends = ("nearest", "wrap", "nearest")
+    around = maximum_filter(strongest.numpy(), (1, 3, 3), mode=ends)  # type: ignore[arg-type]
+    highest = strongest == torch.from_numpy(around)
+    found = detections & highest & (strongest > 0)
+    frame, velocity, place = torch.nonzero(found, as_tuple=True)
     direction = seen.argmax(-1)[frame, velocity, place]
     u, v = direction // grid.v_count, direction % grid.v_count
     cell = [frame, velocity, place, u, v]
@@ -177,17 +175,17 @@ def peaks(
     radar: Radar,
     grid: Grid,
 ) -> PointCloud:
-    """One point for each local maximum over range and direction among the detected cells.
+    """Make a point of each detected cell that is a local maximum over range and direction.
 
     For frames without range rates, such as maps that are compared in a fit; unlike
     ``point_cloud``, one range may hold many points, since the parts of a body at rest differ in
     direction alone. Refined by the same parabola; range rates are zero.
 
     Args:
-        power: Of ``exact_spectrum`` or ``Capture.spectrum``.
+        power: Result of ``exact_spectrum`` or ``Capture.spectrum``.
         detections: Cells of the strongest elevation that hold targets.
         radar: With the poses of the frames.
-        grid: Of the power.
+        grid: Bins of the power.
 
     Raises:
         InputError: Power with gradients, or shapes that do not fit each other.
@@ -195,7 +193,7 @@ def peaks(
     _refuse_gradients(power, "peaks")
     _check_shapes(power, detections, (radar.frame_count, *grid.shape), "frame, range, u, v")
     seen = _within_sphere(power.to("cpu", torch.float64), grid)
-    highest = torch.nn.functional.max_pool3d(seen[:, None], 3, stride=1, padding=1)[:, 0]
+    highest = torch.from_numpy(maximum_filter(seen.numpy(), (1, 3, 3, 3), mode="nearest"))
     found = detections.cpu()[..., None] & (seen == highest) & (seen > 0)
     frame, place, u, v = torch.nonzero(found, as_tuple=True)
     rates = torch.zeros(len(frame), dtype=torch.float64)
@@ -251,7 +249,7 @@ def _check_rates(false_alarm: float, looks: int) -> None:
 
 def _training_cells(
     power: Tensor, guard: tuple[int, int], training: tuple[int, int], name: str
-) -> tuple[Float64[Tensor, "*batch first second cell"], Float64[Tensor, "first second"]]:
+) -> tuple[Float64[Tensor, "*batch first second cell"], Int64[Tensor, "*batch first second"]]:
     """Power of each cell's training cells, infinite beyond the map, and their number."""
     _refuse_gradients(power, name)
     values = power.to("cpu", torch.float64)
@@ -272,23 +270,13 @@ def _training_cells(
     offsets = [(torch.arange(size) - r).abs() for size, r in zip(sizes, reach, strict=True)]
     kept = (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])
     cells = around[..., kept]
-    whole, inner = (
-        [_within(size, r) for size, r in zip(values.shape[-2:], sides, strict=True)]
-        for sides in (reach, guard)
-    )
-    count = whole[0][:, None] * whole[1] - inner[0][:, None] * inner[1]
+    count = torch.isfinite(cells).sum(-1)
     if int(count.min()) < 1:
         raise InputError(
             f"expected training cells around every cell, got none around some of a map of "
             f"{tuple(values.shape[-2:])}; use fewer guard cells or more training cells"
         )
     return cells, count
-
-
-def _within(size: int, reach: int) -> Float64[Tensor, " cell"]:
-    """How many cells of an axis are at most so far from each."""
-    place = torch.arange(size, dtype=torch.float64)
-    return (place + reach).clamp(max=size - 1) - (place - reach).clamp(min=0) + 1
 
 
 @lru_cache(maxsize=1024)
@@ -304,17 +292,7 @@ def _ordered_factor(cells: int, place: int, false_alarm: float, looks: int) -> f
     high = 1.0
     while excess(high) > 0:
         high *= 2
-    root: Any = brentq(excess, 0.0, high, xtol=1e-9 * high)
-    return float(root)
-
-
-def _neighbourhood_maximum(
-    strongest: Float64[Tensor, "frame velocity range"],
-) -> Float64[Tensor, "frame velocity range"]:
-    """Maximum over 3 × 3 cells; the axis of range rates closes on itself."""
-    wrapped = torch.cat([strongest[:, -1:], strongest, strongest[:, :1]], dim=1)
-    padded = torch.nn.functional.pad(wrapped, (1, 1), value=-math.inf)
-    return torch.nn.functional.max_pool2d(padded[:, None], 3, stride=1)[:, 0]
+    return float(brentq(excess, 0.0, high, xtol=1e-9 * high))  # type: ignore[arg-type]
 
 
 def _refinement(

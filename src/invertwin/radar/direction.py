@@ -12,6 +12,7 @@ from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import Aperture, aperture
+from invertwin.scene.checks import check_shape, checked_number
 
 # Gaps between signal and noise eigenvalues below this part of the largest one count as noise of
 # the arithmetic: there the derivative of the subspace is damped instead of unbounded.
@@ -27,7 +28,7 @@ class _Snapshots:
     Attributes:
         values: One row per snapshot, elements as columns.
         array: The whole virtual array.
-        x, y: Of the elements, in the radar frame [m].
+        x, y: Positions of the elements in the radar frame [m].
     """
 
     values: Complex128[Tensor, "frame range snapshot element"]
@@ -73,10 +74,7 @@ def capon(
             does not resolve, a loading that is not positive, smoothing or forward_backward on an
             array that is not a uniform rectangle of elements, or subarrays larger than it.
     """
-    if not (math.isfinite(loading) and loading > 0):
-        raise InputError(
-            f"expected a positive loading, got {loading:g}; 0.01 of the mean power is usual"
-        )
+    checked_number(loading, "loading [mean power]", 0.0, open_low=True)
     snapshots = _snapshots(profile, radar, grid, smoothing, forward_backward)
     covariance = snapshots.covariance()
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1)
@@ -101,19 +99,19 @@ def music(
     smoothing: tuple[int, int] | None = None,
     forward_backward: bool = False,
 ) -> Float64[Tensor, "frame range u v"]:
-    """MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, E the noise subspace. At least 1, no unit.
+    """MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, with E the noise subspace. It is at least 1.
 
     Differentiable in the profile through the projector on the noise subspace, whose derivative
     depends on the gap between signal and noise only: it is finite for equal eigenvalues within
     either, and damped where the gap itself vanishes and the subspace jumps.
 
     Args:
-        profile: As for ``capon``.
+        profile: Range profiles; snapshots are chirps or Doppler bins, see ``capon``.
         radar: Its array, without window; its poses are not used.
         grid: Its directions.
         sources: How many in every bin, or the rule that counts them in each: ``mdl`` or ``aic``.
-        smoothing: As for ``capon``.
-        forward_backward: As for ``capon``.
+        smoothing: Elements of the subarrays along x and y; None = no smoothing, see ``capon``.
+        forward_backward: Average with the array read backwards, which doubles the snapshots.
 
     Raises:
         InputError: As for ``capon``; an unknown rule; more sources than elements less one or
@@ -142,7 +140,7 @@ def music(
 def source_count(
     eigenvalues: Float[Tensor, "*batch element"], snapshots: int, rule: str = "mdl"
 ) -> Int64[Tensor, "*batch"]:
-    """Number of sources from the eigenvalues of a covariance matrix.
+    """Count the sources from the eigenvalues of a covariance matrix.
 
     Minimises −N (M − k) log(geometric/arithmetic mean of the M − k smallest) plus, with
     d = k (2M − k), d for ``aic`` or d log(N)/2 for ``mdl``, over k = 0 … M − 1.
@@ -150,7 +148,7 @@ def source_count(
     Source: Wax and Kailath, Detection of signals by information theoretic criteria, 1985.
 
     Args:
-        eigenvalues: In any order, M of them.
+        eigenvalues: M eigenvalues in any order.
         snapshots: N, independent ones in the covariance.
         rule: ``mdl`` (consistent) or ``aic`` (finds weaker sources, and some that are none).
 
@@ -231,26 +229,18 @@ def _snapshots(
     forward_backward: bool,
 ) -> _Snapshots:
     """Snapshots of the distinct elements, shifted subarrays and the reversed array included."""
-    channels = (len(radar.transmitters.positions), len(radar.receivers.positions))
-    expected = (*channels, grid.range_count)
-    if profile.ndim != 5 or tuple(profile.shape[2:]) != expected or 0 in profile.shape:
-        raise InputError(
-            f"expected a profile of shape (frame, snapshot, {', '.join(map(str, expected))}) with "
-            f"tx, rx and range last, got {tuple(profile.shape)}; use the radar and grid of "
-            "range_profile"
-        )
+    what, do = "a profile (frame, snapshot, tx, rx, range)", "use those of range_profile"
+    check_shape(profile, (None, None, *radar.shape[1:], grid.range_count), what, do)
+    if not profile.numel():
+        raise InputError(f"expected {what} with frames and snapshots, got none; {do}")
     array = aperture(radar)
     array.check_directions(grid)
     rows, columns = len(array.y), len(array.x)
-    flat = profile.to(torch.complex128).flatten(2, 3).movedim(-1, 1)
-    index = (array.column * rows + array.row).to(flat.device)
-    # Elements at the same place are averaged.
-    plane = flat.new_zeros(*flat.shape[:-1], columns * rows).index_add(-1, index, flat)
-    counts = array.counts.flatten().to(flat.device)
-    taken = counts > 0
-    plane = plane[..., taken] / counts[taken]
-    x = array.x.repeat_interleave(rows)[taken.cpu()]
-    y = array.y.repeat(columns)[taken.cpu()]
+    taken = array.counts.flatten() > 0
+    channels = profile.to(torch.complex128).flatten(2, 3).movedim(-1, 1)
+    plane = array.plane(channels).flatten(-2)[..., taken.to(channels.device)]
+    x = array.x.repeat_interleave(rows)[taken]
+    y = array.y.repeat(columns)[taken]
     uniform = bool(taken.all()) and _uniform(array.x) and _uniform(array.y)
     if (smoothing is not None or forward_backward) and not uniform:
         raise InputError(

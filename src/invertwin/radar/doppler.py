@@ -40,7 +40,7 @@ def velocity_axis(
     Args:
         radar: Its transmitters and wavelength.
         chirps: Timing.
-        bins: As many as chirps (None) or more; zero is at ``bins // 2``.
+        bins: Number of bins, at least that of chirps (None); range rate 0 is at ``bins // 2``.
     """
     bins = chirps.count if bins is None else bins
     places = (torch.arange(bins, dtype=torch.float64) - bins // 2) / bins
@@ -54,7 +54,7 @@ def velocity_span(radar: Radar, chirps: Chirps) -> float:
         radar: Its wavelength and transmitters.
         chirps: Their interval and order.
     """
-    return 2 * chirps.max_speed(radar.waveform.wavelength, len(radar.transmitters.positions))
+    return 2 * chirps.max_speed(radar.waveform.wavelength, radar.shape[1])
 
 
 def range_doppler(
@@ -66,7 +66,7 @@ def range_doppler(
     window: str = "hamming",
     bins: int | None = None,
 ) -> Complex[Tensor, "frame velocity tx rx range"]:
-    """Range transform of every chirp, then windowed Fourier transform over the chirps.
+    """Transform every chirp over range, then all chirps over range rate, with a window.
 
     The bins are those of ``velocity_axis``: the beat phase of a target that moves away grows from
     chirp to chirp. Normalised by the sums of the windows: a point
@@ -79,7 +79,7 @@ def range_doppler(
         grid: Its ranges are used.
         chirps: Timing.
         window: Over the chirps, one of ``WINDOWS``.
-        bins: Of range rate, at least as many as chirps (None).
+        bins: Number of range rates, at least that of chirps (None).
 
     Raises:
         InputError: Signal, radar and chirps do not fit, an unknown window, or too few bins.
@@ -107,26 +107,26 @@ def compensate_tdm(
     chirps: Chirps,
     fold: int | Int64[Tensor, "frame velocity range"] = 0,
 ) -> Complex[Tensor, "frame velocity tx rx range"]:
-    """Takes out the phase by which movers turn until a later transmitter's chirp.
+    """Remove the phase that movers gain until a later transmitter sends.
 
     A chirp that starts t later has the phase 2π f t more, f the Doppler frequency, which would
     be taken for a direction. It depends on the true f, not on that modulo one over the time from
     loop to loop: ``fold`` says by how many spans of the velocity axis a bin's target is beyond it.
 
     Args:
-        spectrum: Of ``range_doppler``.
+        spectrum: Result of ``range_doppler``.
         radar: Its transmitters take turns in their order.
         chirps: Timing.
-        fold: For all bins, or for each (``resolve_fold`` finds it).
+        fold: One number for all bins, or one for each (``resolve_fold`` finds it).
 
     Raises:
         InputError: Another number of transmitters in the spectrum than in the radar.
     """
     frames, count, transmitters, _, ranges = spectrum.shape
-    if transmitters != len(radar.transmitters.positions):
+    if transmitters != radar.shape[1]:
         raise InputError(
-            f"expected a spectrum of {len(radar.transmitters.positions)} transmitters, got "
-            f"{transmitters}; use the radar that recorded it"
+            f"expected a spectrum of {radar.shape[1]} transmitters, got {transmitters}; "
+            "use the radar that recorded it"
         )
     folds = torch.as_tensor(fold).cpu().expand(frames, count, ranges).to(torch.float64)
     rate = velocity_axis(radar, chirps, count)[:, None] + folds * velocity_span(radar, chirps)
@@ -144,14 +144,14 @@ def resolve_fold(
     chirps: Chirps,
     candidates: Sequence[int] = (0, -1, 1),
 ) -> Int64[Tensor, "frame velocity range"]:
-    """By how many spans of the velocity axis the target of each bin is beyond it.
+    """Find by how many spans each bin's target is beyond the velocity axis.
 
     The right one makes all transmitters agree with the receivers on a direction: it has the
     highest Bartlett peak; of equal ones the first candidate is taken. With N transmitters that
     take turns, candidates that differ by N cannot be told apart. A choice; no gradients.
 
     Args:
-        spectrum: Of ``range_doppler``, not compensated.
+        spectrum: Result of ``range_doppler``, not compensated.
         radar: With several transmitters.
         grid: With the directions in which to look for the peak.
         chirps: Timing.
@@ -182,7 +182,7 @@ def range_doppler_angle(
     bins: int | None = None,
     fold: int | Int64[Tensor, "frame velocity range"] = 0,
 ) -> Float[Tensor, "frame velocity range u v"]:
-    """Power over range rate, range and direction (Bartlett), transmitters' turns compensated.
+    """Power over range rate, range and direction (Bartlett), with ``compensate_tdm``.
 
     ``range_doppler``, ``compensate_tdm``, then ``beamform``; see there.
 
@@ -218,7 +218,7 @@ def micro_doppler(
         radar: Its transmitters and wavelength.
         chirps: Timing; the signal may be of more or fewer of them.
         length: Chirps in a window.
-        step: From one window to the next, in chirps.
+        step: Chirps from the start of one window to that of the next.
         window: One of ``WINDOWS``.
 
     Raises:

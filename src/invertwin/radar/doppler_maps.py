@@ -89,7 +89,7 @@ def doppler_maps(
     chirps: Chirps,
     frame: int = 0,
 ) -> DopplerMaps:
-    """Range-Doppler and range-direction maps of one frame, transmitters' turns compensated.
+    """Make range-Doppler and range-direction maps of one frame, with ``compensate_tdm``.
 
     Range rates are those of the unambiguous span.
 
@@ -155,7 +155,7 @@ def sharp_map(
         radar: Its array.
         grid: Directions.
         method: capon or music.
-        sources: For music; None = counted in each range.
+        sources: Number of sources for music; None = they are counted in each range.
 
     Raises:
         InputError: As ``capon`` and ``music``.
@@ -175,7 +175,7 @@ def snapshots_of(
     chirps: Chirps,
     frame: int,
 ) -> Complex[Tensor, "velocity tx rx range"]:
-    """Bins of range rate of one frame, transmitters' turns compensated, for `sharp_map`.
+    """The bins of range rate of one frame as snapshots for `sharp_map`.
 
     Args:
         beat: Chirps of every transmitter.
@@ -196,7 +196,7 @@ def points_of(
     chirps: Chirps,
     frame: int,
 ) -> PointCloud | None:
-    """What a cell-averaging CFAR detects in one frame; None where the map is too large for it.
+    """Detect points in one frame by a cell-averaging CFAR; None where the map is too large.
 
     Args:
         beat: Chirps of every transmitter.

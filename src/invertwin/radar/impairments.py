@@ -1,4 +1,4 @@
-"""What a real front end adds to beat signals, of frames or of trains of chirps.
+"""Impairments that a real front end adds to beat signals of frames or trains of chirps.
 
 Each impairment is off unless asked for.
 
@@ -9,27 +9,31 @@ errors of the channels, thermal noise, then the converter.
 import math
 import warnings
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 import torch
-from annotated_types import Ge, Le, Lt
+from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Paths
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, NonNegative, Positive
+from invertwin.limits import RADIANS, NonNegative, Positive, Usual
 from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
+from invertwin.scene.checks import check_fields, checked_number
 
 # Phase of the highest offset between delays at which the residual is computed; linear between
 # them it is then off by less than 1 % there.
 _DELAY_STEP = 0.25
 # Offsets are this many times finer than one sweep resolves, so that noise does not repeat in it.
 _FINER = 4
+
+Level = Annotated[float, Gt(-400), Lt(0)]  # dB below what is sent
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class PhaseNoise:
     first and last of several points it stays. A single point stands for −20 dB per decade.
 
     Attributes:
-        offsets: From the carrier, ascending [Hz].
+        offsets: Distances from the carrier, ascending [Hz].
         levels: Single-sideband level L(f) at them [dBc/Hz].
 
     Raises:
@@ -49,11 +53,11 @@ class PhaseNoise:
     """
 
     offsets: tuple[Positive, ...]
-    levels: tuple[float, ...]
+    levels: tuple[Level, ...]
 
     def __post_init__(self) -> None:
-        ascending = all(a < b for a, b in zip(self.offsets, self.offsets[1:], strict=False))
-        if not (self.offsets and self.offsets[0] > 0 and ascending):
+        check_fields(self)
+        if not self.offsets or any(a >= b for a, b in pairwise(self.offsets)):
             raise InputError(
                 f"expected ascending offsets > 0, got {self.offsets}; give them in Hz, such as "
                 "(1e5, 1e6)"
@@ -62,11 +66,6 @@ class PhaseNoise:
             raise InputError(
                 f"expected {len(self.offsets)} levels, got {len(self.levels)}; "
                 "give one level per offset"
-            )
-        if not all(-400 < level < 0 for level in self.levels):
-            raise InputError(
-                f"expected levels below 0 dBc/Hz, got {self.levels}; "
-                "give them relative to the carrier, such as -95"
             )
 
     def density(self, offset: Float64[Tensor, " offset"]) -> Float64[Tensor, " offset"]:
@@ -96,20 +95,11 @@ class Leakage:
         InputError: A delay that is not one of a board, or more received than sent.
     """
 
-    delay: NonNegative
-    level_db: Annotated[float, Lt(0)]
+    delay: Annotated[NonNegative, Usual("seconds", 1e-9, high=1e-6)]
+    level_db: Level
 
     def __post_init__(self) -> None:
-        if not 0 <= self.delay <= 1e-6:
-            raise InputError(
-                f"expected a leakage delay in seconds, at most 1e-6, got {self.delay:g}; "
-                f"did you mean {self.delay:g}e-9?"
-            )
-        if not -400 < self.level_db < 0:
-            raise InputError(
-                f"expected a leakage level below 0 dB, got {self.level_db:g}; "
-                "give received over transmitted power, such as -40"
-            )
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -117,7 +107,7 @@ class ADC:
     """Converter of I and of Q: uniform steps, two's complement codes, clipped at the ends.
 
     Attributes:
-        bits: Of each of the two.
+        bits: Resolution of each of the two, 2 to 32 bits.
         full_scale: Amplitude that the most negative code stands for, in the units of the beat
             signal, √(received over transmitted power).
 
@@ -129,13 +119,7 @@ class ADC:
     full_scale: Positive
 
     def __post_init__(self) -> None:
-        if not 2 <= self.bits <= 32:
-            raise InputError(f"expected 2 to 32 bits, got {self.bits}; boards have 10 to 16")
-        if not 0 < self.full_scale < math.inf:
-            raise InputError(
-                f"expected a positive full_scale, got {self.full_scale}; "
-                "give the largest amplitude of the beat signal that shall fit"
-            )
+        check_fields(self)
 
     @property
     def step(self) -> float:
@@ -145,16 +129,16 @@ class ADC:
 
 @dataclass(frozen=True)
 class Impairments:
-    """Which impairments a recording has; with the defaults it is the plain beat signal.
+    """The impairments of a recording. The defaults add none.
 
     Attributes:
-        phase_noise: Of the common oscillator.
-        leakage: From transmitters to receivers.
+        phase_noise: Phase noise of the common oscillator.
+        leakage: Direct path from transmitters to receivers.
         gain_std_db: Standard deviation of the channels' gains [dB].
         phase_std: Standard deviation of the channels' phases [rad].
         snr_db: Thermal noise, relative to the mean power of the signal, leakage included [dB].
         noise_figure_db: Thermal noise of a receiver instead [dB].
-        transmit_power: Of one transmitter, for the noise figure [W].
+        transmit_power: Power of one transmitter, for the noise figure [W].
         adc: Converter.
 
     Raises:
@@ -166,28 +150,22 @@ class Impairments:
     gain_std_db: NonNegative = 0.0
     phase_std: Annotated[NonNegative, RADIANS] = 0.0
     snr_db: float | None = None
-    noise_figure_db: float | None = None
+    noise_figure_db: NonNegative | None = None
     transmit_power: Positive = 0.01
     adc: ADC | None = None
 
     def __post_init__(self) -> None:
-        _check_deviations(self.gain_std_db, self.phase_std)
+        check_fields(self)
         if self.snr_db is not None and self.noise_figure_db is not None:
             raise InputError(
                 f"expected snr_db or noise_figure_db, got both, {self.snr_db} and "
                 f"{self.noise_figure_db}; give one of them"
             )
-        figure = 0.0 if self.noise_figure_db is None else self.noise_figure_db
-        if not (figure >= 0 and 0 < self.transmit_power < math.inf):
-            raise InputError(
-                f"expected noise_figure_db >= 0 and a positive transmit_power, got {figure} and "
-                f"{self.transmit_power}; give them in dB and in watts"
-            )
 
     def record(
         self, paths: Paths, radar: Radar, *, seed: int, chirps: Chirps | None = None
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-        """The beat signal of the paths, or of a train of chirps, with these impairments.
+        """Record the paths, in single ramps or a train of chirps, with these impairments.
 
         Each impairment draws from its own stream of the seed: adding one leaves the others'
         numbers as they are. Channel errors and leakage stay from chirp to chirp, thermal noise
@@ -196,7 +174,7 @@ class Impairments:
         Args:
             paths: Field paths.
             radar: One with samples.
-            seed: Of all that is drawn.
+            seed: Seed of all random numbers.
             chirps: Timing of a train, as for ``moving_beat``; None = one ramp a frame.
 
         Raises:
@@ -214,12 +192,12 @@ class Impairments:
     def apply(
         self, beat: Complex128[Tensor, "frame *chirp tx rx sample"], radar: Radar, *, seed: int
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-        """Impair a beat signal, of frames or of trains, with everything except phase noise.
+        """Add all impairments except phase noise to a beat signal of frames or trains.
 
         Args:
             beat: Without impairments.
             radar: What records it.
-            seed: Of all that is drawn.
+            seed: Seed of all random numbers.
 
         Raises:
             InputError: Phase noise, which each path has of its own; otherwise as ``record``.
@@ -228,7 +206,7 @@ class Impairments:
         return self._after_mixing(beat, radar, seed, None)
 
     def check_applicable(self) -> None:
-        """Raise where ``apply`` would: impairments that need the paths."""
+        """Raise if ``apply`` cannot add these impairments, because they need the paths."""
         if self.phase_noise is not None:
             raise InputError(
                 "expected impairments of a finished beat signal, got phase noise, which depends on "
@@ -270,7 +248,7 @@ def _streams(seed: int) -> list[int]:
 def noisy_oscillator_beat(
     paths: Paths, radar: Radar, noise: PhaseNoise, *, seed: int, chirps: Chirps | None = None
 ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-    """Beat signal of an oscillator with phase noise φ, which transmits and mixes.
+    """Beat signal where one oscillator with phase noise φ transmits and mixes.
 
         s'[n] = Σ s_i[n] exp(j (φ(t_n) − φ(t_n − τ_i)))
 
@@ -282,7 +260,7 @@ def noisy_oscillator_beat(
         paths: Field paths.
         radar: An FMCW or stepped frequency radar.
         noise: Its level.
-        seed: Of the noise, see ``residual_phase``.
+        seed: Seed of the noise, see ``residual_phase``.
         chirps: Timing of a train; None = one ramp a frame.
 
     Raises:
@@ -334,14 +312,14 @@ def residual_phase(
         noise: Level of φ.
         radar: An FMCW or stepped frequency radar.
         delay: τ of the echo [s].
-        seed: Of φ, independent for each frame.
+        seed: Seed of φ, which is independent for each frame.
         chirps: Timing of a train; None = one ramp a frame.
 
     Raises:
         InputError: A waveform whose samples are not taken in time.
     """
     waveform = _sampled_in_time(radar)
-    transmitters, samples = len(radar.transmitters.positions), waveform.samples
+    transmitters, samples = radar.shape[1], waveform.samples
     if chirps is None:
         runs = (radar.frame_count, transmitters)
         return _oscillator(noise, waveform, delay, seed, runs, samples)[..., :samples]
@@ -389,28 +367,28 @@ def leakage_signal(leakage: Leakage, radar: Radar) -> Complex128[Tensor, " sampl
 def channel_errors(
     radar: Radar, gain_std_db: float = 0.0, phase_std: float = 0.0, *, seed: int
 ) -> Complex128[Tensor, "tx rx"]:
-    """Factors of the virtual channels with normally distributed gains in dB and phases.
+    """Draw factors of the virtual channels, with normal gains in dB and normal phases.
 
     Args:
         radar: Its arrays.
         gain_std_db: Standard deviation of the gain [dB].
         phase_std: Standard deviation of the phase [rad].
-        seed: Of both.
+        seed: Seed of gains and phases.
 
     Raises:
         InputError: A negative deviation.
     """
-    _check_deviations(gain_std_db, phase_std)
-    shape = (2, len(radar.transmitters.positions), len(radar.receivers.positions))
+    checked_number(gain_std_db, "gain_std_db", 0.0)
+    checked_number(phase_std, "phase_std [rad]", 0.0)
     generator = torch.Generator().manual_seed(seed)
-    gain, phase = torch.randn(shape, dtype=torch.float64, generator=generator)
+    gain, phase = torch.randn((2, *radar.shape[1:]), dtype=torch.float64, generator=generator)
     return torch.polar(10 ** (gain_std_db / 20 * gain), phase_std * phase)
 
 
 def quantize(
     beat: Complex[Tensor, "*batch sample"], radar: Radar, adc: ADC
 ) -> Complex[Tensor, "*batch sample"]:
-    """The beat signal as the converter reads it: rounded to its codes, and clipped, with a warning.
+    """Round a beat signal to the converter's codes; what it clips is warned of.
 
     Args:
         beat: Signal without a gradient.
@@ -459,11 +437,3 @@ def _sampled_in_time(radar: Radar) -> FMCW | SteppedFrequency:
         f"expected samples taken one after the other in time, got {type(waveform).__name__}; phase "
         "noise and converter act in time: use them with FMCW or stepped frequency"
     )
-
-
-def _check_deviations(gain_std_db: float, phase_std: float) -> None:
-    if not (0 <= gain_std_db < math.inf and 0 <= phase_std < math.inf):
-        raise InputError(
-            f"expected standard deviations >= 0, got {gain_std_db} dB and {phase_std} rad; "
-            "give 0 for channels without errors"
-        )

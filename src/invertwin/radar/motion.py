@@ -21,6 +21,7 @@ from invertwin.radar.nonuniform import (
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
+from invertwin.scene.checks import check_fields
 
 # Largest error of interpolating a path's phase factor between the instants of a ramp.
 _INTERPOLATION_ERROR = 1e-6
@@ -35,7 +36,7 @@ class Chirps:
 
     Attributes:
         count: Chirps of each transmitter in a frame (loops).
-        interval: From one ramp's start to the next, idle time included [s].
+        interval: Time from the start of one ramp to the next, idle time included [s].
         tdm: Transmitters take turns (time-division MIMO); else they send at once, told apart
             by an ideal code.
         order: Transmitters, counted from 0, in the order of their turns; None = 0, 1, 2, …
@@ -51,11 +52,7 @@ class Chirps:
     order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.count < 1 or not self.interval > 0:
-            raise InputError(
-                f"expected at least one chirp and an interval > 0, got {self.count} and "
-                f"{self.interval}; the interval is idle time + ramp time in seconds"
-            )
+        check_fields(self)
         if self.order is None:
             return
         object.__setattr__(self, "order", tuple(self.order))
@@ -122,12 +119,12 @@ def moving_beat(
     Differs from the source: the paper's scenes stand still.
 
     Args:
-        paths: From ``trace_field`` of a scene with velocities.
+        paths: Paths that ``trace_field`` gives for a scene with velocities.
         radar: One with samples, at rest within a frame.
         chirps: Timing.
         places: World positions of the paths' points [m] at a time [s] after the start of the
             frame, for motion that is not uniform; None = they move with their velocities.
-        tolerance: As in ``beat_signal``.
+        tolerance: Relative error of the sums, see ``beat_signal``.
 
     Raises:
         InputError: As ``beat_signal``; moving paths of several bounces; points so fast that a
@@ -144,7 +141,7 @@ def moving_beat(
             "simulate their motion chirp by chirp with simulate_chirps(retrace=True)"
         )
     train = Train(paths, radar, places or _uniform(paths), tolerance)
-    return every_ramp(chirps, len(radar.transmitters.positions), train.ramp)
+    return every_ramp(chirps, radar.shape[1], train.ramp)
 
 
 def every_ramp(
@@ -175,7 +172,7 @@ def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
     Positive moves away; the Doppler frequency is 2/λ times it.
 
     Args:
-        paths: Of one bounce; zero where they carry no velocity.
+        paths: Paths of one bounce; the rate is zero where they carry no velocity.
         radar: At rest.
     """
     if paths.velocity is None:
@@ -206,7 +203,7 @@ class Train:
         paths: Their frames, coefficients, and delays at their first points.
         radar: One with samples.
         places: Positions of the first points at a time; the last ones move with them.
-        tolerance: Of the sums.
+        tolerance: Relative error of the sums.
     """
 
     paths: Paths
@@ -220,7 +217,7 @@ class Train:
         """Record one ramp with all receivers.
 
         Args:
-            start: Of the ramp [s].
+            start: Start of the ramp [s].
             senders: Transmitters that send at once.
         """
         paths, waveform = self.paths, sampled(self.radar)
@@ -289,7 +286,7 @@ def _length(first: Tensor, span: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
 
 
 def _instants(bend: float) -> int:
-    """How many instants of a ramp follow phases that bend by so many radians at its ends.
+    """Count the instants of a ramp that follow phases which bend by this much at its ends [rad].
 
     Of exp(jψ) with ψ of second degree over [-1, 1], the power h = (count + 1)/2 is the first that a
     polynomial through the instants misses, by ψʰ/h! · 2^(1 − count).

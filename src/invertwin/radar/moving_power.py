@@ -1,4 +1,4 @@
-"""A smooth surrogate of range-Doppler-angle processing: moving power as a radar shows it."""
+"""The smooth surrogate of range-Doppler-angle processing."""
 
 import math
 from collections.abc import Callable
@@ -9,12 +9,12 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Paths
-from invertwin.errors import InputError
 from invertwin.radar.doppler import velocity_span
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import aperture
 from invertwin.radar.waveform import FMCW, SteppedFrequency, Waveform, unit_window
+from invertwin.scene.checks import check_shape
 
 _TABLE = 32  # entries per cell of a tabulated response
 
@@ -42,7 +42,7 @@ def moving_power(
 
     Args:
         paths: One-bounce power paths, where the points are in the middle of the frame's chirps.
-        velocities: Of their points, in the world [m/s].
+        velocities: Velocities of their points in the world [m/s].
         radar: What records.
         grid: Ranges and directions.
         chirps: Timing.
@@ -53,11 +53,12 @@ def moving_power(
         InputError: Velocities that do not fit the paths, an unknown window, or a grid that the
             array does not resolve.
     """
-    if velocities.shape != paths.first.shape:
-        raise InputError(
-            f"expected velocities of shape {tuple(paths.first.shape)}, one per path, got "
-            f"{tuple(velocities.shape)}; evaluate them at the paths' points"
-        )
+    check_shape(
+        velocities,
+        paths.first.shape,
+        "velocities, one per path,",
+        "evaluate them at the paths' points",
+    )
     direction, own_rates = _seen(paths, velocities, radar)
     off = own_rates - rates[:, None]
     doppler = _doppler_response(off / velocity_span(radar, chirps), chirps, window)
@@ -149,6 +150,6 @@ def _steered(
     toward = array.beams(grid.u, grid.v, x, y) * array.weight
     waves = -2 * math.pi / radar.waveform.wavelength * direction[:, :2] @ torch.stack([x, y])
     arriving = torch.polar(torch.ones_like(waves), waves)
-    elements = len(radar.receivers.positions)
-    pairs = zip(arriving.split(elements, 1), toward.split(elements, 1), strict=True)
+    receivers = radar.shape[2]
+    pairs = zip(arriving.split(receivers, 1), toward.split(receivers, 1), strict=True)
     return torch.stack([wave @ beam.T for wave, beam in pairs])

@@ -1,4 +1,4 @@
-"""What can be fitted of a radar: modules Radar → Radar for its pose, range bias and clock."""
+"""Modules Radar → Radar that can be fitted: pose, range bias and clock offset."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -50,7 +50,7 @@ class RadarPose(RigidMotion):
 
 
 class RangeBias(nn.Module):
-    """All measured ranges are too large by this.
+    """Adds a bias to all ranges that the surrogate shows.
 
     Attributes:
         bias: parameter [m].
@@ -70,7 +70,7 @@ class RangeBias(nn.Module):
 
 
 class ClockOffset(nn.Module):
-    """The clock of the track is ahead of the radar's by this much more than recorded.
+    """Shifts the clock of the track against the radar's.
 
     Attributes:
         shift: parameter [s].

@@ -22,10 +22,10 @@ def range_point_spread(
     """Power of a point target at a distance from its range, peak 1.
 
     Args:
-        waveform: Of the radar.
+        waveform: Waveform of the radar.
         distance: [m].
         window: Taper of the samples.
-        kernel: As ``Surrogate.range_kernel``.
+        kernel: "response", "gaussian" or "dirichlet", see ``Surrogate.range_kernel``.
     """
     if kernel == "gaussian":
         return gaussian_response(waveform, distance)
@@ -41,7 +41,7 @@ def dirichlet(waveform: Waveform, distance: Float64[Tensor, " point"]) -> Float6
 
     Args:
         waveform: One with samples.
-        distance: From the target's range [m].
+        distance: Distance from the target's range [m].
 
     Raises:
         InputError: A waveform without samples.
@@ -79,7 +79,7 @@ def airy_radii(radar: Radar, radius: float | None) -> tuple[float, float]:
 
     Args:
         radar: Its aperture.
-        radius: Of a disc instead [m]; None = the ellipse fills the aperture.
+        radius: Radius of a disc instead [m]; None = the ellipse fills the aperture.
     """
     if radius is not None:
         return radius, radius

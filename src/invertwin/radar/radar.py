@@ -22,7 +22,7 @@ from invertwin.radar.waveform import (
     Waveform,
 )
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import checked_tensor
+from invertwin.scene.checks import check_fields, check_shape, checked_tensor
 
 Window = Annotated[str, Among(WINDOWS)]
 Cosine = Annotated[float, Gt(0), Le(1)]
@@ -77,17 +77,11 @@ class Radar:
         if self.rotations is not None:
             rotations = _checked_rotations(self.rotations, len(positions))
             object.__setattr__(self, "rotations", rotations)
-        for name in ("window", "array_window"):
-            if getattr(self, name) not in WINDOWS:
-                raise InputError(
-                    f"expected {name} to be one of {', '.join(WINDOWS)}, "
-                    f"got {getattr(self, name)!r}; choose one of them"
-                )
-        if not self._shared_visibility and len(self.transmitters.positions) > 1:
+        check_fields(self)
+        if not self._shared_visibility and self.shape[1] > 1:
             raise InputError(
-                "expected one transmitter when TX and RX see separately, got "
-                f"{len(self.transmitters.positions)}; set shared_visibility=True "
-                "or use one transmitter"
+                f"expected one transmitter when TX and RX see separately, got {self.shape[1]}; "
+                "set shared_visibility=True or use one transmitter"
             )
         self._warn_about_spacing()
 
@@ -95,6 +89,12 @@ class Radar:
     def frame_count(self) -> int:
         """Number of poses."""
         return self.positions.shape[0]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Numbers of poses, transmitters and receivers."""
+        elements = len(self.transmitters.positions), len(self.receivers.positions)
+        return self.frame_count, *elements
 
     @property
     def virtual_positions(self) -> Float64[Tensor, "virtual 3"]:
@@ -207,7 +207,8 @@ class Radar:
             if range_max > (1 + 1e-9) * self.waveform.max_range:
                 raise InputError(
                     f"expected range_max within the unambiguous {self.waveform.max_range:.4g} m, "
-                    f"got {range_max:g}; finer frequency steps (more samples) reach farther"
+                    f"got {range_max:g}; give metres, or finer frequency steps (more samples)",
+                    "range_max",
                 )
             step = self.waveform.max_range / round(oversample * self.waveform.samples)
         first = math.floor(range_min / step + 1e-9)
@@ -259,7 +260,7 @@ class Radar:
 
 
 def sampled(radar: Radar) -> SampledWaveform:
-    """The radar's waveform, or the error that it has no beat signal."""
+    """Return the radar's waveform, if it has a beat signal."""
     if isinstance(radar.waveform, SampledWaveform):
         return radar.waveform
     raise InputError(
@@ -271,7 +272,7 @@ def sampled(radar: Radar) -> SampledWaveform:
 def checked_beat(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar
 ) -> Complex[Tensor, "frame tx rx sample"]:
-    """A beat signal that fits a radar.
+    """Return a beat signal, if it fits a radar.
 
     Args:
         beat: One signal per frame and channel.
@@ -280,13 +281,9 @@ def checked_beat(
     Raises:
         InputError: It has another shape.
     """
-    channels = len(radar.transmitters.positions), len(radar.receivers.positions)
-    expected = (radar.frame_count, *channels, sampled(radar).samples)
-    if tuple(beat.shape) != expected:
-        raise InputError(
-            f"expected a beat signal of shape {expected} (frame, tx, rx, sample), got "
-            f"{tuple(beat.shape)}; use the radar that recorded it"
-        )
+    expected = (*radar.shape, sampled(radar).samples)
+    what = "a beat signal (frame, tx, rx, sample)"
+    check_shape(beat, expected, what, "use the radar that recorded it")
     return beat
 
 

@@ -1,4 +1,4 @@
-"""The paper's own surrogate: a field with a random phase per path, in place of mean power."""
+"""The paper's own surrogate: a field with a random phase per path, not mean power."""
 
 import math
 
@@ -45,9 +45,9 @@ def random_phase_spectrum(
             square root of the mean power of the frame's other paths.
         radar: Its arrays, waveform, poses and range bias.
         grid: Bins.
-        seed: Of the phases.
+        seed: Seed of the phases.
         range_width: Standard deviation added to the Gaussian of one range cell [range cells].
-        aperture_radius: As ``Surrogate.aperture_radius``.
+        aperture_radius: Radius of the aperture [m], see ``Surrogate.aperture_radius``.
     """
     inside = (paths.range > grid.ranges[0]) & (paths.range < grid.ranges[-1])
     generator = torch.Generator().manual_seed(seed)

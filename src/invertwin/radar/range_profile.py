@@ -18,7 +18,11 @@ _STANDARD_TEMPERATURE = 290.0  # K, at which noise figures are defined
 
 
 def beat_signal(
-    paths: Paths, radar: Radar, *, tolerance: float = 1e-9
+    paths: Paths,
+    radar: Radar,
+    *,
+    tolerance: float = 1e-9,
+    channels: tuple[slice, slice] = (slice(None), slice(None)),
 ) -> Complex128[Tensor, "frame tx rx sample"]:
     """Beat (IF) signal of every TX and RX element: transmit × conj(receive).
 
@@ -40,6 +44,7 @@ def beat_signal(
         paths: Field paths; their frames index the radar's poses.
         radar: One with samples: FMCW, stepped frequency, OFDM.
         tolerance: Relative error of the sum.
+        channels: Transmitters and receivers whose signals are computed.
 
     Raises:
         InputError: The radar has no samples, the paths carry power only, or a frame is missing.
@@ -59,14 +64,16 @@ def beat_signal(
             - ((first - tx[frame].mean(0)).norm(dim=1) + (last - rx[frame].mean(0)).norm(dim=1))
             / SPEED_OF_LIGHT
         )
-        forth = [inner + (first - place).norm(dim=1) / SPEED_OF_LIGHT for place in tx[frame]]
-        back = [(last - place).norm(dim=1) / SPEED_OF_LIGHT for place in rx[frame]]
-        channels = [
+        forth = [
+            inner + (first - place).norm(dim=1) / SPEED_OF_LIGHT for place in tx[frame][channels[0]]
+        ]
+        back = [(last - place).norm(dim=1) / SPEED_OF_LIGHT for place in rx[frame][channels[1]]]
+        signals = [
             beat_of_delays(coefficient, (f + b)[None], waveform, tolerance)
             for f in forth
             for b in back
         ]
-        frames.append(torch.stack(channels).unflatten(0, (len(forth), len(back))))
+        frames.append(torch.stack(signals).unflatten(0, (len(forth), len(back))))
     return torch.stack(frames)
 
 

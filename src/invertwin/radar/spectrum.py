@@ -13,6 +13,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
 from invertwin.radar.waveform import taper
+from invertwin.scene.checks import check_shape
 
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
 _FLATNESS = 0.05
@@ -59,7 +60,7 @@ class Aperture:
         return self.y_taper * self.counts.sum(0)
 
     def check_resolved(self, grid: Grid) -> None:
-        """Raise where one axis alone of a non-separable array is asked for."""
+        """Raise if the grid resolves only one axis of an array that is not separable."""
         if not self.separable and (grid.u_count == 1 or grid.v_count == 1):
             raise InputError(
                 f"expected a grid that resolves u and v, got {grid.u_count} × {grid.v_count} bins; "
@@ -67,7 +68,7 @@ class Aperture:
             )
 
     def check_directions(self, grid: Grid) -> None:
-        """Raise where the grid leaves out an axis along which the array extends."""
+        """Raise if the grid does not resolve an axis along which the array extends."""
         for name, places, bins in (("u", self.x, grid.u_count), ("v", self.y, grid.v_count)):
             if len(places) > 1 and bins == 1:
                 raise InputError(
@@ -81,6 +82,13 @@ class Aperture:
         weight = self.x_taper[self.column] * self.y_taper[self.row]
         return weight / weight.sum()
 
+    def plane(self, channels: Complex[Tensor, "*batch virtual"]) -> Complex[Tensor, "*batch x y"]:
+        """Channels on the grid of places; those at one place are averaged, empty places are 0."""
+        index = (self.column * len(self.y) + self.row).to(channels.device)
+        plane = channels.new_zeros(*channels.shape[:-1], self.counts.numel())
+        plane = plane.index_add(-1, index, channels).unflatten(-1, self.counts.shape)
+        return plane / self.counts.clamp_min(1).to(plane.device, plane.real.dtype)
+
     def steering(
         self, cosines: Float64[Tensor, " node"], places: Float64[Tensor, " place"]
     ) -> Complex[Tensor, "node place"]:
@@ -88,7 +96,7 @@ class Aperture:
 
         Args:
             cosines: Direction cosines u.
-            places: Of the elements x [m].
+            places: Positions x of the elements [m].
         """
         phase = 2 * math.pi / self.wavelength * cosines[:, None] * places[None]
         return torch.polar(torch.ones_like(phase), phase)
@@ -105,8 +113,8 @@ class Aperture:
         Args:
             u: Direction cosines along x.
             v: Direction cosines along y.
-            x: Of the elements [m].
-            y: Of the elements [m].
+            x: Positions of the elements along x [m].
+            y: Positions of the elements along y [m].
         """
         return (self.steering(u, x)[:, None] * self.steering(v, y)).flatten(0, 1)
 
@@ -133,7 +141,7 @@ def beamform(
     |a|². Along an axis that the grid does not resolve, the power of the elements is averaged.
 
     Args:
-        profile: From ``range_profile``.
+        profile: Range profiles from ``range_profile``.
         radar: What recorded it.
         grid: Bins of range and direction.
 
@@ -141,17 +149,9 @@ def beamform(
         InputError: The profile does not fit radar and grid, the array is not flat, or the grid
             resolves only one axis of an array that is not the product of a row and a column.
     """
-    expected = (
-        radar.frame_count,
-        len(radar.transmitters.positions),
-        len(radar.receivers.positions),
-        grid.range_count,
-    )
-    if tuple(profile.shape) != expected:
-        raise InputError(
-            f"expected a profile of shape {expected} (frame, tx, rx, range), got "
-            f"{tuple(profile.shape)}; use the radar and grid of range_profile"
-        )
+    what = "a profile (frame, tx, rx, range)"
+    expected = (*radar.shape, grid.range_count)
+    check_shape(profile, expected, what, "use the radar and grid of range_profile")
     channels = profile.flatten(1, 2)
     if grid.u_count == grid.v_count == 1:
         return channels.abs().square().mean(1)[..., None, None]
@@ -180,25 +180,17 @@ def exact_spectrum(
 def _separable_power(
     channels: Complex[Tensor, "frame virtual range"], array: Aperture, grid: Grid
 ) -> Float[Tensor, "frame range u v"]:
-    frames, _, ranges = channels.shape
-    nx, ny = array.counts.shape
-    # Elements at the same place are averaged.
-    plane = channels.new_zeros(frames, nx * ny, ranges)
-    index = (array.column * ny + array.row).to(channels.device)
-    plane = plane.index_add(1, index, channels).unflatten(1, (nx, ny))
-    plane = plane / array.counts[..., None].to(plane.device, plane.real.dtype)
+    plane = array.plane(channels.movedim(1, -1))
 
     def steered(cosines: Tensor, places: Tensor, weight: Tensor) -> Tensor:
         return (array.steering(cosines, places) * (weight / weight.sum())).to(channels)
 
     if grid.v_count > 1:
         v = steered(grid.v, array.y, array.y_weight)
-        plane = torch.einsum("vy,fxyr->fxvr", v, plane)
+        plane = torch.einsum("vy,frxy->frxv", v, plane)
     if grid.u_count > 1:
         u = steered(grid.u, array.x, array.x_weight)
-        plane = torch.einsum("ux,fxvr->fruv", u, plane)
-    else:
-        plane = plane.permute(0, 3, 1, 2)
+        plane = torch.einsum("ux,frxv->fruv", u, plane)
     power = plane.abs().square()
     if grid.u_count == 1:
         power = power.mean(2, keepdim=True)

@@ -1,4 +1,4 @@
-"""Waveforms and the radar: what is transmitted, from where, and which bins it resolves."""
+"""Waveforms: what a radar transmits, and how it spreads a point target over range."""
 
 # Fields of the base class may be properties of a waveform.
 # pyright: reportIncompatibleVariableOverride=false
@@ -13,7 +13,8 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.limits import Count, Positive
+from invertwin.limits import Bandwidth, Duration, Frequency, Several, Step
+from invertwin.scene.checks import check_fields
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
@@ -25,7 +26,7 @@ class PhysicsWarning(UserWarning):
 
 
 class Waveform(ABC):
-    """What the radar and the surrogate ask of any waveform; hashable, so that kernels are cached.
+    """What any waveform must offer. Waveforms are hashable, so that kernels are cached.
 
     Attributes:
         center_frequency: [Hz].
@@ -37,7 +38,7 @@ class Waveform(ABC):
 
     @property
     def wavelength(self) -> float:
-        """At the centre frequency [m]."""
+        """Wavelength at the centre frequency [m]."""
         return SPEED_OF_LIGHT / self.center_frequency
 
     @property
@@ -49,10 +50,10 @@ class Waveform(ABC):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """Power of a point target beside its range, peak 1.
+        """Power of a point target at a distance from its range, peak 1.
 
         Args:
-            distance: From the target's range [m].
+            distance: Distance from the target's range [m].
             window: Taper of the samples.
         """
 
@@ -64,9 +65,9 @@ class SampledWaveform(Waveform):
     range transform, its windows and the surrogate's response follow from that alone.
 
     Attributes:
-        start_frequency: Of the first sample [Hz].
+        start_frequency: Frequency of the first sample [Hz].
         samples: Number of frequencies.
-        step: From one sample to the next [Hz].
+        step: Frequency step from one sample to the next [Hz].
         noise_bandwidth: Thermal noise in a sample is kT0F times this, over the transmit power
             [Hz].
     """
@@ -83,7 +84,7 @@ class SampledWaveform(Waveform):
 
     @property
     def frequencies(self) -> Float64[Tensor, " sample"]:
-        """f_n [Hz]."""
+        """Frequencies f_n of the samples [Hz]."""
         return self.start_frequency + torch.arange(self.samples, dtype=torch.float64) * self.step
 
     @property
@@ -97,7 +98,7 @@ class SampledWaveform(Waveform):
         """Power |Σ w_n exp(2πj n d/R_max) / Σ w_n|² of a point target beside its range.
 
         Args:
-            distance: d, from the target's range [m].
+            distance: Distance d from the target's range [m].
             window: Taper w of the samples.
         """
         weight = unit_window(window, self.samples).to(torch.complex128)
@@ -113,7 +114,7 @@ class FMCW(SampledWaveform):
 
     Attributes:
         start_frequency: Frequency at t = 0 [Hz].
-        bandwidth: Swept during ``duration`` [Hz].
+        bandwidth: Bandwidth that is swept during ``duration`` [Hz].
         duration: Sampled part of the ramp [s].
         samples: Samples per ramp.
 
@@ -121,24 +122,13 @@ class FMCW(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: Positive
-    bandwidth: Positive
-    duration: Positive
-    samples: Count
+    start_frequency: Frequency
+    bandwidth: Bandwidth
+    duration: Duration
+    samples: Several
 
     def __post_init__(self) -> None:
-        _check_frequency("start_frequency", self.start_frequency)
-        _check_frequency("bandwidth", self.bandwidth)
-        if not 0 < self.duration <= 1:
-            raise InputError(
-                f"expected a ramp duration in seconds, got {self.duration:g}; "
-                f"did you mean {self.duration:g}e-6?"
-            )
-        if self.samples < 2:
-            raise InputError(
-                f"expected at least 2 samples per ramp, got {self.samples}; "
-                "give the number of ADC samples of one chirp"
-            )
+        check_fields(self)
 
     @property
     def center_frequency(self) -> float:
@@ -147,17 +137,17 @@ class FMCW(SampledWaveform):
 
     @property
     def slope(self) -> float:
-        """S = B/T [Hz/s]."""
+        """Slope of the ramp, S = B/T [Hz/s]."""
         return self.bandwidth / self.duration
 
     @property
     def residual_slope(self) -> float:
-        """S: the ramp goes on while the echo is under way."""
+        """The slope S: the ramp goes on while the echo is on its way [Hz/s]."""
         return self.slope
 
     @property
     def step(self) -> float:
-        """B/N [Hz]."""
+        """Frequency step of the samples, B/N [Hz]."""
         return self.bandwidth / self.samples
 
     @property
@@ -167,7 +157,7 @@ class FMCW(SampledWaveform):
 
     @property
     def sample_times(self) -> Float64[Tensor, " sample"]:
-        """t_n = n T/N [s]."""
+        """Times of the samples, t_n = n T/N [s]."""
         return torch.arange(self.samples, dtype=torch.float64) * (self.duration / self.samples)
 
 
@@ -176,8 +166,8 @@ class SteppedFrequency(SampledWaveform):
     """Tones one after the other, each measured once its echoes have settled.
 
     Attributes:
-        start_frequency: Of the first tone [Hz].
-        step: From one tone to the next [Hz].
+        start_frequency: Frequency of the first tone [Hz].
+        step: Frequency step from one tone to the next [Hz].
         samples: Number of tones.
         dwell: Time on each tone, over which its sample is averaged [s].
 
@@ -185,28 +175,17 @@ class SteppedFrequency(SampledWaveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: Positive
-    step: Positive
-    samples: Count
-    dwell: Positive
+    start_frequency: Frequency
+    step: Step
+    samples: Several
+    dwell: Duration
 
     def __post_init__(self) -> None:
-        _check_frequency("start_frequency", self.start_frequency)
-        _check_step("step", self.step)
-        if self.samples < 2:
-            raise InputError(
-                f"expected at least 2 tones, got {self.samples}; "
-                "give the number of frequencies of one sweep"
-            )
-        if not 0 < self.dwell <= 1:
-            raise InputError(
-                f"expected a dwell time per tone in seconds, got {self.dwell:g}; "
-                f"did you mean {self.dwell:g}e-6?"
-            )
+        check_fields(self)
 
     @property
     def bandwidth(self) -> float:
-        """N · step [Hz]."""
+        """Bandwidth, N · step [Hz]."""
         return self.samples * self.step
 
     @property
@@ -216,12 +195,12 @@ class SteppedFrequency(SampledWaveform):
 
     @property
     def noise_bandwidth(self) -> float:
-        """1 / dwell [Hz]."""
+        """Noise bandwidth, 1 / dwell [Hz]."""
         return 1 / self.dwell
 
     @property
     def sample_times(self) -> Float64[Tensor, " sample"]:
-        """t_n = n · dwell [s]."""
+        """Times of the samples, t_n = n · dwell [s]."""
         return torch.arange(self.samples, dtype=torch.float64) * self.dwell
 
 
@@ -234,40 +213,34 @@ class OFDM(SampledWaveform):
     is ``conj(H)``, so that ``range_profile`` forms the usual inverse FFT of ``Y/X``.
 
     Attributes:
-        start_frequency: Of the lowest subcarrier [Hz].
-        spacing: Between subcarriers [Hz].
-        subcarriers: How many.
+        start_frequency: Frequency of the lowest subcarrier [Hz].
+        spacing: Frequency step between neighbouring subcarriers [Hz].
+        subcarriers: Number of subcarriers.
 
     Raises:
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    start_frequency: Positive
-    spacing: Positive
-    subcarriers: Count
+    start_frequency: Frequency
+    spacing: Step
+    subcarriers: Several
 
     def __post_init__(self) -> None:
-        _check_frequency("start_frequency", self.start_frequency)
-        _check_step("spacing", self.spacing)
-        if self.subcarriers < 2:
-            raise InputError(
-                f"expected at least 2 subcarriers, got {self.subcarriers}; "
-                "give the number of subcarriers that carry symbols"
-            )
+        check_fields(self)
 
     @property
     def samples(self) -> int:
-        """One per subcarrier."""
+        """Number of samples, one per subcarrier."""
         return self.subcarriers
 
     @property
     def step(self) -> float:
-        """The spacing [Hz]."""
+        """Frequency step of the samples: the spacing [Hz]."""
         return self.spacing
 
     @property
     def bandwidth(self) -> float:
-        """N · spacing [Hz]."""
+        """Bandwidth, N · spacing [Hz]."""
         return self.subcarriers * self.spacing
 
     @property
@@ -286,7 +259,7 @@ class OFDM(SampledWaveform):
         """Y = H X: what the receiver's FFT gives for these symbols.
 
         Args:
-            beat: From ``beat_signal``.
+            beat: Signals from ``beat_signal``.
             symbols: X, sent on each subcarrier.
 
         Raises:
@@ -301,7 +274,7 @@ class OFDM(SampledWaveform):
         """conj(Y / X), the samples that ``range_profile`` takes.
 
         Args:
-            received: Y.
+            received: Y, what the receiver's FFT gives.
             symbols: X, sent on each subcarrier.
 
         Raises:
@@ -339,12 +312,11 @@ class Impulse(Waveform):
         InputError: A value is not positive or its unit is evidently wrong.
     """
 
-    center_frequency: Positive
-    bandwidth: Positive
+    center_frequency: Frequency
+    bandwidth: Bandwidth
 
     def __post_init__(self) -> None:
-        _check_frequency("center_frequency", self.center_frequency)
-        _check_frequency("bandwidth", self.bandwidth)
+        check_fields(self)
 
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
@@ -352,14 +324,14 @@ class Impulse(Waveform):
         """Power of the pulse beside the target's range, peak 1.
 
         Args:
-            distance: From the target's range [m].
+            distance: Distance from the target's range [m].
             window: Ignored: a pulse has no samples to taper.
         """
         return gaussian_response(self, distance)
 
 
 def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[Tensor, " element"]:
-    """Window weights by position, so that it serves samples and any array alike.
+    """Weights of a window by position, for samples and for arrays.
 
     At ``count`` uniform positions "hamming" is the usual symmetric window; "hann" and
     "blackman" leave out their zero end points, which would switch off the outermost elements.
@@ -391,7 +363,7 @@ def unit_window(name: str, count: int) -> Float64[Tensor, " sample"]:
 
     Args:
         name: One of ``WINDOWS``.
-        count: How many there are.
+        count: Number of samples or chirps.
 
     Raises:
         InputError: An unknown window.
@@ -406,25 +378,8 @@ def gaussian_response(
     """Gaussian whose full width at half maximum is one range cell, peak 1.
 
     Args:
-        waveform: Its range cell.
-        distance: From the peak [m].
+        waveform: Waveform whose range cell counts.
+        distance: Distance from the peak [m].
     """
     sigma = SIGMA_PER_FWHM * waveform.range_resolution
     return torch.exp(-0.5 * (distance / sigma).square())
-
-
-def _check_frequency(name: str, value: float) -> None:
-    if value >= 1e6:
-        return
-    if value > 0:
-        meant = f"{value:g}e9" if value < 1e3 else f"{value:g}e6"
-        raise InputError(f"expected {name} in Hz, got {value:g}; did you mean {meant}?")
-    raise InputError(f"expected a positive {name}, got {value}; give it in Hz, such as 77e9")
-
-
-def _check_step(name: str, value: float) -> None:
-    if value >= 1e3:
-        return
-    if value > 0:
-        raise InputError(f"expected {name} in Hz, got {value:g}; did you mean {value:g}e6?")
-    raise InputError(f"expected a positive {name}, got {value}; give it in Hz, such as 1e6")

@@ -1,23 +1,32 @@
-"""Conversion and validation of what enters the scene: the public edge of this room."""
+"""Checks of values that enter the library, with errors that say what to do."""
 
 import math
+import operator
 from collections.abc import Sequence
-from typing import Annotated, Any
+from functools import cache
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
-from annotated_types import Ge, Len
+from annotated_types import Ge, Gt, Le, Len, Lt
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.limits import Among, Usual, marks
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 Point = Annotated[ArrayLike, Len(3, 3)]
 Counts = Annotated[Sequence[Annotated[int, Ge(2)]], Len(3, 3)]
+_LIMITS: dict[type, tuple[str, str, Any]] = {
+    Gt: ("gt", "above", operator.gt),
+    Ge: ("ge", "of at least", operator.ge),
+    Lt: ("lt", "below", operator.lt),
+    Le: ("le", "of at most", operator.le),
+}
 
 
 def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: str) -> Tensor:
-    """`value` as a finite float64 tensor of the given shape; gradients are kept.
+    """Convert a value to a finite float64 tensor of the given shape; gradients are kept.
 
     Args:
         value: tensor, array or nested sequence of numbers.
@@ -28,17 +37,12 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
     Raises:
         InputError: not numbers, wrong shape, NaN or infinite.
     """
-    sizes = ", ".join("any" if size is None else str(size) for size in shape)
-    expected = f"expected {what} as numbers of shape [{sizes}]"
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
+        expected = f"expected {what} as numbers of shape {_listed(shape)}"
         raise InputError(f"{expected}, got {type(value).__name__}; {do}") from None
-    fits = len(tensor.shape) == len(shape) and all(
-        size is None or size == actual for size, actual in zip(shape, tensor.shape, strict=True)
-    )
-    if not fits:
-        raise InputError(f"{expected}, got shape {list(tensor.shape)}; {do}")
+    check_shape(tensor, shape, f"{what} as numbers", do)
     bad = int((~torch.isfinite(tensor)).sum())
     if bad:
         raise InputError(
@@ -47,10 +51,33 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
     return tensor
 
 
+def check_shape(value: Tensor, shape: Sequence[int | None], what: str, do: str) -> None:
+    """Raise unless a tensor has the given shape.
+
+    Args:
+        value: the tensor.
+        shape: expected size of every dimension, None where any size will do.
+        what: what the value is, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: another shape.
+    """
+    pairs = zip(shape, value.shape, strict=False)
+    if value.ndim != len(shape) or any(size not in (None, actual) for size, actual in pairs):
+        raise InputError(
+            f"expected {what} of shape {_listed(shape)}, got shape {list(value.shape)}; {do}"
+        )
+
+
+def _listed(shape: Sequence[int | None]) -> str:
+    return f"[{', '.join('any' if size is None else str(size) for size in shape)}]"
+
+
 def checked_number(
     value: object, what: str, low: float, high: float = math.inf, *, open_low: bool = False
 ) -> float:
-    """`value` as a finite number in [low, high], or (low, high] if `open_low`.
+    """Convert a value to a finite number in [low, high], or in (low, high] if `open_low`.
 
     Args:
         value: a number, or a tensor of dimension 0.
@@ -79,7 +106,7 @@ def checked_number(
 
 
 def checked_count(value: object, what: str, low: int) -> int:
-    """`value` as an integer that is at least `low`.
+    """Convert a value to an integer that is at least `low`.
 
     Args:
         value: an integer.
@@ -92,3 +119,61 @@ def checked_count(value: object, what: str, low: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
         raise InputError(f"expected {what} as an integer >= {low}, got {value!r}; give a count")
     return int(value)
+
+
+def check_fields(holder: object) -> None:
+    """Raise unless the fields of a dataclass keep to the limits in their annotations.
+
+    Fields that are None have no limits. In a tuple every item is checked.
+
+    Raises:
+        InputError: a word that is not one of those allowed; a number that is beyond a limit, not
+            finite, not whole where a count is expected, or evidently in another unit.
+    """
+    for name, found in _marks_of_fields(type(holder)).items():
+        value = getattr(holder, name)
+        allowed = [word for mark in found for word in _words(mark)]
+        if allowed and value not in allowed:
+            raise InputError(
+                f"expected {name} to be one of {', '.join(allowed)}, got {value!r}; "
+                "choose one of them"
+            )
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not allowed:
+                _check_number(holder, name, number, found)
+
+
+@cache
+def _marks_of_fields(kind: type) -> dict[str, tuple[Any, ...]]:
+    found = {n: tuple(marks(h)) for n, h in get_type_hints(kind, include_extras=True).items()}
+    return {
+        name: of
+        for name, of in found.items()
+        if any(type(mark) in _LIMITS or _words(mark) for mark in of)
+    }
+
+
+def _words(mark: Any) -> tuple[str, ...]:
+    if isinstance(mark, Among):
+        return mark.names
+    return get_args(mark) if get_origin(mark) is Literal else ()
+
+
+def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]) -> None:
+    usual = next((mark for mark in found if isinstance(mark, Usual)), None)
+    do = f"correct {type(holder).__name__}({name}=...)"
+    if usual is not None:
+        do = f"give it in {usual.unit}, such as {usual.value:g}"
+    if int in found and not isinstance(number, int | np.integer):
+        raise InputError(f"expected {name} as an integer, got {number!r}; give a count")
+    if isinstance(number, bool) or not isinstance(number, int | float | np.number):
+        raise InputError(f"expected {name} as a number, got {number!r}; {do}")
+    for mark in found:
+        if type(mark) in _LIMITS:
+            field, words, holds = _LIMITS[type(mark)]
+            limit = getattr(mark, field)
+            if not (math.isfinite(number) and holds(number, limit)):
+                raise InputError(f"expected {name} {words} {limit:g}, got {number}; {do}")
+    if usual and not usual.low <= number <= usual.high:
+        meant = usual.meant(float(number))
+        raise InputError(f"expected {name} in {usual.unit}, got {number:g}; did you mean {meant}?")

@@ -1,4 +1,4 @@
-"""Clouds: a density of soft point scatterers in a box, where no surface is known."""
+"""Clouds of soft point scatterers in a box, for objects whose surface is not known."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ _CORNER = "give x, y, z of the box's corners"
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Point scatterers that dim what they do not scatter back, in a box.
+    """Point scatterers in a box. They dim the power that passes and scatter some of it back.
 
     The density is the extinction σ: what passes a way s of it is exp(−∫σ ds) of the power. Each
     volume dV scatters alike in all directions, with a radar cross section of albedo · σ dV.

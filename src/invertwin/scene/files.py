@@ -1,9 +1,10 @@
-"""Meshes and scene geometry from files, and meshes into files."""
+"""Read meshes and scene geometry from files, and write meshes to files."""
 
+import math
 import os
 import xml.etree.ElementTree as ElementTree
 import zlib
-from collections.abc import Collection, Generator, Iterator, Mapping
+from collections.abc import Collection, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from zipfile import BadZipFile
@@ -12,15 +13,21 @@ import numpy as np
 import torch
 import trimesh
 from torch import Tensor
+from trimesh import transformations
 from trimesh.exchange.gltf import export_glb
 
 from invertwin.errors import InputError
 from invertwin.scene import shapes
+from invertwin.scene.checks import checked_tensor
 from invertwin.scene.material import Material, RoughDielectric
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import rigid, rotation_from_vector
 from invertwin.scene.scene import Object, Scene
 
+UNREADABLE = (
+    *(OSError, ValueError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error),
+    RuntimeError,  # archives that need a password or a later version
+)
+"""What reading a damaged file of arrays can raise."""
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
@@ -39,7 +46,7 @@ def load_mesh(path: str | Path) -> Mesh:
     Raises:
         InputError: no such file, another format, a broken file, no triangles, or NaN.
     """
-    file = _existing(path)
+    file = existing_file(path)
     if file.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
             f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {file.name}; convert it first"
@@ -63,7 +70,7 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
-    """Write a mesh, or all objects of a scene in the world: PLY in float64, or GLB in float32.
+    """Write a mesh, or all objects of a scene, as PLY in float64 or as GLB in float32.
 
     A GLB file keeps the objects apart, by name.
 
@@ -91,7 +98,7 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
 
 @contextmanager
 def replacing(path: str | Path) -> Generator[Path]:
-    """A new file beside a path, which takes its place when it is complete.
+    """Write a new file beside a path; it takes its place when it is complete.
 
     A failure leaves an existing file as it was.
 
@@ -115,7 +122,7 @@ def replacing(path: str | Path) -> Generator[Path]:
 def read_arrays(
     path: Path, do: str, wanted: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` file by name; those that are wanted, if they are there.
+    """Read the arrays of an ``.npz`` file by name. Wanted arrays that are missing are left out.
 
     Args:
         path: the file.
@@ -123,23 +130,15 @@ def read_arrays(
         wanted: names; None = all.
 
     Raises:
-        InputError: a file that is damaged, or another one, or pickled objects.
+        InputError: no such file, a damaged one, or pickled objects.
     """
+    if not path.is_file():
+        raise InputError(f"expected {path.name} in {path.parent}, got no such file; {do}")
     try:
         # Opened here: numpy leaves a damaged file open.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
             return {k: arrays[k] for k in arrays.files if wanted is None or k in wanted}
-    # The last one is of archives that need a password or a later version.
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        EOFError,
-        BadZipFile,
-        zlib.error,
-        RuntimeError,
-    ) as error:
+    except UNREADABLE as error:
         raise InputError(
             f"expected plain arrays in {path.name}, got {type(error).__name__}; {do}"
         ) from None
@@ -164,7 +163,7 @@ def load_scene_xml(
         InputError: no such file, broken XML, something unsupported that would lose geometry, or a
             material id that no shape refers to.
     """
-    file = _existing(path)
+    file = existing_file(path)
     try:
         root = ElementTree.parse(file).getroot()
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
@@ -177,10 +176,19 @@ def load_scene_xml(
         raise InputError(f"{file}: {error}") from None
 
 
-def _existing(path: str | Path) -> Path:
+def existing_file(path: str | Path, what: str = "an existing file") -> Path:
+    """Check that a file exists, and return its path.
+
+    Args:
+        path: the file.
+        what: what it should be, for the error.
+
+    Raises:
+        InputError: no such file.
+    """
     file = Path(path)
     if not file.is_file():
-        raise InputError(f"expected an existing file, got {file}; check the path")
+        raise InputError(f"expected {what}, got no file {file}; check the path")
     return file
 
 
@@ -309,59 +317,49 @@ def _property(shape: ElementTree.Element, tag: str, name: str, default: str) -> 
 
 def _center(shape: ElementTree.Element) -> Tensor:
     element = shape.find("point[@name='center']")
-    return torch.zeros(3, dtype=torch.float64) if element is None else _vector(element, 0.0)
+    return torch.from_numpy(np.zeros(3) if element is None else _vector(element, 0.0))
 
 
 def _to_world(shape: ElementTree.Element) -> Tensor:
     """The shape's transform: its steps act in the order written."""
     transform = torch.eye(4, dtype=torch.float64)
-    for step in _steps(shape):
+    for element in shape.findall("transform[@name='to_world']/*"):
+        step = checked_tensor(_step(element), (4, 4), element.tag, "correct the scene file")
         transform = step @ transform
     return transform
 
 
-def _steps(shape: ElementTree.Element) -> Iterator[Tensor]:
-    identity = torch.eye(3, dtype=torch.float64)
-    for element in shape.findall("transform[@name='to_world']/*"):
-        if element.tag == "translate":
-            yield rigid(identity, _vector(element, 0.0))
-        elif element.tag == "scale":
-            yield torch.diag(torch.cat([_vector(element, 1.0), identity[0, :1]]))
-        elif element.tag == "rotate":
-            yield rigid(_rotation(element), torch.zeros(3, dtype=torch.float64))
-        elif element.tag == "matrix":
-            yield _matrix(element.get("value", ""))
-        else:
-            raise InputError(
-                "expected translate, rotate, scale or matrix in to_world, "
-                f"got {element.tag}; write it as a matrix"
-            )
+def _step(element: ElementTree.Element) -> np.ndarray:
+    """The matrix of one step of a transform."""
+    if element.tag == "translate":
+        return transformations.translation_matrix(_vector(element, 0.0))
+    if element.tag == "scale":
+        return np.diag([*_vector(element, 1.0), 1.0])
+    if element.tag == "rotate":
+        axis = _vector(element, 0.0)
+        if not axis.any():
+            raise InputError("expected a rotation axis, got none; give x, y, z and angle (degrees)")
+        (angle,) = _numbers(element.get("angle", ""), 1)
+        return np.asarray(transformations.rotation_matrix(np.radians(angle), axis))
+    if element.tag == "matrix":
+        values = _numbers(element.get("value", ""), 9, 16)
+        matrix, size = np.eye(4), math.isqrt(len(values))
+        matrix[:size, :size] = np.reshape(values, (size, size))
+        return matrix
+    raise InputError(
+        "expected translate, rotate, scale or matrix in to_world, "
+        f"got {element.tag}; write it as a matrix"
+    )
 
 
-def _rotation(element: ElementTree.Element) -> Tensor:
-    axis = _vector(element, 0.0)
-    length = torch.linalg.vector_norm(axis)
-    if length == 0:
-        raise InputError("expected a rotation axis, got none; give x, y, z and angle (degrees)")
-    (angle,) = _numbers(element.get("angle", ""), 1)
-    return rotation_from_vector(axis / length * np.radians(angle))
-
-
-def _matrix(text: str) -> Tensor:
-    values = torch.tensor(_numbers(text, 9, 16), dtype=torch.float64)
-    if len(values) == 9:
-        return rigid(values.reshape(3, 3), torch.zeros(3, dtype=torch.float64))
-    return values.reshape(4, 4)
-
-
-def _vector(element: ElementTree.Element, missing: float) -> Tensor:
+def _vector(element: ElementTree.Element, missing: float) -> np.ndarray:
     """Three numbers: from `value` (one stands for all three), or from x, y and z."""
     if "value" in element.attrib:
         values = _numbers(element.attrib["value"], 1, 3)
         values = values * 3 if len(values) == 1 else values
     else:
         values = [_numbers(element.get(axis, str(missing)), 1)[0] for axis in "xyz"]
-    return torch.tensor(values, dtype=torch.float64)
+    return np.array(values)
 
 
 def _numbers(text: str, *counts: int) -> list[float]:

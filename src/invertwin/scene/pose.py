@@ -71,7 +71,7 @@ def rigid(
     rotation: Float[Tensor, "3 3"] | None = None,
     translation: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Float[Tensor, "4 4"]:
-    """The transform x → rotation x + translation [m] as a matrix; no rotation where None.
+    """Make the matrix of the transform x → rotation x + translation [m].
 
     Args:
         rotation: matrix; None = no rotation.
@@ -90,10 +90,10 @@ def rigid(
 def look_at(
     positions: Float[Tensor, "n 3"] | Sequence[Sequence[float]], target: ArrayLike
 ) -> Float64[Tensor, "n 3 3"]:
-    """Rotations whose boresight (third column) points at a target, x level, y upwards.
+    """Make rotations whose boresight (third column) points at a target, x level, y upwards.
 
     Args:
-        positions: where the radar is [m].
+        positions: positions of the radar [m].
         target: what it looks at [m].
 
     Raises:

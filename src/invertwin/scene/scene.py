@@ -87,7 +87,7 @@ class Object:
         return self._to_world(self.mesh.center)
 
     def at(self, time: float) -> "Object":
-        """The object after moving with its velocity for `time` [s], as an instant: at rest."""
+        """The object after it has moved with its velocity for `time` [s]; the result is at rest."""
         checked_number(time, "time [s]", -torch.inf)
         if self.velocity is None:
             return self

@@ -162,7 +162,7 @@ def test_a_saved_prior_is_loaded(tmp_path):
 
 
 def test_what_is_no_prior_is_refused(tmp_path):
-    with pytest.raises(InputError, match="got no file"):
+    with pytest.raises(InputError, match="got no such file"):
         load_prior(tmp_path / "none.npz")
     good = tmp_path / "good.npz"
     PRIOR.save(good)

@@ -11,14 +11,17 @@ from torch import Tensor
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.landscape import exact_losses, line_name, moved, smooth_losses
+from invertwin.cli.landscape import exact_losses, line_through
 from invertwin.cli.report import Table, finish, picture
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
-from invertwin.models import SurrogateMap
+from invertwin.inversion import Observation
+from invertwin.inversion.lines import Line, losses_along
+from invertwin.inversion.loss import relative_error
+from invertwin.models import BeatMap, SurrogateMap
 from invertwin.radar.direction import music
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
@@ -59,7 +62,8 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
     if depth > 1:
         raise InputError(f"data.depth: expected 1 for loss-scan, got {depth}; set depth = 1")
     found = exact(run, truth, radar, grid)
-    near, wide = _losses(run, settings, truth, radar, grid, found.beat)
+    line, along = line_through(truth, settings.object, settings.axis)
+    near, wide = _losses(run, settings, line, radar, grid, found.beat)
     wavelengths = 2 * settings.span / radar.waveform.wavelength
     minima = {name: deep_minima(losses) for name, (_, losses) in near.items()}
     metrics: dict[str, Any] = {
@@ -72,7 +76,6 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
         "lowest_m": {name: _lowest(curve) for name, curve in near.items()},
         "wall_seconds": time.perf_counter() - begin,
     }
-    along = line_name(settings.object, settings.axis)
     figure = scan({TITLES[name]: curve for name, curve in near.items()}, wide, along)
     drawn = picture(folder, "losses", figure, "Loss against displacement")
     title = run.title or "Losses along a line"
@@ -84,7 +87,7 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
 def _losses(
     run: RunFile,
     settings: LossScan,
-    truth: Any,
+    line: Line,
     radar: Radar,
     grid: Grid,
     measured: Tensor,
@@ -93,23 +96,22 @@ def _losses(
     capture = Capture.from_beat(measured, radar)
     sampling = Sampling(depth=1, samples=settings.samples)
     model = SurrogateMap(grid, build.surrogate(run.surrogate), sampling)
+    smooth = Observation(model, radar, capture, loss=build.loss(run.loss))
+    first = radar.frames([0])
+    views = _views(settings, first, grid)
 
-    def line(span: float, points: int) -> tuple[np.ndarray, list[Any]]:
-        x = np.linspace(-span, span, points)
-        return x, moved(truth, settings.object, settings.axis, x)
+    targets = [view(measured[:1]) for view in views.values()]
 
-    def smooth(scenes: list[Any]) -> np.ndarray:
-        return smooth_losses(run, radar, capture, scenes, model)
+    def errors(beat: Tensor, _: Tensor) -> Tensor:
+        pairs = zip(views.values(), targets, strict=True)
+        return torch.stack([relative_error(view(beat), target) for view, target in pairs])
 
-    with torch.no_grad():
-        x, scenes = line(settings.span, settings.points)
-        first = radar.frames([0])
-        views = _views(settings, first, grid)
-        losses = exact_losses(run, truth, first, scenes, measured[:1], views)
-        near = {name: (x, values) for name, values in losses.items()}
-        near["surrogate"] = (x, smooth(scenes))
-        x, scenes = line(settings.wide_span, settings.wide_points)
-        return near, (x, smooth(scenes))
+    x = np.linspace(-settings.span, settings.span, settings.points)
+    far = np.linspace(-settings.wide_span, settings.wide_span, settings.wide_points)
+    exact = exact_losses(run, line, x, Observation(BeatMap(grid), first, measured[:1], loss=errors))
+    near = {name: (x, exact[:, k]) for k, name in enumerate(views)}
+    near["surrogate"] = (x, losses_along(line, x, smooth, seed=run.seed).numpy())
+    return near, (far, losses_along(line, far, smooth, seed=run.seed).numpy())
 
 
 def _views(settings: LossScan, radar: Radar, grid: Grid) -> dict[str, Callable[[Tensor], Tensor]]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from invertwin.cli.report import Again, Picture, Table, report_html
+from invertwin.cli.report import Picture, Table, report_html
 from invertwin.cli.runs import RunFolder
 from invertwin.plotting import PALETTE, png_bytes
 from invertwin.scene import Mesh, ShapePrior, load_prior
@@ -84,9 +84,7 @@ def run_train_prior(
         f"{100 * trained.held_out_error:.1f} cm off, {100 * trained.mean_error:.1f} cm at the mean."
     )
     note = f"Seed {settings.seed}; the log is train.log, the model prior.npz."
-    html = report_html(
-        "Shape prior of vehicles", status, note, [table, *pictures], Again(again, {})
-    )
+    html = report_html("Shape prior of vehicles", status, note, [table, *pictures], again, {})
     folder.write_text("report.html", html)
     return [table]
 

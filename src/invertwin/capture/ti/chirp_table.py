@@ -1,4 +1,4 @@
-"""What both kinds of settings file share: numbers in other units, masks, and who sends when."""
+"""What both kinds of settings file share: numbers in other units, masks, turns of transmitters."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,6 +8,7 @@ from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings, shortest_loop
 from invertwin.errors import InputError
+from invertwin.scene.files import existing_file
 
 # By the first two digits of the device; later ones record through several kinds of link.
 _LANES = {"12": 4, "14": 4, "16": 2, "18": 2, "68": 2}
@@ -53,8 +54,7 @@ def read_text(path: Path, what: str) -> str:
     Raises:
         InputError: no such file, or one that is no text.
     """
-    if not path.is_file():
-        raise InputError(f"expected {what}, got no file {path}; check the path")
+    existing_file(path, what)
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -72,7 +72,7 @@ def lanes_of(device: str) -> int | None:
 def transmit_order(
     chirps: Mapping[int, tuple[int, int]], first: int, last: int, profiles: Sequence[int]
 ) -> tuple[tuple[int, ...], int]:
-    """Who sends in the chirps of one loop, and in which profile.
+    """Find which transmitter sends in each chirp of a loop, and in which profile.
 
     Args:
         chirps: chirp number → profile, transmitter mask.
@@ -114,13 +114,13 @@ def transmit_order(
 def settings(
     order: tuple[int, ...], loops: int, frames: int, period_ms: Any, **values: Any
 ) -> ChirpSettings:
-    """Settings of a frame as files count: 0 frames are endless, repeated orders are loops.
+    """Make settings of a frame as files count: 0 frames are endless, repeated orders are loops.
 
     Args:
         order: transmitters in their order of sending.
         loops: how often the order is sent in a frame.
         frames: number of frames; 0 = endless.
-        period_ms: from frame to frame [ms].
+        period_ms: time between the starts of two frames [ms].
         values: further fields of `ChirpSettings`.
     """
     order, loops = shortest_loop(order, loops)

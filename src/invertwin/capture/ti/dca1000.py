@@ -23,7 +23,7 @@ from invertwin.capture.ti.settings_files import read_settings, recorded_files
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.files import replacing
+from invertwin.scene.files import existing_file, replacing
 
 _WORD = np.dtype("<i2")
 _LANE_COUNT = 4
@@ -42,7 +42,7 @@ def read(
     positions: Float64[Tensor, "frame 3"] | None = None,
     rotations: Float64[Tensor, "frame 3 3"] | None = None,
 ) -> Capture:
-    """A DCA1000 recording as a `Capture`, one beat signal per frame.
+    """Read a DCA1000 recording as a `Capture` with one beat signal per frame.
 
     Args:
         path: `.bin` file, or a `.setup.json` that names the files.
@@ -53,9 +53,9 @@ def read(
         elevation: sign of elevation of the preset, see `Board.arrays`.
         azimuth: sign of azimuth of the preset.
         arrays: TX and RX elements in use, instead of a preset.
-        lanes: of the LVDS link, where the settings do not say.
-        positions: of the radar in every frame [m]; None = the origin.
-        rotations: of the radar in every frame; None = axes of the world.
+        lanes: lanes of the LVDS link, where the settings do not say.
+        positions: position of the radar in every frame [m]; None = the origin.
+        rotations: orientation of the radar in every frame; None = axes of the world.
 
     Raises:
         InputError: what `read_samples` and `ChirpData.capture` raise, or no board.
@@ -72,12 +72,12 @@ def read_recording(
     settings: str | Path | ChirpSettings | None = None,
     lanes: int | None = None,
 ) -> ChirpData:
-    """Every chirp of a recording, with the settings it was made with.
+    """Read every chirp of a recording, with its settings.
 
     Args:
         path: `.bin` file, or a `.setup.json` that names the files.
-        settings: as for `read`.
-        lanes: of the LVDS link, where the settings do not say.
+        settings: the settings or their file; None = those that the `.setup.json` names.
+        lanes: lanes of the LVDS link, where the settings do not say.
 
     Raises:
         InputError: other lanes than the settings say, or what `read_settings` and `read_samples`
@@ -97,7 +97,7 @@ def read_recording(
 
 
 def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSettings) -> ChirpData:
-    """Every chirp of a recording, in ADC counts.
+    """Read every chirp of a recording, in ADC counts.
 
     Warns (`PhysicsWarning`) of an incomplete last frame, which is dropped, of frames that are
     missing, and of saturated samples.
@@ -113,8 +113,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(part) for part in path]
     settings = _with_lanes(settings)
     for part in paths:
-        if not part.is_file():
-            raise InputError(f"expected a recording, got no file {part}; check the path")
+        existing_file(part, "a recording")
     # Files are split anywhere, so only their sum counts.
     size = sum(part.stat().st_size for part in paths)
     name = paths[0].name if paths else "nothing"
@@ -136,7 +135,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
 
 
 def write_samples(path: str | Path, data: ChirpData) -> None:
-    """Writes what `read_samples` reads, word for word.
+    """Write what `read_samples` reads, word for word.
 
     Args:
         path: `.bin` file.
@@ -196,7 +195,7 @@ def _check_parity(settings: ChirpSettings) -> None:
 
 
 def _whole_frames(size: int, settings: ChirpSettings, name: str) -> int:
-    """How many frames to read, after warnings of what is missing."""
+    """Count the frames to read, and warn of what is missing."""
     _check_parity(settings)
     frame = _frame_words(settings) * _WORD.itemsize
     frames, rest = divmod(size, frame)

@@ -30,7 +30,7 @@ _VARIATIONS = (
 
 
 def read_studio(path: str | Path) -> ChirpSettings:
-    """Settings of a `.mmwave.json` file, or of the one that a `.setup.json` file names.
+    """Read the settings of a `.mmwave.json` file, or of the one that a `.setup.json` file names.
 
     A setup names its files by their absolute path on the PC that recorded them; where that does
     not exist, the file of that name beside the setup is taken.
@@ -60,7 +60,7 @@ def read_studio(path: str | Path) -> ChirpSettings:
 
 
 def setup_files(path: str | Path) -> list[Path]:
-    """The raw files that a `.setup.json` file names, in the order of recording.
+    """Find the raw files that a `.setup.json` file names, in the order of recording.
 
     Raises:
         InputError: no file, no JSON, or none that names raw files.
@@ -195,7 +195,7 @@ def _integer(value: Any) -> int:
 
 
 def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
-    """Writes the `.mmwave.json` that `read_studio` reads.
+    """Write the `.mmwave.json` that `read_studio` reads.
 
     Args:
         path: file to write.
@@ -270,7 +270,7 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
 
 
 def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str | Path]) -> None:
-    """Writes a `.setup.json` that names its settings and raw files, which lie beside it.
+    """Write a `.setup.json` that names its settings and raw files. They must lie beside it.
 
     Args:
         path: the setup.

@@ -32,7 +32,7 @@ _BITS = {0: 12, 1: 14, 2: 16}
 
 
 def read_cfg(path: str | Path) -> ChirpSettings:
-    """Settings of a `.cfg` file: `channelCfg`, `adcCfg`, `profileCfg`, `chirpCfg`, `frameCfg`.
+    """Read `channelCfg`, `adcCfg`, `profileCfg`, `chirpCfg` and `frameCfg` of a `.cfg` file.
 
     The byte order of I and Q is that of `adcbufCfg`, where there is one; lanes are those of the
     device in a comment such as ``% Platform:xWR18xx``. All other commands concern what the demo
@@ -152,7 +152,7 @@ def _swapped(commands: Sequence[list[str]]) -> bool:
 
 
 def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
-    """Writes what `read_cfg` reads. What the settings do not hold is written as the demos have it.
+    """Write what `read_cfg` reads. What the settings do not hold is written as in TI's demos.
 
     Args:
         path: file to write.

@@ -1,4 +1,4 @@
-"""Settings files by their ending."""
+"""Settings files are told apart by their ending."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from invertwin.errors import InputError
 
 
 def read_settings(path: str | Path) -> ChirpSettings:
-    """Settings of a `.cfg`, `.mmwave.json` or `.setup.json` file.
+    """Read the settings of a `.cfg`, `.mmwave.json` or `.setup.json` file.
 
     Raises:
         InputError: another ending, or what the reader of that file raises.

@@ -58,7 +58,7 @@ def draw_rough_paths(
         link: Antennas, a few frames of which tell how much a path contributes.
         count: Paths to draw, of each length; at most a quarter of them are kept.
         depth: Most points of a path.
-        seed: Of places and phases.
+        seed: Seed of places and phases.
 
     Source: derivations §4 (one independent phase per ordered path).
     """

@@ -1,4 +1,4 @@
-"""What is random in a field and stays: the points and paths of rough surfaces."""
+"""Speckle: the fixed random points and paths of rough surfaces."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Spe
         scene: Surfaces.
         link: Antennas, which suggest what rough paths are worth drawing.
         sampling: Points per m², number and depth of rough paths.
-        seed: Of places and phases.
+        seed: Seed of places and phases.
     """
     with use_backend(sampling.backend):
         paths = draw_rough_paths(

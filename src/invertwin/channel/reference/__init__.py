@@ -1,1 +1,1 @@
-"""Slow, readable statements of the kernels' laws: the oracles of their tests."""
+"""Slow, readable implementations of the kernels' laws. Tests compare the kernels with them."""

@@ -30,7 +30,7 @@ class Place:
     Attributes:
         position, normal: Attached [m].
         jacobian: Area of the triangle over that area detached: one in value.
-        row: Of the surface.
+        row: Row of the surface in the tables.
     """
 
     position: Float64[Tensor, "n 3"]
@@ -46,7 +46,7 @@ class SurfacePaths:
     Attributes:
         face, b1, b2: Places, per point.
         weight: One over (paths × probability per area of all points).
-        phase: Of the path's field [rad].
+        phase: Phase of the path's field [rad].
     """
 
     face: Int64[Tensor, "n k"]
@@ -90,7 +90,7 @@ class Echo:
         power: Received over transmitted power per m² of every point; Jacobians included.
         arriving: The same at the last point, before it scatters.
         spread: Gains and 1/R² alone: the power without scattering, over (λ/4π)².
-        length: From antenna to antenna [m].
+        length: Length from antenna to antenna [m].
     """
 
     frame: Int64[Tensor, " n"]
@@ -112,7 +112,7 @@ class Echo:
         """Paths of one kind, see ``Paths``; power or coefficient that are not given are zero.
 
         Args:
-            kind, power, coefficient, velocity: Of the paths.
+            kind, power, coefficient, velocity: What ``Paths`` holds.
             boundary: Whether all of them are boundary paths.
         """
         zero = torch.zeros(len(self.frame), dtype=torch.float64)
@@ -301,7 +301,7 @@ def unblocked(
     Args:
         rays: The scene and its antennas.
         frame: Radar pose of every path.
-        paths: Their points.
+        paths: The points of the paths.
     """
     with torch.no_grad():
         passes = _passes(rays, frame, paths.places(rays.geometry))
@@ -314,7 +314,7 @@ def path_view(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -
     Args:
         rays: The scene and its antennas.
         frame: Radar pose of every path.
-        paths: Their points.
+        paths: The points of the paths.
     """
     echo = radar_equation(rays.geometry, rays.link, frame, paths.places(rays.geometry))
     if not rays.geometry.sheets:

@@ -25,7 +25,7 @@ class ShadowEdge:
     Attributes:
         frame, face: Radar pose, and the triangle the shadow falls on.
         b1, b2: Where on the triangle.
-        place: Where it falls, detached.
+        place: Place where the shadow falls, detached.
         speed: Area newly lit per unit of θ, over the probability of the sample: attached, and
             zero in derivative where the other antenna does not see the point.
     """
@@ -47,7 +47,7 @@ def shadow_edge(rays: RayScene, points: EdgePoints) -> ShadowEdge:
 
     Args:
         rays: The scene and its antennas.
-        points: On edges, as torch tensors.
+        points: Points on silhouettes, as torch tensors.
     """
     geometry, link = rays.geometry, rays.link
     tx, rx = link.tx[points.frame], link.rx[points.frame]
@@ -90,7 +90,7 @@ def boundary_rows(
     Args:
         rays: The scene and its antennas.
         samples: Silhouette points over all antennas and frames.
-        seed: Of the points.
+        seed: Seed of the points.
         row: Makes paths of shadow points and of the radar equation there.
     """
     centres = ("tx",) if rays.link.shared_visibility else ("tx", "rx")

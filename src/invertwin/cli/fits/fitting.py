@@ -160,7 +160,7 @@ def _staged(
         return reconstruct(
             start.scene,
             observations_of(problem),
-            unknowns_of(run, start),
+            unknowns_of(run),
             loss=build.loss(run.loss),
             optimizer=build.optimizer(run.optimizer),
             schedule=stages,

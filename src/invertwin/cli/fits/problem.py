@@ -12,7 +12,6 @@ from torch import nn
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.recordings import measured
 from invertwin.cli.registry import registry
@@ -88,7 +87,7 @@ def problem_of(run: RunFile, console: Console) -> Problem:
                 f"{len(run.parameters)} parameters; leave only that"
             )
     # Their errors come before any work.
-    build.parameters(run.parameters, scene, sought_bodies(run), run.scene)
+    build.parameters(run.parameters, scene, run.scene)
     sights, observed = {}, observed_runs(run)
     for name, (own, weight) in observed.items():
         with about(f"observations.{name}") if name else nullcontext():
@@ -316,10 +315,10 @@ def _nuisances(run: RunFile, sight: Sight, name: str) -> dict[str, nn.Module]:
     return {f"{name}.{kind}" if name else kind: made[kind]() for kind in kinds}
 
 
-def unknowns_of(run: RunFile, start: build.Start) -> dict[str, Unknown]:
-    """What is fitted of the scene, by name, from a start."""
+def unknowns_of(run: RunFile) -> dict[str, Unknown]:
+    """What is fitted of the scene, by name."""
     tables = build.named(run.parameters)
-    makers = build.builders(run.parameters, start, run.scene)
+    makers = build.builders(run.parameters, run.scene)
     return {
         name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
         for name, table in tables.items()

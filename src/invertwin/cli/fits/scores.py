@@ -12,11 +12,11 @@ from invertwin.channel import Sampling
 from invertwin.cli import build
 from invertwin.cli.fits.likeness import shape_scores
 from invertwin.cli.fits.problem import Problem, Sight, points_per_m2, sampling_of
-from invertwin.cli.materials import value_errors
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
+from invertwin.inversion.metrics import value_errors
 from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
@@ -58,7 +58,10 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
         rows |= {"scale_error": abs(after.scale - 1)}
     sought = [p for p in problem.run.parameters if _made_known(problem, p)]
     frequency = problem.first.radar.waveform.center_frequency
-    return rows | shapes | value_errors(sought, twin, problem.truth, frequency)
+    for p in sought:
+        ends = twin[p.object].material, problem.truth[p.object].material
+        rows |= value_errors(p.values, *ends, frequency, p.layer)
+    return rows | shapes
 
 
 def _made_known(problem: Problem, parameter: Any) -> bool:

@@ -1,35 +1,61 @@
 """The table of gradient checks."""
 
+import math
 from typing import Annotated, Any, Literal
 
-from pydantic import model_validator
+from pydantic import GetCoreSchemaHandler, model_validator
 
-from invertwin.cli.registry import OneOf
-from invertwin.cli.section import Depth, Section, check_presence, key
+from invertwin.cli.registry import OneOf, Table, number_or_list, registry
+from invertwin.cli.section import Depth, check_presence, fail, key
+from invertwin.inversion.gradcheck import Check
+from invertwin.inversion.tangents import Bump
 from invertwin.limits import Count, Positive
 
 
-class Gradcheck(Section):
-    """Derivative of the map against central differences."""
+class _Change:
+    """Annotates a key that says how fast a value changes with θ."""
 
-    parameter: Annotated[Any, OneOf("theta")] = key("the scalar θ; θ = 0 is the scene as written")
-    step: Positive | None = key(
-        "of the differences: m, relative for scale and density, standard deviations for latent",
-        None,
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        bump = registry.table_of(Bump, "Bump", checked=None)
+        return handler.generate_schema(number_or_list(float, list[Any], bump))
+
+
+class Gradcheck(Table):
+    """Derivative of the map against central differences: `Check`, and what is checked."""
+
+    parameter: Annotated[Any, OneOf("parameter", Table)] = key(
+        "what changes with θ, as in [[parameters]]; θ = 0 is its start"
     )
-    step_deg: Positive | None = key("the same for rotations and joints", None)
-    noise: Positive = key("‖standard error‖₁/‖g_FD‖₁ at which repeating stops", 0.007)
-    max_pairs: Count = key("of differences, at most", 64)
+    tangent: dict[str, Annotated[Any, _Change]] = key(
+        "how fast its values change with θ, by name: a number for all entries, a list, or a bump "
+        "over the nodes of a grid"
+    )
+    step: Positive | None = key("of θ in the differences", None)
+    step_deg: Positive | None = key("the same where θ turns something", None)
     depth: Depth = key("most bounces of a path", 3)
     samples: Count = key("rays of one derivative", 4_000_000)
     boundary_samples: Count = key("silhouette samples of one derivative", 1_000_000)
-    repeats: Count = key("derivatives averaged", 4)
-    difference_samples: Count = key("samples of one end of a pair", 8_000_000)
-    sampling: Literal["rays", "area"] = key("of the differences", "rays")
+
+    @property
+    def of(self) -> Literal["scene", "sensor"]:
+        """What changes with θ."""
+        return "sensor" if self.parameter.kind == "radar_pose" else "scene"
+
+    @property
+    def turns(self) -> bool:
+        """Whether θ is an angle."""
+        return "rotation" in self.tangent or self.parameter.kind == "body"
+
+    def build(self, given: Any = None, /, **more: Any) -> Check:
+        """How sharp the check is."""
+        turn = {} if self.step_deg is None else {"step": math.radians(self.step_deg)}
+        return super().build(given, **turn, **more)
 
     @model_validator(mode="after")
     def _complete(self) -> "Gradcheck":
-        turns = self.parameter.kind.endswith("rotation") or self.parameter.kind == "joint"
-        wanted = {"step_deg": turns, "step": not turns}
+        if self.parameter.kind == "mover":
+            fail("expected a parameter of the scene or the radar, got a mover; choose another kind")
+        wanted = {"step_deg": self.turns, "step": not self.turns}
         check_presence(self, wanted, f"with kind = {self.parameter.kind}")
         return self

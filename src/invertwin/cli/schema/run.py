@@ -24,6 +24,7 @@ from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.section import InputPath, Section, Seed, Vector, fail, key
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.errors import InputError
+from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 
@@ -34,6 +35,7 @@ AnyMaterial = Annotated[Any, OneOf("material")]
 AnyModel = Annotated[Any, OneOf("model")]
 AnyData = Annotated[Any, OneOf("data")]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
+AnyGradcheck = Annotated[Any, TableOf(Check, Gradcheck)]
 
 
 class SceneFile(Section):
@@ -127,7 +129,7 @@ class _RunFile(Section):
     measures: Measures | None = key("of the found shape", None)
     calibration: Calibration | None = key("before the fit", None)
     landscape: Landscape | None = key("losses along a line", None)
-    gradcheck: Gradcheck | None = key("the gradient check", None)
+    gradcheck: AnyGradcheck | None = key("the gradient check", None)
 
     @model_validator(mode="after")
     def _names_exist(self) -> "_RunFile":
@@ -206,7 +208,7 @@ class _RunFile(Section):
 
     @model_validator(mode="after")
     def _learned_shapes_have_their_own_size(self) -> "_RunFile":
-        for parameter in self.parameters:
+        for parameter in self.unknowns.values():
             if parameter.kind not in ("shape_space", "prior"):
                 continue
             name, why = parameter.object, f'with kind = "{parameter.kind}", which has its own size'
@@ -222,19 +224,23 @@ class _RunFile(Section):
         """What stages and variants call the parameters."""
         return [p.name or p.kind for p in self.parameters]
 
+    @property
+    def unknowns(self) -> dict[str, Any]:
+        """The tables of what is sought, and of what a gradient check moves, by path."""
+        found = {f"parameters[{i}]": table for i, table in enumerate(self.parameters)}
+        own = {} if self.gradcheck is None else {"gradcheck.parameter": self.gradcheck.parameter}
+        return found | own
+
     def references(self) -> list[tuple[str, str]]:
         """Where the run file names an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
-        for i, parameter in enumerate(self.parameters):
-            if getattr(parameter, "object", None) is not None:
-                used.append((f"parameters[{i}].object", parameter.object))
+        for path, table in self.unknowns.items():
+            if getattr(table, "object", None) is not None:
+                used.append((f"{path}.object", table.object))
         for section in type(self).model_fields:
             name = getattr(getattr(self, section), "object", None)
             if name is not None:
                 used.append((f"{section}.object", name))
-        name = self.gradcheck and getattr(self.gradcheck.parameter, "object", None)
-        if name:
-            used.append(("gradcheck.parameter.object", name))
         return used
 
 

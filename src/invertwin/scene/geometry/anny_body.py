@@ -18,7 +18,7 @@ _TURN = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype
 def load_anny(
     phenotypes: Mapping[str, float] | None = None, sought: Sequence[str] = ()
 ) -> BodyTemplate:
-    """A person of the model Anny (Apache-2.0), which the optional extra ``anny`` installs.
+    """Load a person of the model Anny (Apache-2.0), which the optional extra ``anny`` installs.
 
     The joints are its 104 bones by their names, such as ``upperarm01.L`` and ``lowerarm01.L``; the
     rest pose is its own, turned so that the person faces −z, y up. The first use of Anny prepares

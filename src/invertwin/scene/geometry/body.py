@@ -14,6 +14,7 @@ from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.scene.files import read_arrays
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.parameters import Entries
 from invertwin.scene.pose import rotation_from_vector
 from invertwin.scene.scene import Scene
 
@@ -281,6 +282,11 @@ class SkinnedBody(nn.Module):
         if self.template.shape_count:
             named[f"{self.object}.shape"] = self.shape.detach().clone()
         return named
+
+    def entries(self) -> dict[str, Entries]:
+        """The rotation vectors [rad] of the joints that are sought and have a name."""
+        joints = enumerate(self.template.names)
+        return {name: Entries("rotation", k) for k, name in joints if self._sought[k].any()}
 
     def _posed(self) -> tuple[Tensor, Tensor]:
         free = self.rotation * self._sought + self.rotation.detach() * (1 - self._sought)

@@ -1,4 +1,4 @@
-"""A density of soft scatterers on a grid: a shape without a surface, until it is meshed."""
+"""A density of soft scatterers on a grid: a shape that has no surface until it is meshed."""
 
 from collections.abc import Sequence
 
@@ -6,12 +6,14 @@ import torch
 from jaxtyping import Float64
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.parameters import Entries
 from invertwin.scene.scene import Scene
 
 # Starts are kept this far above zero, in units of one over a node spacing: below, softplus is so
@@ -27,7 +29,7 @@ class DensityGrid(nn.Module):
 
     Attributes:
         value: parameter [x, y, z].
-        albedo: of the cloud.
+        albedo: albedo of the cloud, see ``Cloud``.
     """
 
     def __init__(
@@ -76,14 +78,14 @@ class DensityGrid(nn.Module):
         counts: Sequence[int],
         depth: float = 0.5,
     ) -> "DensityGrid":
-        """A grid of one density σ; a way through the box along its longest side has ∫σ ds.
+        """Make a grid of one density σ, from ∫σ ds through the box along its longest side.
 
         Args:
             object: name of the object.
             low: corner of the box in the object's frame [m].
             high: the opposite corner [m].
             counts: nodes along x, y and z.
-            depth: that ∫σ ds; faint, since what is opaque hides what lies behind it from the fit.
+            depth: that ∫σ ds. Keep it small: what is opaque hides what lies behind it from the fit.
 
         Raises:
             InputError: as above.
@@ -102,7 +104,12 @@ class DensityGrid(nn.Module):
     @property
     def density(self) -> Float64[Tensor, "x y z"]:
         """Extinction at the nodes [1/m]."""
-        return nn.functional.softplus(self.value) / self._unit
+        return softplus(self.value) / self._unit
+
+    def entries(self) -> dict[str, Entries]:
+        """The logarithm of the density: its changes are relative ones of the density."""
+        value = self.value.detach()
+        return {"log_density": Entries("value", slope=value.sigmoid() / softplus(value))}
 
     @property
     def cloud(self) -> Cloud:
@@ -132,7 +139,7 @@ class DensityGrid(nn.Module):
 
 
 def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
-    """The closed surface of equal density, by marching cubes; without gradients.
+    """Mesh the closed surface of equal density by marching cubes, without gradients.
 
     Args:
         cloud: the densities.
@@ -161,7 +168,7 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
 
 
 def without_clouds(scene: Scene) -> Scene:
-    """The scene with every cloud as the surface of its usual level; for exact signals, pictures.
+    """Replace every cloud of a scene by its surface, for exact signals and pictures.
 
     An even cloud has no such surface: its object keeps the mesh that marked its place.
     """

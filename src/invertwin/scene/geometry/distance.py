@@ -191,12 +191,12 @@ class NeuralDistance(_Distance):
             low: corner of the box in the object's frame [m].
             high: the opposite corner [m].
             counts: nodes along x, y and z at which the field is meshed.
-            radius: of the ball [m].
+            radius: radius of the ball [m].
             width: sines of a layer.
             depth: layers of sines.
             frequency: of the first layer's sines, in radians over the box's half diagonal: higher
                 for finer detail.
-            seed: of the network.
+            seed: seed of the network's first weights.
 
         Raises:
             InputError: a box without volume, or a number that is not positive.

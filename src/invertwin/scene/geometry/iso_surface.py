@@ -1,4 +1,4 @@
-"""From a field to a mesh, and derivatives back: marching cubes and the implicit relation."""
+"""Mesh a field by marching cubes, with derivatives by the implicit function theorem."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ _FLAT = 1e-6  # least slope of a distance, whose own is 1
 def iso_surface(
     field: Field, lattice: Lattice, values: Float64[Tensor, "x y z"] | None = None
 ) -> Mesh:
-    """The surface where a field is zero, as a mesh whose vertices follow the field.
+    """Mesh the surface where a field is zero; the vertices follow the field.
 
     Values and topology are those of marching cubes, moved onto the field's zero; the derivative of
     a vertex V with unit normal n = ∇f/|∇f| is ``dV = −n df/|∇f|``, in reverse and in forward mode.
@@ -54,7 +54,7 @@ def surface_of(
     """Places of vertices, without derivatives, and triangles.
 
     Args:
-        field: as above.
+        field: the signed distance at points in the box.
         lattice: nodes on which the field is known.
         values: there.
 
@@ -93,7 +93,7 @@ def follow(
 
     Args:
         field: whose zero the points are on.
-        points: of the surface [m].
+        points: points of the surface [m].
         slope: the field's gradient there, where it is known already; None asks the field.
     """
     fixed = points.detach()

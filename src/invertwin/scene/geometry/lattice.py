@@ -107,7 +107,7 @@ def tensor_product(
     Args:
         values: at the nodes.
         index: first node of each point along every axis.
-        weights: of four nodes along every axis.
+        weights: weights of four nodes along every axis.
     """
     steps = torch.arange(4)
     x, y, z = (index[:, k, None] + steps for k in range(3))
@@ -118,7 +118,7 @@ def tensor_product(
 def cubic(
     values: Float64[Tensor, "x y z"], lattice: Lattice, points: Float64[Tensor, "p 3"]
 ) -> Float64[Tensor, " p"]:
-    """Values at points by cubic convolution (Catmull–Rom), continued outside the lattice.
+    """Interpolate at points by cubic convolution (Catmull–Rom), also outside the lattice.
 
     Args:
         values: at the nodes.

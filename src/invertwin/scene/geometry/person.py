@@ -46,7 +46,7 @@ _TALL = 1.75  # m
 
 
 def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
-    """A person who faces −z, y up, arms held out along ±x, in the frame of the pelvis.
+    """Make a person who faces −z, y up, arms held out along ±x, in the frame of the pelvis.
 
     One closed skin around tapered cylinders that run into each other; its weights pass smoothly
     from joint to joint. The joints are pelvis, chest, neck, and shoulder, elbow, hip and knee of
@@ -55,7 +55,7 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
 
     Args:
         height: [m].
-        spacing: of the triangles' corners [m].
+        spacing: distance of neighbouring corners of the triangles [m].
 
     Raises:
         InputError: a height or spacing out of range.

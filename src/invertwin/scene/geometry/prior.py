@@ -1,4 +1,4 @@
-"""A learned prior of shapes: few numbers decode to a signed distance, and that to a mesh."""
+"""A learned prior of shapes: a few numbers decode to a signed distance, which is meshed."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -37,9 +37,9 @@ class Decoder(nn.Module):
 
         Args:
             latent: number of coordinates.
-            width: of the hidden layer.
+            width: size of the hidden layer.
             features: number of learned fields.
-            nodes: of half a grid.
+            nodes: number of nodes in half a grid.
         """
         super().__init__()
         self.enter = nn.Linear(latent, width)
@@ -54,7 +54,7 @@ class Decoder(nn.Module):
 
 
 class ShapePrior:
-    """A kind of shapes with mirror symmetry in y, as a decoder of latents with unit variance.
+    """A family of shapes with mirror symmetry in y, decoded from latents of unit variance.
 
     Latents of the shapes it was trained on have zero mean and unit variance along each coordinate,
     so ½ |z|² is the negative logarithm of their probability density, and z = 0 is the mean shape.
@@ -285,7 +285,7 @@ def _packaged() -> ShapePrior:
 
 
 def load_prior(file: str | Path | None = None) -> ShapePrior:
-    """A prior from a file that `ShapePrior.save` or ``invertwin train-prior`` wrote.
+    """Load a prior that `ShapePrior.save` or ``invertwin train-prior`` wrote.
 
     Args:
         file: the file; None is the prior of vehicles that comes with the package. It decodes
@@ -300,8 +300,6 @@ def load_prior(file: str | Path | None = None) -> ShapePrior:
 
 def _read(path: Path) -> ShapePrior:
     do = "give a file of invertwin train-prior"
-    if not path.is_file():
-        raise InputError(f"expected a shape prior, got no file {path}; {do}")
     found = read_arrays(path, do)
     try:
         if str(found.pop("format")) != _FORMAT:

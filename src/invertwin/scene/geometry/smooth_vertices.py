@@ -128,7 +128,7 @@ def smoothed(latent: Tensor, solver: Solver) -> Tensor:
 
     Args:
         latent: u.
-        solver: of the matrix I + λL.
+        solver: what multiplies by (I + λL)⁻¹.
     """
     return _Smoothed.apply(latent, solver)  # type: ignore[return-value]
 

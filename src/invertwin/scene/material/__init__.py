@@ -31,5 +31,6 @@ from invertwin.scene.material.surface import ANGLE_COUNT as ANGLE_COUNT
 from invertwin.scene.material.surface import Material as Material
 from invertwin.scene.material.surface import Surface as Surface
 from invertwin.scene.material.values import RANGES as RANGES
+from invertwin.scene.material.values import MaterialValue as MaterialValue
 from invertwin.scene.material.values import Texture as Texture
 from invertwin.scene.material.values import Value as Value

@@ -16,7 +16,7 @@ LEAST_COSINE = 1e-9
 
 
 class FieldCoefficients(NamedTuple):
-    """Reflected and transmitted over incident electric field, for exp(+jωt), by polarisation.
+    """Reflected and transmitted field over the incident one, for exp(+jωt), by polarisation.
 
     Perpendicular (s, TE): E normal to the plane of incidence. Parallel (p, TM): E within it, with
     the sign by which both reflection coefficients of a conductor are opposite, −1 and +1.

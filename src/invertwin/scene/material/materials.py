@@ -6,7 +6,7 @@ gradients; permittivity and conductivity may also follow the ITU table (`Itu`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Annotated, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import torch
 from annotated_types import MinLen
@@ -103,6 +103,28 @@ class Medium(_Values):
         polarised = evaluated(real) * (1 - 1j * evaluated(self.loss_tangent))
         dispersion = real_slope * polarised + (sigma_slope - 1) * (epsilon - polarised)
         return epsilon, dispersion
+
+
+def held_by(material: Any, layer: int | None, name: str) -> Any:
+    """What holds the values: the material, or one of its layers.
+
+    Args:
+        material: such as a `Multilayer`.
+        layer: from 0; None = the material itself.
+        name: what the material is called in the error.
+
+    Raises:
+        InputError: no such layer.
+    """
+    if layer is None:
+        return material
+    layers = getattr(material, "layers", ())
+    if layer >= len(layers):
+        raise InputError(
+            f"expected a layer below {len(layers)} of {name}, got {layer}; "
+            "count layers from 0, and give `layer` for a Multilayer only"
+        )
+    return layers[layer]
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Roughness: how the reflected power is shared among a mirror-like lobe and scattered ones.
+"""Roughness: how the reflected power is split between a mirror-like lobe and others.
 
-Effective roughness: the share 1 − S² of the reflected power stays about the mirror direction, in a
-glossy lobe as wide as the slopes of the surface make it; the share S² is scattered, into a
-Lambertian part, a directive lobe about the mirror direction, and a lobe back to where it came from.
+Effective roughness: the part 1 − S² of the reflected power stays about the mirror direction, in a
+glossy lobe. The slopes of the surface set the width of this lobe. The part S² is scattered: into a
+Lambertian part, a directive lobe about the mirror direction, and a lobe back to the source.
 
 Source: Degli-Esposti et al., "Measurement and modelling of scattering from buildings", 2007.
 
@@ -71,11 +71,11 @@ def lobe_integral(exponent: Float64[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
 def specular_weights(
     diffuse: Float64[Tensor, "*#row"], exponent: Float64[Tensor, "*#row"]
 ) -> Weights:
-    """A Lambertian part, and the rest in the specular lobe.
+    """Weights of a Lambertian part, with the rest in the specular lobe.
 
     Args:
         diffuse: Lambertian part, 0 to 1.
-        exponent: of the specular lobe.
+        exponent: exponent of the specular lobe.
     """
     diffuse, exponent = torch.broadcast_tensors(diffuse, exponent)
     none = diffuse.new_zeros((*diffuse.shape, LOBE_COUNT - 1))

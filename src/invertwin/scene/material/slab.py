@@ -78,7 +78,7 @@ def slab_coefficients(
     The transmission is from the entry face to the exit face, at the same place along them.
 
     Args:
-        layers: from the side of incidence on.
+        layers: the layers in the order in which the wave meets them.
         cos_theta: cosine of the angle of incidence, in [0, 1].
         frequency: [Hz].
 
@@ -98,7 +98,7 @@ def slab_tables(
     power that each lets through. Differentiable in the layers' values.
 
     Args:
-        layers: from the side of incidence on.
+        layers: the layers in the order in which the wave meets them.
         cos_theta: cosine of the angle of incidence, in [0, 1].
         frequency: [Hz].
 

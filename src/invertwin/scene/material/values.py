@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import InitVar, dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.limits import Among
 from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh
 
@@ -61,7 +62,7 @@ class Texture:
 
     @classmethod
     def over(cls, image: ArrayLike, mesh: Mesh) -> "Texture":
-        """The image laid over a mesh as seen along its z axis.
+        """Lay an image over a mesh, as seen along its z axis.
 
         The left and right borders are at the least and largest x of the mesh, bottom and top at
         the least and largest y, in the object's own frame.
@@ -136,9 +137,11 @@ RANGES: Mapping[str, Range] = {
 }
 """Every value of the library's materials by the name of its field."""
 
+MaterialValue = Annotated[str, Among(tuple(RANGES))]
+
 
 def checked_value(value: object, name: str) -> Value:
-    """The value of the field `name`, lists and arrays as tensors.
+    """Check the value of a field; lists and arrays become tensors.
 
     Args:
         value: a number, one per triangle, or a `Texture`.
@@ -175,7 +178,7 @@ def evaluated(value: Value) -> Float64[Tensor, "*row"]:
 
 
 def row_count(values: Mapping[str, object]) -> int | None:
-    """For how many triangles the values are, None if they hold for a whole object.
+    """Count the triangles that values are for; None if they hold for a whole object.
 
     Raises:
         InputError: values for different numbers of triangles.

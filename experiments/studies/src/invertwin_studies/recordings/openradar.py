@@ -12,9 +12,9 @@ import torch
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirps import ChirpData, ChirpSettings
 from invertwin.capture.elements import elements
-from invertwin.capture.npz import read_npz
 from invertwin.errors import InputError
 from invertwin.scene.antenna import AntennaArray
+from invertwin.scene.files import read_arrays
 
 FILE = "openradar.npz"
 _TX, _RX = 2, 4
@@ -55,7 +55,7 @@ def read_chirps(folder: str | Path) -> ChirpData:
     Raises:
         InputError: no file, a damaged one, an array of another shape, or no settings.
     """
-    arrays = read_npz(Path(folder) / FILE)
+    arrays = read_arrays(Path(folder) / FILE, "it is damaged or truncated: copy it again")
     frame = arrays.get("frame_2tx4rx")
     if frame is None or frame.ndim != 3 or frame.shape[1] != _TX * _RX or frame.dtype.kind != "c":
         got = "none" if frame is None else f"{frame.dtype} of shape {frame.shape}"

@@ -13,12 +13,12 @@ import torch
 from scipy.signal import hilbert
 
 from invertwin.capture.capture import Capture
-from invertwin.capture.npz import read_npz
 from invertwin.capture.track import Track
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import Impulse
 from invertwin.scene.antenna import AntennaArray
+from invertwin.scene.files import read_arrays
 
 FILE = "bwsi_rail_trial6.npz"
 
@@ -93,7 +93,7 @@ def read(
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    arrays = read_npz(path)
+    arrays = read_arrays(path, "it is damaged or truncated: copy it again")
     for name, dimensions in _DIMENSIONS.items():
         if name not in arrays or arrays[name].ndim != dimensions:
             got = f"shape {arrays[name].shape}" if name in arrays else "none"

@@ -1,0 +1,98 @@
+"""How the parameters of a module change with a scalar θ, from numbers as a user writes them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.limits import Positive
+from invertwin.scene.checks import ArrayLike, Point
+from invertwin.scene.geometry import Lattice
+from invertwin.scene.parameters import Entries
+
+
+@dataclass(frozen=True)
+class Bump:
+    """A round bump over the nodes of a grid: ``height · exp(−|x − center|² / (2 width²))``.
+
+    Attributes:
+        center: in the object's frame [m].
+        width: standard deviation [m].
+        height: change in the middle; three numbers where every node has three.
+    """
+
+    center: Point
+    width: Positive
+    height: float | Sequence[float] = 1.0
+
+    def over(self, lattice: Lattice, shape: Sequence[int]) -> Tensor:
+        """The change of every entry of a parameter.
+
+        Args:
+            lattice: Nodes of the module.
+            shape: Of the parameter. It may have nodes beyond the lattice, as many on every side.
+        """
+        beyond = (shape[0] - lattice.counts[0]) / 2 * lattice.spacing
+        nodes = Lattice.between(lattice.low - beyond, lattice.high + beyond, shape[:3]).nodes
+        far = (nodes - nodes.new_tensor(self.center)).square().sum(-1)
+        bump = torch.exp(-far / (2 * self.width**2))
+        height = bump.new_tensor(self.height)
+        return bump[..., None] * height if height.ndim else bump * height
+
+
+Change = float | ArrayLike | Bump
+"""One number for all entries, all entries, the first ones of a row, or a bump over a grid."""
+
+
+def changes_of(module: nn.Module, tangent: Mapping[str, Change]) -> dict[str, Tensor]:
+    """Changes of a module's parameters, by name, for θ = 1.
+
+    A tangent names parameters, or what the module calls some of their entries (see ``Entries``):
+    the ``rotation`` [rad] of a ``Pose``, the joints of a ``SkinnedBody`` [rad], the
+    ``log_density`` of a ``DensityGrid``, the values of ``MaterialValues``.
+
+    Args:
+        module: What is moved.
+        tangent: How fast the named values change with θ. A list may be shorter than a row of
+            entries; what it leaves out does not change.
+
+    Raises:
+        InputError: A name or a shape that the module does not have.
+    """
+    start = {name: value.detach() for name, value in module.named_parameters()}
+    known = {name: Entries(name) for name in start}
+    if hasattr(module, "entries"):
+        known |= module.entries()  # type: ignore[operator]
+    parts = {name: start[found.parameter][found.index] for name, found in known.items()}
+    changes: dict[str, Tensor] = {}
+    for name, change in tangent.items():
+        rate = _rate(change, parts.get(name), getattr(module, "lattice", None))
+        if name not in parts or rate.shape != parts[name].shape:
+            shapes = ", ".join(f"{other} {tuple(part.shape)}" for other, part in parts.items())
+            raise InputError(
+                f"expected changes of {type(module).__name__} ({shapes}), got {name} "
+                f"{tuple(rate.shape)}; give one number, or as many"
+            )
+        found = known[name]
+        whole = changes.setdefault(found.parameter, torch.zeros_like(start[found.parameter]))
+        whole[found.index] = rate / found.slope
+    return changes
+
+
+def _rate(change: Change, part: Tensor | None, lattice: Lattice | None) -> Tensor:
+    """How fast every one of some entries changes; None stands for unknown ones."""
+    if isinstance(change, Bump):
+        if lattice is None or part is None or part.ndim < 3:
+            raise InputError("expected numbers, got a bump; bumps are for the nodes of a grid")
+        return change.over(lattice, part.shape)
+    try:
+        rate = torch.as_tensor(change, dtype=torch.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"expected numbers, got {change!r}; give rows of one length") from None
+    if part is not None and rate.ndim == 0:
+        return rate.expand_as(part)
+    if part is not None and isinstance(change, list) and rate.ndim == part.ndim == 1:
+        return torch.cat([rate, part.new_zeros(max(len(part) - len(rate), 0))])
+    return rate
