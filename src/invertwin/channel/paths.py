@@ -10,6 +10,8 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
+from invertwin.scene.checks import check_fields
 
 
 @runtime_checkable
@@ -34,23 +36,17 @@ class Grid:
     """
 
     range_start: float
-    range_step: float
-    range_count: int
+    range_step: Positive
+    range_count: Count
     u_start: float = 0.0
-    u_step: float = 1.0
-    u_count: int = 1
+    u_step: Positive = 1.0
+    u_count: Count = 1
     v_start: float = 0.0
-    v_step: float = 1.0
-    v_count: int = 1
+    v_step: Positive = 1.0
+    v_count: Count = 1
 
     def __post_init__(self) -> None:
-        for axis in ("range", "u", "v"):
-            count, step = getattr(self, f"{axis}_count"), getattr(self, f"{axis}_step")
-            if count < 1 or not step > 0:
-                raise InputError(
-                    f"expected a positive {axis}_count and {axis}_step, got {count} and {step}; "
-                    "build the grid with Radar.grid(range_min, range_max)"
-                )
+        check_fields(self)
 
     @property
     def shape(self) -> tuple[int, int, int]:

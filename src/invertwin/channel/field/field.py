@@ -23,10 +23,6 @@ from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
-_NO_ROUGH_DERIVATIVE = (
-    "expected no geometry derivative of rough field paths, got one: single points appear and "
-    "vanish; use power paths, or boundary=False for fixed visibility"
-)
 _GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
 
 
@@ -73,7 +69,10 @@ def trace_field(
                 )
             parts += _conductors(rays, sampling, seed)
         if moves and (depth > 1 or not all(geometry.coherent)):
-            raise InputError(_NO_ROUGH_DERIVATIVE)
+            raise InputError(
+                "expected no geometry derivative of rough field paths, got one: single points "
+                "appear and vanish; use power paths, or boundary=False for fixed visibility"
+            )
         if depth > 1:
             geometry.require_rest(depth)
         fixed = speckle or draw_speckle(scene, link, sampling, seed)
