@@ -30,12 +30,7 @@ _FLAT = 1e-12  # least component of a direction: a ray along a face of the box
 
 
 def deposit_density(
-    item: Object,
-    link: Link,
-    grid: Grid,
-    *,
-    sampling: Sampling,
-    seed: int,
+    item: Object, link: Link, grid: Grid, *, sampling: Sampling, seed: int
 ) -> Float32[Tensor, "frame range u v"]:
     """Expected received over transmitted power of an object's cloud in every bin, per frame.
 
