@@ -99,13 +99,12 @@ def boundary_rows(
     if not sampler.size:
         return []
     drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept()
-    columns = {
-        name: to_torch(column) for name, column in vars(drawn).items() if column is not False
-    }
+    columns = {n: to_torch(column) for n, column in vars(drawn).items() if column is not False}
     wide = {n: c.double() if c.is_floating_point() else c.long() for n, c in columns.items()}
     edge = shadow_edge(rays, replace(drawn, **wide))
     with torch.no_grad():
-        return [row(edge, radar_equation(rays.geometry, rays.link, edge.frame, [edge.place]))]
+        echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.place])
+    return [row(edge, echo)]
 
 
 def _barycentric(point: Tensor, p0: Tensor, p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor]:
