@@ -40,7 +40,7 @@ from invertwin.cli.fits.problem import (
     Problem,
     observations_of,
     problem_of,
-    stages_of,
+    schedule_of,
     unknowns_of,
 )
 from invertwin.cli.run_file import load_run
@@ -65,11 +65,11 @@ COUNTED = {
 def fit(problem: Problem, steps: int, after_step: Callable[[dict[str, Any]], None]) -> None:
     """The first steps of the demo's fit."""
     run = problem.run
-    (stage,) = stages_of(run)
+    (stage,) = schedule_of(problem)
     reconstruct(
         problem.scene,
         observations_of(problem),
-        unknowns_of(run, build.Start(problem.scene, {})),
+        unknowns_of(run),
         loss=build.loss(run.loss),
         optimizer=build.optimizer(run.optimizer),
         schedule=replace(stage, steps=steps),

@@ -151,9 +151,6 @@ def test_both_run_files_are_one_experiment(shapes):
                 update={
                     "variants": {},
                     "title": "",
-                    "reconstruct": need(found, "reconstruct", "reconstruct").model_copy(
-                        update={"parameters": []}
-                    ),
                 }
             )
             for found in fits

@@ -6,7 +6,7 @@ import pytest
 import torch
 import xarray as xr
 
-from invertwin.capture import READERS, Capture, Track, read
+from invertwin.capture import Capture, Track, read
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
@@ -306,12 +306,11 @@ def test_half_a_complex_variable_is_refused(tmp_path):
         Capture.load(path)
 
 
-def test_readers_are_found_by_name(tmp_path):
+def test_recordings_are_told_by_their_ending(tmp_path):
     beat_capture().save(tmp_path / "capture.nc")
     assert read(tmp_path / "capture.nc").frame_count == FRAMES
-    assert set(READERS) == {"netcdf", "dca1000", "arrays"}
-    with pytest.raises(InputError, match="did you mean 'dca1000'"):
-        read(tmp_path, "dca100")
+    with pytest.raises(InputError, match=r"ends in .bin, .setup.json, .toml or .nc, got .*x.wav"):
+        read(tmp_path / "x.wav")
 
 
 def test_numpy_samples_are_welcome_and_real_ones_are_named():

@@ -70,9 +70,9 @@ def test_chirps_are_calibrated_alike():
     calibration = ChannelCalibration(errors())
     device = recorded().radar()
     arrays = (device.transmitters, device.receivers)
-    corrected = calibration.apply(data.recorded(*arrays))
+    corrected = calibration.apply(data.recorded(arrays))
     torch.testing.assert_close(corrected.beat[:, 1], calibration.apply(recorded()).beat)
-    real = ChirpData(data.samples.real + 0j, replace(settings, real=True)).recorded(*arrays)
+    real = ChirpData(data.samples.real + 0j, replace(settings, real=True)).recorded(arrays)
     clean = calibration.apply(real)
     torch.testing.assert_close(clean.beat * calibration.gains[..., None], real.beat)
     assert clean.max_range == CHIRP.max_range / 2

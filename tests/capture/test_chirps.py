@@ -82,10 +82,10 @@ def test_repeated_orders_are_loops():
 
 def test_a_capture_is_the_mean_or_one_chirp():
     data = ChirpData(samples(), SETTINGS)
-    mean = data.capture(*ARRAYS, chirps="mean")
+    mean = data.recorded(ARRAYS).capture("mean")
     torch.testing.assert_close(mean.beat, data.samples.mean(1))
     assert mean.times.tolist() == [0.0, 0.05]
-    one = data.capture(*ARRAYS, chirps=2, positions=torch.ones(2, 3, dtype=torch.float64))
+    one = data.recorded(ARRAYS, torch.ones(2, 3, dtype=torch.float64)).capture(2)
     assert torch.equal(one.beat, data.samples[:, 2])
     assert float(one.radar().positions.sum()) == 6
     assert one.radar().waveform == SETTINGS.waveform
@@ -97,8 +97,8 @@ def test_real_samples_become_analytic():
     echo = torch.exp(2j * torch.pi * (8 * time + 0.2))
     recorded = torch.zeros(2, 4, 3, 4, 64, dtype=torch.complex64) + echo.real
     data = ChirpData(recorded, settings)
-    torch.testing.assert_close(data.beat[:, 0], data.capture(*ARRAYS, chirps=0).beat)
-    beat = data.capture(*ARRAYS, chirps="mean").beat
+    torch.testing.assert_close(data.beat[:, 0], data.recorded(ARRAYS).capture(0).beat)
+    beat = data.recorded(ARRAYS).capture("mean").beat
     torch.testing.assert_close(beat[1, 2, 3].to(torch.complex128), echo, atol=1e-6, rtol=0)
 
 
@@ -163,9 +163,9 @@ def test_a_capture_needs_a_choice_and_its_elements():
     data = ChirpData(samples(), SETTINGS)
     for chirps in (4, -1, "all", True):
         with pytest.raises(InputError, match='"mean" or a number from 0 to 3'):
-            data.capture(*ARRAYS, chirps=chirps)
+            data.recorded(ARRAYS).capture(chirps)
     two = board("xWR1642").arrays()
     with pytest.raises(InputError, match="expected 3 TX elements"):
-        data.capture(*two, chirps=0)
+        data.recorded(two)
     with pytest.raises(InputError, match="expected 4 RX elements"):
-        data.capture(ARRAYS[0], two[0], chirps=0)
+        data.recorded((ARRAYS[0], two[0]))

@@ -9,7 +9,7 @@ import scipy.io
 import torch
 
 from invertwin.capture import ChirpData, ChirpSettings, read
-from invertwin.capture.described_arrays import read_chirps, write_chirps
+from invertwin.capture.described_arrays import described_board, read_chirps, write_chirps
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
 from invertwin.radar.waveform import PhysicsWarning
@@ -138,14 +138,14 @@ def test_matlab_shows_dimensions_in_its_own_order(tmp_path, described):
 
 
 def test_a_description_becomes_a_capture(described):
-    capture = read(described(), "arrays", chirps=0)
+    capture = read(described()).capture(0)
     assert torch.equal(capture.beat, read_chirps(described()).samples[:, 0])
     tx, _ = board("xWR1843").arrays(elevation=1)
     assert torch.equal(capture.radar().transmitters.positions, tx.positions)
-    down = read(described(), "arrays", chirps="mean", elevation=-1)
+    down = read(described(), board=described_board(described(), elevation=-1))
     assert torch.equal(down.radar().transmitters.positions[:, 1], -tx.positions[:, 1])
     other = board("xWR1443").arrays(elevation=1, azimuth=-1)
-    given = read(described(), "arrays", chirps=0, arrays=other)
+    given = read(described(), board=other)
     assert torch.equal(given.radar().receivers.positions, other[1].positions)
 
 
@@ -154,13 +154,15 @@ def test_elements_may_be_listed(described):
     rx = [[0.001 * i, 0.0, 0.0] for i in range(4)]
     listed = f"tx_positions = {tx}\nrx_positions = {rx}\n"
     preset = 'board = "xWR1843"\nelevation = 1\n'
-    capture = read(described(None, preset, listed), "arrays", chirps=0)
+    capture = read(described(None, preset, listed))
     assert capture.radar().receivers.positions.tolist() == rx
     wrong = described(None, preset, listed.replace("[0.0, 0.0, 0.0]", "1"))
     with pytest.raises(InputError, match="TX positions"):
-        read(wrong, "arrays", chirps=0)
-    with pytest.raises(InputError, match="either board or arrays"):
-        read(described(None, preset, ""), "arrays", chirps=0)
+        read(wrong)
+    with pytest.raises(InputError, match=r"either a board or tx_positions .* got neither"):
+        read(described(None, preset, ""))
+    with pytest.raises(InputError, match=r"either a board or tx_positions .* got both"):
+        read(described(None, preset, preset + listed))
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,9 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_many_starts_with_and_without_boundary_terms(run_file, monkeypatch):
-    run_file.write_text(RUN + "also_interior_only = true\n" + STARTS)
+    run_file.write_text(
+        RUN + "[variants.interior_only]\nreconstruct = { boundary = false }\n" + STARTS
+    )
     assert call(monkeypatch, "reconstruct", run_file) == 0
     out = run_file.parent / "out" / "small"
     metrics = read_metrics(out)

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from invertwin.cli import build
-from invertwin.cli.bodies import sought_bodies
+from invertwin.cli.fits.problem import Problem, starts_of
+from invertwin.cli.fits.scores import joint_scores
 from invertwin.cli.run_file import validate
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
@@ -39,16 +40,17 @@ def run_file(joints: Any = LEFT, scale: float = 1.0, **tables: Any) -> RunFile:
 def test_every_sought_joint_starts_that_far_off_and_only_these():
     run = run_file(scale=1.2)
     assert run.starts is not None
-    scene, bodies = build.scene(run), sought_bodies(run)
-    starts = build.starts(run.starts, scene, scene, 1, bodies)
-    again = build.starts(run.starts, scene, scene, 1, bodies)
+    scene = build.scene(run)
+    bodies = build.sought_bodies(run, scene)
+    problem = Problem(run, scene, scene, frozenset())
+    starts, again = starts_of(problem), starts_of(problem)
     body = bodies["person"]
     truth = scene["person"].mesh
     true = body.template.rotations_of(truth.vertices)
     for start, same in zip(starts, again, strict=True):
         mesh = start.scene["person"].mesh
         assert torch.equal(mesh.vertices, same.scene["person"].mesh.vertices)
-        angles = body.errors(mesh, truth, truth)
+        angles = joint_scores(body, mesh, truth, truth)
         assert angles["joint_error_before_deg"] == pytest.approx(20.0, abs=1e-4)
         assert angles["joint_error_after_deg"] == pytest.approx(0.0, abs=1e-4)
         found = body.template.rotations_of(mesh.vertices)
@@ -65,9 +67,8 @@ def test_every_sought_joint_starts_that_far_off_and_only_these():
 def test_a_truth_may_have_other_angles():
     run = run_file(truth={"person": {"angles_deg": {"neck": [10.0, 0.0, 0.0]}}})
     scene, truth = build.scene(run), build.true_scene(run)
-    angles = sought_bodies(run)["person"].errors(
-        scene["person"].mesh, scene["person"].mesh, truth["person"].mesh
-    )
+    body, mesh = build.sought_bodies(run, scene)["person"], scene["person"].mesh
+    angles = joint_scores(body, mesh, mesh, truth["person"].mesh)
     assert angles["joint_error_left_elbow_deg"] == pytest.approx(50.0, abs=1e-4)
     assert angles["joint_error_left_hip_deg"] == pytest.approx(0.0, abs=1e-4)
 
@@ -83,8 +84,9 @@ def test_a_truth_may_have_other_angles():
     ],
 )
 def test_bad_bodies(changes, message):
+    run = run_file(**changes)
     with pytest.raises(InputError, match=message):
-        sought_bodies(run_file(**changes))
+        build.parameters(run.parameters, build.scene(run), run.scene)
 
 
 def checked(
@@ -106,7 +108,8 @@ ELBOW = {"kind": "body", "joints": {"left_elbow": ["y"]}}
 
 def test_theta_turns_a_joint():
     start, moved = checked(ELBOW, {"left_elbow": [0.0, 1.0, 0.0]})
-    body = sought_bodies(run_file())["person"].template
+    run = run_file()
+    body = build.sought_bodies(run, build.scene(run))["person"].template
     before, after = (body.rotations_of(s["person"].mesh.vertices) for s in (start, moved))
     assert float((after - before)[body.joint("left_elbow"), 1]) == pytest.approx(0.01, abs=1e-9)
     assert float((after - before).abs().sum()) == pytest.approx(0.01, abs=1e-7)

@@ -285,7 +285,7 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
         ({"frame": 2}, r"data\.frame: expected a number below 2, got 2"),
         ({"channels": "none.json"}, r"data\.channels: .*none\.json"),
         ({"board": {"name": "xWR1642", "transmitters": [1]}}, r"data\.board: .*remove the key"),
-        ({"orientation": {"look_at": [0, 1, 0]}}, r"data\.positions: "),
+        ({"orientation": {"look_at": [0, 1, 0]}}, r"data\.orientation\.look_at: "),
     ],
 )
 def test_recordings_that_do_not_fit_are_refused(train, changes, message):
@@ -332,7 +332,7 @@ def test_samples_are_kept_as_they_are(tmp_path):
     assert isinstance(data, ChirpData)
     arrays = (radar.transmitters, radar.receivers)
     described_arrays.write_chirps(tmp_path / "a.toml", data, "a.npy", arrays)
-    tx, rx = described_arrays.described_elements(tmp_path / "a.toml", data.settings)
+    tx, rx = described_arrays.described_board(tmp_path / "a.toml")
     assert torch.equal(tx.positions, radar.transmitters.positions)
     assert torch.equal(rx.positions, radar.receivers.positions)
     assert torch.equal(described_arrays.read_chirps(tmp_path / "a.toml").samples, beat)

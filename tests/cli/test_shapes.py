@@ -2,23 +2,28 @@
 
 import tomllib
 
-import numpy as np
 import pytest
-import torch
 from PIL import Image
 from rich.console import Console
 
 from cli.small import RUN, call, read_metrics
 from invertwin.cli import build
-from invertwin.cli.fits.likeness import is_shape_key, shape_label, shape_scores
-from invertwin.cli.fits.problem import FULL, annealed_until, problem_of, stages_of, varied_run
+from invertwin.cli.fits.problem import (
+    FULL,
+    Problem,
+    annealed_until,
+    problem_of,
+    schedule_of,
+    stages_of,
+    varied_run,
+)
+from invertwin.cli.fits.shape_scores import is_shape_key, shape_label, shape_scores
 from invertwin.cli.fits.writing import Fitted, tables_of
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, box
+from invertwin.scene import Mesh, PriorShape
 from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry import LinearShape, PriorShape
 
 HEAD, TAIL = RUN.split("[[parameters]]")
 SHAPES = """
@@ -54,15 +59,19 @@ parameters = ["vertices"]
 [[stages]]
 parameters = ["vertices"]
 remesh = 0.06
-steps = 2
-rate = 0.01
+reconstruct = { steps = 2 }
+optimizer = { rate = 0.01 }
 
 [variants.no_boundary]
-boundary = false
+reconstruct = { boundary = false }
 
 [variants.rough]
-smooth = 0.0
-stages = [{ parameters = ["vertices"], steps = 2 }]
+stages = [{ parameters = ["vertices"], reconstruct = { steps = 2 } }]
+
+[[variants.rough.parameters]]
+kind = "vertices"
+object = "plate"
+rate = 0.004
 
 [measures]
 object = "plate"
@@ -197,7 +206,7 @@ def test_a_run_with_stages_survives_the_way_to_toml(tmp_path):
 
 
 def test_extra_widths_end_where_the_only_stage_says(tmp_path):
-    settings = "steps = 2\nrange_width = 3.0\nannealing = 0.5\n"
+    settings = "reconstruct = { steps = 2, annealing = 0.5 }\nsurrogate = { range_width = 3.0 }\n"
     one = LETTERS.replace("[measures]", f"[[stages]]\n{settings}\n[measures]")
     assert annealed_until(check(shapes(LETTERS), tmp_path)) is None
     assert annealed_until(check(shapes(one), tmp_path)) == 1.0
@@ -208,11 +217,13 @@ def test_extra_widths_end_where_the_only_stage_says(tmp_path):
 
 def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
     text = shapes(SHAPES).replace(
-        "[variants.no_boundary]\nboundary = false\n",
-        '[variants.no_boundary]\noptimizer = "sgd"\nrate = 0.5\nannealing = 0.25\nstages = []\n',
+        "[variants.no_boundary]\nreconstruct = { boundary = false }\n",
+        '[variants.no_boundary]\noptimizer = { kind = "sgd", rate = 0.5 }\n'
+        "reconstruct = { annealing = 0.25 }\nstages = []\n",
     )
     text = text.replace(
-        "steps = 2\nrate = 0.01\n", 'steps = 2\noptimizer = "sgd"\nannealing = 0.5\n'
+        "reconstruct = { steps = 2 }\noptimizer = { rate = 0.01 }\n",
+        'reconstruct = { steps = 2, annealing = 0.5 }\noptimizer = { kind = "sgd" }\n',
     )
     run = check(text, tmp_path)
     own = varied_run(run, "no_boundary")
@@ -220,8 +231,10 @@ def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
     assert own.reconstruct is not None
     assert own.reconstruct.annealing == 0.25
     assert varied_run(run, FULL).optimizer.kind == "adam"
-    first, second = stages_of(varied_run(run, FULL))
-    assert first.optimizer is None
+    scene = build.scene(run)
+    first, second = schedule_of(Problem(run, scene, scene, frozenset()))
+    assert first.optimizer == build.optimizer(run.optimizer)
+    assert (first.steps, first.annealing) == (3, 0.7)
     assert second.optimizer is not None
     assert second.optimizer.kind == "sgd"
     assert second.annealing == 0.5
@@ -244,21 +257,6 @@ def test_learned_shapes_are_objects_and_parameters(tmp_path):
     assert len(shape_terms(tables["vertices"], module, scene)) == 1
 
 
-def save_vehicles(folder):
-    """A space of boxes, in the files of the public one."""
-    mean, modes = box([1.0, 2.0, 3.0]), np.random.default_rng(0).normal(size=(24, 4))
-    folder.mkdir()
-    (folder / "dodec_mean.obj").write_text(
-        "\n".join(
-            [f"v {x} {y} {z}" for x, y, z in mean.vertices.tolist()]
-            + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mean.faces.tolist()]
-        )
-    )
-    names = ("default_dodec_mean", "default_dodec_pc", "default_dodec_sv")
-    parts = (mean.vertices.numpy().ravel(), modes, np.ones(4))
-    np.savez(folder / "vehicle3d_pca.npz", **dict(zip(names, parts, strict=True)))
-
-
 def test_learned_shapes_start_as_their_object(tmp_path):
     latent = [0.5, -0.25] + [0.0] * 22
     run = check(learned(f'shape = "prior"\nlatent = {latent}'), tmp_path)
@@ -266,19 +264,6 @@ def test_learned_shapes_start_as_their_object(tmp_path):
     first, *_ = build.parameters(run.parameters, scene, objects=run.scene)
     assert isinstance(first, PriorShape)
     assert first.latent.tolist() == latent
-    save_vehicles(tmp_path / "vehicles")
-    space = f'folder = "{tmp_path}/vehicles"\nlevel = "coarse"'
-    text = learned(f'shape = "vehicle"\n{space}\ncoefficients = [0.5, -2.0]')
-    text = text.replace('kind = "prior"', f'kind = "shape_space"\n{space}\nmodes = 3')
-    run = check(text, tmp_path)
-    scene = build.scene(run)
-    first, *_ = build.parameters(run.parameters, scene, objects=run.scene)
-    assert isinstance(first, LinearShape)
-    assert first.latent.tolist() == [0.5, -2.0, 0.0]
-    torch.testing.assert_close(first(scene)["plate"].mesh.vertices, scene["plate"].mesh.vertices)
-    run = check(text.replace("modes = 3", "modes = 1"), tmp_path)
-    with pytest.raises(InputError, match=r"parameters\[0\]: expected at least as many modes as"):
-        build.parameters(run.parameters, scene, objects=run.scene)
 
 
 def test_learned_shapes_have_a_size_of_their_own(tmp_path):
@@ -291,7 +276,7 @@ def test_learned_shapes_have_a_size_of_their_own(tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    ["full", "interior_only", "whole", "seen", "count", "m", '"a/b"', "a-b", "2nd", '"a\\n"'],
+    ["full", "whole", "seen", "count", "m", '"a/b"', "a-b", "2nd", '"a\\n"'],
 )
 def test_variants_have_names_of_their_own(name, tmp_path):
     text = shapes().replace("[variants.rough]", f"[variants.{name}]")
@@ -311,12 +296,13 @@ def test_variants_have_names_of_their_own(name, tmp_path):
             r'stages\[1\].remesh: expected a parameter with kind = "vertices"',
         ),
         (
-            'stages = [{ parameters = ["vertices"], steps = 2 }]',
-            'parameters = ["field"]\nstages = [{ remesh = 0.1 }]',
-            r"variants.rough.stages\[0\].remesh: .*got none",
+            "reconstruct = { boundary = false }",
+            'reconstruct = { parameters = ["field"] }\nstages = [{ remesh = 0.1 }]',
+            r"variants.no_boundary.stages\[0\].remesh: .*got none",
         ),
         ('object = "plate"\nseen', 'object = "plane"\nseen', "measures.object"),
         ("[variants.rough]\n", "[variants.rough]\nlaplacian = 1.0\n", "variants.rough.laplacian"),
+        ("steps = 3\n", "also_interior_only = true\n", r"; add \[variants.interior_only\] with"),
     ],
 )
 def test_wrong_keys_are_named(old, new, message, tmp_path):
@@ -324,3 +310,50 @@ def test_wrong_keys_are_named(old, new, message, tmp_path):
     assert old in text
     with pytest.raises(InputError, match=message):
         check(text.replace(old, new, 1), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("variant", "message"),
+    [
+        ("rate = 0.5", r"mine.rate: expected one of the keys .*; write it in `optimizer`"),
+        ("reconstruct = { stepz = 5 }", r"variants.mine.reconstruct.stepz: .*mean `steps`"),
+        ("optimizer = { rate = -1.0 }", r"variants.mine.optimizer.rate: expected .*, got -1.0"),
+        ('optimizer = { kind = "adm" }', r"variants.mine.optimizer.kind: .*mean `adam`"),
+        ("surrogate = { range_widht = 1.0 }", r"variants.mine.surrogate.range_widht: .*mean"),
+        ('surrogate = "anealed"', r"variants.mine.surrogate: .*annealed"),
+        (
+            "stages = [{ optimizer = { rate = 0.0 } }]",
+            r"variants.mine.stages\[0\].optimizer.rate: expected .*, got 0.0",
+        ),
+        (
+            "stages = [{ reconstruct = { position_limit = 1.0 } }]",
+            r"variants.mine.stages\[0\].reconstruct.position_limit: expected one of the keys",
+        ),
+        ('reconstruct = { observations = ["door"] }', r"variants.mine.reconstruct.observations"),
+        (
+            'parameters = [{ kind = "vertices", object = "plat" }]',
+            r"variants.mine.parameters\[0\].object: .*mean `plate`",
+        ),
+    ],
+)
+def test_errors_of_a_variant_begin_at_its_own_path(variant, message, tmp_path):
+    text = f"{shapes()}\n[variants.mine]\n{variant}\n"
+    with pytest.raises(InputError, match=message) as caught:
+        check(text, tmp_path)
+    assert str(caught.value).count("also") == 0
+
+
+def test_parts_are_merged_key_by_key_and_kinds_replace(tmp_path):
+    text = shapes().replace(
+        "[variants.no_boundary]\nreconstruct = { boundary = false }\n",
+        '[variants.no_boundary]\noptimizer = { kind = "gauss_newton" }\nloss = { levels = 1 }\n'
+        'surrogate = "response"\n',
+    )
+    text += '\n[loss]\nkind = "likelihood"\nfloor = 0.5\n[surrogate]\nangle_kernel = "airy"\n'
+    run = check(text + "[optimizer]\nrate = 0.2\n", tmp_path)
+    own = varied_run(run, "no_boundary")
+    assert (own.loss.kind, own.loss.floor, own.loss.levels) == ("likelihood", 0.5, 1)
+    assert (own.optimizer.kind, own.optimizer.rate) == ("gauss_newton", 0.03)
+    assert (own.surrogate.range_kernel, own.surrogate.angle_kernel) == ("response", "response")
+    first, second = (found.optimizer.rate for _, found in stages_of(run))
+    assert (first, second) == (0.2, 0.01)

@@ -11,22 +11,28 @@ from invertwin.channel import Sampling
 from invertwin.inversion.gradcheck import Check, gradcheck
 from invertwin.models import SurrogateMap
 from invertwin.radar import Surrogate
-from invertwin.scene import Mesh, Scene, box, plate, rigid, rotation_from_vector, sphere
-from invertwin.scene.geometry import (
+from invertwin.scene import (
     BodyTemplate,
     DistanceGrid,
-    Lattice,
     LatticeDeformation,
     LinearShape,
+    Mesh,
     NeuralDistance,
     PriorShape,
+    Scene,
     ShapePrior,
     ShapeSpace,
     SkinnedBody,
     SmoothVertices,
     articulated_template,
+    box,
     load_prior,
+    plate,
+    rigid,
+    rotation_from_vector,
+    sphere,
 )
+from invertwin.scene.geometry.lattice import Lattice
 from scenes import float64, radar, thing
 
 Line = tuple[Scene, nn.Module, dict[str, Tensor]]

@@ -12,8 +12,16 @@ from invertwin.inversion.loss import relative_error
 from invertwin.inversion.tangents import Bump, changes_of
 from invertwin.models import BeatMap, SurrogateMap
 from invertwin.radar import Surrogate
-from invertwin.scene import Pose, Scene, Translation, rotation_from_vector, sphere
-from invertwin.scene.geometry import DensityGrid, DistanceGrid, LatticeDeformation
+from invertwin.scene import (
+    DensityGrid,
+    DistanceGrid,
+    LatticeDeformation,
+    Pose,
+    Scene,
+    Translation,
+    rotation_from_vector,
+    sphere,
+)
 from invertwin.scene.parameters import MaterialValues
 from invertwin.simulation import simulate
 from scenes import float64, radar, thing

@@ -14,8 +14,8 @@ from invertwin.scene import (
     Translation,
     box,
     load_prior,
-    load_vehicle_space,
 )
+from invertwin_studies.vehicle_space import load_vehicle_space
 from scenes import thing
 
 

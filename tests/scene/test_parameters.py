@@ -31,7 +31,7 @@ from invertwin.scene import (
     rotation_angle,
     rotation_from_vector,
 )
-from invertwin.scene.material import RANGES
+from invertwin.scene.material.values import RANGES
 
 
 def vector(*numbers: float) -> Tensor:

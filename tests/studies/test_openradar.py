@@ -1,15 +1,17 @@
 """The reader of the OpenRadar recording, on a small imitation and on the recording itself."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.radar.boards import board
+from invertwin.radar.boards import Mounting, board
 from invertwin.radar.doppler import compensate_tdm, range_doppler
-from invertwin_studies.recordings.openradar import FILE, read, read_chirps
+from invertwin_studies.recordings.kinds import openradar_data
+from invertwin_studies.recordings.openradar import FILE, read_chirps
 
 META = {"f0_hz": 77e9, "slope_hz_s": 6e13, "fs_hz": 2.5e6, "idle_s": 3e-5, "ramp_end_s": 6.2e-5}
 
@@ -36,13 +38,17 @@ def test_virtual_channels_are_transmitters_times_receivers(write):
 
 
 def test_a_capture_has_the_elements_of_a_board(write):
-    capture = read(write(), chirps="mean")
     tx, _ = board("xWR1642").arrays()
-    assert torch.equal(capture.radar().transmitters.positions, tx.positions)
-    torch.testing.assert_close(capture.beat, read_chirps(write()).samples.mean(1))
-    mine = board("xWR1843").arrays(elevation=1, transmitters=[1, 3])
-    other = read(write(), chirps=3, arrays=mine)
-    assert torch.equal(other.radar().transmitters.positions, mine[0].positions)
+    found = openradar_data(str(write()))
+    assert found.moving
+    assert torch.equal(found.radar().transmitters.positions, tx.positions)
+    torch.testing.assert_close(found.beat, read_chirps(write()).samples)
+    mine = Mounting("xWR1843", elevation=1)
+    with pytest.raises(InputError, match="board: "):
+        openradar_data(str(write()), replace(mine, transmitters=[1, 3]))
+    other = openradar_data(str(write()), mine)
+    expected, _ = board("xWR1843").arrays(elevation=1, transmitters=[1, 2])
+    assert torch.equal(other.radar().transmitters.positions, expected.positions)
 
 
 @pytest.mark.parametrize(
@@ -82,13 +88,13 @@ def test_the_recording_has_movers_near_three_metres(data_folder):
     nearest = data.settings.waveform.range_resolution
     ranges = torch.arange(128) * nearest
     assert 2.8 < float(ranges[profile.argmax()]) < 3.2
-    capture = read(data_folder / "openradar", chirps=0)
+    capture = data.recorded(Mounting("xWR1642")).capture(0)
     assert capture.radar().waveform.center_frequency == pytest.approx(78.956e9, rel=1e-4)
 
 
 def test_the_channels_of_the_mover_are_a_plane_wave(data_folder):
     data = read_chirps(data_folder / "openradar")
-    radar = data.recorded(*board("xWR1642").arrays()).radar()
+    radar = data.recorded(Mounting("xWR1642")).radar()
     moving = (data.beat - data.beat.mean(1, keepdim=True)).to(torch.complex128)
     spectrum = range_doppler(moving, radar, radar.grid(2.5, 3.5), data.settings.chirps)
     spectrum = compensate_tdm(spectrum, radar, data.settings.chirps)[0]

@@ -24,9 +24,9 @@ def backproject(
 ) -> Complex128[Tensor, "*point"]:
     """Focus the data on points: average the echoes from each point's distance over all frames.
 
-    Echoes of a target at the point add in phase, since the profiles carry their carrier: the
-    matched filter of a point target without its spreading loss. Beat samples go through
-    ``backproject_beat``.
+    Echoes of a target at the point add in phase, since the profiles keep the phase of the carrier.
+    This is the matched filter of a point target without its spreading loss. Beat samples go
+    through ``backproject_beat``.
 
     Args:
         capture: range profiles or beat samples.
@@ -78,9 +78,9 @@ def locate(
 def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
     """Find the clock offset and the range bias that focus a known target best.
 
-    Both are searched within 0.1 s and 0.1 m of the present ones. The power of the coherent sum is
-    the measure: over the bias it follows the envelope of the pulse, not its carrier, since a bias
-    turns all frames alike; over the clock offset it is as sharp as the image.
+    Both are searched within 0.1 s and 0.1 m of the present ones. The search maximises the power of
+    the coherent sum. A bias turns all frames alike, so this power follows the envelope of the
+    pulse, not its carrier. Over the clock offset the maximum is as sharp as the image.
 
     Args:
         capture: range profiles with the track of the radar.

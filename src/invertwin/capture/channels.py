@@ -118,12 +118,12 @@ def estimate_channels(
 ) -> ChannelCalibration:
     """Estimate the gains of the channels from a reflector at a known place.
 
-    Each channel is compared with the beat signal of an ideal point there,
-    ``c = Σ w_n s[n] conj(ideal[n])``, whose delays are exact to every element (so the reflector
-    may be close), which weighs down echoes from other ranges. Over several frames
-    ``c ≈ amplitude(frame) · gain(channel)``: the gains are the leading singular vector, whatever
-    phase the reflector has in each frame. Positions of the elements that are wrong count as phases;
-    they are right in the direction of this reflector only.
+    Each channel is compared with the beat signal of an ideal point at that place:
+    ``c = Σ w_n s[n] conj(ideal[n])``. The delays of the ideal point are exact to every element, so
+    the reflector may be close. The sum suppresses echoes from other ranges. Over several frames
+    ``c ≈ amplitude(frame) · gain(channel)``. The gains are the leading singular vector, whatever
+    phase the reflector has in each frame. Errors of the elements' positions end up in the phases,
+    which then are right in the direction of this reflector only.
 
     Args:
         capture: samples with the reflector as the strongest echo at its range.

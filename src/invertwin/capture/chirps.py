@@ -12,14 +12,13 @@ from jaxtyping import Complex, Float64
 from scipy.signal import hilbert
 from torch import Tensor
 
-from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.errors import InputError
 from invertwin.limits import Count, Frequency, NonNegative, Positive, Several, Usual
+from invertwin.radar.boards import Elements, Mounting
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, PhysicsWarning
-from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import check_fields, check_shape, checked_number
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
@@ -181,26 +180,25 @@ class ChirpData:
 
     def recorded(
         self,
-        transmitters: AntennaArray,
-        receivers: AntennaArray,
+        board: Mounting | Elements,
         positions: Float64[Tensor, "frame 3"] | None = None,
         rotations: Float64[Tensor, "frame 3 3"] | None = None,
     ) -> ChirpCapture:
         """Complex beat signals of every chirp, with the radar that recorded them.
 
         Args:
-            transmitters: elements in the order of sending.
-            receivers: elements in the order of `ChirpSettings.receivers`.
+            board: whose elements recorded, those that the settings name; or the elements: of TX in
+                the order of sending, and of RX as in `ChirpSettings.receivers`.
             positions: position of the radar in every frame [m]; None = the origin.
             rotations: orientation of the radar in every frame; None = axes of the world.
 
         Raises:
-            InputError: another number of elements.
+            InputError: another number of elements, or what `Mounting.arrays` refuses.
         """
-        for name, array, count in (
-            ("TX", transmitters, self.samples.shape[2]),
-            ("RX", receivers, self.samples.shape[3]),
-        ):
+        settings = self.settings
+        if isinstance(board, Mounting):
+            board = board.arrays(settings.transmit_order, settings.receivers)
+        for name, array, count in zip(("TX", "RX"), board, self.samples.shape[2:4], strict=True):
             if len(array.positions) != count:
                 raise InputError(
                     f"expected {count} {name} elements as in the recording, got "
@@ -208,32 +206,8 @@ class ChirpData:
                 )
         if positions is None:
             positions = torch.zeros(self.frame_count, 3, dtype=torch.float64)
-        settings = self.settings
-        radar = Radar(transmitters, receivers, settings.waveform, positions, rotations)
+        radar = Radar(*board, settings.waveform, positions, rotations)
         return ChirpCapture(self.beat, radar, settings.chirps, settings.frame_period, settings.real)
-
-    def capture(
-        self,
-        transmitters: AntennaArray,
-        receivers: AntennaArray,
-        *,
-        chirps: int | str,
-        positions: Float64[Tensor, "frame 3"] | None = None,
-        rotations: Float64[Tensor, "frame 3 3"] | None = None,
-    ) -> Capture:
-        """One beat signal per frame and channel, see `ChirpCapture.capture`.
-
-        Args:
-            transmitters: elements in the order of sending.
-            receivers: elements in the order of `ChirpSettings.receivers`.
-            chirps: "mean", or the number from 0 of the chirp to take.
-            positions: position of the radar in every frame [m]; None = the origin.
-            rotations: orientation of the radar in every frame; None = axes of the world.
-
-        Raises:
-            InputError: another number of elements, or a chirp that does not exist.
-        """
-        return self.recorded(transmitters, receivers, positions, rotations).capture(chirps)
 
 
 def adc_counts(

@@ -10,10 +10,9 @@ import scipy.io
 import tomli_w
 import torch
 
-from invertwin.capture.capture import Capture
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
-from invertwin.capture.elements import elements
 from invertwin.errors import InputError
+from invertwin.radar.boards import Elements, Mounting
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
 from invertwin.scene.files import UNREADABLE, existing_file, replacing
@@ -38,68 +37,42 @@ _ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-def read(
+def described_board(
     path: str | Path,
-    *,
-    chirps: int | str,
     board: str | None = None,
     elevation: int | None = None,
     azimuth: int | None = None,
-    arrays: tuple[AntennaArray, AntennaArray] | None = None,
-) -> Capture:
-    """Read described samples as a `Capture` with one beat signal per frame.
+) -> Mounting | Elements:
+    """Whose elements recorded described samples: a board as it is mounted, or TX and RX elements.
 
-    The elements are those of the arguments or, without any, of the description's ``[radar]``:
-    ``board``, ``elevation`` and ``azimuth`` of a preset, or ``tx_positions`` and ``rx_positions``
-    [m].
+    The description's ``[radar]`` says it: ``board``, ``elevation`` and ``azimuth`` of a preset, or
+    ``tx_positions`` and ``rx_positions`` [m].
 
     Args:
-        path: the TOML file, see `read_chirps`.
-        chirps: "mean" or a chirp number, see `ChirpData.capture`.
-        board: preset of `invertwin.radar.boards`.
-        elevation: sign of elevation of the preset, see `Board.arrays`.
-        azimuth: sign of azimuth of the preset.
-        arrays: TX and RX elements in use, instead of a preset.
-
-    Raises:
-        InputError: what `read_chirps` and `ChirpData.capture` raise, or no elements.
-    """
-    data = read_chirps(path)
-    chosen = described_elements(path, data.settings, board, elevation, azimuth, arrays)
-    return data.capture(*chosen, chirps=chirps)
-
-
-def described_elements(
-    path: str | Path,
-    settings: ChirpSettings,
-    board: str | None = None,
-    elevation: int | None = None,
-    azimuth: int | None = None,
-    arrays: tuple[AntennaArray, AntennaArray] | None = None,
-) -> tuple[AntennaArray, AntennaArray]:
-    """Find the TX and RX elements of described samples, see `read`.
-
-    Args:
-        path: file of the samples, beside its description.
-        settings: chirp settings of the recording.
+        path: the TOML file.
         board: name of a preset; None = as described.
         elevation: channels of the preset along y; None = as described.
         azimuth: channels of the preset along x; None = as described.
-        arrays: (transmitters, receivers) instead of a preset.
 
     Raises:
         InputError: neither the arguments nor the description say which.
     """
     described = _description(Path(path)).get("radar", {})
-    if board is None and arrays is None:
-        board = described.get("board")
-        tx, rx = described.get("tx_positions"), described.get("rx_positions")
-        if tx is not None and rx is not None:
-            arrays = (_elements(tx, "TX"), _elements(rx, "RX"))
-    elevation = described.get("elevation") if elevation is None else elevation
-    azimuth = described.get("azimuth", 1) if azimuth is None else azimuth
-    assert azimuth is not None
-    return elements(settings, board, elevation, azimuth, arrays)
+    if board is None:
+        board, tx, rx = (described.get(key) for key in ("board", "tx_positions", "rx_positions"))
+        if (board is None) == (tx is None or rx is None):
+            raise InputError(
+                f"expected either a board or tx_positions and rx_positions in [radar] of {path}, "
+                f"got {'neither' if board is None else 'both'}; name a preset of "
+                "invertwin.radar.boards, or list the elements"
+            )
+        if board is None:
+            return _elements(tx, "TX"), _elements(rx, "RX")
+    return Mounting(
+        board,
+        described.get("elevation") if elevation is None else elevation,
+        described.get("azimuth", 1) if azimuth is None else azimuth,
+    )
 
 
 def read_chirps(path: str | Path) -> ChirpData:
@@ -159,7 +132,7 @@ def write_chirps(
     path: str | Path,
     data: ChirpData,
     file: str,
-    arrays: tuple[AntennaArray, AntennaArray] | None = None,
+    arrays: Elements | None = None,
 ) -> None:
     """Write samples, bit for bit, and the description that `read_chirps` reads.
 

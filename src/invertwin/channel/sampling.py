@@ -1,8 +1,12 @@
 """How much work a trace does: one value that travels from the user to the kernels."""
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Ge, Le
 
 from invertwin.errors import InputError
+from invertwin.limits import Count
 
 _DEEPEST = 16
 
@@ -31,9 +35,9 @@ class Sampling:
         InputError: A number out of range.
     """
 
-    depth: int = 3
-    samples: int = 400_000
-    boundary_samples: int = 50_000
+    depth: Annotated[int, Ge(1), Le(_DEEPEST)] = 3
+    samples: Count = 400_000
+    boundary_samples: Annotated[int, Ge(0)] = 50_000
     boundary: bool = True
     interior_edges: bool = True
     points_per_m2: float = 20_000.0

@@ -1,28 +1,25 @@
-"""From the tables of a run file to the library's values: scenes, parameters, starts."""
+"""From the tables of a run file to the library's values: scenes, parameters."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 from invertwin.channel import Grid
-from invertwin.cli.bodies import SoughtBody
 from invertwin.cli.fit_tables import surrogate as surrogate
 from invertwin.cli.registry import Table
 from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import need, unknown_object
-from invertwin.cli.schema import RunFile, SceneFile, Starts
+from invertwin.cli.schema import RunFile, SceneFile
 from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
-from invertwin.cli.shape_tables import ObjectTable, Placement, given_for, joined
+from invertwin.cli.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.tangents import Change, changes_of
 from invertwin.radar.surrogate import Surrogate
-from invertwin.scene import Mesh, Object, Scene, rigid, rotation_angle, rotation_from_vector
+from invertwin.scene import Mesh, Object, Scene, SkinnedBody, joined
 from invertwin.scene.files import CONCRETE, load_scene_xml
 
 
@@ -107,7 +104,7 @@ class Start:
     """Where a fit starts."""
 
     scene: Scene
-    bodies: Mapping[str, SoughtBody] = field(default_factory=dict)  # whose joints are sought
+    bodies: Mapping[str, SkinnedBody] = field(default_factory=dict)  # whose joints are sought
 
 
 def builders(
@@ -145,6 +142,15 @@ def parameters(
     return [make(scene) for make in builders(tables, objects).values()]
 
 
+def sought_bodies(run: RunFile, scene: Scene) -> dict[str, Any]:
+    """The bodies whose joints are sought: a `SkinnedBody` each, by object."""
+    return {
+        table.object: _module(table, f"parameters[{i}]", run.scene, scene)
+        for i, table in enumerate(run.parameters)
+        if table.kind == "body"
+    }
+
+
 def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, Change]]:
     """The module that a gradient check moves, and how its values change with θ.
 
@@ -167,89 +173,3 @@ def _module(table: Any, path: str, objects: Mapping[str, ObjectTable], scene: Sc
         given = given_for(name, scene, objects)
     with about(path):
         return table.build(given)
-
-
-def starts(
-    table: Starts,
-    scene: Scene,
-    truth: Scene,
-    seed: int,
-    bodies: Mapping[str, SoughtBody] | None = None,
-) -> list[Start]:
-    """From where the fits of the `[starts]` table start; of its object the pose is replaced."""
-    generator = torch.Generator().manual_seed(seed if table.seed is None else table.seed)
-
-    def uniform(low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
-
-    def direction(axes: Sequence[str]) -> Tensor:
-        vector = torch.randn(3, generator=generator, dtype=torch.float64)
-        vector = vector * _float64([axis in axes for axis in "xyz"])
-        return vector / vector.norm()
-
-    found = []
-    for _ in range(table.count):
-        offset = uniform(*table.distance) * direction(table.axes)
-        axis = direction("xyz")
-        if table.rotation_axis is not None:
-            fixed = _float64(table.rotation_axis)
-            axis = fixed / fixed.norm() * (1 if uniform(0, 1) < 0.5 else -1)
-        rotation = math.radians(uniform(*table.angle_deg)) * axis
-        moved = displaced(truth, table.object, offset, rotation)[table.object]
-        turn = moved.transform[:3, :3]
-        # The object as known may have another size: it is its centre that is placed.
-        place = moved.center - turn @ scene[table.object].mesh.center
-        begun = scene.replace(table.object, pose=rigid(turn, place))
-        body = (bodies or {}).get(table.object)
-        if body is not None and table.joint_deg > 0:
-            angle = math.radians(table.joint_deg)
-            mesh = body.turned(truth[table.object].mesh, angle, generator)
-            begun = begun.replace(table.object, mesh=mesh, pose=moved.transform)
-        found.append(Start(begun, bodies or {}))
-    return found
-
-
-def displaced(scene: Scene, name: str, offset: Tensor, rotation: Tensor) -> Scene:
-    """The scene with one object turned [rad, rotation vector] about its centre and moved [m]."""
-    item = scene[name]
-    turn = rotation_from_vector(rotation)
-    motion = rigid(turn, offset + item.center - turn @ item.center)
-    return scene.replace(name, pose=motion @ item.transform)
-
-
-@dataclass(frozen=True)
-class Residual:
-    """How one object differs from where it really is."""
-
-    offset: Tensor  # [3], m, of its centre
-    angle: float  # rad
-    scale: float
-
-    @property
-    def distance(self) -> float:
-        """Length of the offset [m]."""
-        return float(self.offset.norm())
-
-
-def residual(found: Object, truth: Object) -> Residual | None:
-    """The similarity transform that remains between two copies of an object.
-
-    Least squares over the vertices (Umeyama), so it does not depend on how the pose is
-    parameterised. None for other triangles: no vertex is another one's copy.
-    """
-    same = found.vertices.shape == truth.vertices.shape
-    if not same or not torch.equal(found.mesh.faces, truth.mesh.faces):
-        return None
-    a, b = found.vertices.detach(), truth.vertices.detach()
-    a0, b0 = a - a.mean(0), b - b.mean(0)
-    u, values, vt = torch.linalg.svd(b0.T @ a0)
-    sign = torch.ones(3, dtype=torch.float64)
-    sign[2] = torch.det(u @ vt).sign()
-    turn = u @ torch.diag(sign) @ vt
-    scale = float(b0.square().sum() / (values * sign).sum())
-    offset = found.center.detach() - truth.center.detach()
-    return Residual(offset, float(rotation_angle(turn)), 1 / scale if scale else math.nan)
-
-
-def _float64(values: object) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)

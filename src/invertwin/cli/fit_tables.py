@@ -31,7 +31,7 @@ class SurrogateTable(Table):
             chosen = chosen_surrogate(data)
         except InputError as error:
             fail(str(error))
-        return {"exact": True} if chosen is None else dict(vars(chosen))
+        return {"exact": True} if chosen is None else {"exact": False, **vars(chosen)}
 
 
 def register(registry: Registry) -> None:

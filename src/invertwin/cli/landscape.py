@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from invertwin import plotting
 from invertwin.cli import build
-from invertwin.cli.fits.problem import Sight, sampling_of
+from invertwin.cli.fits.problem import Problem, models_of
 from invertwin.cli.run_file import need
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion import Observation
@@ -20,11 +20,12 @@ from invertwin.models import BeatMap
 from invertwin.scene import Scene, Translation
 
 
-def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[Figure, dict[str, Any]]:
+def landscape(problem: Problem) -> tuple[Figure, dict[str, Any]]:
     """The figure of the `[landscape]` table, and the local minima of every curve.
 
     For the exact signal one channel of one frame is enough to show the shape.
     """
+    run, truth, sight = problem.run, problem.truth, problem.first
     table = need(run, "landscape", "the loss landscape")
     line, along = line_through(truth, table.object, table.axis)
     fine = np.linspace(-table.exact_span, table.exact_span, table.exact_points)
@@ -32,7 +33,7 @@ def landscape(run: RunFile, truth: Scene, sight: Sight) -> tuple[Figure, dict[st
     model, first = BeatMap(sight.grid, channels=(slice(1), slice(1))), sight.radar.frames([0])
     beat = Observation(model, first, sight.capture.beat[:1, :1, :1], loss=relative_error)
     exact = exact_losses(run, line, fine, beat)
-    model, loss = sight.model(sampling_of(run)), build.loss(run.loss)
+    model, loss = models_of(problem)[0], build.loss(run.loss)
     smooth = {}
     for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
         seen = Observation(model.narrowed(share), sight.radar, sight.capture, loss=loss)

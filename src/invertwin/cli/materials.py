@@ -27,9 +27,8 @@ from invertwin.scene import (
     Slab,
     Texture,
 )
-from invertwin.scene.material import RANGES, Value
-from invertwin.scene.material import MaterialValue as MaterialValue
 from invertwin.scene.material.materials import Medium
+from invertwin.scene.material.values import RANGES, Value
 
 _KINDS: Mapping[str, type[Material]] = {
     "rough_dielectric": RoughDielectric,

@@ -4,7 +4,6 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
 from pydantic import model_validator
-from torch import float64, zeros
 
 from invertwin.capture import (
     Capture,
@@ -14,11 +13,10 @@ from invertwin.capture import (
     described_arrays,
     ti,
 )
-from invertwin.capture.elements import elements
 from invertwin.capture.radar_fields import WAVEFORMS
 from invertwin.cli.registry import Group, Registry, Table, registry
 from invertwin.cli.section import Depth, InputPath, Section, Seed, about, fail, key
-from invertwin.cli.sensors import Orientation, Track, rotations_of, track
+from invertwin.cli.sensors import Posed
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.boards import Mounting
@@ -59,7 +57,7 @@ class DataTable(Table):
             return ChannelCalibration.load(self.channels).apply(found)
 
 
-class ChirpTable(DataTable):
+class ChirpTable(DataTable, Posed):
     """Raw chirps of a board, made one signal per frame."""
 
     chirp: Annotated[int, Ge(0)] | None = key(
@@ -67,12 +65,6 @@ class ChirpTable(DataTable):
     )
     frame: Annotated[int, Ge(0)] | None = key(
         "number from 0 of the only one that is used; without it all", None
-    )
-    positions: Track | None = key(
-        "m, of the radar in every frame, or one for all; without it the origin", None
-    )
-    orientation: Orientation | None = key(
-        "look_at or rotation_deg; without it the axes of the world", None
     )
 
     def build(self, given: Any = None, /, **more: Any) -> ChirpCapture:
@@ -82,15 +74,7 @@ class ChirpTable(DataTable):
         if self.frame is not None:
             with about("frame"):
                 found = found.frames([self.frame])
-        if self.positions is None and self.orientation is None:
-            return found
-        with about("positions"):
-            positions = zeros(1, 3, dtype=float64)
-            positions = positions if self.positions is None else track(self.positions)
-            if len(positions) == 1:
-                positions = positions.expand(found.frame_count, 3).clone()
-            rotations = self.orientation and rotations_of(self.orientation, positions)
-        return found.placed(positions, rotations)
+        return found.placed(*self.poses(found.frame_count))
 
 
 def register(kinds: Registry) -> None:
@@ -149,13 +133,13 @@ def arrays(file: InputPath, board: Mounting | None = None) -> ChirpCapture:
     if board is not None:
         return recorded(chirps, board)
     with about("board"):
-        return chirps.recorded(*described_arrays.described_elements(file, chirps.settings))
+        return chirps.recorded(described_arrays.described_board(file))
 
 
 def recorded(chirps: ChirpData, board: Mounting) -> ChirpCapture:
     """Chirps that the elements of a board have recorded, those that the settings name."""
     with about("board"):
-        return chirps.recorded(*elements(chirps.settings, board))
+        return chirps.recorded(board)
 
 
 def measured(data: Any) -> Capture:

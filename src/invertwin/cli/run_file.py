@@ -22,7 +22,17 @@ from invertwin.errors import InputError
 
 _MOST_ERRORS = 4  # in one line
 # Sections and kinds of the package in experiments/studies.
-_STUDIES = ("methods", "loss_scan", "openradar", "rail_sar")
+_STUDIES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
+_MOVED = {
+    "also_interior_only": "add [variants.interior_only] with reconstruct = { boundary = false }",
+    **dict.fromkeys(("rate", "final_rate"), "write it in `optimizer`"),
+    **dict.fromkeys(("range_width", "angle_width"), "write it in `surrogate`"),
+    **dict.fromkeys(
+        ("steps", "samples", "boundary_samples", "boundary", "annealing"),
+        "write it in `reconstruct`",
+    ),
+}
+"""Where keys belong that stand in the wrong table, or are gone."""
 _INSTALL = "install the studies: pip install -e ./experiments/studies"
 _WORDS = {
     r"a valid dictionary( or .*)?": "a table",
@@ -142,10 +152,13 @@ def _explain(error: ErrorDetails) -> str:
             if not path and key in _STUDIES:
                 return f"{key}: {said}{_INSTALL}"
             return (
-                f"{path}.{key}".lstrip(".") + f": {said}" + _nearest(key, allowed, "remove the key")
+                f"{path}.{key}".lstrip(".")
+                + f": {said}"
+                + (_MOVED.get(key) or _nearest(key, allowed, "remove the key"))
             )
         case "unknown_object":
-            return unknown_object(context["path"], context["name"], list(error["input"]["scene"]))
+            at = ".".join(filter(None, (path, context["path"])))
+            return unknown_object(at, context["name"], list(error["input"]["scene"]))
         case "union_tag_not_found":
             keys = context["discriminator"].removesuffix("()").split(",")
             present = list(error["input"]) if isinstance(error["input"], dict) else []
@@ -174,7 +187,7 @@ def _explain(error: ErrorDetails) -> str:
             )
             return f"{path}: expected {size} items, got {got}; correct the list"
         case "section":
-            return f"{context['path'] or path}: {error['msg']}"
+            return ".".join(filter(None, (path, context["path"]))) + f": {error['msg']}"
     # Pydantic says "..., got a number with a fractional part": the value itself says it, too.
     expected = error["msg"].removeprefix("Input should be ").split(", got ")[0]
     for words, ours in _WORDS.items():

@@ -12,9 +12,8 @@ from invertwin.capture import (
     ChirpCapture,
     described_arrays,
     estimate_channels,
-    ti,
+    read,
 )
-from invertwin.capture.elements import elements
 from invertwin.channel import Grid
 from invertwin.cli.options import Look
 from invertwin.cli.registry import load_plugins, registry
@@ -34,7 +33,6 @@ from invertwin.radar import (
     velocity_span,
 )
 from invertwin.radar.boards import Mounting
-from invertwin.radar.boards import board as preset
 
 Recording = Capture | ChirpCapture
 _ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"
@@ -107,17 +105,17 @@ def _read(look: Look) -> tuple[str, Recording]:
         raise InputError(f"expected a recording, got no file {path}; check the path")
     if path.is_dir() or ending == ".npz":
         return _read_public(look, path if path.is_dir() else path.parent)
-    if ending == ".nc":
-        return "netcdf", Capture.load(path)
+    readers = {".nc": "netcdf", ".toml": "arrays", ".bin": "dca1000", ".json": "dca1000"}
+    if ending not in readers:
+        raise InputError(
+            f"expected a recording that ends in {_ENDINGS}, got {path.name}; convert it"
+        )
+    board = None
     if ending == ".toml":
-        data = described_arrays.read_chirps(path)
-        given = (look.board, look.elevation, look.azimuth)
-        arrays = described_arrays.described_elements(path, data.settings, *given)
-        return "arrays", data.recorded(*arrays)
-    if ending in (".bin", ".json"):
-        data = ti.read_recording(path, look.config, look.lanes)
-        return "dca1000", data.recorded(*elements(data.settings, _board(look, look.board)))
-    raise InputError(f"expected a recording that ends in {_ENDINGS}, got {path.name}; convert it")
+        board = described_arrays.described_board(path, look.board, look.elevation, look.azimuth)
+    elif ending != ".nc":
+        board = _board(look, look.board)
+    return readers[ending], read(path, look.config, board=board, lanes=look.lanes)
 
 
 def _read_public(look: Look, folder: Path) -> tuple[str, Recording]:
@@ -137,7 +135,7 @@ def _board(look: Look, board: str | None) -> Mounting:
         raise InputError(
             "expected a --board, got none; name the preset that recorded, and its --elevation"
         )
-    return Mounting(preset(board), look.elevation, 1 if look.azimuth is None else look.azimuth)
+    return Mounting(board, look.elevation, 1 if look.azimuth is None else look.azimuth)
 
 
 def _capture(look: Look, recording: Recording) -> Capture:

@@ -8,13 +8,10 @@ from typing import Any
 
 from rich.console import Console
 
-from invertwin.cli import build
-from invertwin.cli.bodies import sought_bodies
 from invertwin.cli.fits.fitting import calibrated, fit
 from invertwin.cli.fits.initial import guessed
-from invertwin.cli.fits.likeness import check_measures, is_shape_key
 from invertwin.cli.fits.mover import run_mover
-from invertwin.cli.fits.problem import modes_of, problem_of
+from invertwin.cli.fits.problem import FULL, problem_of, settings_of, starts_of, varied
 from invertwin.cli.fits.scores import (
     agreement,
     heldout,
@@ -23,16 +20,16 @@ from invertwin.cli.fits.scores import (
     summary,
     without_history,
 )
+from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table, finish
-from invertwin.cli.run_file import need
 from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.inversion import Reconstruction
 from invertwin.scene.files import save_mesh
-from invertwin.scene.geometry import without_clouds
+from invertwin.scene.geometry.density import without_clouds
 
 
 def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
@@ -43,25 +40,20 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     if isinstance(next(iter(run.parameters), None), Mover):
         return run_mover(run, folder, console)
     begin = time.perf_counter()
-    need(run, "reconstruct", "reconstruct")
+    settings_of(run)
     problem, calibration = calibrated(problem_of(run, console), folder, console)
     problem, conventional = guessed(problem, console)
-    starts = [build.Start(problem.scene, sought_bodies(run))]
-    if run.starts is not None:
-        starts = build.starts(
-            run.starts, problem.scene, problem.truth, run.seed, sought_bodies(run)
-        )
+    starts, modes = starts_of(problem), [FULL, *run.variants]
+    whole, problem = problem, varied(problem, FULL)
     check_measures(problem, without_clouds(starts[0].scene))
-    modes = modes_of(run)
     single = len(starts) * len(modes) == 1
     rows: dict[str, list[dict[str, Any]]] = {}
     outcomes: dict[int, Callable[[], Reconstruction]] = {}
     for mode in modes:
         rows[mode] = []
         for i, start in enumerate(starts):
-            row, outcome = fit(
-                problem, start, i, mode, folder, console, CHECKPOINT if single else None
-            )
+            checkpoint = CHECKPOINT if single else None
+            row, outcome = fit(whole, start, i, mode, folder, console, checkpoint)
             rows[mode].append(row)
             if mode == modes[0]:
                 outcomes[i] = outcome
@@ -94,7 +86,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         metrics |= {f"{key}_{mode}": same[key] for key in own}
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         console.print("computing the loss landscape")
-        figure, found = landscape(run, problem.truth, problem.first)
+        figure, found = landscape(problem)
         folder.write_figure("landscape.png", figure)
         metrics["landscape"] = found
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)

@@ -90,14 +90,41 @@ Orientation = Annotated[
 ]
 
 
-class RadarTable(Table):
+class Posed(Table):
+    """Where a radar is in every frame."""
+
+    positions: Track = key(
+        "m, one for each frame: a list of points or a track; for a recording also one for all",
+        [[0.0, 0.0, 0.0]],
+    )
+    orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
+
+    def poses(self, frames: int) -> tuple[Tensor, Tensor]:
+        """Positions [frame, 3]; columns are the radar's right, up and boresight axes [frame, 3, 3].
+
+        Args:
+            frames: How many there are, where one position holds for all.
+
+        Raises:
+            InputError: A target straight above a position.
+        """
+        listed = isinstance(self.positions, list)
+        places = _float64(self.positions) if listed else self.positions.build()
+        if len(places) == 1:
+            places = places.expand(frames, 3).clone()
+        if isinstance(self.orientation, LookAt):
+            with about("orientation.look_at"):
+                return places, look_at(places, self.orientation.look_at)
+        turn = rotation_from_vector(_float64(self.orientation.rotation_deg).deg2rad())
+        return places, turn.expand(len(places), 3, 3).clone()
+
+
+class RadarTable(Posed):
     """Arrays, waveform and poses; one frame per position."""
 
     board: Annotated[Any, OneOf("board")] | None = key("antenna elements of a board, or:", None)
     transmitters: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
     receivers: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
-    positions: Track = key("m, one frame each: a list of points or a track", [[0.0, 0.0, 0.0]])
-    orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
 
     @model_validator(mode="after")
     def _elements(self) -> "RadarTable":
@@ -112,8 +139,7 @@ class RadarTable(Table):
             with about("board"):
                 arrays = self.board.build().arrays()
             more |= {"transmitters": arrays[0], "receivers": arrays[1]}
-        with about("orientation.look_at"):
-            more["rotations"] = rotations_of(self.orientation, track(self.positions))
+        more["positions"], more["rotations"] = self.poses(1)
         found = super().build(given, **more)
         WAVEFORMS.setdefault(type(found.waveform).__name__, type(found.waveform))
         return found
@@ -178,23 +204,6 @@ def radar(table: Any) -> Radar:
     """
     with about("radar"):
         return table.build()
-
-
-def track(table: Any) -> Tensor:
-    """Positions [frame, 3] of a track or of a list of points."""
-    return _float64(table) if isinstance(table, list) else table.build()
-
-
-def rotations_of(table: Any, positions: Tensor) -> Tensor:
-    """Columns are the radar's right, up and boresight axes in the world [frame, 3, 3].
-
-    Raises:
-        InputError: A target straight above a position.
-    """
-    if isinstance(table, Turned):
-        turn = rotation_from_vector(torch.deg2rad(_float64(table.rotation_deg)))
-        return turn.expand(len(positions), 3, 3).clone()
-    return look_at(positions, table.look_at)
 
 
 def grid(table: Any, radar: Radar) -> Grid:

@@ -1,38 +1,49 @@
 """Shapes of run files: objects and their parts, and what is sought of them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import MinLen
 from torch import Tensor, nn
 
-from invertwin.cli.bodies import body, sought_body
 from invertwin.cli.registry import Group, OneOf, Registry, Table
 from invertwin.cli.section import Counts, InputPath, Vector, about, key
 from invertwin.errors import InputError
 from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
-from invertwin.inversion.remeshing import remeshed, signed_distance
-from invertwin.limits import Axes, Count, NonNegative, Positive
+from invertwin.inversion.remeshing import signed_distance
+from invertwin.limits import RADIANS, Axes, Count, NonNegative, Positive
 from invertwin.radar.parameters import RadarPose
-from invertwin.scene import Mesh, Object, Scene, rigid, rotation_from_vector, shapes
-from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry import (
+from invertwin.scene import (
+    BodyTemplate,
     DensityGrid,
     DistanceGrid,
-    Lattice,
     LatticeDeformation,
     LinearShape,
+    Mesh,
     NeuralDistance,
+    Object,
     PriorShape,
+    Scene,
     SkinnedBody,
     SmoothVertices,
+    joined,
+    load_anny,
     load_prior,
-    load_vehicle_space,
+    load_smpl,
+    person,
+    rigid,
+    rotation_from_vector,
+    shapes,
 )
+from invertwin.scene.files import load_mesh
+from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
+
+Angles = Annotated[dict[str, Vector], RADIANS]
+_AT_REST: dict[str, list[float]] = {}
 
 
 class Placement(Table):
@@ -83,6 +94,12 @@ class ParameterTable(Table):
     rate: Positive | None = key("of its own; without it the optimizer's", None)
 
 
+class LearnedTable(Table):
+    """Coordinates of a learned shape, which has a size of its own."""
+
+    weight: NonNegative = key("of ½ Σ z²", 0.0)
+
+
 class Mover(ParameterTable):
     """Place, size, velocity, turn and diffuse share of a rough body in motion.
 
@@ -100,16 +117,16 @@ class Mover(ParameterTable):
 
 def register(registry: Registry) -> None:
     """Adds shapes, and the modules of what is sought of them."""
-    registry.groups["shape"] = Group(tag="shape", base=Placement)
+    registry.groups["shape"] = Group(tag="shape", base=Placement, product=Mesh)
     registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
     registry.groups["parameter"] = Group(base=ParameterTable)
+    registry.bases |= {PriorShape: LearnedTable, LinearShape: LearnedTable}
     registry.given |= {Scene, Mesh, Object, ObjectTable}
     for name in ("plate", "box", "sphere", "dihedral", "trihedral", "text"):
         registry.add("shape", name, getattr(shapes, name))
-    registry.add("shape", "vehicle", vehicle)
     registry.add("shape", "prior", learned)
     registry.add("shape", "body", body)
-    registry.add("shape", "file", mesh_file, untagged=True)
+    registry.add("shape", "file", load_mesh, untagged=True)
     registry.add("object", "parts", joined, untagged=True)
     for name, make, without in (
         ("translation", Translation, ("initial",)),
@@ -121,52 +138,12 @@ def register(registry: Registry) -> None:
         ("neural_distance", NeuralDistance, ("seed",)),
         ("density", density, ()),
         ("prior", prior, ()),
-        ("shape_space", shape_space, ()),
         ("body", joints, ()),
         ("material", MaterialValues.of, ()),
         ("radar_pose", RadarPose, ("translation", "rotation")),
         ("mover", Mover, ()),
     ):
         registry.add("parameter", name, make, without=without)
-
-
-def mesh_file(file: InputPath) -> Mesh:
-    """A mesh file: OBJ, PLY, STL or glTF.
-
-    Args:
-        file: path, from the run file's folder.
-    """
-    return load_mesh(file)
-
-
-def joined(parts: Annotated[list[Annotated[Any, OneOf("shape")]], MinLen(1)]) -> Mesh:
-    """Several shapes as one rigid object of one material.
-
-    Args:
-        parts: shapes, each placed within the object.
-    """
-    starts = torch.tensor([0, *(len(part.vertices) for part in parts)]).cumsum(0)
-    faces = [part.faces + int(start) for part, start in zip(parts, starts, strict=False)]
-    return Mesh(torch.cat([part.vertices for part in parts]), torch.cat(faces))
-
-
-def vehicle(
-    folder: InputPath = "vehicle_prior",
-    level: Literal["coarse", "fine"] = "fine",
-    coefficients: Sequence[float] = (),
-    max_edge: Positive | None = None,
-) -> Mesh:
-    """The body of a car of the public learned space: x ahead, y to the left, z up.
-
-    Args:
-        folder: path, from the run file's folder, then from INVERTWIN_DATA.
-        level: of detail.
-        coefficients: of the first modes, in standard deviations; the others are 0.
-        max_edge: m, longest edge of the mesh; without it as in the file.
-    """
-    space = load_vehicle_space(folder, level)
-    mesh = space.mesh(space.mean.new_tensor(coefficients))
-    return mesh if max_edge is None else remeshed(mesh, max_edge)
 
 
 def learned(latent: Sequence[float] | None = None, prior: InputPath | None = None) -> Mesh:
@@ -233,43 +210,9 @@ def density(
     return DensityGrid(object, low, high, filled)
 
 
-def shape_space(
-    object: str,
-    table: ObjectTable | None = None,
-    folder: InputPath = "vehicle_prior",
-    level: Literal["coarse", "fine"] = "fine",
-    modes: Count = 10,
-    weight: NonNegative = 0.0,
-) -> LinearShape:
-    """Coordinates of the public space of vehicles, from those of its object, else the mean.
-
-    Args:
-        table: of the object; its coordinates count where they are of the same space.
-        folder: path, from the run file's folder, then from INVERTWIN_DATA.
-        level: of detail.
-        modes: coordinates that are sought.
-        weight: of ½ Σ z².
-
-    Raises:
-        InputError: files are missing, or fewer modes than the object has coefficients.
-    """
-    start = torch.zeros(modes, dtype=torch.float64)
-    known: Any = table
-    if _shape(known) == "vehicle" and (known.folder, known.level) == (folder, level):
-        count = len(known.coefficients)
-        if count > modes:
-            raise InputError(
-                f"expected at least as many modes as {object} has coefficients, {count}, got "
-                f"{modes}; raise modes"
-            )
-        start[:count] = start.new_tensor(known.coefficients)
-    return LinearShape(object, load_vehicle_space(folder, level), start)
-
-
 def prior(
     object: str,
     table: ObjectTable | None = None,
-    weight: NonNegative = 0.0,
     file: InputPath | None = None,
     counts: Counts | None = None,
 ) -> PriorShape:
@@ -277,13 +220,43 @@ def prior(
 
     Args:
         table: of the object; its coordinates count where they are of the same prior.
-        weight: of ½ Σ z².
         file: that `invertwin train-prior` wrote; without it the prior of the package.
         counts: nodes along x, y and z at which it is meshed; without it every 0.1 m or so.
     """
     known: Any = table
     same = _shape(known) == "prior" and known.prior == file
     return PriorShape(object, load_prior(file), known.latent if same else None, counts)
+
+
+def body(
+    model: Literal["person", "anny"] = "person",
+    file: InputPath | None = None,
+    height: Positive = 1.75,
+    spacing: Positive = 0.03,
+    angles: Angles = _AT_REST,
+) -> Mesh:
+    """A body with joints and one skin, y up, facing −z, in the frame of its model.
+
+    Args:
+        model: person = made of formulas, arms held out at rest; anny = of the extra `anny`.
+        file: SMPL's layout (.npz), from the run file's folder; in place of a model.
+        height: m, of `person`.
+        spacing: m, of the corners of its triangles.
+        angles: rotation vectors of joints by name, each in the frame of the joint before; others
+            at rest.
+
+    Raises:
+        InputError: A file is missing or broken, the extra `anny` is not installed, or no such
+            joint.
+    """
+    return _template(model, file, height, spacing).mesh(angles)
+
+
+@cache
+def _template(model: str, file: str | None, height: float, spacing: float) -> BodyTemplate:
+    if file is not None:
+        return load_smpl(file)
+    return load_anny() if model == "anny" else person(height, spacing)
 
 
 def joints(
@@ -296,8 +269,18 @@ def joints(
 
     Args:
         joints: by name: the components of the rotation vector that are sought, such as ["y"].
+
+    Raises:
+        InputError: The object is no body, or has no such joint.
     """
-    return sought_body(object, table, joints).module(object, mesh)
+    known: Any = table
+    if _shape(known) != "body":
+        raise InputError(
+            f'expected an object with shape = "body", got {object}; give it this shape, or use '
+            'kind = "pose"'
+        )
+    found = _template(known.model, known.file, known.height, known.spacing).scaled(known.scale)
+    return SkinnedBody.of(object, found, mesh, joints)
 
 
 def _shape(table: Any) -> str | None:
@@ -308,7 +291,7 @@ def shape_terms(table: Any, module: nn.Module, scene: Scene) -> list[Regularizer
     """What keeps a shape that is sought plausible: of its table, module and first scene."""
     if table.kind == "vertices" and table.laplacian > 0:
         return [Laplacian(scene, table.object, table.laplacian)]
-    if table.kind in ("shape_space", "prior") and table.weight > 0:
+    if isinstance(table, LearnedTable) and table.weight > 0:
         return [LatentNorm(module, table.weight)]
     return []
 

@@ -3,6 +3,8 @@
 from invertwin.inversion.callbacks import Checkpoint as Checkpoint
 from invertwin.inversion.callbacks import Report as Report
 from invertwin.inversion.callbacks import Watch as Watch
+from invertwin.inversion.first_pose import FirstPose as FirstPose
+from invertwin.inversion.first_pose import Guess as Guess
 from invertwin.inversion.fit import Callback as Callback
 from invertwin.inversion.fit import Fit as Fit
 from invertwin.inversion.gradcheck import Agreement as Agreement
@@ -12,12 +14,15 @@ from invertwin.inversion.lines import line_of as line_of
 from invertwin.inversion.lines import losses_along as losses_along
 from invertwin.inversion.loss import CorrelationLoss as CorrelationLoss
 from invertwin.inversion.loss import SpectrumLoss as SpectrumLoss
+from invertwin.inversion.metrics import Residual as Residual
 from invertwin.inversion.metrics import ShapeMetrics as ShapeMetrics
 from invertwin.inversion.metrics import Topology as Topology
 from invertwin.inversion.metrics import compare_shapes as compare_shapes
+from invertwin.inversion.metrics import residual as residual
 from invertwin.inversion.metrics import topology as topology
 from invertwin.inversion.metrics import volume_iou as volume_iou
 from invertwin.inversion.mover import Echo as Echo
+from invertwin.inversion.mover import MoverMaps as MoverMaps
 from invertwin.inversion.mover import MovingBody as MovingBody
 from invertwin.inversion.mover import of_point as of_point
 from invertwin.inversion.mover import strongest_mover as strongest_mover
@@ -33,4 +38,6 @@ from invertwin.inversion.remeshing import remeshed as remeshed
 from invertwin.inversion.remeshing import signed_distance as signed_distance
 from invertwin.inversion.schedule import Schedule as Schedule
 from invertwin.inversion.schedule import Stage as Stage
+from invertwin.inversion.starts import displaced as displaced
+from invertwin.inversion.starts import nearby as nearby
 from invertwin.inversion.tangents import Bump as Bump

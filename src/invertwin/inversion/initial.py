@@ -24,7 +24,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
 from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
 from invertwin.scene.checks import ArrayLike, checked_number
-from invertwin.scene.geometry import Lattice
+from invertwin.scene.geometry.lattice import Lattice
 
 _TURNS = 91  # yaws that a rectangle is tried at, over a quarter turn
 _EDGE = 0.02  # share of the points beyond a side of a rectangle

@@ -269,6 +269,9 @@ class _Divergence(torch.autograd.Function):
         return ctx.factor * (slope * tangents[0]).sum()
 
 
+Scale = Literal["magnitude", "power", "level"]
+
+
 @dataclass(frozen=True)
 class CorrelationLoss:
     """One minus Pearson's correlation of two power maps; no gain or offset changes it.
@@ -281,7 +284,7 @@ class CorrelationLoss:
         InputError: An unknown scale.
     """
 
-    scale: Literal["magnitude", "power", "level"] = "magnitude"
+    scale: Scale = "magnitude"
 
     def __post_init__(self) -> None:
         if self.scale not in _SCALES:

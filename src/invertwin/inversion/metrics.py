@@ -1,4 +1,4 @@
-"""Metrics of shape: distances between two surfaces, shared volume, normals, parts and holes."""
+"""How near a found object is to the true one: place, turn, size; surfaces, volume, holes."""
 
 import math
 from collections.abc import Sequence
@@ -14,11 +14,13 @@ from torch import Tensor
 
 from invertwin.channel import visible_points
 from invertwin.errors import InputError
+from invertwin.scene import Itu, Material
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number
-from invertwin.scene.material import Itu, Material, Value
 from invertwin.scene.material.materials import held_by
-from invertwin.scene.material.values import evaluated
+from invertwin.scene.material.values import Value, evaluated
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.pose import rotation_angle
+from invertwin.scene.scene import Object
 
 POINTS = 20_000  # of each surface
 VOXEL = 0.02  # [m]
@@ -59,6 +61,50 @@ class Topology:
 
     components: int
     euler_number: int
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How one object differs from where it really is.
+
+    Attributes:
+        offset: of its centre [m].
+        angle: of the turn that remains [rad].
+        scale: size over the true one.
+    """
+
+    offset: Float64[Tensor, "3"]
+    angle: float
+    scale: float
+
+    @property
+    def distance(self) -> float:
+        """Length of the offset [m]."""
+        return float(self.offset.norm())
+
+
+def residual(found: Object, truth: Object) -> Residual | None:
+    """The similarity transform that remains between two copies of an object.
+
+    Least squares over the vertices (Umeyama), so it does not depend on how the pose is
+    parameterised. None for other triangles: no vertex is another one's copy.
+
+    Args:
+        found: the result.
+        truth: where it really is.
+    """
+    same = found.vertices.shape == truth.vertices.shape
+    if not same or not torch.equal(found.mesh.faces, truth.mesh.faces):
+        return None
+    a, b = found.vertices.detach(), truth.vertices.detach()
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    u, values, vt = torch.linalg.svd(b0.T @ a0)
+    sign = torch.ones(3, dtype=torch.float64)
+    sign[2] = torch.det(u @ vt).sign()
+    turn = u @ torch.diag(sign) @ vt
+    scale = float(b0.square().sum() / (values * sign).sum())
+    offset = found.center.detach() - truth.center.detach()
+    return Residual(offset, float(rotation_angle(turn)), 1 / scale if scale else math.nan)
 
 
 def compare_shapes(

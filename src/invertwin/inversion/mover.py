@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import torch
 from jaxtyping import Float64
@@ -11,12 +12,13 @@ from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Grid, Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.inversion.loss import CorrelationLoss, Scale
 from invertwin.models import MotionMap
 from invertwin.radar.detection import ordered_statistics_cfar, point_cloud
 from invertwin.radar.doppler import compensate_tdm, range_doppler, velocity_axis
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import aperture
-from invertwin.scene.material import RoughDielectric
+from invertwin.scene import RoughDielectric
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Scene
@@ -24,6 +26,7 @@ from invertwin.scene.scene import Scene
 # Cells of a map that an echo and its neighbours fill; and those that the noise is taken from.
 _GUARD, _TRAINING = 2, 2
 _FALSE_ALARM = 1e-6
+_RAYS = 10_000  # of a map that is compared or drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +139,7 @@ class MovingBody(nn.Module):
     the velocity of each of its vertices.
 
     Attributes:
+        echo: Where it started.
         place: parameter [2], of the body's nearest point from the start, across and along [m].
         height: parameter [], the same, up [m]; fitted if the radar has several rows of antennas.
         velocity: parameter [2], across and along [m/s].
@@ -165,7 +169,7 @@ class MovingBody(nn.Module):
             InputError: A material without a diffuse share between 0 and 1, or an unknown name.
         """
         super().__init__()
-        self.object = object
+        self.object, self.echo = object, echo
         material = _rough(scene, object)
         share = material.diffuse
         if not isinstance(share, float | int) or not 0 < share < 1:
@@ -244,6 +248,64 @@ class MovingBody(nn.Module):
     def _extent(self) -> Tensor:
         """Full size across, up and along [m]."""
         return self._first_extent * self.size.exp()
+
+
+@dataclass(frozen=True, eq=False)
+class MoverMaps:
+    """Maps about an echo that moves: of its twin, and of a bare point in its place.
+
+    Attributes:
+        model: What the maps show.
+        twin: Power [velocity, range, u, v].
+        point: The same of the point.
+    """
+
+    model: MotionMap
+    twin: Tensor
+    point: Tensor
+
+    @classmethod
+    def near(
+        cls,
+        body: MovingBody,
+        scene: Scene,
+        radar: Radar,
+        model: MotionMap,
+        *,
+        cells: int = 4,
+        time: float = 0.0,
+        seed: int = 0,
+    ) -> "MoverMaps":
+        """The maps of a body and of a point, where the echo that it started at has moved to.
+
+        Args:
+            body: As fitted.
+            scene: With its object.
+            radar: What records.
+            model: Of the whole recording.
+            cells: To either side of the echo.
+            time: After the middle of the recording [s].
+            seed: Of the rays.
+        """
+        echo = body.echo
+        near = model.around(echo.range + echo.rate * time, echo.rate, cells, radar)
+        with torch.no_grad():
+            twin = near.sampled_by(samples=_RAYS).predict(body(scene, time), radar, seed)[0]
+        return cls(near, twin, of_point(near, radar, echo, time)[0])
+
+    def correlations(self, recording: ChirpCapture) -> dict[str, dict[str, float]]:
+        """Correlations of ``twin`` and ``bare_psf`` with a recording, on the same cells, by scale.
+
+        Args:
+            recording: One frame of chirps.
+        """
+        seen = self.model.observe(recording)[0]
+        found = {}
+        for scale in get_args(Scale):
+            loss = CorrelationLoss(scale)
+            pair = ("twin", self.twin), ("bare_psf", self.point)
+            found[scale] = {name: 1 - float(loss(power, seen)) for name, power in pair}
+        return found
 
 
 def _rough(scene: Scene, name: str) -> RoughDielectric:

@@ -14,6 +14,7 @@ from invertwin.inversion.observation import Observation, Unknown, Unknowns, name
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
+from invertwin.models import ForwardModel
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene
 
@@ -115,7 +116,7 @@ def reconstruct(
         free.apply(stage)
         fit = Fit(
             begun,
-            [o if stage.change is None else stage.change(o) for o in watched],
+            [replace(o, model=m) for o, m in zip(watched, _models(stage, watched), strict=True)],
             list(modules.values()),
             [list(named.values()) for named in sensor_modules],
             stage=stage,
@@ -132,6 +133,16 @@ def reconstruct(
     if status == "diverged" and fit.progress.best is not None:
         final = fit.progress.best[1]
     return Reconstruction(twin, sensors, fit.modules, history, status, len(history), final)
+
+
+def _models(stage: Stage, observations: Sequence[Observation]) -> Sequence[ForwardModel]:
+    """The forward model of every observation in a stage."""
+    if stage.models and len(stage.models) != len(observations):
+        raise InputError(
+            f"expected a model for each of {len(observations)} observations in a stage, got "
+            f"{len(stage.models)}; give one each, or none"
+        )
+    return stage.models or [o.model for o in observations]
 
 
 def _made(scene: Scene, unknowns: Mapping[str, Unknown]) -> tuple[dict[str, nn.Module], list[Any]]:

@@ -2,10 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from typing import Annotated
+
+from annotated_types import Gt, Le
 
 from invertwin.errors import InputError
-from invertwin.inversion.observation import Observation
 from invertwin.inversion.optimizer import Optimizer
+from invertwin.limits import Count, NonNegative
+from invertwin.models import ForwardModel
 from invertwin.scene.mesh import Mesh
 
 
@@ -21,11 +25,11 @@ class Schedule:
             this share over 20 steps; 0 = it uses the whole budget.
     """
 
-    steps: int = 200
+    steps: Count = 200
     _: KW_ONLY
-    annealing: float = 0.7
-    frames_per_step: int | None = None
-    tolerance: float = 0.0
+    annealing: Annotated[float, Gt(0), Le(1)] = 0.7
+    frames_per_step: Count | None = None
+    tolerance: NonNegative = 0.0
 
     @property
     def widths_end(self) -> float:
@@ -44,14 +48,14 @@ class Stage(Schedule):
         remesh: For every object named here, a function of its mesh that is applied before modules
             are made anew.
         optimizer: Optimizer of this stage; None = that of the whole fit.
-        change: What the stage changes of every observation, such as its model's sampling.
+        models: Of the observations in this stage, in their order; empty = their own.
     """
 
     unknowns: tuple[str, ...] = ()
     rebuild: bool = False
     remesh: Mapping[str, Callable[[Mesh], Mesh]] = field(default_factory=dict)
     optimizer: Optimizer | None = None
-    change: Callable[[Observation], Observation] | None = None
+    models: Sequence[ForwardModel] = ()
 
     @property
     def renews(self) -> bool:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from invertwin.errors import InputError
 from invertwin.limits import Positive
 from invertwin.scene.checks import ArrayLike, Point
-from invertwin.scene.geometry import Lattice
+from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.parameters import Entries
 
 

@@ -26,7 +26,7 @@ def backproject_beat(
     with τ from each TX element over p to each RX element in each pose: no plane waves, so it
     focuses in the near field of the array and along the track of a moving radar. A point target
     of coefficient a gives conj(a) at its place; points at rest add in phase, movers do not.
-    Differentiable in the signal, the points and the poses.
+    Differentiable with respect to the signal, the points and the poses.
 
     Source: the matched filter of the paper's eq:fmcw_if.
 

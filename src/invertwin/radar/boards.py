@@ -20,6 +20,7 @@ from invertwin.limits import Among, Positive
 from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern
 from invertwin.scene.checks import checked_number
 
+Elements = tuple[AntennaArray, AntennaArray]  # TX and RX
 Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
 
 
@@ -85,7 +86,7 @@ class Board:
         transmitters: Sequence[int] | None = None,
         receivers: Sequence[int] | None = None,
         pattern: Pattern | None = None,
-    ) -> tuple[AntennaArray, AntennaArray]:
+    ) -> Elements:
         """TX and RX elements in the radar frame (x right, y up, z boresight).
 
         Public sources disagree which way is up, for the xWR1843's middle transmitter for one, and
@@ -146,7 +147,7 @@ class Mounting:
     """A board as it is mounted, and which of its elements are in use.
 
     Attributes:
-        board: where its elements are.
+        board: where its elements are, or the name of a preset.
         elevation: as in `Board.arrays`.
         azimuth: as in `Board.arrays`.
         transmitters: numbers from 1 in the order of sending; None = all, or those of a recording.
@@ -154,7 +155,7 @@ class Mounting:
         pattern: gain of every element; None = isotropic.
     """
 
-    board: Board
+    board: Board | str
     elevation: int | None = None
     azimuth: int = 1
     transmitters: Sequence[int] | None = None
@@ -165,7 +166,7 @@ class Mounting:
         self,
         transmitters: Sequence[int] | None = None,
         receivers: Sequence[int] | None = None,
-    ) -> tuple[AntennaArray, AntennaArray]:
+    ) -> Elements:
         """TX (in the order of sending) and RX elements in use: its own, or those that recorded.
 
         Args:
@@ -182,7 +183,8 @@ class Mounting:
                     f"expected no `{name}` with a recording, got {list(given)}; remove the key: "
                     f"the recording's settings say {list(recorded)}"
                 )
-        return self.board.arrays(
+        found = board(self.board) if isinstance(self.board, str) else self.board
+        return found.arrays(
             elevation=self.elevation,
             azimuth=self.azimuth,
             transmitters=transmitters or self.transmitters,

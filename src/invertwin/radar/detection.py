@@ -57,11 +57,11 @@ def cell_averaging_cfar(
 ) -> Bool[Tensor, "*batch first second"]:
     """Detect cells whose power exceeds a multiple of the mean of their training cells.
 
-    The multiple keeps the rate of false alarms exact for noise whose power is exponentially
-    distributed (one look: a channel or a beam) or the mean of several such (looks: the channels,
-    where a grid without directions averages them), independent from cell to cell: tapers that
-    correlate neighbours raise it. Near the edges of the map fewer training cells are left and
-    the multiple is that of their number.
+    The multiple makes the rate of false alarms exact for noise that is independent from cell to
+    cell. Its power is exponentially distributed for one look, such as a channel or a beam, or the
+    mean of several looks, such as the channels that a grid without directions averages. Tapers
+    correlate neighbours and raise the rate. Near the edges of the map fewer training cells are
+    left; the multiple follows their number.
 
     Args:
         power: Maps over the last two axes, such as range rate and range.
@@ -131,8 +131,8 @@ def point_cloud(
 ) -> PointCloud:
     """Make a point of each detected cell that is a local maximum over range rate and range.
 
-    Its direction is the strongest one that exists (u² + v² ≤ 1); all are refined by the parabola
-    through the logarithms of the power at a peak and its two neighbours.
+    A point has the strongest direction with u² + v² ≤ 1. Along each axis its place is refined by
+    the parabola through the logarithms of the power at the peak and its two neighbours.
 
     Args:
         power: Result of ``range_doppler_angle``.
@@ -177,9 +177,9 @@ def peaks(
 ) -> PointCloud:
     """Make a point of each detected cell that is a local maximum over range and direction.
 
-    For frames without range rates, such as maps that are compared in a fit; unlike
-    ``point_cloud``, one range may hold many points, since the parts of a body at rest differ in
-    direction alone. Refined by the same parabola; range rates are zero.
+    Use it for frames without range rates, such as maps that are compared in a fit. Unlike in
+    ``point_cloud``, one range may hold many points, since the parts of a body at rest may differ in
+    direction alone. Places are refined as in ``point_cloud``; range rates are zero.
 
     Args:
         power: Result of ``exact_spectrum`` or ``Capture.spectrum``.

@@ -1,4 +1,4 @@
-"""Directions finer than a beam: Capon and MUSIC, differentiable in the signal."""
+"""Directions finer than a beam: Capon and MUSIC, differentiable with respect to the signal."""
 
 import math
 from dataclasses import dataclass
@@ -56,8 +56,8 @@ def capon(
 ) -> Float64[Tensor, "frame range u v"]:
     """Capon (minimum variance) power spectrum: 1 / aᴴ (R + δI)⁻¹ a.
 
-    A single point target of |a|² peaks at |a|² (1 + δ/elements) plus noise. Differentiable in
-    the profile.
+    A single point target of |a|² peaks at |a|² (1 + δ/elements) plus noise. The result is
+    differentiable with respect to the profile.
 
     Args:
         profile: Range profiles; snapshots are chirps, or one snapshot per Doppler bin with the
@@ -101,9 +101,10 @@ def music(
 ) -> Float64[Tensor, "frame range u v"]:
     """MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, with E the noise subspace. It is at least 1.
 
-    Differentiable in the profile through the projector on the noise subspace, whose derivative
-    depends on the gap between signal and noise only: it is finite for equal eigenvalues within
-    either, and damped where the gap itself vanishes and the subspace jumps.
+    It is differentiable with respect to the profile. The derivative of the projector on the noise
+    subspace depends on the gap between signal and noise eigenvalues only. It is finite where
+    eigenvalues are equal within either set, and damped where the gap itself vanishes and the
+    subspace jumps.
 
     Args:
         profile: Range profiles; snapshots are chirps or Doppler bins, see ``capon``.

@@ -70,9 +70,9 @@ def range_doppler(
     """Transform every chirp over range, then all chirps over range rate, with a window.
 
     The bins are those of ``velocity_axis``: the beat phase of a target that moves away grows from
-    chirp to chirp. Normalised by the sums of the windows: a point
-    target of coefficient a peaks at |a|. What transmitters that take turns add to the phase is
-    left in; ``compensate_tdm`` takes it out.
+    chirp to chirp. The result is normalised by the sums of the windows, so a point target of
+    coefficient a peaks at |a|. Where transmitters take turns, movers gain phase between them;
+    ``compensate_tdm`` removes it.
 
     Args:
         beat: Chirps of every transmitter.
@@ -107,9 +107,10 @@ def compensate_tdm(
 ) -> Complex[Tensor, "frame velocity tx rx range"]:
     """Remove the phase that movers gain until a later transmitter sends.
 
-    A chirp that starts t later has the phase 2π f t more, f the Doppler frequency, which would
-    be taken for a direction. It depends on the true f, not on that modulo one over the time from
-    loop to loop: ``fold`` says by how many spans of the velocity axis a bin's target is beyond it.
+    A chirp that starts t later has 2π f t more phase, with f the Doppler frequency. Beamforming
+    would take this for a direction. The phase depends on the true f, but a bin shows it modulo one
+    over the time from loop to loop: ``fold`` says by how many spans of the velocity axis a bin's
+    target is beyond it.
 
     Args:
         spectrum: Result of ``range_doppler``.
@@ -141,9 +142,9 @@ def resolve_fold(
 ) -> Int64[Tensor, "frame velocity range"]:
     """Find by how many spans each bin's target is beyond the velocity axis.
 
-    The right one makes all transmitters agree with the receivers on a direction: it has the
-    highest Bartlett peak; of equal ones the first candidate is taken. With N transmitters that
-    take turns, candidates that differ by N cannot be told apart. A choice; no gradients.
+    The right number makes all transmitters agree with the receivers on a direction, so it has the
+    highest Bartlett peak. Of equal candidates the first is taken. With N transmitters that take
+    turns, candidates that differ by N cannot be told apart. The result has no gradients.
 
     Args:
         spectrum: Result of ``range_doppler``, not compensated.

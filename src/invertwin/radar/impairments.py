@@ -40,8 +40,8 @@ Level = Annotated[float, Gt(-400), Lt(0)]  # dB below what is sent
 class PhaseNoise:
     """Phase noise of the oscillator that drives both transmitter and mixer.
 
-    Between the points the level is a straight line over the logarithm of the offset; beyond the
-    first and last of several points it stays. A single point stands for −20 dB per decade.
+    Between the points the level is a straight line over the logarithm of the offset. Beyond the
+    first and the last of several points it is constant. A single point means −20 dB per decade.
 
     Attributes:
         offsets: Distances from the carrier, ascending [Hz].
@@ -167,9 +167,9 @@ class Impairments:
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
         """Record the paths, in single ramps or a train of chirps, with these impairments.
 
-        Each impairment draws from its own stream of the seed: adding one leaves the others'
-        numbers as they are. Channel errors and leakage stay from chirp to chirp, thermal noise
-        is new in every sample, and the oscillator runs on through a train (``residual_phase``).
+        Each impairment draws from its own stream of the seed, so adding one does not change the
+        numbers of the others. Channel errors and leakage are the same in all chirps. Thermal noise
+        is new in every sample. The oscillator runs on through a train (``residual_phase``).
 
         Args:
             paths: Field paths.
@@ -252,9 +252,9 @@ def noisy_oscillator_beat(
 
         s'[n] = Σ s_i[n] exp(j (φ(t_n) − φ(t_n − τ_i)))
 
-    with s_i the beat signal of one path: noise that the echo and the mixer share cancels. The
-    factor is computed at delays so close that it is linear between them; in a train of chirps
-    a path keeps the τ of the frame's start in this factor.
+    with s_i the beat signal of one path. Noise that the echo and the mixer share cancels. The
+    factor is computed at delays so close that it is linear between them. In a train of chirps
+    this factor uses a path's delay τ at the start of the frame.
 
     Args:
         paths: Field paths.
@@ -302,11 +302,11 @@ def residual_phase(
     Its one-sided density is ``S_φ(f) · 4 sin²(πfτ)``. Offsets reach up to half the sampling
     rate, where the IF filter ends. The same seed gives the same φ at every delay.
 
-    Sweeps one by one have φ of their own, in every frame and transmitter, without what is slower
-    than four sweeps. In a train of chirps one oscillator runs through the frame, pauses
-    included: transmitters in turn read φ at their own times, those at once the same φ, and
-    what is slow is correlated from chirp to chirp, down to a quarter of 1 / frame. Ramps start
-    on multiples of the sampling interval, to which φ is rounded.
+    Single sweeps have independent φ in every frame and transmitter, without components slower than
+    four sweeps. In a train of chirps one oscillator runs through the frame, pauses included.
+    Transmitters in turn read φ at their own times; transmitters at once read the same φ. Slow
+    components are correlated from chirp to chirp, down to a frequency of 1 / (4 frames). The starts
+    of ramps are rounded to the sampling interval.
 
     Args:
         noise: Level of φ.

@@ -107,11 +107,11 @@ def moving_beat(
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
     """Beat signals of a train of chirps, during which scattering points move.
 
-    Every sample of every ramp has the delay of its own time, to each element: of the point
-    where it was when it scattered what is received then. Delays are computed exactly at three
-    or more instants of a ramp, as many as leave an error of 1e-6 between them; so range
-    migration, acceleration and rotation within a ramp and from ramp to ramp are exact.
-    Amplitudes and visibility stay those of the start of the frame. Approaching points have
+    Every sample of every ramp has the delay of its own time, to each element. This is the delay of
+    the place where a point scattered what is received at that time. Delays are computed exactly at
+    three or more instants of a ramp, as many as leave an error of 1e-6 between them. Range
+    migration, acceleration and rotation are therefore exact within a ramp and from ramp to ramp.
+    Amplitudes and visibility are those of the start of the frame. Approaching points have
     falling delays, so their beat phase falls from chirp to chirp by 4π v T/λ. Samples that are
     not taken in time (OFDM) see the points where the symbol starts.
 

@@ -31,12 +31,12 @@ def moving_power(
 ) -> Float64[Tensor, "frame velocity range u v"]:
     """Expected power over range rate, range and direction, as ``range_doppler_angle`` shows it.
 
-    Every path is spread by what exact signals show of a point in motion: the power responses of
-    the samples' window over range and of the chirps' window over range rate, and Bartlett
+    Every path is spread as exact signals spread a point in motion: by the power response of the
+    samples' window over range, by that of the chirps' window over range rate, and by Bartlett
     beamforming of its plane wave. Transmitters in turn are compensated for the rate of the bin, not
-    for that of the point, and a range rate shifts the range that a ramp shows. For independent
-    random phases, the mean of the exact power is therefore this one. Differentiable in paths and
-    velocities; a range rate is that of half the way from transmitters to receivers.
+    for that of the point. A range rate shifts the range that a ramp shows. For independent random
+    phases, the mean of the exact power therefore equals this power. It is differentiable with
+    respect to paths and velocities. A range rate is that of half the length of the path.
 
     Source: derivations §5 and §6.
 

@@ -6,39 +6,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from invertwin.limits import Axes
 from invertwin.radar.radar import Radar
-from invertwin.scene.checks import ArrayLike
-from invertwin.scene.parameters import ORIGIN, RigidMotion
+from invertwin.scene.parameters import RigidMotion
 
 
 class RadarPose(RigidMotion):
-    """Turns and moves all poses of a radar together, as `Radar.moved` defines it.
-
-    Attributes:
-        translation: parameter [3], metres.
-        rotation: parameter [4], as in `Pose`.
-    """
-
-    def __init__(
-        self,
-        translation: ArrayLike = ORIGIN,
-        rotation: ArrayLike = ORIGIN,
-        axes: Axes = "xyz",
-        rotation_axes: Axes = "xyz",
-    ) -> None:
-        """Move the radar, from these values at the start.
-
-        Args:
-            translation: [m].
-            rotation: rotation vector of any angle [3] (rad), or q itself [4].
-            axes: world axes along which the fit may move it.
-            rotation_axes: components of the rotation vector that the fit may change.
-
-        Raises:
-            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
-        """
-        super().__init__(translation, rotation, axes, rotation_axes)
+    """Turns and moves all poses of a radar together, as `Radar.moved` defines it."""
 
     def forward(self, radar: Radar) -> Radar:
         """The moved radar."""

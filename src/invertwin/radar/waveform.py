@@ -68,8 +68,8 @@ class SampledWaveform(Waveform):
         start_frequency: Frequency of the first sample [Hz].
         samples: Number of frequencies.
         step: Frequency step from one sample to the next [Hz].
-        noise_bandwidth: Thermal noise in a sample is kT0F times this, over the transmit power
-            [Hz].
+        noise_bandwidth: Bandwidth B of the thermal noise in a sample, whose power is kT₀F · B over
+            the transmit power [Hz].
     """
 
     start_frequency: float
@@ -208,9 +208,9 @@ class SteppedFrequency(SampledWaveform):
 class OFDM(SampledWaveform):
     """Subcarriers sent at once; known symbols are divided out, one sample per subcarrier.
 
-    ``Y = H X`` on every subcarrier, as a cyclic prefix longer than the largest delay makes it.
-    The power is shared evenly: ``|X|² = 1`` on average. In the library's sign the beat signal
-    is ``conj(H)``, so that ``range_profile`` forms the usual inverse FFT of ``Y/X``.
+    On every subcarrier ``Y = H X``, since the cyclic prefix is taken as longer than the largest
+    delay. All subcarriers have the same mean power, ``|X|² = 1``. In the library's sign the beat
+    signal is ``conj(H)``, so that ``range_profile`` forms the usual inverse FFT of ``Y/X``.
 
     Attributes:
         start_frequency: Frequency of the lowest subcarrier [Hz].

@@ -2,14 +2,12 @@
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number, checked_tensor
-
-_CORNER = "give x, y, z of the box's corners"
+from invertwin.scene.geometry.lattice import Lattice
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,29 +38,21 @@ class Cloud:
     albedo: float | Float64[Tensor, ""] = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("low", "high"):
-            corner = checked_tensor(
-                getattr(self, name), (3,), f"{name} corner of the box [m]", _CORNER
-            )
-            object.__setattr__(self, name, corner.detach())
-        if not bool((self.high > self.low).all()):
-            raise InputError(
-                "expected a box with low < high, "
-                f"got {self.low.tolist()} and {self.high.tolist()}; {_CORNER}"
-            )
         density = checked_tensor(
             self.density, (None, None, None), "densities [1/m]", "give one for each node"
         )
-        if min(density.shape) < 2 or float(density.detach().min()) < 0:
+        lattice = Lattice.between(self.low, self.high, density.shape)
+        least = float(density.detach().min())
+        if least < 0:
             raise InputError(
-                "expected densities of at least 0 at two or more nodes along each axis, got a "
-                f"least of {float(density.detach().min()) if density.numel() else 0:.3g} and shape "
-                f"{list(density.shape)}; the density is an extinction [1/m]"
+                f"expected densities of at least 0, got a least of {least:.3g}; "
+                "the density is an extinction [1/m]"
             )
-        object.__setattr__(self, "density", density)
         checked_number(self.albedo, "albedo", 0.0)
+        for name, value in (("low", lattice.low), ("high", lattice.high), ("density", density)):
+            object.__setattr__(self, name, value)
 
     @property
     def spacing(self) -> Float64[Tensor, "3"]:
         """Distance of neighbouring nodes [m] along each axis."""
-        return (self.high - self.low) / (torch.tensor(self.density.shape).double() - 1)
+        return (self.high - self.low) / (self.low.new_tensor(self.density.shape) - 1)

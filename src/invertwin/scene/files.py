@@ -19,7 +19,8 @@ from trimesh.exchange.gltf import export_glb
 from invertwin.errors import InputError
 from invertwin.scene import shapes
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.material import Material, RoughDielectric
+from invertwin.scene.material.materials import RoughDielectric
+from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
 
@@ -33,40 +34,40 @@ CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
 
 
-def load_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh from an OBJ, PLY, STL or glTF file.
+def load_mesh(file: str | Path) -> Mesh:
+    """A triangle mesh from an OBJ, PLY, STL or glTF file.
 
     Vertices at equal positions are merged, vertices of no triangle are left out, the rest keep
     their order. All parts of the file become one mesh; units are taken as metres and axes as they
     are.
 
     Args:
-        path: the file; its suffix tells the format.
+        file: OBJ, PLY, STL or glTF; its suffix tells the format.
 
     Raises:
         InputError: no such file, another format, a broken file, no triangles, or NaN.
     """
-    file = existing_file(path)
-    if file.suffix.lower() not in MESH_SUFFIXES:
+    path = existing_file(file)
+    if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
-            f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {file.name}; convert it first"
+            f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {path.name}; convert it first"
         )
     try:
-        loaded = trimesh.load_scene(file, process=False).to_mesh()
+        loaded = trimesh.load_scene(path, process=False).to_mesh()
         vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
         faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
     # A broken file can make the readers fail in any way; every one means the same to the user.
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise InputError(
-            f"expected a readable {file.suffix} mesh, got {file} ({reason}); export the file again"
+            f"expected a readable {path.suffix} mesh, got {path} ({reason}); export the file again"
         ) from error
     try:
         # The first check sees the file as it is: merging would hide what is wrong with it.
         Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
         return _merged(vertices, faces)
     except InputError as error:
-        raise InputError(f"{file}: {error}") from None
+        raise InputError(f"{path}: {error}") from None
 
 
 def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:

@@ -1,8 +1,11 @@
 """Triangle meshes as plain tensors."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import MinLen
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
@@ -39,6 +42,17 @@ class Mesh:
     def center(self) -> Float64[Tensor, "3"]:
         """Middle of the bounding box [m]."""
         return (self.vertices.amin(0) + self.vertices.amax(0)) / 2
+
+
+def joined(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
+    """Several shapes as one rigid object of one material.
+
+    Args:
+        parts: shapes, each placed within the object.
+    """
+    starts = torch.tensor([0, *(len(part.vertices) for part in parts)]).cumsum(0)
+    faces = [part.faces + int(start) for part, start in zip(parts, starts, strict=False)]
+    return Mesh(torch.cat([part.vertices for part in parts]), torch.cat(faces))
 
 
 def _checked_faces(faces: object, vertex_count: int) -> Tensor:

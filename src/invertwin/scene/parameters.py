@@ -59,12 +59,41 @@ class Entries:
     slope: float | Tensor = 1.0
 
 
-class Translation(nn.Module):
+class ObjectModule(nn.Module):
+    """A module Scene → Scene that changes one object, its mesh unless it says otherwise.
+
+    Attributes:
+        object: name of the object.
+        reported: names of the attributes that `values` returns.
+    """
+
+    reported: tuple[str, ...] = ()
+
+    def __init__(self, object: str) -> None:
+        super().__init__()
+        self.object = object
+
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The object's new mesh, given the one that it has before."""
+        raise NotImplementedError
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object's mesh replaced."""
+        return scene.replace(self.object, mesh=self.reshaped(scene[self.object].mesh))
+
+    def values(self) -> dict[str, Tensor]:
+        """What is fitted by name, in SI units, for progress and reports."""
+        return {f"{self.object}.{n}": getattr(self, n).detach().clone() for n in self.reported}
+
+
+class Translation(ObjectModule):
     """Moves an object along the world axes.
 
     Attributes:
         translation: parameter [3], metres.
     """
+
+    reported = ("translation",)
 
     def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: Axes = "xyz") -> None:
         """Move `object`, by `initial` [m] at the start.
@@ -77,8 +106,7 @@ class Translation(nn.Module):
         Raises:
             InputError: `initial` is not three finite numbers, or an unknown axis.
         """
-        super().__init__()
-        self.object = object
+        super().__init__(object)
         self.translation = nn.Parameter(_vector(initial, "initial translation [m]"))
         self._axes = _checked_axes(axes)
 
@@ -87,24 +115,34 @@ class Translation(nn.Module):
         motion = rigid(translation=_free(self.translation, self._axes))
         return scene.replace(self.object, pose=compose(scene[self.object].transform, motion))
 
-    def values(self) -> dict[str, Tensor]:
-        """Translation [m] by name, for progress and reports."""
-        return {f"{self.object}.translation": self.translation.detach().clone()}
-
 
 class RigidMotion(nn.Module):
-    """A translation and a rotation without singularities: quaternion ∝ (w, r/2)."""
+    """A translation and a rotation without singularities: quaternion ∝ (w, r/2).
+
+    Attributes:
+        translation: parameter [3], metres.
+        rotation: parameter [4], q = (w, r) with the quaternion ∝ (w, r/2); near the identity
+            (1, 0, 0, 0), r is the rotation vector in the world [rad]. Any q but zero is a
+            rotation, and its derivative is finite everywhere.
+    """
 
     def __init__(
-        self, translation: ArrayLike, rotation: ArrayLike, axes: str, rotation_axes: str
+        self,
+        translation: ArrayLike = ORIGIN,
+        rotation: ArrayLike = ORIGIN,
+        axes: Axes = "xyz",
+        rotation_axes: Axes = "xyz",
     ) -> None:
         """Move from these values at the start.
 
         Args:
             translation: [m].
             rotation: rotation vector of any angle [3] (rad), or q itself [4].
-            axes: world axes along which the fit may move.
+            axes: world axes along which the fit may move it.
             rotation_axes: components of the rotation vector that the fit may change.
+
+        Raises:
+            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
         """
         super().__init__()
         self.translation = nn.Parameter(_vector(translation, "initial translation [m]"))
@@ -141,14 +179,7 @@ class RigidMotion(nn.Module):
 
 
 class Pose(RigidMotion):
-    """Turns an object about its centre, then moves it along the world axes.
-
-    Attributes:
-        translation: parameter [3], metres.
-        rotation: parameter [4], q = (w, r) with the quaternion ∝ (w, r/2); near the identity
-            (1, 0, 0, 0), r is the rotation vector in the world [rad]. Any q but zero is a
-            rotation, and its derivative is finite everywhere.
-    """
+    """Turns an object about its centre, then moves it along the world axes."""
 
     def __init__(
         self,
@@ -158,17 +189,10 @@ class Pose(RigidMotion):
         axes: Axes = "xyz",
         rotation_axes: Axes = "xyz",
     ) -> None:
-        """Move `object`, from these values at the start.
+        """Move an object. `RigidMotion` tells what the other arguments mean.
 
         Args:
             object: name of the object.
-            translation: [m].
-            rotation: rotation vector of any angle [3] (rad), or q itself [4].
-            axes: world axes along which the fit may move it.
-            rotation_axes: components of the rotation vector that the fit may change.
-
-        Raises:
-            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
         """
         super().__init__(translation, rotation, axes, rotation_axes)
         self.object = object
@@ -185,12 +209,14 @@ class Pose(RigidMotion):
         return self.named_values(self.object)
 
 
-class Scale(nn.Module):
+class Scale(ObjectModule):
     """Scales an object about its centre.
 
     Attributes:
         log_scale: parameter, natural logarithm of the factor.
     """
+
+    reported = ("scale",)
 
     def __init__(self, object: str, initial: float = 1.0) -> None:
         """Scale `object`, from this size at the start.
@@ -202,28 +228,28 @@ class Scale(nn.Module):
         Raises:
             InputError: `initial` is not positive.
         """
-        super().__init__()
+        super().__init__(object)
         factor = checked_number(initial, "initial scale", 0.0, open_low=True)
-        self.object = object
         self.log_scale = nn.Parameter(torch.tensor(math.log(factor), dtype=torch.float64))
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the object scaled."""
-        mesh = scene[self.object].mesh
-        vertices = mesh.center + (mesh.vertices - mesh.center) * self.log_scale.exp()
-        return scene.replace(self.object, mesh=Mesh(vertices, mesh.faces))
+    @property
+    def scale(self) -> Float64[Tensor, ""]:
+        """The factor."""
+        return self.log_scale.exp()
 
-    def values(self) -> dict[str, Tensor]:
-        """Scale factor by name, for progress and reports."""
-        return {f"{self.object}.scale": self.log_scale.detach().exp()}
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The mesh in its new size."""
+        return Mesh(mesh.center + (mesh.vertices - mesh.center) * self.scale, mesh.faces)
 
 
-class Vertices(nn.Module):
+class Vertices(ObjectModule):
     """Moves every vertex of an object freely.
 
     Attributes:
         offsets: parameter [v, 3] in the object's frame, metres.
     """
+
+    reported = ("offsets",)
 
     def __init__(self, object: str, count: int) -> None:
         """Move the `count` vertices of `object`, by zero at the start.
@@ -235,28 +261,22 @@ class Vertices(nn.Module):
         Raises:
             InputError: no vertices.
         """
-        super().__init__()
-        self.object = object
+        super().__init__(object)
         rows = checked_count(count, "number of vertices", 1)
         self.offsets = nn.Parameter(torch.zeros(rows, 3, dtype=torch.float64))
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the vertices moved.
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The mesh with its vertices moved.
 
         Raises:
-            InputError: the object has another number of vertices.
+            InputError: another number of vertices.
         """
-        mesh = scene[self.object].mesh
         if mesh.vertices.shape != self.offsets.shape:
             raise InputError(
                 f"expected {len(self.offsets)} vertices in {self.object!r}, "
                 f"got {len(mesh.vertices)}; create Vertices with the mesh's count"
             )
-        return scene.replace(self.object, mesh=Mesh(mesh.vertices + self.offsets, mesh.faces))
-
-    def values(self) -> dict[str, Tensor]:
-        """Vertex offsets [m] by name, for progress and reports."""
-        return {f"{self.object}.offsets": self.offsets.detach().clone()}
+        return Mesh(mesh.vertices + self.offsets, mesh.faces)
 
 
 class MaterialValues(nn.Module):
@@ -277,7 +297,7 @@ class MaterialValues(nn.Module):
             object: name of the object.
             layer: of a `Multilayer`, the layer whose values are meant; None for values of the
                 material itself.
-            start: by the names of `invertwin.scene.material.RANGES`, inside their ranges, ends
+            start: by the names of `RANGES` of the materials, inside their ranges, ends
                 excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
                 lobe_width [rad], scattering, rms_slope, lambertian, directive, directive_exponent,
                 backscatter_exponent.

@@ -12,7 +12,7 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number, checked_tensor
 from invertwin.scene.cloud import Cloud
-from invertwin.scene.material import Material
+from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import compose, rigid
 
@@ -41,16 +41,13 @@ class Object:
     cloud: Cloud | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.mesh, Mesh):
-            raise InputError(
-                f"expected a Mesh, got {type(self.mesh).__name__}; "
-                "build one with Mesh(vertices, faces) or load_mesh(path)"
-            )
-        if not isinstance(self.material, Material):
-            raise InputError(
-                f"expected a Material, got {type(self.material).__name__}; "
-                "give a PerfectConductor or a RoughDielectric"
-            )
+        for value, kind, what, do in (
+            (self.mesh, Mesh, "Mesh", "build one with Mesh(vertices, faces) or load_mesh(path)"),
+            (self.material, Material, "Material", "give one such as RoughDielectric(permittivity)"),
+            (self.cloud, Cloud | None, "Cloud or None", "build one with Cloud(low, high, density)"),
+        ):
+            if not isinstance(value, kind):
+                raise InputError(f"expected a {what}, got {type(value).__name__}; {do}")
         faces = self.material.faces
         if faces is not None and faces != len(self.mesh.faces):
             raise InputError(
@@ -62,11 +59,6 @@ class Object:
         if self.velocity is not None:
             velocity = _checked_velocity(self.velocity, len(self.mesh.vertices))
             object.__setattr__(self, "velocity", velocity)
-        if not (self.cloud is None or isinstance(self.cloud, Cloud)):
-            raise InputError(
-                f"expected a Cloud or None, got {type(self.cloud).__name__}; "
-                "build one with Cloud(low, high, density)"
-            )
 
     @property
     def transform(self) -> Float64[Tensor, "4 4"]:
@@ -75,7 +67,7 @@ class Object:
 
     @property
     def vertices(self) -> Float64[Tensor, "v 3"]:
-        """Vertex positions in the world [m], differentiable in the mesh and the pose."""
+        """Vertex positions in the world [m], with the gradients of the mesh and the pose."""
         return self._to_world(self.mesh.vertices)
 
     @property

@@ -17,7 +17,7 @@ from invertwin.capture.ti import (
     write_studio,
 )
 from invertwin.errors import InputError
-from invertwin.radar.boards import board
+from invertwin.radar.boards import Mounting, board
 from invertwin.radar.waveform import PhysicsWarning
 
 SETTINGS = ChirpSettings(
@@ -237,8 +237,8 @@ def test_a_recording_becomes_a_capture(tmp_path):
     data = counts(SETTINGS)
     write_samples(tmp_path / "adc.bin", data)
     write_cfg(tmp_path / "profile.cfg", SETTINGS)
-    options = {"chirps": 1, "board": "xWR1843", "elevation": -1}
-    capture = read(tmp_path / "adc.bin", "dca1000", settings=tmp_path / "profile.cfg", **options)
+    mounted = Mounting("xWR1843", elevation=-1)
+    capture = read(tmp_path / "adc.bin", tmp_path / "profile.cfg", board=mounted).capture(1)
     assert torch.equal(capture.beat, data.samples[:, 1])
     assert capture.times.tolist() == pytest.approx([0.0, 0.1, 0.2])
     tx, rx = board("xWR1843").arrays(elevation=-1, transmitters=[1, 3, 2], receivers=[1, 2, 4])
@@ -246,15 +246,9 @@ def test_a_recording_becomes_a_capture(tmp_path):
     assert torch.equal(capture.radar().receivers.positions, rx.positions)
     capture.save(tmp_path / "capture.nc")
     assert torch.equal(Capture.load(tmp_path / "capture.nc").beat, capture.beat)
-    given = read(
-        tmp_path / "adc.bin",
-        "dca1000",
-        settings=replace(SETTINGS, lanes=None),
-        chirps="mean",
-        arrays=(tx, rx),
-        lanes=2,
-    )
-    torch.testing.assert_close(given.beat, data.samples.mean(1))
+    unknown = replace(SETTINGS, lanes=None)
+    given = read(tmp_path / "adc.bin", unknown, board=(tx, rx), lanes=2)
+    torch.testing.assert_close(given.capture().beat, data.samples.mean(1))
 
 
 def test_a_setup_is_enough(tmp_path):
@@ -264,20 +258,20 @@ def test_a_setup_is_enough(tmp_path):
     files = {"fileBasePath": "D:\\data", "files": [{"rawFileName": "adc_Raw_0.bin"}]}
     setup = {"configUsed": "D:\\data\\bench.mmwave.json", "capturedFiles": files}
     (tmp_path / "bench.setup.json").write_text(json.dumps(setup))
-    options = {"chirps": 0, "board": "xWR1843", "elevation": 1}
-    capture = read(tmp_path / "bench.setup.json", "dca1000", **options)
+    mounted = Mounting("xWR1843", elevation=1)
+    capture = read(tmp_path / "bench.setup.json", board=mounted).capture(0)
     assert torch.equal(capture.beat, data.samples[:, 0])
     write_setup(
         tmp_path / "own.setup.json", tmp_path / "bench.mmwave.json", [tmp_path / "adc_Raw_0.bin"]
     )
-    own = read(tmp_path / "own.setup.json", "dca1000", **options)
+    own = read(tmp_path / "own.setup.json", board=mounted).capture(0)
     assert torch.equal(own.beat, capture.beat)
     with pytest.raises(InputError, match=r"expected adc_Raw_1\.bin beside"):
         write_setup(tmp_path / "x.setup.json", "bench.mmwave.json", ["adc_Raw_1.bin"])
     with pytest.raises(InputError, match="existing folder"):
         write_setup(tmp_path / "nowhere" / "x.setup.json", "bench.mmwave.json", [])
     with pytest.raises(InputError, match=r"settings in a .cfg or .json file"):
-        read(tmp_path / "adc_Raw_0.bin", "dca1000", **options)
+        read(tmp_path / "adc_Raw_0.bin", board=mounted)
 
 
 def test_a_simulated_echo_is_found_in_its_file(tmp_path):
@@ -286,8 +280,8 @@ def test_a_simulated_echo_is_found_in_its_file(tmp_path):
     cycles = 2 * 3.0 / 299792458.0 * (chirp.start_frequency + chirp.slope * chirp.sample_times)
     beat = (2e-5 * torch.exp(2j * torch.pi * cycles)).expand(1, 3, 3, 64)
     write_samples(tmp_path / "adc.bin", adc_counts(beat, settings, full_scale=1e-4))
-    options = {"chirps": "mean", "board": "xWR1843", "elevation": 1}
-    capture = read(tmp_path / "adc.bin", "dca1000", settings=settings, **options)
+    mounted = Mounting("xWR1843", elevation=1)
+    capture = read(tmp_path / "adc.bin", settings, board=mounted).capture()
     grid = capture.radar().grid(0.0, 6.0)
     profile = capture.spectrum(grid)[0].amax((1, 2))
     assert grid.ranges[profile.argmax()] == pytest.approx(3.0, abs=chirp.range_resolution / 2)
@@ -332,7 +326,7 @@ def test_other_tools_find_the_samples_and_the_echo(tmp_path, lanes):
 
 def test_a_capture_needs_a_board(tmp_path):
     write_samples(tmp_path / "adc.bin", counts(SETTINGS))
-    with pytest.raises(InputError, match="either board or arrays, got neither"):
-        read(tmp_path / "adc.bin", "dca1000", settings=SETTINGS, chirps=0)
+    with pytest.raises(InputError, match="expected the board that recorded, got none"):
+        read(tmp_path / "adc.bin", SETTINGS)
     with pytest.raises(InputError, match="TX numbers of xWR1642"):
-        read(tmp_path / "adc.bin", "dca1000", settings=SETTINGS, chirps=0, board="xWR1642")
+        read(tmp_path / "adc.bin", SETTINGS, board=Mounting("xWR1642"))

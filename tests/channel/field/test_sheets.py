@@ -6,8 +6,16 @@ import torch
 from invertwin.channel import Sampling, trace_field, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, Object, PerfectConductor, RoughDielectric, Scene, plate, rigid
-from invertwin.scene.material import Slab
+from invertwin.scene import (
+    Mesh,
+    Object,
+    PerfectConductor,
+    RoughDielectric,
+    Scene,
+    Slab,
+    plate,
+    rigid,
+)
 from scenes import link
 
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.scene import rotation_from_vector
-from invertwin.scene.geometry import load_anny
+from invertwin.scene import load_anny, rotation_from_vector
 from scenes import float64
 
 TURN = float64([[-1, 0, 0], [0, 0, 1], [0, 1, 0]])

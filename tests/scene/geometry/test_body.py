@@ -10,12 +10,15 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, Scene, box, rotation_from_vector
-from invertwin.scene.geometry import (
+from invertwin.scene import (
     BodyTemplate,
+    Mesh,
+    Scene,
     SkinnedBody,
     articulated_template,
+    box,
     load_smpl,
+    rotation_from_vector,
 )
 from scenes import float64, thing
 

@@ -5,8 +5,7 @@ import torch
 from torch.autograd import gradcheck
 
 from invertwin.errors import InputError
-from invertwin.scene import RoughDielectric, Scene, sphere
-from invertwin.scene.geometry import LatticeDeformation
+from invertwin.scene import LatticeDeformation, RoughDielectric, Scene, sphere
 from scenes import float64, thing
 
 BALL = sphere(0.2, subdivisions=1)

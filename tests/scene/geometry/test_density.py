@@ -7,7 +7,7 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import volume_iou
 from invertwin.scene import DensityGrid, Object, RoughDielectric, Scene, plate, sphere
-from invertwin.scene.geometry import without_clouds
+from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.parameters import Scale, Translation
 
 BOX = [-0.5] * 3, [0.5] * 3

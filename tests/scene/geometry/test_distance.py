@@ -11,8 +11,15 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, RoughDielectric, Scene, sphere
-from invertwin.scene.geometry import DistanceGrid, NeuralDistance, iso_surface
+from invertwin.scene import (
+    DistanceGrid,
+    Mesh,
+    NeuralDistance,
+    RoughDielectric,
+    Scene,
+    iso_surface,
+    sphere,
+)
 from invertwin.scene.geometry.lattice import Lattice
 from scenes import float64, thing
 

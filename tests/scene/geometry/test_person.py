@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.scene import Scene, box, rotation_from_vector
-from invertwin.scene.geometry import BodyTemplate, SkinnedBody, person
+from invertwin.scene import BodyTemplate, Scene, SkinnedBody, box, person, rotation_from_vector
 from scenes import float64, thing
 
 TEMPLATE = person()

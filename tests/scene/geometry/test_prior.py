@@ -15,7 +15,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, PriorShape, Scene, ShapePrior, box, load_prior
-from invertwin.scene.geometry import Lattice
+from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.geometry.prior import Decoder
 from scenes import float64, thing
 

@@ -1,17 +1,11 @@
-"""Linear shape spaces, and the public one of vehicles."""
+"""Linear shape spaces."""
 
-import shutil
-from typing import Any
-
-import numpy as np
 import pytest
 import torch
-import trimesh
 from torch.autograd import gradcheck
 
 from invertwin.errors import InputError
-from invertwin.scene import Scene, box
-from invertwin.scene.geometry import LinearShape, ShapeSpace, load_vehicle_space
+from invertwin.scene import LinearShape, Scene, ShapeSpace, box
 from scenes import float64, thing
 
 CUBE = box(1.0)
@@ -62,52 +56,3 @@ def test_bad_input(unchecked):
         ShapeSpace(CUBE.vertices, space().components, float64([0.1, -1.0]), CUBE.faces)
     with pytest.raises(InputError, match="expected components as numbers of shape"):
         ShapeSpace(CUBE.vertices, space().components[1:], float64([0.1, 0.1]), CUBE.faces)
-
-
-@pytest.mark.parametrize(("level", "vertices", "modes"), [("fine", 127, 78), ("coarse", 16, 14)])
-def test_public_vehicles(data_folder, level, vertices, modes):
-    vehicles = load_vehicle_space(data_folder / "vehicle_prior", level)
-    assert vehicles.components.shape == (vertices, 3, modes)
-    assert bool((vehicles.deviations.diff() <= 0).all())
-    share = vehicles.deviations.square().cumsum(0) / vehicles.deviations.square().sum()
-    assert float(share[4]) > 0.9
-    car = vehicles.mesh(torch.zeros(1, dtype=torch.float64))
-    length, width, height = extent(car).tolist()
-    assert 4 < length < 5
-    assert 1.6 < width < 1.9
-    assert 1.1 < height < 1.4
-    for latent in torch.randn(
-        5, modes, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    ):
-        mesh = vehicles.mesh(latent.clamp(-2, 2))
-        solid = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
-        assert solid.is_watertight
-        assert solid.volume > 3
-
-
-def test_mean_meshes_in_another_order_are_sorted(data_folder, tmp_path):
-    source = data_folder / "vehicle_prior"
-    shutil.copyfile(source / "vehicle3d_pca.npz", tmp_path / "vehicle3d_pca.npz")
-    solid: Any = trimesh.load(source / "dodec_mean.obj", process=False)
-    order = np.random.default_rng(0).permutation(16)
-    trimesh.Trimesh(solid.vertices[order], np.argsort(order)[solid.faces], process=False).export(
-        tmp_path / "dodec_mean.obj"
-    )
-    ours, theirs = (load_vehicle_space(folder, "coarse") for folder in (tmp_path, source))
-    assert torch.equal(ours.faces, theirs.faces)
-
-
-def test_missing_vehicles_say_where_they_are_from(tmp_path):
-    with pytest.raises(InputError, match=r"INVERTWIN_DATA.*github\.com/mleotta/vehicle3d"):
-        load_vehicle_space(tmp_path)
-    np.savez(tmp_path / "vehicle3d_pca.npz", default1_mean=np.zeros(3))
-    with pytest.raises(InputError, match="expected default1_pc in vehicle3d_pca"):
-        load_vehicle_space(tmp_path)
-    (tmp_path / "vehicle3d_pca.npz").write_bytes(b"")
-    with pytest.raises(InputError, match=r"plain arrays in vehicle3d_pca.npz.*load the original"):
-        load_vehicle_space(tmp_path)
-
-
-def test_unknown_level(tmp_path, unchecked):
-    with pytest.raises(InputError, match="expected level 'coarse' or 'fine'"):
-        load_vehicle_space(tmp_path, "finest")  # type: ignore[arg-type]

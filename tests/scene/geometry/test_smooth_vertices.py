@@ -8,8 +8,7 @@ import torch
 from torch.autograd import gradcheck
 
 from invertwin.errors import InputError
-from invertwin.scene import Scene, box, sphere
-from invertwin.scene.geometry import SmoothVertices
+from invertwin.scene import Scene, SmoothVertices, box, sphere
 from invertwin.scene.geometry.smooth_vertices import Smoother, laplacian
 from invertwin.scene.parameters import Vertices
 from scenes import thing

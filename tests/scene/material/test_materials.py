@@ -16,8 +16,10 @@ from invertwin.scene import (
     RoughDielectric,
     Slab,
     complex_permittivity,
+    lobe_exponent,
+    lobe_integral,
 )
-from invertwin.scene.material import RANGES, lobe_exponent, lobe_integral
+from invertwin.scene.material.values import RANGES
 
 FREQUENCY = 77e9
 

@@ -18,8 +18,10 @@ from invertwin.scene import (
     Surface,
     complex_permittivity,
     fresnel_reflectance,
+    lobe_exponent,
+    lobe_integral,
+    slope_exponent,
 )
-from invertwin.scene.material import lobe_exponent, lobe_integral, slope_exponent
 from invertwin.scene.material.roughness import EffectiveRoughness
 
 FREQUENCY = 77e9

@@ -1,8 +1,9 @@
 """Studies of invertwin: figures, peers to compare with, training of the prior, public recordings.
 
 A plugin of invertwin: it adds the run-file sections `[methods]` and `[loss_scan]`, the commands
-`loss-scan` and `train-prior`, and the readers of two public recordings, the `[data]` kinds
-`openradar` and `rail_sar`. Nothing in invertwin builds on it.
+`loss-scan` and `train-prior`, the readers of two public recordings, the `[data]` kinds
+`openradar` and `rail_sar`, and the public space of vehicles, the shape `vehicle` with the unknown
+`shape_space`. Nothing in invertwin builds on it.
 """
 
 from typing import Any
@@ -20,6 +21,9 @@ def register(registry: Any) -> None:
     registry.sections["loss_scan"] = LossScan
     registry.commands["loss-scan"] = loss_scan
     registry.commands["train-prior"] = train_prior
+    registry.add("shape", "vehicle", "invertwin_studies.vehicle_space:vehicle")
+    coordinates = "invertwin_studies.vehicle_space:vehicle_coordinates"
+    registry.add("parameter", "shape_space", coordinates)
     for kind, file, board in (
         ("openradar", "openradar.npz", "xWR1642"),
         ("rail_sar", "bwsi_rail_trial6.npz", None),

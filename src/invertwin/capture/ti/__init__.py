@@ -1,6 +1,5 @@
 """Files of Texas Instruments' tools: settings of the SDK and of mmWave Studio, DCA1000 samples."""
 
-from invertwin.capture.ti.dca1000 import read as read
 from invertwin.capture.ti.dca1000 import read_recording as read_recording
 from invertwin.capture.ti.dca1000 import read_samples as read_samples
 from invertwin.capture.ti.dca1000 import write_samples as write_samples

@@ -1,9 +1,9 @@
 """Samples as the DCA1000 records them: little-endian 16-bit words in the order of the LVDS lanes.
 
-Through 4 lanes (xWR12xx, xWR14xx) all receivers come side by side, RX1 to RX4 whether enabled or
-not: the four I of one sample, then its four Q. Through 2 lanes (xWR16xx, 18xx, 68xx) the enabled
-receivers come one after the other in every chirp, two samples at a time: I, I, Q, Q. Real samples
-have no Q. (TI, SWRA581, "Mmwave Radar Device ADC Raw Data Capture".)
+Devices with 4 lanes (xWR12xx, xWR14xx) send all receivers side by side, RX1 to RX4, enabled or
+not: the four I of one sample, then its four Q. Devices with 2 lanes (xWR16xx, 18xx, 68xx) send the
+enabled receivers one after the other in every chirp, two samples at a time: I, I, Q, Q. Real
+samples have no Q. (TI, SWRA581, "Mmwave Radar Device ADC Raw Data Capture".)
 """
 
 import warnings
@@ -13,58 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.capture.capture import Capture
 from invertwin.capture.chirps import ChirpData, ChirpSettings
-from invertwin.capture.elements import elements
 from invertwin.capture.ti.settings_files import read_settings, recorded_files
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
-from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.files import existing_file, replacing
 
 _WORD = np.dtype("<i2")
 _LANE_COUNT = 4
-
-
-def read(
-    path: str | Path,
-    settings: str | Path | ChirpSettings | None = None,
-    *,
-    chirps: int | str,
-    board: str | None = None,
-    elevation: int | None = None,
-    azimuth: int = 1,
-    arrays: tuple[AntennaArray, AntennaArray] | None = None,
-    lanes: int | None = None,
-    positions: Float64[Tensor, "frame 3"] | None = None,
-    rotations: Float64[Tensor, "frame 3 3"] | None = None,
-) -> Capture:
-    """Read a DCA1000 recording as a `Capture` with one beat signal per frame.
-
-    Args:
-        path: `.bin` file, or a `.setup.json` that names the files.
-        settings: what the recording was set up with, or its file (`read_settings`); None = those
-            that the `.setup.json` names.
-        chirps: "mean" or a chirp number, see `ChirpData.capture`.
-        board: preset of `invertwin.radar.boards` whose elements in use are those of the settings.
-        elevation: sign of elevation of the preset, see `Board.arrays`.
-        azimuth: sign of azimuth of the preset.
-        arrays: TX and RX elements in use, instead of a preset.
-        lanes: lanes of the LVDS link, where the settings do not say.
-        positions: position of the radar in every frame [m]; None = the origin.
-        rotations: orientation of the radar in every frame; None = axes of the world.
-
-    Raises:
-        InputError: what `read_samples` and `ChirpData.capture` raise, or no board.
-    """
-    data = read_recording(path, settings, lanes)
-    transmitters, receivers = elements(data.settings, board, elevation, azimuth, arrays)
-    return data.capture(
-        transmitters, receivers, chirps=chirps, positions=positions, rotations=rotations
-    )
 
 
 def read_recording(

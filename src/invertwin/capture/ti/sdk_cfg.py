@@ -34,10 +34,10 @@ _BITS = {0: 12, 1: 14, 2: 16}
 def read_cfg(path: str | Path) -> ChirpSettings:
     """Read `channelCfg`, `adcCfg`, `profileCfg`, `chirpCfg` and `frameCfg` of a `.cfg` file.
 
-    The byte order of I and Q is that of `adcbufCfg`, where there is one; lanes are those of the
-    device in a comment such as ``% Platform:xWR18xx``. All other commands concern what the demo
-    computes, and are passed over. In MCU+ SDK files (AWR2944), `frameCfg` repeats the number of
-    samples before the period.
+    `adcbufCfg` tells the order of I and Q, if the file has it. A comment such as
+    ``% Platform:xWR18xx`` names the device, which tells the number of lanes. All other commands
+    set up what the demo computes; they are ignored. In MCU+ SDK files (AWR2944), `frameCfg` repeats
+    the number of samples before the period.
 
     Raises:
         InputError: no file, a command that is missing or cannot be understood, or one that asks for

@@ -13,7 +13,7 @@ from invertwin.channel.power.surface import Surfaces, gaussian
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import RayScene
-from invertwin.scene.material import Surface
+from invertwin.scene import Surface
 
 _TOWARDS = 0.5  # share of the directions that aim at other objects, where there are some
 

@@ -11,7 +11,7 @@ from typing import Any
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
-from invertwin.scene.material import Surface
+from invertwin.scene import Surface
 
 #: Names of a surface's tables.
 SURFACE = tuple(field.name for field in fields(Surface))

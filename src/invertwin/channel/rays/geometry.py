@@ -13,7 +13,7 @@ from invertwin.channel.paths import Link
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.scene.material import Material, Surface
+from invertwin.scene import Material, Surface
 from invertwin.scene.scene import Object, Scene
 
 

@@ -3,7 +3,7 @@
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -19,19 +19,18 @@ from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
-from invertwin.cli.fits.likeness import CURVE, watch_of
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
+    models_of,
     observations_of,
-    sampling_of,
-    stages_of,
-    steps_of,
+    schedule_of,
+    settings_of,
     unknowns_of,
     varied,
 )
 from invertwin.cli.fits.scores import scores
-from invertwin.cli.run_file import need
+from invertwin.cli.fits.shape_scores import CURVE, watch_of
 from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.errors import InputError
 from invertwin.inversion import (
@@ -39,7 +38,6 @@ from invertwin.inversion import (
     Observation,
     Reconstruction,
     Report,
-    Schedule,
     Watch,
     reconstruct,
 )
@@ -65,22 +63,16 @@ def calibrated(
         capture, row = calibrate(sight.capture, target.center), {}
     else:
         bias, clock = RangeBias(), ClockOffset(sight.capture.positions)
-        stage, model = stages_of(run)[0], sight.model(sampling_of(run))
-        steps = table.steps or steps_of(run)
-        optimizer = build.optimizer(run.optimizer)
-        with watched(Bar(console, "calibration", steps)) as shown:
+        own = replace(problem, run=run.varied(table))
+        schedule, (model,) = settings_of(own.run).build(), models_of(own)
+        with watched(console, "calibration", schedule.steps) as shown:
             found = reconstruct(
                 Scene({table.object: target}),
                 Observation(model, sight.radar, sight.capture, parameters=[bias, clock]),
                 [],
                 loss=build.loss(run.loss),
-                optimizer=replace(optimizer, rate=table.rate or run.optimizer.rate),
-                schedule=Schedule(
-                    steps,
-                    annealing=stage.annealing,
-                    frames_per_step=stage.frames_per_step,
-                    tolerance=stage.tolerance,
-                ),
+                optimizer=build.optimizer(own.run.optimizer),
+                schedule=schedule,
                 callbacks=[*shown, _checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
                 seed=run.seed,
             )
@@ -127,7 +119,9 @@ def fit(
         return row, again
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    found = again(Bar(console, name, steps_of(own.run)))
+    steps = sum(stage.steps for stage in schedule_of(own))
+    with watched(console, name, steps) as shown:
+        found = again(shown)
     row = {
         "start": index,
         **scores(own, start, found.scene),
@@ -150,33 +144,31 @@ def _staged(
     index: int,
     folder: RunFolder,
     checkpoint: str,
-    bar: "Bar | None" = None,
+    shown: Sequence[Report] = (),
 ) -> Reconstruction:
-    run, stages, watch = problem.run, stages_of(problem.run), watch_of(problem)
+    run, stages, watch = problem.run, schedule_of(problem), watch_of(problem)
     for k in range(len(stages) - 1):
         folder.file(str(stage_file(Path(checkpoint), k)))
     every = run.measures.every if run.measures else 1
-    with watched(bar) as shown:
-        return reconstruct(
-            start.scene,
-            observations_of(problem),
-            unknowns_of(run),
-            loss=build.loss(run.loss),
-            optimizer=build.optimizer(run.optimizer),
-            schedule=stages,
-            callbacks=[
-                *([] if watch is None else [Watch(watch, every)]),
-                *shown,
-                _checkpoint(problem, folder, checkpoint),
-            ],
-            seed=derived_seed(run.seed, index),
-        )
+    return reconstruct(
+        start.scene,
+        observations_of(problem),
+        unknowns_of(run),
+        loss=build.loss(run.loss),
+        optimizer=build.optimizer(run.optimizer),
+        schedule=stages,
+        callbacks=[
+            *([] if watch is None else [Watch(watch, every)]),
+            *shown,
+            _checkpoint(problem, folder, checkpoint),
+        ],
+        seed=derived_seed(run.seed, index),
+    )
 
 
 def _checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
-    every = need(problem.run, "reconstruct", "reconstruct").checkpoint_every
-    return Checkpoint(folder.file(name), every, resume=True)
+    return Checkpoint(folder.file(name), settings_of(problem.run).checkpoint_every, resume=True)
 
 
 def _values(modules: nn.ModuleList) -> dict[str, Any]:
@@ -189,18 +181,31 @@ def _values(modules: nn.ModuleList) -> dict[str, Any]:
 
 
 @contextmanager
-def watched(bar: "Bar | None") -> Iterator[list[Report]]:
-    """Progress that is shown; Ctrl-C waits for the end of the step."""
-    if bar is None:
-        yield []
-        return
+def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
+    """Progress with the loss and the first parameters: a bar, or lines where no terminal is.
+
+    Ctrl-C waits for the end of the step.
+    """
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    words, lines = TextColumn("{task.description}"), not console.is_terminal
+    bar = Progress(*columns, words, console=console, disable=lines)
+    task = bar.add_task("", total=steps)
     with bar, _interrupted_between_steps() as heed:
 
-        def advance(row: dict[str, Any]) -> None:
-            bar.advance(row)
+        def show(row: dict[str, Any]) -> None:
+            values = " ".join(
+                np.array2string(np.atleast_1d(value), precision=3, suppress_small=True)
+                for value in list(row["values"].values())[:2]
+                if np.size(value) <= 3
+            )
+            text, done = f"loss {row['loss']:.4f} {values}", row["step"] + 1
+            bar.update(task, completed=done, description=text)
+            if lines and done * 10 // steps > row["step"] * 10 // steps:
+                line = f"{name}: step {done} of {steps}, {text}"
+                console.print(line, markup=False, soft_wrap=True)
             heed()
 
-        yield [Report(advance)]
+        yield [Report(show)]
 
 
 @contextmanager
@@ -231,37 +236,3 @@ def _interrupted_between_steps() -> Iterator[Callable[[], None]]:
         heed()
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-class Bar:
-    """Progress with the loss and the first parameters: a bar, or lines where no terminal is."""
-
-    def __init__(self, console: Console, name: str, steps: int):
-        self._console, self._name, self._steps = console, name, steps
-        columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self._bar = Progress(*columns, TextColumn("{task.description}"), console=console)
-        self._task = self._bar.add_task("", total=steps)
-
-    def __enter__(self) -> "Bar":
-        if self._console.is_terminal:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._console.is_terminal:
-            self._bar.stop()
-
-    def advance(self, row: dict[str, Any]) -> None:
-        """Shows a row of the history."""
-        values = " ".join(
-            np.array2string(np.atleast_1d(value), precision=3, suppress_small=True)
-            for value in list(row["values"].values())[:2]
-            if np.size(value) <= 3
-        )
-        text = f"loss {row['loss']:.4f} {values}"
-        done = row["step"] + 1
-        if self._console.is_terminal:
-            self._bar.update(self._task, completed=done, description=text)
-        elif done * 10 // self._steps > row["step"] * 10 // self._steps:
-            line = f"{self._name}: step {done} of {self._steps}, {text}"
-            self._console.print(line, markup=False, soft_wrap=True)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -15,7 +15,7 @@ from invertwin import plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
 from invertwin.cli import build
-from invertwin.cli.fits.fitting import Bar, watched
+from invertwin.cli.fits.fitting import watched
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
 from invertwin.cli.run_file import about, need
@@ -26,12 +26,11 @@ from invertwin.cli.shape_tables import Mover
 from invertwin.errors import InputError
 from invertwin.inversion import (
     CorrelationLoss,
-    Echo,
+    MoverMaps,
     MovingBody,
     Observation,
     Reconstruction,
     Schedule,
-    of_point,
     reconstruct,
     strongest_mover,
 )
@@ -41,11 +40,9 @@ from invertwin.radar import doppler_maps
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 
-Scale = Literal["magnitude", "power", "level"]
 _CELLS = 4  # about the mover, that twin and point are scored on
 _DRAWN_CELLS = 8
-_RAYS = 10_000  # of a map that is scored or drawn
-_SCALES: dict[Scale, str] = {
+_SCALES = {
     "magnitude": "magnitude (√power)",
     "power": "power",
     "level": "level (dB, down to −40 dB)",
@@ -58,41 +55,23 @@ class _Fit:
 
     recording: ChirpCapture
     model: MotionMap  # of the whole recording
-    echo: Echo
     body: MovingBody
     found: Reconstruction
     seconds: float
 
-    def maps(self, scene: Scene, cells: int, seed: int, time: float = 0.0) -> "_Maps":
+    def maps(self, scene: Scene, cells: int, seed: int, time: float = 0.0) -> MoverMaps:
         """Twin and point about the echo, a time after the middle of the recording [s]."""
         radar = self.recording.radar()
-        place = self.echo.range + self.echo.rate * time
-        model = self.model.around(place, self.echo.rate, cells, radar)
-        with torch.no_grad():
-            moved = self.body(scene, time)
-            twin = model.sampled_by(samples=_RAYS).predict(moved, radar, seed)[0]
-        return _Maps(model, twin, of_point(model, radar, self.echo, time)[0])
+        return MoverMaps.near(
+            self.body, scene, radar, self.model, cells=cells, time=time, seed=seed
+        )
 
 
-@dataclass(frozen=True)
-class _Maps:
-    model: MotionMap
-    twin: Tensor
-    point: Tensor
-
-    def scores(self, recording: ChirpCapture, prefix: str = "") -> dict[str, Any]:
-        """Correlations with a recording, on the same cells, by scale."""
-        observed = self.model.observe(recording)[0]
-        maps = {"twin": self.twin, "bare_psf": self.point}
-        rows = {
-            scale: {
-                name: 1 - float(CorrelationLoss(scale)(power, observed))
-                for name, power in maps.items()
-            }
-            for scale in _SCALES
-        }
-        headline = {f"{prefix}{name}_correlation": v for name, v in rows["magnitude"].items()}
-        return {**headline, f"{prefix}correlations": rows}
+def _scores(maps: MoverMaps, recording: ChirpCapture, prefix: str = "") -> dict[str, Any]:
+    """Correlations with a recording, by scale."""
+    rows = maps.correlations(recording)
+    headline = {f"{prefix}{name}_correlation": v for name, v in rows["magnitude"].items()}
+    return {**headline, f"{prefix}correlations": rows}
 
 
 def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
@@ -113,12 +92,12 @@ def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
     values = whole.body.values()
     metrics: dict[str, Any] = {
         "task": run.task,
-        "mover_range_m": whole.echo.range,
-        "mover_velocity_m_s": whole.echo.rate,
-        "mover_azimuth_deg": math.degrees(math.asin(max(-1.0, min(1.0, whole.echo.u)))),
-        "phase_coherence": whole.echo.coherence,
-        **whole.maps(scene, _CELLS, run.seed).scores(recording),
-        **half.maps(scene, _CELLS, run.seed, later).scores(second, "heldout_"),
+        "mover_range_m": whole.body.echo.range,
+        "mover_velocity_m_s": whole.body.echo.rate,
+        "mover_azimuth_deg": math.degrees(math.asin(max(-1.0, min(1.0, whole.body.echo.u)))),
+        "phase_coherence": whole.body.echo.coherence,
+        **_scores(whole.maps(scene, _CELLS, run.seed), recording),
+        **_scores(half.maps(scene, _CELLS, run.seed, later), second, "heldout_"),
         "twin": {name: value.tolist() for name, value in values.items()},
         **_errors(run, table.object, recording, values),
         "loss": whole.found.history[-1]["loss"],
@@ -189,7 +168,7 @@ def _fitted(
     with about(f"scene.{table.object}"):
         body = MovingBody(table.object, scene, radar, echo, table.free)
     near = model.around(echo.range, echo.rate, table.cells, radar)
-    with watched(Bar(console, name, settings.steps)) as callbacks:
+    with watched(console, name, settings.steps) as callbacks:
         found = reconstruct(
             scene,
             Observation(near, radar, recording),
@@ -200,7 +179,7 @@ def _fitted(
             callbacks=callbacks,
             seed=run.seed,
         )
-    return _Fit(recording, model, echo, body, found, time.perf_counter() - begin)
+    return _Fit(recording, model, body, found, time.perf_counter() - begin)
 
 
 def _times(recording: ChirpCapture) -> Tensor:
@@ -247,7 +226,7 @@ def _pictures(
         for name, power in maps.items()
     }
     with torch.no_grad():
-        begun = MovingBody(whole.body.object, scene, radar, whole.echo)(scene)
+        begun = MovingBody(whole.body.object, scene, radar, whole.body.echo)(scene)
         scenes = {"start": begun, "twin": whole.body(scene)}
     losses = {
         name: [[row["loss"] for row in fit.found.history]]

@@ -1,23 +1,23 @@
-"""What is to be fitted: scene, observations and unknowns of a run file."""
+"""What is to be fitted: scene, observations, unknowns and stages of a run file."""
 
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+import torch
 from rich.console import Console
 from torch import nn
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.recordings import measured
-from invertwin.cli.registry import registry
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import RunFile, Settings, SimulatedData, Variant
+from invertwin.cli.schema import SAMPLED, Measures, Reconstruct, RunFile, SimulatedData
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError
@@ -25,14 +25,12 @@ from invertwin.inversion import Observation, Stage, Unknown, remeshed
 from invertwin.models import ExactMap, ForwardModel, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.radar.radar import Radar
-from invertwin.scene import Scene
+from invertwin.scene import Object, Scene, rigid
 from invertwin.seeds import derived_seed
 
 FULL, INTERIOR = "full", "interior_only"
 
 _POINTS_PER_M2 = 2_000.0
-_WIDTHS = ("range_width", "angle_width")
-_OWN = ("radar", "grid", "data", "surrogate", "chirps", "model")  # sections of a sensor
 
 
 @dataclass(frozen=True)
@@ -42,17 +40,7 @@ class Sight:
     capture: Capture
     radar: Radar
     grid: Grid
-    surrogate: SurrogateTable
     weight: float = 1.0  # in the loss
-    table: Any = None  # `[model]` of a plugin
-
-    def model(self, sampling: Sampling) -> ForwardModel:
-        """The forward model that is fitted."""
-        if self.table is not None:
-            return build.model(self.table, self.grid, build.surrogate(self.surrogate))
-        if self.surrogate.exact:
-            return ExactMap(self.grid, sampling)
-        return SurrogateMap(self.grid, build.surrogate(self.surrogate), sampling)
 
 
 @dataclass(frozen=True)
@@ -70,6 +58,18 @@ class Problem:
     def first(self) -> Sight:
         """The only sensor, or the first one."""
         return next(iter(self.sights.values()))
+
+    @property
+    def sensors(self) -> list[tuple[RunFile, Sight]]:
+        """Every sensor with the run file as it is for it."""
+        runs = observed_runs(self.run)
+        return [(runs[name], sight) for name, sight in self.sights.items()]
+
+    @property
+    def measures(self) -> Measures | None:
+        """How the shape is scored, where the true one is known."""
+        table = self.run.measures
+        return table if table is not None and table.object in self.known else None
 
 
 def problem_of(run: RunFile, console: Console) -> Problem:
@@ -89,50 +89,49 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     # Their errors come before any work.
     build.parameters(run.parameters, scene, run.scene)
     sights, observed = {}, observed_runs(run)
-    for name, (own, weight) in observed.items():
+    for name, own in observed.items():
         with about(f"observations.{name}") if name else nullcontext():
-            sights[name] = _sight(own, weight, truth, console)
-    simulated = all(isinstance(own.data, SimulatedData) for own, _ in observed.values())
+            weight = run.observations[name].weight if name else 1.0
+            sights[name] = Sight(*_recorded(own, truth, console), weight)
+    simulated = all(isinstance(own.data, SimulatedData) for own in observed.values())
     known = frozenset(truth.names if simulated else run.truth)
     target = run.starts.object if run.starts else next(iter(sought_objects(run)), None)
     return Problem(run, scene, truth, known, sights, target)
 
 
-def observed_runs(run: RunFile) -> dict[str, tuple[RunFile, float]]:
-    """The run file with the sections of every sensor, and the sensor's weight, by name.
+def observed_runs(run: RunFile) -> dict[str, RunFile]:
+    """The run file with the sections of every sensor, by the sensor's name.
 
     The only sensor of a run file without `[observations]` has an empty name.
     """
     if not run.observations:
-        return {"": (run, 1.0)}
+        return {"": run}
     found = {}
     for number, (name, table) in enumerate(run.observations.items()):
-        keys = [key for key in _OWN if getattr(table, key) is not None]
-        own = {key: getattr(table, key) for key in keys}
+        own = {key: value for key, value in table if key != "weight" and value is not None}
         if "data" not in own and isinstance(run.data, SimulatedData):
             # The noise of one radar is not that of another.
             seed = derived_seed(run.seed if run.data.seed is None else run.data.seed, number)
             own["data"] = run.data.model_copy(update={"seed": seed})
-        found[name] = (run.model_copy(update={**own, "observations": {}}), table.weight)
+        found[name] = run.model_copy(update={**own, "observations": {}})
     return found
 
 
-def _sight(run: RunFile, weight: float, truth: Scene, console: Console) -> Sight:
+def _recorded(run: RunFile, truth: Scene, console: Console) -> tuple[Capture, Radar, Grid]:
     data, table = need(run, "data", "reconstruct"), need(run, "grid", "reconstruct")
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
         grid = build.grid(table, radar)
         console.print("simulating the exact signals of the true scene")
         capture = Capture.from_beat(exact(run, truth, radar, grid).beat, radar)
-        return Sight(capture, radar, grid, run.surrogate, weight, run.model)
+        return capture, radar, grid
     if run.radar is not None:
         raise InputError(
             f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
             "remove it: a capture brings its radar along"
         )
     capture = measured(data)
-    radar = capture.radar()
-    return Sight(capture, radar, build.grid(table, radar), run.surrogate, weight, run.model)
+    return capture, capture.radar(), build.grid(table, capture.radar())
 
 
 def sought_objects(run: RunFile) -> list[str]:
@@ -140,137 +139,100 @@ def sought_objects(run: RunFile) -> list[str]:
     return [p.object for p in run.parameters if getattr(p, "object", None)]
 
 
-def varied(problem: Problem, mode: str) -> Problem:
-    """The problem of a mode, with the parameters and the sensors of this fit only."""
-    wanted = _wanted(problem.run, mode)
-    widths = _among(_given(wanted), _WIDTHS)
-    chosen = getattr(wanted, "observations", None) or problem.sights
-    sights = {
-        name: replace(sight, surrogate=sight.surrogate.model_copy(update=widths))
-        for name, sight in problem.sights.items()
-        if name in chosen
-    }
-    return replace(problem, run=varied_run(problem.run, mode), sights=sights)
-
-
-def _wanted(run: RunFile, mode: str) -> Variant:
-    if mode in (FULL, INTERIOR):
-        return Variant() if mode == FULL else Variant(boundary=False)
-    return run.variants[mode]
-
-
-def varied_run(run: RunFile, mode: str) -> RunFile:
-    """The run file of a mode, with the parameters of this fit only."""
-    wanted = _wanted(run, mode)
-    given = _given(wanted)
-    changes: dict[str, Any] = {}
-    stages = run.stages if wanted.stages is None else wanted.stages
-    names = wanted.parameters or need(run, "reconstruct", "reconstruct").parameters
-    tables = build.named(run.parameters)
-    if stages and all(stage.parameters for stage in stages):
-        staged = {name for stage in stages for name in stage.parameters}
-        names = [name for name in staged if name in (names or tables)]
-    kept = {name: table for name, table in tables.items() if name in (names or tables)}
-    smooth = {} if wanted.smooth is None else {"smooth": wanted.smooth}
-    changes["parameters"] = [
-        table.model_copy(update=smooth if table.kind == "vertices" else {})
-        for table in kept.values()
-    ]
-    # Stages seek what the fit has; one that has nothing left to seek falls out.
-    changes["stages"] = [
-        stage.model_copy(update={"parameters": [n for n in stage.parameters if n in kept]})
-        for stage in stages
-        if not stage.parameters or any(name in kept for name in stage.parameters)
-    ]
-    changes["optimizer"] = _optimizer(run, given)
-    for section in ("reconstruct", "surrogate"):
-        table = getattr(run, section)
-        keys = set(type(table).model_fields) - {"parameters"}
-        changes[section] = table.model_copy(update=_among(given, keys))
-    return run.model_copy(update=changes)
-
-
-def _optimizer(run: RunFile, given: Mapping[str, Any]) -> Any:
-    """The table of the optimizer with what a variant or a stage changes."""
-    table = run.optimizer
-    made = registry.table("optimizer", given.get("kind", table.kind))
-    if isinstance(table, made):
-        return table.model_copy(update=_among(given, made.model_fields))
-    # Each kind has a table of its own.
-    values = table.model_dump(exclude_unset=True) | given
-    return made(**_among(values, made.model_fields))
-
-
-def _given(table: Settings) -> dict[str, Any]:
-    """What a table says, by the names of the sections that it varies."""
-    found = table.model_dump(exclude_none=True)
-    if "optimizer" in found:
-        found["kind"] = found.pop("optimizer")
+def starts_of(problem: Problem) -> list[build.Start]:
+    """Where fits start: about the truth as `[starts]` says, or where the scene is."""
+    run, scene = problem.run, problem.scene
+    bodies = build.sought_bodies(run, scene)
+    table = run.starts
+    if table is None:
+        return [build.Start(scene, bodies)]
+    name, truth, found = table.object, problem.truth[table.object], []
+    seed = run.seed if table.seed is None else table.seed
+    generator = torch.Generator().manual_seed(seed)
+    for moved in table.build({Object: truth}, generator=generator):
+        # The object as known may have another size: it is its centre that is placed.
+        turn = moved.transform[:3, :3]
+        begun = scene.replace(name, pose=rigid(turn, moved.center - turn @ scene[name].mesh.center))
+        if name in bodies and table.joint_deg > 0:
+            mesh = bodies[name].turned(truth.mesh, math.radians(table.joint_deg), generator)
+            begun = begun.replace(name, mesh=mesh, pose=moved.transform)
+        found.append(build.Start(begun, bodies))
     return found
 
 
-def _among(values: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    return {key: value for key, value in values.items() if key in keys}
+def settings_of(run: RunFile) -> Reconstruct:
+    """The `[reconstruct]` table, which every fit needs."""
+    return need(run, "reconstruct", "reconstruct")
 
 
-def stages_of(run: RunFile) -> list[Stage]:
+def varied_run(run: RunFile, mode: str) -> RunFile:
+    """The run file of a way to fit: the run's own, or a variant."""
+    return run if mode == FULL else run.varied(run.variants[mode])
+
+
+def varied(problem: Problem, mode: str) -> Problem:
+    """The problem of a way to fit, with the sensors of this fit only."""
+    run = varied_run(problem.run, mode)
+    chosen = settings_of(run).observations or problem.sights
+    sights = {name: sight for name, sight in problem.sights.items() if name in chosen}
+    return replace(problem, run=run, sights=sights)
+
+
+def sought_of(run: RunFile) -> dict[str, Any]:
+    """The tables of what a fit seeks, by name."""
+    tables = build.named(run.parameters)
+    names = set(settings_of(run).parameters or tables)
+    if run.stages and all(stage.parameters for stage in run.stages):
+        names &= {name for stage in run.stages for name in stage.parameters}
+    return {name: table for name, table in tables.items() if name in names}
+
+
+def stages_of(run: RunFile) -> list[tuple[StageTable, RunFile]]:
+    """The stages of a fit, each with its run file; one that has nothing to seek falls out."""
+    sought = sought_of(run)
+    found = [
+        (stage, run.varied(stage))
+        for stage in run.stages
+        if not stage.parameters or sought.keys() & set(stage.parameters)
+    ]
+    return found or [(StageTable(), run)]
+
+
+def schedule_of(problem: Problem) -> list[Stage]:
     """The stages of a fit, as the library takes them."""
-    settings = vars(need(run, "reconstruct", "reconstruct"))
-    common = _among(settings, ("steps", "annealing", "frames_per_step", "tolerance"))
-    if not run.stages:
-        return [Stage(**common)]
-    return [_stage(run, table, common) for table in run.stages]
+    sought, found = sought_of(problem.run), []
+    for table, run in stages_of(problem.run):
+        names = [name for name in table.parameters if name in sought]
+        free = [sought[name] for name in names or sought]
+        finer = partial(remeshed, edge=table.remesh or 0.0)
+        counts = {k: v for k, v in (table.reconstruct or {}).items() if k in SAMPLED.made_from}
+        models = models_of(replace(problem, run=run))
+        stage = Stage(
+            **vars(settings_of(run).build()),
+            unknowns=tuple(names),
+            rebuild=table.rebuild,
+            remesh={t.object: finer for t in free if table.remesh and t.kind == "vertices"},
+            optimizer=build.optimizer(run.optimizer),
+            models=[model.sampled_by(**counts) if counts else model for model in models],
+        )
+        found.append(stage)
+    return found
 
 
-def _stage(run: RunFile, table: StageTable, common: dict[str, Any]) -> Stage:
-    given = _given(table)
-    rates = _among(given, ("kind", "rate", "final_rate"))
-    counts, widths = _among(given, ("samples", "boundary_samples")), _among(given, _WIDTHS)
-    remesh = {}
-    if table.remesh is not None:
-        tables = build.named(run.parameters)
-        sought = [tables[name] for name in table.parameters or tables]
-        change = partial(remeshed, edge=table.remesh)
-        remesh = {t.object: change for t in sought if t.kind == "vertices"}
-    return Stage(
-        unknowns=tuple(table.parameters),
-        rebuild=table.rebuild,
-        remesh=remesh,
-        optimizer=build.optimizer(_optimizer(run, rates)) if rates else None,
-        change=partial(_changed, counts, widths) if counts or widths else None,
-        **{**common, **_among(given, common)},
-    )
-
-
-def _changed(
-    counts: Mapping[str, int], widths: Mapping[str, float], observation: Observation
-) -> Observation:
-    """An observation with what a stage says of samples and extra widths."""
-    model = observation.model.sampled_by(**counts)
-    if widths and isinstance(model, SurrogateMap):
-        model = replace(model, surrogate=replace(model.kernels, **widths))
-    return replace(observation, model=model)
-
-
-def steps_of(run: RunFile) -> int:
-    """The budget of a fit."""
-    return sum(stage.steps for stage in stages_of(run))
-
-
-def modes_of(run: RunFile) -> list[str]:
-    """The fits of one start: as the run file says, and its variants."""
-    settings = need(run, "reconstruct", "reconstruct")
-    modes = [FULL if settings.boundary else INTERIOR]
-    if settings.also_interior_only and settings.boundary:
-        modes.append(INTERIOR)
-    return [*modes, *run.variants]
+def annealed_until(run: RunFile) -> float | None:
+    """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
+    (_, own), *others = stages_of(run)
+    kernels, settings = own.surrogate, settings_of(own)
+    if others or kernels.exact or not (kernels.range_width > 0 or kernels.angle_width > 0):
+        return None
+    return settings.annealing * settings.steps
 
 
 def sampling_of(run: RunFile) -> Sampling:
     """How the model of a fit samples paths."""
-    settings = vars(need(run, "reconstruct", "reconstruct"))
-    keys = ("depth", "samples", "boundary_samples", "boundary")
-    return Sampling(**_among(settings, keys), points_per_m2=points_per_m2(run))
+    settings = settings_of(run)
+    counts = {name: getattr(settings, name) for name in SAMPLED.made_from}
+    return Sampling(**counts, points_per_m2=points_per_m2(run))
 
 
 def points_per_m2(run: RunFile) -> float:
@@ -278,49 +240,62 @@ def points_per_m2(run: RunFile) -> float:
     return run.data.density if isinstance(run.data, SimulatedData) else _POINTS_PER_M2
 
 
-def annealed_until(run: RunFile) -> float | None:
-    """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
-    stages = stages_of(run)
-    if len(stages) > 1 or run.surrogate.exact:
-        return None
-    given = _given(run.stages[0]) if run.stages else {}
-    wide = any(given.get(key, getattr(run.surrogate, key)) > 0 for key in _WIDTHS)
-    return stages[0].annealing * stages[0].steps if wide else None
+def models_of(problem: Problem) -> list[ForwardModel]:
+    """The forward models that are fitted, one for every sensor."""
+    sampling = sampling_of(problem.run)
+    found: list[ForwardModel] = []
+    for run, sight in problem.sensors:
+        kernels = build.surrogate(run.surrogate)
+        if run.model is not None:
+            found.append(build.model(run.model, sight.grid, kernels))
+        elif run.surrogate.exact:
+            found.append(ExactMap(sight.grid, sampling))
+        else:
+            found.append(SurrogateMap(sight.grid, kernels, sampling))
+    return found
+
+
+def sharp_models(problem: Problem) -> list[SurrogateMap]:
+    """The smooth model of every sensor without extra widths, mean over phases."""
+    sharp = {"range_width": 0.0, "angle_width": 0.0, "phases": "mean"}
+    sampling = sampling_of(problem.run)
+    return [
+        SurrogateMap(sight.grid, replace(build.surrogate(run.surrogate), **sharp), sampling)
+        for run, sight in problem.sensors
+    ]
 
 
 def observations_of(problem: Problem) -> list[Observation]:
     """What is fitted of every sensor: data, model and the sensor's own unknowns."""
-    run = problem.run
     poses = {
         name: Unknown(lambda _: RadarPose(), getattr(table, "rate", None))
-        for name, table in build.named(run.parameters).items()
+        for name, table in sought_of(problem.run).items()
         if table.kind == "radar_pose"
     }
     return [
         Observation(
-            sight.model(sampling_of(run)),
+            model,
             sight.radar,
             sight.capture,
             sight.weight,
-            {**poses, **_nuisances(run, sight, name)},
+            {**poses, **_nuisances(problem.run, sight, name)},
         )
-        for name, sight in problem.sights.items()
+        for model, (name, sight) in zip(models_of(problem), problem.sights.items(), strict=True)
     ]
 
 
 def _nuisances(run: RunFile, sight: Sight, name: str) -> dict[str, nn.Module]:
     """Modules of what is wrong with a measurement, fitted along."""
     made = {"range_bias": RangeBias, "clock_offset": lambda: ClockOffset(sight.capture.positions)}
-    kinds = need(run, "reconstruct", "reconstruct").nuisances
+    kinds = settings_of(run).nuisances
     return {f"{name}.{kind}" if name else kind: made[kind]() for kind in kinds}
 
 
 def unknowns_of(run: RunFile) -> dict[str, Unknown]:
     """What is fitted of the scene, by name."""
-    tables = build.named(run.parameters)
     makers = build.builders(run.parameters, run.scene)
     return {
         name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
-        for name, table in tables.items()
+        for name, table in sought_of(run).items()
         if table.kind != "radar_pose"
     }

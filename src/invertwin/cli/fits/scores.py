@@ -10,18 +10,23 @@ import torch
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
 from invertwin.cli import build
-from invertwin.cli.fits.likeness import shape_scores
-from invertwin.cli.fits.problem import Problem, Sight, points_per_m2, sampling_of
-from invertwin.cli.run_file import need
+from invertwin.cli.fits.problem import (
+    Problem,
+    points_per_m2,
+    settings_of,
+    sharp_models,
+    sought_of,
+)
+from invertwin.cli.fits.shape_scores import shape_scores
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
-from invertwin.inversion.metrics import value_errors
-from invertwin.models import SurrogateMap, surrogate_correlation
+from invertwin.inversion.metrics import residual, value_errors
+from invertwin.models import surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
-from invertwin.scene import Scene
-from invertwin.scene.geometry import without_clouds
+from invertwin.scene import Mesh, Scene, SkinnedBody
+from invertwin.scene.geometry.density import without_clouds
 
 
 def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
@@ -33,14 +38,14 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
     if name not in problem.known:
         return {"position": place}
     shapes = shape_scores(problem, without_clouds(start.scene), twin)
-    before = build.residual(start.scene[name], problem.truth[name])
-    after = build.residual(twin[name], problem.truth[name])
+    before = residual(start.scene[name], problem.truth[name])
+    after = residual(twin[name], problem.truth[name])
     if before is None or after is None:
         return {"position": place, **shapes}
-    settings = need(problem.run, "reconstruct", "reconstruct")
+    settings = settings_of(problem.run)
     if name in start.bodies:
-        meshes = (scene[name].mesh for scene in (start.scene, twin, problem.truth))
-        angles = start.bodies[name].errors(*meshes)
+        scenes = (start.scene, twin, problem.truth)
+        angles = joint_scores(start.bodies[name], *(scene[name].mesh for scene in scenes))
         good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
         return {**angles, "success": good, "position": place, **shapes}
     rows: dict[str, Any] = {
@@ -49,19 +54,30 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
         "success": after.distance <= settings.position_limit,
         "position": place,
     }
-    kinds = {p.kind for p in problem.run.parameters}
+    sought = sought_of(problem.run).values()
+    kinds = {table.kind for table in sought}
     if "pose" in kinds:
         angle = math.degrees(after.angle)
         rows |= {"start_angle_deg": math.degrees(before.angle), "rotation_error_deg": angle}
         rows["success"] &= angle <= settings.rotation_limit_deg
     if "scale" in kinds:
         rows |= {"scale_error": abs(after.scale - 1)}
-    sought = [p for p in problem.run.parameters if _made_known(problem, p)]
+    told = [table for table in sought if _made_known(problem, table)]
     frequency = problem.first.radar.waveform.center_frequency
-    for p in sought:
-        ends = twin[p.object].material, problem.truth[p.object].material
-        rows |= value_errors(p.values, *ends, frequency, p.layer)
+    for table in told:
+        ends = twin[table.object].material, problem.truth[table.object].material
+        rows |= value_errors(table.values, *ends, frequency, table.layer)
     return rows | shapes
+
+
+def joint_scores(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> dict[str, float]:
+    """Angles [°] by which the sought joints are off, means over them and each at the end."""
+    before, after = (body.joint_errors(mesh, truth) for mesh in (start, found))
+    return {
+        "joint_error_before_deg": math.degrees(sum(before.values()) / len(before)),
+        "joint_error_after_deg": math.degrees(sum(after.values()) / len(after)),
+        **{f"joint_error_{name}_deg": math.degrees(angle) for name, angle in after.items()},
+    }
 
 
 def _made_known(problem: Problem, parameter: Any) -> bool:
@@ -82,11 +98,11 @@ def summary(
     counts = {mode: sum(row.get("success", False) for row in rows[mode]) for mode in modes}
     found = {"successes": counts[modes[0]], "starts_count": len(rows[modes[0]])}
     found |= {f"successes_{mode}": counts[mode] for mode in modes[1:]}
-    alone = {
-        variant.observations[0]: counts[mode]
+    chosen = {
+        mode: (variant.reconstruct or {}).get("observations", [])
         for mode, variant in problem.run.variants.items()
-        if variant.observations and len(variant.observations) == 1
     }
+    alone = {names[0]: counts[mode] for mode, names in chosen.items() if len(names) == 1}
     if alone:
         found |= {"joint_successes": counts[modes[0]], "alone_successes": alone}
     return found
@@ -122,12 +138,11 @@ def without_history(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def sharp_maps(problem: Problem, scene: Scene, radars: Sequence[Radar]) -> list[torch.Tensor]:
     """The surrogate's map of every sensor, as fitted, without extra widths."""
-    settings = need(problem.run, "reconstruct", "reconstruct")
-    counts = {"samples": 4 * settings.samples, "boundary_samples": 0}
+    counts = {"samples": 4 * settings_of(problem.run).samples, "boundary_samples": 0}
     with torch.no_grad():
         return [
-            sharp_model(problem, sight).sampled_by(**counts).predict(scene, radar, problem.run.seed)
-            for sight, radar in zip(problem.sights.values(), radars, strict=True)
+            model.sampled_by(**counts).predict(scene, radar, problem.run.seed)
+            for model, radar in zip(sharp_models(problem), radars, strict=True)
         ]
 
 
@@ -135,20 +150,11 @@ def agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
     """Correlation of the surrogate with the mean of exact spectra: one bounce, first frame."""
     if not isinstance(radar.waveform, SampledWaveform):
         return {}
-    model = replace(
-        sharp_model(problem, problem.first),
-        sampling=Sampling(depth=1, points_per_m2=points_per_m2(problem.run)),
-    )
+    sampling = Sampling(depth=1, points_per_m2=points_per_m2(problem.run))
+    model = replace(sharp_models(problem)[0], sampling=sampling)
     first = replace(radar.frames([0]), range_bias=0.0)
     found = surrogate_correlation(twin, first, model, seed=problem.run.seed)
     return {"surrogate_correlation": found}
-
-
-def sharp_model(problem: Problem, sight: Sight) -> SurrogateMap:
-    """The kernels of a sensor without extra widths, mean over phases."""
-    kernels = build.surrogate(sight.surrogate)
-    sharp = replace(kernels, range_width=0.0, angle_width=0.0, phases="mean")
-    return SurrogateMap(sight.grid, sharp, sampling_of(problem.run))
 
 
 def misfit(

@@ -1,24 +1,30 @@
 """What a reconstruction leaves behind: tables, pictures, the report."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from invertwin import plotting
-from invertwin.cli import build
-from invertwin.cli.fits.likeness import CURVE, is_shape_key, shape_label, short_label
-from invertwin.cli.fits.problem import FULL, INTERIOR, Problem, annealed_until, sought_objects
+from invertwin.cli.fits.problem import (
+    FULL,
+    INTERIOR,
+    Problem,
+    annealed_until,
+    settings_of,
+    sought_objects,
+)
+from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
 from invertwin.cli.run_file import need
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.inversion.metrics import residual
 from invertwin.scene import Mesh, Scene
-from invertwin.scene.material import RANGES
+from invertwin.scene.material.values import RANGES
 
-_MODES = {FULL: "with boundary terms", INTERIOR: "interior only"}
 _MATERIAL = {f"{name}_error": name for name in RANGES}
 _UNITS = {"translation": " [m]", "rotation": " [rad, rotation vector]", "scale": " [factor]"}
 _CONVENTIONAL = (
@@ -42,19 +48,31 @@ class Fitted:
     twin: Scene
     maps: Mapping[str, list[torch.Tensor]]  # by what they show, one for every sensor
 
+    @property
+    def ways(self) -> list[tuple[str, list[dict[str, Any]]]]:
+        """The fits of every way to fit, by its name in words."""
+        run = self.problem.run
+        own = "with boundary terms" if settings_of(run).boundary else "interior only"
+        if set(self.rows) - {FULL, INTERIOR}:
+            own = "as the run says"
+        return [
+            (own if mode == FULL else mode.replace("_", " "), fits)
+            for mode, fits in self.rows.items()
+        ]
+
 
 def tables_of(fitted: Fitted) -> list[Table]:
     """What is printed, and shown in the report."""
-    metrics, rows = fitted.metrics, fitted.rows
+    metrics = fitted.metrics
     tables = [_result(fitted.problem.run, metrics)]
-    for mode, fits in rows.items():
+    for way, fits in fitted.ways:
         if len(fits) > 1:
             keys = [key for key in COLUMNS if key in fits[0]]
             cells = [[row["start"] + 1, *(_cell(key, row[key]) for key in keys)] for row in fits]
             heads = ["start", *(COLUMNS[key] for key in keys)]
-            tables.append(Table(f"Starts, {_mode(mode, rows)}", heads, cells))
-    if len(rows) > 1 and any(is_shape_key(key) for key in metrics):
-        tables.append(_variants(rows))
+            tables.append(Table(f"Starts, {way}", heads, cells))
+    if len(fitted.ways) > 1 and any(is_shape_key(key) for key in metrics):
+        tables.append(_variants(fitted))
     tables.append(_places(fitted))
     moves = [[k + _UNITS.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
     if moves:
@@ -79,7 +97,7 @@ def _result(run: RunFile, metrics: dict[str, Any]) -> Table:
     rows.extend(map(list, quantities("", metrics, skip=skip).rows))
     made_of = {key: name for key, name in _MATERIAL.items() if key in metrics}
     rows += [[f"{name}, share off the truth", metrics[key]] for key, name in made_of.items()]
-    others = tuple(f"_{mode}" for mode in (INTERIOR, *run.variants))
+    others = tuple(f"_{mode}" for mode in run.variants)
     for key in metrics:
         if is_shape_key(key) and not key.endswith(others):
             rows.append([shape_label(key), metrics[key]])
@@ -91,15 +109,15 @@ def _result(run: RunFile, metrics: dict[str, Any]) -> Table:
     return Table("Result", ["quantity", "value"], rows)
 
 
-def _variants(rows: Mapping[str, list[dict[str, Any]]]) -> Table:
+def _variants(fitted: Fitted) -> Table:
     """What each way to fit has made of the shape, means over the starts."""
-    first = next(iter(rows.values()))[0]
+    first = fitted.ways[0][1][0]
     begun = [key for key in first if key.startswith("start_") and is_shape_key(key)]
     keys = [key.removeprefix("start_") for key in begun]
     cells: list[list[Any]] = [["start", *(first[key] for key in begun)]]
-    for mode, fits in rows.items():
+    for way, fits in fitted.ways:
         means = [[row[key] for row in fits if key in row] for key in keys]
-        cells.append([_mode(mode, rows), *(sum(v) / len(v) if v else None for v in means)])
+        cells.append([way, *(sum(v) / len(v) if v else None for v in means)])
     return Table("Ways to fit", ["fit", *(short_label(key) for key in keys)], cells)
 
 
@@ -113,7 +131,7 @@ def _places(fitted: Fitted) -> Table:
         for i, axis in enumerate("xyz"):
             cells.append([f"{name}.{axis} [m]", *(_clean(center[i]) for center in centers)])
         if known and "rotation_error_deg" in fitted.metrics:
-            off = [build.residual(scene[name], problem.truth[name]) for scene in scenes]
+            off = [residual(scene[name], problem.truth[name]) for scene in scenes]
             angles = [_clean(math.degrees(found.angle)) if found else None for found in off]
             cells.append([f"{name}, angle to the truth [°]", *angles])
     cells = [row + [None] * (4 - len(row)) for row in cells]
@@ -135,7 +153,7 @@ def _added(metrics: dict[str, Any]) -> Table:
 
 def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
     """Writes the pictures of the best fit; returns those of the report."""
-    problem, rows, metrics = fitted.problem, fitted.rows, fitted.metrics
+    problem, metrics = fitted.problem, fitted.metrics
     run, truth, sought = problem.run, problem.truth, sought_objects(problem.run)
     known = {k: truth[k] for k in truth.names if k in problem.known and k in sought}
     scenes = {"truth": truth} if known else {}
@@ -150,14 +168,14 @@ def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
         titled = {titles[key]: maps[number] for key, maps in fitted.maps.items()}
         file = f"spectra_{name}" if name else "spectra"
         found.append(picture(folder, file, plotting.spectrum(titled, sight.grid), note="spectra"))
-    losses = {_mode(mode, rows): [row["losses"] for row in fits] for mode, fits in rows.items()}
+    losses = {way: [row["losses"] for row in fits] for way, fits in fitted.ways}
     annealed = annealed_until(run)
     before = metrics["start_loss_sharp"] if annealed else None
     figure = plotting.convergence(losses, annealed=annealed, before=before)
     found.append(picture(folder, "loss", figure, note=_loss_note(run, metrics)))
     if run.measures is not None:
         folder.write_bytes("turntable.gif", _turntable(fitted, run.measures.object))
-        curves = {_mode(mode, rows): [_curve(row) for row in fits] for mode, fits in rows.items()}
+        curves = {way: [_curve(row) for row in fits] for way, fits in fitted.ways}
         if any(curve for fits in curves.values() for curve in fits):
             figure = plotting.convergence(losses, curves)
             found.append(picture(folder, "convergence", figure))
@@ -238,7 +256,7 @@ def _ended(metrics: dict[str, Any]) -> str:
 
 def _limits(run: RunFile, metrics: dict[str, Any]) -> str:
     """How near the truth counts as a success."""
-    settings = need(run, "reconstruct", "reconstruct")
+    settings = settings_of(run)
     if "joint_error_after_deg" in metrics:
         return f"{settings.joint_limit_deg:g}° (mean over the joints)"
     turned = "rotation_error_deg" in metrics
@@ -248,13 +266,6 @@ def _limits(run: RunFile, metrics: dict[str, Any]) -> str:
 
 def _cell(key: str, value: Any) -> Any:
     return texts("ends")[value] if key == "status" else value
-
-
-def _mode(mode: str, modes: Iterable[str]) -> str:
-    """A way to fit in words; beside variants the run's own is just that."""
-    if mode == FULL and any(other not in _MODES for other in modes):
-        return "as the run says"
-    return _MODES.get(mode, mode.replace("_", " "))
 
 
 def _clean(value: float) -> float:

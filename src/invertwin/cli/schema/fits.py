@@ -1,117 +1,92 @@
 """The tables of fits: starts, budget, stages, variants, scores."""
 
-from typing import Annotated, Literal
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, Gt, Le, Lt, MinLen
-from pydantic import model_validator
+from annotated_types import Ge, MinLen
+from pydantic import PlainSerializer, WrapValidator
 
-from invertwin.cli.registry import NameOf
-from invertwin.cli.section import (
-    Depth,
-    Interval,
-    Section,
-    Seed,
-    Vector,
-    WorldAxes,
-    check_presence,
-    key,
-)
+from invertwin.channel import Sampling
+from invertwin.cli.fit_tables import SurrogateTable
+from invertwin.cli.registry import OneOf, Table, TableOf, registry
+from invertwin.cli.section import Section, Seed, Vector, key
+from invertwin.inversion.first_pose import FirstPose
+from invertwin.inversion.schedule import Schedule
+from invertwin.inversion.starts import nearby
 from invertwin.limits import Count, NonNegative, Positive
-
-Names = Annotated[list[str], MinLen(1)]
-_Rate = NonNegative | None
-_WholeOr = "; without it that of the main fit"
+from invertwin.radar.surrogate import Surrogate
 
 
-class Starts(Section):
+class _StartsTable(Table):
     """Random starting poses about the true pose of one object."""
 
     object: str = key("name in the scene")
-    count: Count = key("of starts", 1)
-    distance: Interval = key("m, least and most")
-    angle_deg: Interval = key("least and most", [0.0, 0.0])
-    axes: WorldAxes = key("of the offset", ["x", "y", "z"])
-    rotation_axis: Vector | None = key("without it any axis", None)
     joint_deg: NonNegative = key(
         "turn of each sought joint of a body, about a random axis among its own", 0.0
     )
     seed: Seed | None = key("without it the run's", None)
 
 
-class Initial(Section):
-    """Where an object stands by conventional processing: the fit starts there, not where the
-    scene has it."""
+class _InitialTable(Table):
+    """Where an object stands by conventional processing: the fit starts there."""
 
     object: str = key("name in the scene")
-    low: Vector | None = key(
-        "m, corner of the box of the world that is searched; needed unless the pose is known", None
-    )
-    high: Vector | None = key("m, its opposite corner", None)
-    method: Literal["points", "image"] = key(
-        "points = of a CFAR detector; image = backprojected power", "points"
-    )
-    pose: Literal["rectangle", "axes", "position", "known"] = key(
-        "how it stands: the near sides of a rectangle, principal axes, no turn, or as the scene "
-        "says: then its density alone is guessed",
-        "rectangle",
-    )
-    scale: bool = key("size from the rectangle, too", False)
-    up: Literal["y", "z"] = key("world axis of heights", "y")
-    false_alarm: Annotated[float, Gt(0), Lt(1)] = key("of a cell of noise, for points", 1e-6)
-    step: Positive = key("m, of the image", 0.1)
-    gap: Positive = key("m; echoes with wider gaps between them are not of one object", 1.0)
-
-    @model_validator(mode="after")
-    def _complete(self) -> "Initial":
-        needed = self.pose != "known"
-        check_presence(self, {"low": needed, "high": needed}, f'with pose = "{self.pose}"')
-        return self
 
 
-class Reconstruct(Section):
+AnyStarts = Annotated[Any, TableOf(nearby, _StartsTable, ("generator",))]
+AnyInitial = Annotated[Any, TableOf(FirstPose, _InitialTable)]
+
+SAMPLED = registry.table_of(
+    Sampling,
+    "SamplingTable",
+    without=("interior_edges", "points_per_m2", "rough_paths", "memory_budget", "backend"),
+)
+
+
+class Budget(registry.table_of(Schedule, "Schedule", SAMPLED)):
+    """How long a fit lasts, and what it samples."""
+
+
+class Reconstruct(Budget):
     """The fit: its budget, and what counts as a success."""
 
-    steps: Count = key("budget")
-    parameters: list[str] = key(
-        "names of what is sought, where variants seek other things; empty = all", []
-    )
-    depth: Depth = key("most bounces of a path", 3)
-    samples: Count = key("rays a step", 400_000)
-    boundary_samples: Count = key("silhouette samples a step", 50_000)
-    annealing: Annotated[float, Gt(0), Le(1)] = key("share of the steps with extra width", 0.7)
-    frames_per_step: Count | None = key("random frames a step; without it all", None)
-    tolerance: NonNegative = key(
-        "stop when the loss falls by less than this share; 0 = use all steps", 0.0
-    )
+    parameters: list[str] = key("names of what is sought; empty = all", [])
+    observations: list[str] = key("names of the sensors that are fitted; empty = all", [])
     checkpoint_every: Count = key("steps", 10)
     nuisances: list[Literal["range_bias", "clock_offset"]] = key("fitted along", [])
-    boundary: bool = key("with boundary terms (silhouettes)", True)
-    also_interior_only: bool = key("fit again without boundary terms, to compare", False)
     position_limit: Positive = key("m, of a success", 0.03)
     rotation_limit_deg: Positive = key("of a success", 3.0)
     joint_limit_deg: Positive = key("of a success, mean over the sought joints of a body", 5.0)
 
 
-class Settings(Section):
-    """What a part of a fit may do otherwise; without a key as in the tables of the whole."""
+def _checked(value: Any, check: Callable[[Any], Any]) -> Any:
+    check(value)
+    return value
 
-    steps: Count | None = key("budget", None)
-    optimizer: Annotated[str, NameOf("optimizer")] | None = key(
-        "how a gradient becomes a step: its `kind`", None
+
+# A table of a part stays as given. What must be complete to be right is checked once it is merged.
+_GIVEN = WrapValidator(lambda value, _: value), PlainSerializer(lambda value: value)
+_CHECKED = WrapValidator(_checked), _GIVEN[1]
+AnyTable = dict[str, Any]
+
+
+class Part(Section):
+    """A part of a run: its sections say only what is other than in those of the whole."""
+
+    reconstruct: Annotated[Budget, *_CHECKED] = key("what is other than in [reconstruct]", None)
+    optimizer: Annotated[Any, OneOf("optimizer"), *_GIVEN] = key(
+        "what is other than in [optimizer]; another `kind` replaces it", None
     )
-    rate: Positive | None = key("of the optimizer", None)
-    final_rate: _Rate = key("of the optimizer", None)
-    samples: Count | None = key("rays a step", None)
-    boundary_samples: Count | None = key("silhouette samples a step", None)
-    frames_per_step: Count | None = key("random frames a step", None)
-    range_width: _Rate = key("of the surrogate at the first step, in range cells", None)
-    angle_width: _Rate = key("of the surrogate at the first step, in beamwidths", None)
-    annealing: Annotated[float, Gt(0), Le(1)] | None = key(
-        "share of these steps with extra width", None
+    surrogate: Annotated[Any, TableOf(Surrogate, SurrogateTable), *_GIVEN] = key(
+        "what is other than in [surrogate], or a name that replaces it", None
     )
 
+    def changes(self) -> dict[str, Any]:
+        """What is merged over the run; a part has no stages."""
+        return {**self.model_dump(include=set(Part.model_fields), exclude_none=True), "stages": []}
 
-class Stage(Settings):
+
+class Stage(Part):
     """A part of a fit, from where the one before has ended."""
 
     parameters: list[str] = key(
@@ -125,14 +100,39 @@ class Stage(Settings):
     )
 
 
-class Variant(Settings):
-    """The same data and start, fitted otherwise, to compare."""
+class Variant(Part):
+    """The same data and starts, fitted otherwise, to compare."""
 
-    parameters: Names | None = key("names of what is sought; without it all", None)
-    observations: Names | None = key("names of the sensors that are fitted; without it all", None)
-    boundary: bool | None = key("with boundary terms", None)
-    smooth: _Rate = key("of free vertices", None)
+    reconstruct: Annotated[Reconstruct, *_CHECKED] = key(  # type: ignore[override]
+        "what is other than in [reconstruct]", None
+    )
+    loss: AnyTable | None = key("what is other than in [loss]", None)
+    model: AnyTable | None = key("what is other than in [model]", None)
+    parameters: list[Annotated[Any, OneOf("parameter")]] | None = key(
+        "in place of [[parameters]]", None
+    )
     stages: list[Stage] | None = key("in place of [[stages]]", None)
+
+    def changes(self) -> dict[str, Any]:
+        """What is merged over the run."""
+        return self.model_dump(exclude_unset=True, exclude_none=True)
+
+    def placed(self, run: Any) -> "Variant":
+        """The variant with paths of files as the run that it makes has found them."""
+        found: dict[str, Any] = {}
+        for name, change in self.changes().items():
+            value = run.model_dump(include={name}, exclude_unset=True)[name]
+            found[name] = {k: value[k] for k in change} if isinstance(change, dict) else value
+        return Variant.model_validate(found)
+
+
+class Calibration(Part):
+    """Range bias and clock offset from one object whose place is known, before the fit."""
+
+    object: str = key("name of the known object")
+    method: Literal["fit", "backprojection"] = key(
+        "a fit of the two numbers, or what focuses the object best", "fit"
+    )
 
 
 class Measures(Section):
@@ -143,21 +143,6 @@ class Measures(Section):
     voxel: Positive = key("m, for the shared volume", 0.02)
     seen: bool = key("score what some radar position sees; both are written", False)
     every: Count = key("steps between two points of the curve", 10)
-
-
-class Calibration(Section):
-    """Range bias and clock offset from one object whose place is known, before the fit.
-
-    With `method = "fit"` by a reconstruction of these two numbers, all else as in the main fit;
-    with `"backprojection"` by what focuses the object best.
-    """
-
-    object: str = key("name of the known object")
-    method: Literal["fit", "backprojection"] = key(
-        "a fit of the two numbers, or what focuses the object best", "fit"
-    )
-    steps: Count | None = key("without it those of the main fit", None)
-    rate: Positive | None = key("without it that of the main fit", None)
 
 
 class Landscape(Section):

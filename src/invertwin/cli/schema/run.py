@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import MinLen
@@ -11,25 +12,29 @@ from pydantic_core import PydanticCustomError
 from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.registry import NameOf, OneOf, TableOf, load_plugins, registry
 from invertwin.cli.schema.fits import (
+    AnyInitial,
+    AnyStarts,
     Calibration,
-    Initial,
     Landscape,
     Measures,
+    Part,
     Reconstruct,
     Stage,
-    Starts,
     Variant,
 )
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.section import InputPath, Section, Seed, Vector, fail, key
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
+from invertwin.cli.shape_tables import LearnedTable
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 
 # How a run calls its own fits, and how names of its metrics end.
-_TAKEN = ("full", "interior_only", "whole", "seen", "count", "m", "number", "consistency")
+_TAKEN = ("full", "whole", "seen", "count", "m", "number", "consistency")
+
+_AS_GIVEN: dict[str, Any] = {"exclude_unset": True, "exclude_none": True}
 
 AnyMaterial = Annotated[Any, OneOf("material")]
 AnyModel = Annotated[Any, OneOf("model")]
@@ -111,8 +116,8 @@ class _RunFile(Section):
         "[observations.<name>]: several sensors, each with its own data", {}
     )
     parameters: list[Annotated[Any, OneOf("parameter")]] = key("[[parameters]]: what is sought", [])
-    starts: Starts | None = key("where fits start; without it where the scene says", None)
-    initial: Initial | None = key(
+    starts: AnyStarts | None = key("where fits start; without it where the scene says", None)
+    initial: AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
     )
     surrogate: AnySurrogate = key("kernels of the smooth model", {}, validate_default=True)
@@ -156,20 +161,17 @@ class _RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _parameters_are_named(self) -> "_RunFile":
+    def _names_are_known(self) -> "_RunFile":
         known = self.parameter_names
         doubled = next((name for name in known if known.count(name) > 1), None)
-        staged = [("stages", self.stages)]
-        for name, variant in self.variants.items():
-            staged.append((f"variants.{name}.stages", variant.stages or []))
-            _named(variant.parameters or [], known, f"variants.{name}.parameters")
-        if self.reconstruct is not None:
-            _named(self.reconstruct.parameters, known, "reconstruct.parameters")
-        for path, stages in staged:
-            for i, stage in enumerate(stages):
-                _named(stage.parameters, known, f"{path}[{i}].parameters")
         if doubled and (self.stages or self.variants):
             fail(f'expected parameters of different names, got "{doubled}" twice; add `name`')
+        if self.reconstruct is not None:
+            _named("parameters", self.reconstruct.parameters, known, "reconstruct.parameters")
+            sensors, used = [*self.observations], self.reconstruct.observations
+            _named("observations", used, sensors, "reconstruct.observations")
+        for i, stage in enumerate(self.stages):
+            _named("parameters", stage.parameters, known, f"stages[{i}].parameters")
         return self
 
     @model_validator(mode="after")
@@ -187,30 +189,23 @@ class _RunFile(Section):
     @model_validator(mode="after")
     def _stages_remesh_what_they_seek(self) -> "_RunFile":
         names = self.parameter_names
-        free = {n for n, p in zip(names, self.parameters, strict=True) if p.kind == "vertices"}
         own = set(self.reconstruct.parameters if self.reconstruct else []) or set(names)
-        staged = [("stages", self.stages, set(own))]
-        for name, variant in self.variants.items():
-            sought = set(variant.parameters or own)
-            if variant.stages is None:
-                staged[0][2].update(sought)
-            else:
-                staged.append((f"variants.{name}.stages", variant.stages, sought))
-        for path, stages, sought in staged:
-            for i, stage in enumerate(stages):
-                if stage.remesh is not None and not free & sought & set(stage.parameters or names):
-                    fail(
-                        'expected a parameter with kind = "vertices" among those of the stage, got '
-                        "none; add one, or remove `remesh`",
-                        f"{path}[{i}].remesh",
-                    )
+        kinds = dict(zip(names, self.parameters, strict=True))
+        for i, stage in enumerate(self.stages):
+            sought = own & set(stage.parameters or names)
+            if stage.remesh and sought and all(kinds[n].kind != "vertices" for n in sought):
+                fail(
+                    'expected a parameter with kind = "vertices" among those of the stage, got '
+                    "none; add one, or remove `remesh`",
+                    f"stages[{i}].remesh",
+                )
         return self
 
     @model_validator(mode="after")
     def _learned_shapes_have_their_own_size(self) -> "_RunFile":
-        for parameter in self.unknowns.values():
-            if parameter.kind not in ("shape_space", "prior"):
-                continue
+        unknowns = self.unknowns.values()
+        learned: list[Any] = [table for table in unknowns if isinstance(table, LearnedTable)]
+        for parameter in learned:
             name, why = parameter.object, f'with kind = "{parameter.kind}", which has its own size'
             scale = self.scene[name].scale if name in self.scene else 1.0
             if scale != 1:
@@ -218,6 +213,33 @@ class _RunFile(Section):
             if self.initial is not None and self.initial.object == name and self.initial.scale:
                 fail(f"expected false {why}, got true; remove it", "initial.scale")
         return self
+
+    @model_validator(mode="after")
+    def _parts_are_runs(self, info: Any) -> "_RunFile":
+        """Every stage and variant makes a run that is right; errors begin at its own path."""
+        runs = _parts(type(self))
+        runs.model_validate({"stages": [self._with(s) for s in self.stages]}, context=info.context)
+        variants = {name: self._with(variant) for name, variant in self.variants.items()}
+        found = runs.model_validate({"variants": variants}, context=info.context).variants
+        for name, run in found.items():
+            self.variants[name] = self.variants[name].placed(run)
+        if self.calibration is not None:
+            runs.model_validate({"calibration": self._with(self.calibration)}, context=info.context)
+        return self
+
+    def varied(self, part: Part) -> "_RunFile":
+        """The run file with a stage, a variant or the calibration merged over it."""
+        return type(self).model_validate(self._with(part))
+
+    def _with(self, part: Part) -> dict[str, Any]:
+        """The run file as TOML, with a part: keys of tables replace keys, all else is replaced."""
+        found = self.model_dump(**_AS_GIVEN, exclude={"variants", "calibration"})
+        for name, change in part.changes().items():
+            found[name] = _merged(getattr(self, name), change)
+            for sensor, table in self.observations.items():
+                if getattr(table, name, None) is not None:
+                    found["observations"][sensor][name] = _merged(getattr(table, name), change)
+        return found
 
     @property
     def parameter_names(self) -> list[str]:
@@ -244,11 +266,30 @@ class _RunFile(Section):
         return used
 
 
-def _named(used: list[str], known: list[str], path: str) -> None:
+def _named(what: str, used: list[str], known: list[str], path: str) -> None:
     for name in used:
         if name not in known:
-            got = f'expected names of parameters ({", ".join(known)}), got "{name}"; correct it'
+            got = f'expected names of {what} ({", ".join(known)}), got "{name}"; correct it'
             fail(got, path)
+
+
+def _merged(table: Any, change: Any) -> Any:
+    """A table with other keys, or what replaces it: a list, a name, a table of another kind."""
+    kind = getattr(table, "kind", None)
+    if table is None or not isinstance(change, dict) or change.get("kind", kind) != kind:
+        return change
+    return table.model_dump(**_AS_GIVEN) | change
+
+
+@cache
+def _parts(run: type[_RunFile]) -> Any:
+    """Runs where the run file has its parts."""
+    return create_model(
+        "Parts",
+        stages=(list[run], []),  # type: ignore[valid-type]
+        variants=(dict[str, run], {}),  # type: ignore[valid-type]
+        calibration=(run, None),
+    )
 
 
 def _with_plugins() -> type[_RunFile]:

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.scene.files import read_arrays
-from invertwin.scene.mesh import Mesh
+from invertwin.scene.mesh import Mesh, joined
 from invertwin.scene.parameters import Entries
-from invertwin.scene.pose import rotation_from_vector
+from invertwin.scene.pose import rotation_angle, rotation_from_vector
 from invertwin.scene.scene import Scene
 
 _DO = "give arrays of one template"
@@ -139,6 +139,18 @@ class BodyTemplate:
             found[self.joint(name)] = checked_tensor(turn, (3,), what, "give x, y and z")
         return found
 
+    def mesh(self, turns: Mapping[str, ArrayLike]) -> Mesh:
+        """The skin with some joints turned, the others at rest.
+
+        Args:
+            turns: as in `rotations`.
+
+        Raises:
+            InputError: no such joint, or not three finite numbers.
+        """
+        rows = [rotation_from_vector(turn) for turn in self.rotations(turns)]
+        return Mesh(self.posed(torch.stack(rows))[0], self.faces)
+
     def scaled(self, factor: float) -> "BodyTemplate":
         """The body in another size."""
         given = ("vertices", "joints", "shape_directions", "joint_directions", "pose_directions")
@@ -258,6 +270,7 @@ class SkinnedBody(nn.Module):
         chosen = range(count) if sought is None else sought
         free = chosen if isinstance(chosen, Mapping) else dict.fromkeys(chosen, "xyz")
         self._sought = torch.zeros(count, 3, dtype=torch.float64)
+        self._joints = {str(name): template.joint(name) for name in free}
         for name, axes in free.items():
             self._sought[template.joint(name)] = _axes_mask(axes)
         self.rotation = nn.Parameter(turns.detach().clone())
@@ -267,6 +280,63 @@ class SkinnedBody(nn.Module):
         """The scene with the object's mesh replaced."""
         vertices, _ = self._posed()
         return scene.replace(self.object, mesh=Mesh(vertices, self.template.faces))
+
+    @classmethod
+    def of(
+        cls, object: str, template: BodyTemplate, mesh: Mesh, joints: Mapping[str, str]
+    ) -> "SkinnedBody":
+        """The body from the joint angles that a mesh of it shows; its shape is the template's.
+
+        Args:
+            object: name of the object.
+            template: the body.
+            mesh: with its triangles.
+            joints: as `sought`.
+
+        Raises:
+            InputError: other vertices, or a joint that the template does not have.
+        """
+        for name in joints:
+            template.joint(name)
+        found = cls(object, template, template.rotations_of(mesh.vertices), sought=joints)
+        found.shape.requires_grad_(False)
+        return found
+
+    def turned(self, mesh: Mesh, angle: float, generator: torch.Generator) -> Mesh:
+        """A mesh of the body with every sought joint turned by `angle` [rad], about random axes.
+
+        Args:
+            mesh: of the body, as it is posed.
+            angle: rad.
+            generator: of the axes.
+        """
+        turns = self.template.rotations_of(mesh.vertices)
+        rotations = torch.stack([rotation_from_vector(turn) for turn in turns])
+        for joint in self._joints.values():
+            free = self._sought[joint]
+            axis = torch.randn(3, generator=generator, dtype=torch.float64) * free
+            change = angle * axis / axis.norm()
+            # A hinge stays one: its angle changes, not its axis.
+            rotations[joint] = (
+                rotation_from_vector(turns[joint] + change)
+                if int(free.sum()) == 1
+                else rotation_from_vector(change) @ rotations[joint]
+            )
+        return Mesh(self.template.posed(rotations)[0], mesh.faces)
+
+    def joint_errors(self, found: Mesh, truth: Mesh) -> dict[str, float]:
+        """Angles [rad] by which the sought joints of two meshes of the body differ, by name.
+
+        Args:
+            found: the result.
+            truth: what it should be.
+        """
+        ends = [self.template.rotations_of(mesh.vertices.detach()) for mesh in (found, truth)]
+        errors = {}
+        for name, joint in self._joints.items():
+            a, b = (rotation_from_vector(end[joint]) for end in ends)
+            errors[name] = float(rotation_angle(a.T @ b))
+        return errors
 
     def joints(self) -> Float64[Tensor, "j 3"]:
         """Present places of the joints in the object's frame [m]."""
@@ -320,10 +390,10 @@ def articulated_template(
         )
     sizes = [len(part.vertices) for part in parts]
     owner = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(sizes))
-    starts = np.cumsum([0, *sizes[:-1]])
+    whole = joined(parts)
     return BodyTemplate(
-        torch.cat([part.vertices for part in parts]),
-        torch.cat([part.faces + int(first) for part, first in zip(parts, starts, strict=True)]),
+        whole.vertices,
+        whole.faces,
         torch.nn.functional.one_hot(owner, len(parts)).double(),
         tuple(parents),
         checked_tensor(joints, (len(parts), 3), "joints [m]", "give one per part"),

@@ -8,10 +8,10 @@ from invertwin.errors import InputError
 from invertwin.scene.checks import Counts, Point
 from invertwin.scene.geometry.lattice import Lattice, tensor_product
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.scene import Scene
+from invertwin.scene.parameters import ObjectModule
 
 
-class LatticeDeformation(nn.Module):
+class LatticeDeformation(ObjectModule):
     """Moves an object's points by cubic B-splines over a lattice of control points.
 
     The displacement field is twice continuously differentiable, whatever the mesh; equal offsets
@@ -34,8 +34,7 @@ class LatticeDeformation(nn.Module):
         Raises:
             InputError: a box without volume, or fewer than two nodes along an axis.
         """
-        super().__init__()
-        self.object = object
+        super().__init__(object)
         self.lattice = Lattice.between(low, high, counts)
         shape = [n + 2 for n in self.lattice.counts]
         self.offsets = nn.Parameter(torch.zeros(*shape, 3, dtype=torch.float64))
@@ -58,15 +57,13 @@ class LatticeDeformation(nn.Module):
         index, t = self.lattice.cell(points)
         return tensor_product(self.offsets, index, _cubic_spline(t))
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the object deformed.
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The mesh deformed.
 
         Raises:
-            InputError: the object's mesh leaves the box.
+            InputError: it leaves the box.
         """
-        mesh = scene[self.object].mesh
-        vertices = mesh.vertices + self.displacement(mesh.vertices)
-        return scene.replace(self.object, mesh=Mesh(vertices, mesh.faces))
+        return Mesh(mesh.vertices + self.displacement(mesh.vertices), mesh.faces)
 
     def values(self) -> dict[str, Tensor]:
         """Offsets [m] of the control points by name, for progress and reports."""

@@ -9,11 +9,11 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.scene.checks import ArrayLike, checked_number
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.parameters import Entries
+from invertwin.scene.parameters import Entries, ObjectModule
 from invertwin.scene.scene import Scene
 
 # Starts are kept this far above zero, in units of one over a node spacing: below, softplus is so
@@ -21,11 +21,11 @@ from invertwin.scene.scene import Scene
 _FAINTEST = 1e-3
 
 
-class DensityGrid(nn.Module):
+class DensityGrid(ObjectModule):
     """An object seen as a cloud of soft scatterers, by densities at the nodes of a grid.
 
-    ``σ = softplus(value) / h``, h the mean spacing of the nodes: at a value of 0 one cell holds
-    back half of the power, and rates of about 0.1 suit all grids alike.
+    ``σ = softplus(value) / h``, with h the mean spacing of the nodes. At a value of 0 one cell
+    holds back half of the power. Learning rates of about 0.1 suit all grids.
 
     Attributes:
         value: parameter [x, y, z].
@@ -53,18 +53,10 @@ class DensityGrid(nn.Module):
         Raises:
             InputError: wrong shapes, NaN, a negative density, or a box without volume.
         """
-        super().__init__()
-        given = checked_tensor(
-            density, (None, None, None), "densities [1/m]", "give one for each node"
-        ).detach()
-        if bool((given < 0).any()):
-            raise InputError(
-                f"expected densities of at least 0, got a least of {float(given.min()):.3g}; "
-                "the density is an extinction [1/m]"
-            )
-        self.object = object
-        self.lattice = Lattice.between(low, high, tuple(given.shape))
+        super().__init__(object)
         self.albedo = checked_number(albedo, "albedo", 0.0, open_low=True)
+        self.lattice = Lattice.between(low, high, density.shape)
+        given = Cloud(self.lattice.low, self.lattice.high, density, albedo).density.detach()
         scaled = (given * self._unit).clamp_min(_FAINTEST)
         # log(exp(s) − 1), the inverse of softplus, without overflow.
         self.value = nn.Parameter(scaled + torch.log(-torch.expm1(-scaled)))
@@ -91,11 +83,9 @@ class DensityGrid(nn.Module):
             InputError: as above.
         """
         lattice = Lattice.between(low, high, counts)
-        density = checked_number(depth, "optical depth", 0.0, open_low=True) / float(
-            (lattice.high - lattice.low).max()
-        )
-        filled = torch.full(lattice.counts, density, dtype=torch.float64)
-        return cls(object, low, high, filled)
+        whole = checked_number(depth, "optical depth", 0.0, open_low=True)
+        density = whole / (lattice.high - lattice.low).max()
+        return cls(object, low, high, density.expand(lattice.counts))
 
     @property
     def _unit(self) -> float:

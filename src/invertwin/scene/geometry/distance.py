@@ -4,10 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
-import numpy as np
 import torch
 from jaxtyping import Float64
-from scipy.fft import dctn, idctn
 from torch import Tensor, nn
 
 from invertwin.limits import Count, Positive
@@ -21,31 +19,31 @@ from invertwin.scene.checks import (
 )
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice, cubic
-from invertwin.scene.geometry.smooth_vertices import smoothed
-from invertwin.scene.scene import Scene
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.parameters import ObjectModule
 
 
-class _Distance(nn.Module):
-    """A field whose zero is the object's surface."""
+class _Distance(ObjectModule):
+    """A field whose zero is the object's surface.
+
+    The material must not have values per triangle, nor the object velocities per vertex.
+    """
 
     def __init__(self, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int]) -> None:
-        super().__init__()
-        self.object = object
+        super().__init__(object)
         self.lattice = Lattice.between(low, high, counts)
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
         """The field at points in the object's frame [m]: negative inside."""
         raise NotImplementedError
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the object's mesh replaced by the present surface, meshed anew.
-
-        The material must not have values per triangle, nor the object velocities per vertex.
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The present surface, meshed anew, whatever was there before.
 
         Raises:
             InputError: no surface in the box.
         """
-        return scene.replace(self.object, mesh=iso_surface(self.distance, self.lattice))
+        return iso_surface(self.distance, self.lattice)
 
 
 class DistanceGrid(_Distance):
@@ -83,10 +81,8 @@ class DistanceGrid(_Distance):
             value, (None, None, None), "signed distances [m]", "give one for each node"
         )
         super().__init__(object, low, high, tuple(given.shape))
-        self._smoother = GridSmoother(
-            tuple(given.shape), checked_number(smoothing, "smoothing λ", 0)
-        )
-        self.value = nn.Parameter(self._smoother.roughened(given.detach()))
+        self._smoother = GridSmoother(given.shape, checked_number(smoothing, "smoothing λ", 0))
+        self.value = nn.Parameter(self._smoother.power(1, given.detach()).clone())
 
     @classmethod
     def sampled(
@@ -119,9 +115,7 @@ class DistanceGrid(_Distance):
     @property
     def distances(self) -> Float64[Tensor, "x y z"]:
         """Signed distances at the nodes [m]."""
-        if self._smoother.amount == 0:
-            return self.value
-        return smoothed(self.value, self._smoother)
+        return self._smoother.power(-1, self.value)
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
         """The field at points in the object's frame [m]: negative inside."""
@@ -131,7 +125,7 @@ class DistanceGrid(_Distance):
 class GridSmoother:
     """I + λL of a grid, L its graph Laplacian, by cosine transforms, which diagonalise it."""
 
-    def __init__(self, shape: tuple[int, ...], amount: float) -> None:
+    def __init__(self, shape: Sequence[int], amount: float) -> None:
         """Prepare I + λL.
 
         Args:
@@ -139,25 +133,25 @@ class GridSmoother:
             amount: λ.
         """
         self.amount = amount
-        squares = np.zeros(shape)
-        for axis, count in enumerate(shape):
-            rates = 2 - 2 * np.cos(np.pi * np.arange(count) / count)
-            squares += np.moveaxis(
-                np.broadcast_to(rates, (*np.delete(shape, axis), count)), -1, axis
-            )
-        self._factors = 1 + amount * squares
+        modes = [torch.arange(count, dtype=torch.float64) for count in shape]
+        waves = [torch.cos(torch.pi * k * (k[:, None] + 0.5) / len(k)) for k in modes]
+        self._waves = [wave / wave.norm(dim=0) for wave in waves]
+        # L adds up the second differences along the axes, and so do its eigenvalues.
+        x, y, z = (2 - 2 * torch.cos(torch.pi * k / len(k)) for k in modes)
+        self._factors = 1 + amount * (x[:, None, None] + y[:, None] + z)
 
-    def solve(self, values: Tensor) -> Tensor:
-        """(I + λL)⁻¹ times values at the nodes, without derivatives."""
-        spectrum = np.asarray(dctn(values.detach().numpy(), norm="ortho")) / self._factors
-        return torch.from_numpy(np.asarray(idctn(spectrum, norm="ortho")))
+    def power(self, exponent: int, values: Tensor) -> Tensor:
+        """(I + λL)ⁿ times values at the nodes.
 
-    def roughened(self, values: Tensor) -> Tensor:
-        """(I + λL) times values at the nodes, without derivatives."""
+        Args:
+            exponent: n.
+            values: [x, y, z].
+        """
         if self.amount == 0:
-            return values.detach().clone()
-        spectrum = np.asarray(dctn(values.detach().numpy(), norm="ortho")) * self._factors
-        return torch.from_numpy(np.asarray(idctn(spectrum, norm="ortho")))
+            return values
+        x, y, z = self._waves
+        spectrum = torch.einsum("xyz,xa,yb,zc->abc", values, x, y, z) * self._factors**exponent
+        return torch.einsum("abc,xa,yb,zc->xyz", spectrum, x, y, z)
 
 
 class NeuralDistance(_Distance):
@@ -226,8 +220,4 @@ class NeuralDistance(_Distance):
         hidden, scale = away / half, self.frequency
         for layer in list(self.layers)[:-1]:
             hidden, scale = torch.sin(scale * layer(hidden)), 1.0
-        return (
-            torch.linalg.vector_norm(away, dim=1)
-            - self.radius
-            + (half * self.layers[-1](hidden)[:, 0])
-        )
+        return away.norm(dim=1) - self.radius + half * self.layers[-1](hidden)[:, 0]

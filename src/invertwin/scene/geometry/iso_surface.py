@@ -18,9 +18,7 @@ _CHUNK = 65_536  # points of the field at a time
 _FLAT = 1e-6  # least slope of a distance, whose own is 1
 
 
-def iso_surface(
-    field: Field, lattice: Lattice, values: Float64[Tensor, "x y z"] | None = None
-) -> Mesh:
+def iso_surface(field: Field, lattice: Lattice) -> Mesh:
     """Mesh the surface where a field is zero; the vertices follow the field.
 
     Values and topology are those of marching cubes, moved onto the field's zero; the derivative of
@@ -34,24 +32,20 @@ def iso_surface(
         field: negative inside, positive outside; its parameters may carry gradients, and points
             are given in the object's frame [m].
         lattice: nodes on which the field is looked at; thinner parts are missed.
-        values: the field at the nodes, where it is known already; None asks the field.
 
     Raises:
         InputError: a field that is not finite, or has one sign at all nodes.
     """
-    if values is None:
-        nodes = lattice.nodes.reshape(-1, 3)
-        with torch.no_grad():
-            parts = [field(part).detach() for part in nodes.split(_CHUNK)]
-        values = torch.cat(parts).reshape(lattice.counts)
-    points, faces = surface_of(field, lattice, values)
-    return Mesh(follow(field, points), faces)
+    with torch.no_grad():
+        parts = [field(part).detach() for part in lattice.nodes.reshape(-1, 3).split(_CHUNK)]
+    points, faces, slope = surface_of(field, lattice, torch.cat(parts).reshape(lattice.counts))
+    return Mesh(follow(field, points, slope), faces)
 
 
 def surface_of(
     field: Field, lattice: Lattice, values: Float64[Tensor, "x y z"]
-) -> tuple[Float64[Tensor, "p 3"], Int64[Tensor, "t 3"]]:
-    """Places of vertices, without derivatives, and triangles.
+) -> tuple[Float64[Tensor, "p 3"], Int64[Tensor, "t 3"], Float64[Tensor, "p 3"]]:
+    """Places of vertices, triangles, and the field's slope there, all without derivatives.
 
     Args:
         field: the signed distance at points in the box.
@@ -73,31 +67,22 @@ def surface_of(
         values.detach().numpy(), 0.0, gradient_direction="descent", allow_degenerate=False
     )
     start = lattice.low + torch.from_numpy(corners).double() * lattice.spacing
-    return _polished(field, start, lattice), torch.from_numpy(faces.astype("int64"))
-
-
-def slope_of(field: Field, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p 3"]:
-    """The field's gradient in space at points, without derivatives.
-
-    Args:
-        field: a function of points.
-        points: [m].
-    """
-    return _value_and_slope(field, points)[1]
+    points = _polished(field, start, lattice)
+    slope = _value_and_slope(field, points)[1]
+    return points, torch.from_numpy(faces.astype("int64")), slope
 
 
 def follow(
-    field: Field, points: Float64[Tensor, "p 3"], slope: Float64[Tensor, "p 3"] | None = None
+    field: Field, points: Float64[Tensor, "p 3"], slope: Float64[Tensor, "p 3"]
 ) -> Float64[Tensor, "p 3"]:
     """Points of the surface as they are, with the derivative dV = −n df/|∇f|.
 
     Args:
         field: whose zero the points are on.
         points: points of the surface [m].
-        slope: the field's gradient there, where it is known already; None asks the field.
+        slope: the field's gradient there.
     """
     fixed = points.detach()
-    slope = slope_of(field, fixed) if slope is None else slope
     direction = slope / slope.square().sum(1, keepdim=True).clamp_min(_FLAT**2)
     value = field(fixed)
     return fixed - direction * (value - value.detach())[:, None]

@@ -15,14 +15,11 @@ _DO = "give x, y, z of the box's corners"
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes of a box, corners included.
+    """Nodes of a box, corners included, as `between` makes them.
 
     Attributes:
         low, high: corners of the box in the object's frame [m].
         counts: nodes along x, y and z.
-
-    Raises:
-        InputError: a box without volume, or fewer than two nodes along an axis.
     """
 
     low: Float64[Tensor, "3"]
@@ -39,25 +36,21 @@ class Lattice:
             counts: nodes along x, y and z.
 
         Raises:
-            InputError: as above, wrong shapes, or NaN.
+            InputError: a box without volume, fewer than two nodes along an axis, wrong shapes, or
+                NaN.
         """
         if len(counts) != 3:
             raise InputError(f"expected three counts, got {counts!r}; give those of x, y, z")
-        corners = [
+        first, last = (
             checked_tensor(corner, (3,), f"{name} corner of the box [m]", _DO).detach().clone()
             for name, corner in (("low", low), ("high", high))
-        ]
-        x, y, z = (checked_count(count, "nodes along an axis", 2) for count in counts)
-        return cls(corners[0], corners[1], (x, y, z))
-
-    def __post_init__(self) -> None:
-        if not bool((self.high > self.low).all()):
+        )
+        if not bool((last > first).all()):
             raise InputError(
-                "expected a box with low < high, "
-                f"got {self.low.tolist()} and {self.high.tolist()}; {_DO}"
+                f"expected a box with low < high, got {first.tolist()} and {last.tolist()}; {_DO}"
             )
-        for count in self.counts:
-            checked_count(count, "nodes along an axis", 2)
+        x, y, z = (checked_count(count, "nodes along an axis", 2) for count in counts)
+        return cls(first, last, (x, y, z))
 
     @property
     def spacing(self) -> Float64[Tensor, "3"]:
@@ -70,30 +63,18 @@ class Lattice:
         return torch.stack(torch.meshgrid(*self.axes, indexing="ij"), dim=-1)
 
     @property
-    def axes(self) -> tuple[Tensor, Tensor, Tensor]:
+    def axes(self) -> list[Tensor]:
         """Places of the nodes [m] along x, y and z."""
-        x, y, z = (
+        return [
             torch.linspace(float(a), float(b), n, dtype=torch.float64)
             for a, b, n in zip(self.low, self.high, self.counts, strict=True)
-        )
-        return x, y, z
+        ]
 
     def cell(self, points: Float64[Tensor, "p 3"]) -> tuple[Tensor, Tensor]:
         """Cell of each point [p, 3], outside the nearest one, and the place in it in cells."""
         place = (points - self.low) / self.spacing
         last = torch.tensor(self.counts) - 2
         index = place.detach().floor().long().clamp_min(0).minimum(last)
-        return index, place - index
-
-    def along(self, axis: int, places: Float64[Tensor, " n"]) -> tuple[Tensor, Tensor]:
-        """Cells along one axis that hold coordinates, and the places in them.
-
-        Args:
-            axis: 0, 1 or 2.
-            places: coordinates along the axis [m].
-        """
-        place = (places - self.low[axis]) / self.spacing[axis]
-        index = place.floor().long().clamp(0, self.counts[axis] - 2)
         return index, place - index
 
 
@@ -141,39 +122,32 @@ def cubic_slices(
         lattice: the nodes.
         wanted: nodes of the result.
     """
-    extended, places = _extended(values), wanted.axes
-    index, t = zip(*(lattice.along(k, place) for k, place in enumerate(places)), strict=True)
-    across = [_matrix(index[k], t[k], extended.shape[k]) for k in (1, 2)]
-    weights = _cubic_convolution(t[0])
-    for first, weight in zip(index[0].tolist(), weights, strict=True):
-        plane = torch.einsum("i,iyz->yz", weight, extended[first : first + 4])
-        yield across[0] @ plane @ across[1].T
+    extended = _extended(values)
+    x, y, z = (_matrix(lattice, axis, places) for axis, places in enumerate(wanted.axes))
+    for weights in x:
+        yield y @ torch.tensordot(weights, extended, dims=1) @ z.T
 
 
-def _matrix(index: Tensor, t: Tensor, count: int) -> Tensor:
-    """Weights [places, nodes] of a cubic convolution along one axis."""
-    matrix = torch.zeros(len(index), count, dtype=torch.float64)
-    return matrix.scatter(1, index[:, None] + torch.arange(4), _cubic_convolution(t))
+def _matrix(lattice: Lattice, axis: int, places: Tensor) -> Tensor:
+    """Weights [place, node] of a cubic convolution along one axis, of the extended nodes."""
+    count = lattice.counts[axis]
+    place = (places - lattice.low[axis]) / lattice.spacing[axis]
+    index = place.floor().long().clamp(0, count - 2)
+    matrix = torch.zeros(len(places), count + 2, dtype=torch.float64)
+    return matrix.scatter(1, index[:, None] + torch.arange(4), _cubic_convolution(place - index))
 
 
 def _extended(values: Tensor) -> Tensor:
     """One more node on every side, by a straight line through the last two."""
     for axis in range(3):
-        first, second = values.narrow(axis, 0, 1), values.narrow(axis, 1, 1)
-        count = values.shape[axis]
-        last, before = values.narrow(axis, count - 1, 1), values.narrow(axis, count - 2, 1)
+        first, second = values.narrow(axis, 0, 2).split(1, axis)
+        before, last = values.narrow(axis, -2, 2).split(1, axis)
         values = torch.cat([2 * first - second, values, 2 * last - before], dim=axis)
     return values
 
 
 def _cubic_convolution(t: Tensor) -> Tensor:
     """Weights of the four nodes around places t in [0, 1] of a cell: 0, 1, 0, 0 at t = 0."""
-    return 0.5 * torch.stack(
-        [
-            -t + 2 * t**2 - t**3,
-            2 - 5 * t**2 + 3 * t**3,
-            t + 4 * t**2 - 3 * t**3,
-            -(t**2) + t**3,
-        ],
-        dim=-1,
-    )
+    r = 1 - t
+    inner = 2 - 5 * t**2 + 3 * t**3, 2 - 5 * r**2 + 3 * r**3
+    return 0.5 * torch.stack([-t * r**2, *inner, -r * t**2], dim=-1)

@@ -64,39 +64,32 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
     step = checked_number(spacing, "spacing of the triangles [m]", 0.01, 0.05)
     low = torch.tensor([-0.93, -1.0, -0.24], dtype=torch.float64)
     high = torch.tensor([0.93, 0.86, 0.18], dtype=torch.float64)
-    x, y, z = (int(count) for count in ((high - low) * tall / _TALL / step).ceil() + 1)
-    mesh = iso_surface(_distance, Lattice(low, high, (x, y, z)))
+    counts = ((high - low) * tall / _TALL / step).ceil().int() + 1
+    mesh = iso_surface(_distance, Lattice.between(low, high, counts.tolist()))
     names = list(_JOINTS)
     parents = [-1 if parent is None else names.index(parent) for parent, _ in _JOINTS.values()]
     joints = torch.tensor([place for _, place in _JOINTS.values()], dtype=torch.float64)
-    size = tall / _TALL
-    return BodyTemplate(
-        mesh.vertices * size,
+    template = BodyTemplate(
+        mesh.vertices,
         mesh.faces,
         _weights(mesh.vertices),
         tuple(parents),
-        joints * size,
+        joints,
         names=tuple(names),
     )
+    return template.scaled(tall / _TALL)
 
 
 def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:
     """All cones: joint, ends, radii."""
-    sided = []
-    for name, start, end, first, last in _LIMBS:
-        for side, sign in (("left", -1.0), ("right", 1.0)):
-            ends = [(sign * place[0], *place[1:]) for place in (start, end)]
-            sided.append((f"{side}_{name}", *ends, first, last))
-    return [
-        (
-            name,
-            torch.tensor(start, dtype=torch.float64),
-            torch.tensor(end, dtype=torch.float64),
-            first,
-            last,
-        )
-        for name, start, end, first, last in [*_CONES, *sided]
-    ]
+    parts = []
+    for name, *ends, first, last in [*_CONES, *_LIMBS]:
+        start, end = torch.tensor(ends, dtype=torch.float64)
+        sides = {f"left_{name}": -1.0, f"right_{name}": 1.0}
+        for own, sign in ({name: 1.0} if name in _JOINTS else sides).items():
+            mirror = start.new_tensor([sign, 1.0, 1.0])
+            parts.append((own, start * mirror, end * mirror, first, last))
+    return parts
 
 
 def _cone(

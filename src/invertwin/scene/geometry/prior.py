@@ -1,8 +1,7 @@
 """A learned prior of shapes: a few numbers decode to a signed distance, which is meshed."""
 
-import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -14,12 +13,11 @@ from torch import Tensor, nn
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_tensor
 from invertwin.scene.files import read_arrays
-from invertwin.scene.geometry.iso_surface import follow, slope_of, surface_of
+from invertwin.scene.geometry.iso_surface import follow, surface_of
 from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.scene import Scene
+from invertwin.scene.parameters import ObjectModule
 
-LIMIT = 6.0  # standard deviations within which a latent decodes to something like its kind
 _MODEL = "vehicle_prior.npz"
 _FORMAT = "invertwin shape prior 1"
 _SPACING = 0.1  # of the nodes at which shapes are meshed unless asked otherwise [m]
@@ -65,7 +63,8 @@ class ShapePrior:
         lattice: the decoder's nodes, both halves.
     """
 
-    limit = LIMIT
+    limit = 6.0
+    """Standard deviations within which a latent decodes to something like its kind."""
 
     def __init__(self, decoder: Decoder, lattice: Lattice) -> None:
         """A prior from its network and the nodes that it decodes to.
@@ -103,11 +102,15 @@ class ShapePrior:
         """The opposite corner [m]."""
         return self.lattice.high
 
-    @property
-    def counts(self) -> tuple[int, int, int]:
-        """Nodes at which shapes are meshed unless asked otherwise, about 0.1 m apart."""
-        x, y, z = (math.ceil(float(a)) + 1 for a in (self.high - self.low) / _SPACING - 1e-9)
-        return x, y, z
+    def nodes(self, counts: Sequence[int] | None = None) -> Lattice:
+        """Nodes in the box, as many along x, y and z as told; None is about 0.1 m apart.
+
+        Raises:
+            InputError: fewer than two nodes along an axis.
+        """
+        if counts is None:
+            counts = (((self.high - self.low) / _SPACING - 1e-9).ceil().int() + 1).tolist()
+        return Lattice.between(self.low, self.high, counts)
 
     def values(self, latent: Float64[Tensor, " k"]) -> Float64[Tensor, "x y z"]:
         """Signed distances at the decoder's nodes [m], negative inside.
@@ -147,8 +150,7 @@ class ShapePrior:
         Raises:
             InputError: as above, or fewer than two nodes along an axis.
         """
-        wanted = Lattice.between(self.low, self.high, counts)
-        return cubic_slices(self.values(latent), self.lattice, wanted)
+        return cubic_slices(self.values(latent), self.lattice, self.nodes(counts))
 
     def decode(
         self, latent: Float64[Tensor, " k"], counts: Sequence[int]
@@ -169,14 +171,13 @@ class ShapePrior:
 
         Args:
             latent: coordinates in standard deviations.
-            counts: nodes along x, y and z at which the field is meshed; None = `counts`.
+            counts: nodes along x, y and z at which the field is meshed, see `nodes`.
 
         Raises:
             InputError: as above.
         """
-        wanted = Lattice.between(self.low, self.high, self.counts if counts is None else counts)
         values = self.values(latent)
-        points, faces, slope = self._surface(values.detach(), wanted)
+        points, faces, slope = self._surface(values.detach(), self.nodes(counts))
         return Mesh(follow(lambda at: cubic(values, self.lattice, at), points, slope), faces)
 
     def mean_mesh(self, counts: Sequence[int] | None = None) -> Mesh:
@@ -202,16 +203,11 @@ class ShapePrior:
                 return cubic(values, self.lattice, at)
 
             known = torch.stack(list(cubic_slices(values, self.lattice, wanted)))
-            points, faces = surface_of(field, wanted, known)
-            last = self._last = wanted.counts, values, (points, faces, slope_of(field, points))
+            last = self._last = wanted.counts, values, surface_of(field, wanted, known)
         return last[2]
 
     def _checked(self, latent: Tensor) -> Tensor:
-        """The latent, if it is one that decodes.
-
-        Raises:
-            InputError: another size, not finite, or out of range.
-        """
+        """The latent, if it is one that decodes."""
         do = f"give {self.latent_size} numbers in standard deviations"
         given = checked_tensor(latent, (self.latent_size,), "latent", do)
         most = float(given.detach().abs().max())
@@ -223,7 +219,7 @@ class ShapePrior:
         return given
 
 
-class PriorShape(nn.Module):
+class PriorShape(ObjectModule):
     """Replaces an object's mesh by one that a prior decodes, meshed anew at every step.
 
     The material must not have values per triangle, nor the object velocities per vertex.
@@ -231,6 +227,8 @@ class PriorShape(nn.Module):
     Attributes:
         latent: parameter [k], in standard deviations.
     """
+
+    reported = ("latent",)
 
     def __init__(
         self,
@@ -250,12 +248,9 @@ class PriorShape(nn.Module):
         Raises:
             InputError: coordinates of another number, not finite, or out of range.
         """
-        super().__init__()
-        self.object = object
+        super().__init__(object)
         self.prior = load_prior() if prior is None else prior
-        self.lattice = Lattice.between(
-            self.prior.low, self.prior.high, self.prior.counts if counts is None else counts
-        )
+        self.lattice = self.prior.nodes(counts)
         start = torch.zeros(self.prior.latent_size) if initial is None else initial
         start = checked_tensor(start, (None,), "latent", "give numbers in standard deviations")
         self.prior.values(start.detach())
@@ -265,23 +260,13 @@ class PriorShape(nn.Module):
         """The present field at points in the object's frame [m]: negative inside."""
         return self.prior.distance(points, self.latent)
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the object's mesh replaced by the decoded one.
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The decoded mesh, whatever was there before.
 
         Raises:
             InputError: a latent that has run out of range.
         """
-        return scene.replace(self.object, mesh=self.prior.mesh(self.latent, self.lattice.counts))
-
-    def values(self) -> dict[str, Tensor]:
-        """Coordinates by name, for progress and reports."""
-        return {f"{self.object}.latent": self.latent.detach().clone()}
-
-
-@lru_cache(maxsize=1)
-def _packaged() -> ShapePrior:
-    with resources.as_file(resources.files("invertwin.scene.geometry") / _MODEL) as file:
-        return _read(file)
+        return self.prior.mesh(self.latent, self.lattice.counts)
 
 
 def load_prior(file: str | Path | None = None) -> ShapePrior:
@@ -295,7 +280,13 @@ def load_prior(file: str | Path | None = None) -> ShapePrior:
     Raises:
         InputError: no such file, or not a prior.
     """
-    return _packaged() if file is None else _read(Path(file))
+    return _loaded() if file is None else _read(Path(file))
+
+
+@cache
+def _loaded() -> ShapePrior:
+    with resources.as_file(resources.files("invertwin.scene.geometry") / _MODEL) as file:
+        return _read(file)
 
 
 def _read(path: Path) -> ShapePrior:

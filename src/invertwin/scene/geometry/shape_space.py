@@ -1,23 +1,15 @@
 """Linear shape spaces: a mean, and the directions in which shapes of a kind differ."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
-from invertwin.scene.files import load_mesh, read_arrays
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
-
-_TRAINED = 79  # vehicles behind the public space: σ of mode k is its singular value over √79
-_LEVELS = {"coarse": ("default_dodec", "dodec_mean.obj"), "fine": ("default1", "body_mean.obj")}
-_ORIGINAL = "github.com/mleotta/vehicle3d"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,53 +103,3 @@ class LinearShape(nn.Module):
     def values(self) -> dict[str, Tensor]:
         """Coordinates by name, for progress and reports."""
         return {f"{self.object}.latent": self.latent.detach().clone()}
-
-
-def load_vehicle_space(folder: str | Path, level: Literal["coarse", "fine"] = "fine") -> ShapeSpace:
-    """The public learned space of vehicles, bodies without wheels.
-
-    The frame is that of the files: x ahead, y to the left, z up, metres.
-
-    Args:
-        folder: holds ``vehicle3d_pca.npz``, ``body_mean.obj`` and ``dodec_mean.obj``.
-        level: ``fine`` has 127 vertices and 78 modes, ``coarse`` 16 and 14.
-
-    Raises:
-        InputError: no such level, files missing, or arrays that do not fit.
-    """
-    if level not in _LEVELS:
-        raise InputError(f"expected level 'coarse' or 'fine', got {level!r}; choose one")
-    name, mean_file = _LEVELS[level]
-    file = Path(folder) / "vehicle3d_pca.npz"
-    if not file.is_file():
-        raise InputError(
-            f"expected the vehicle space {file.name} in {folder}, got no such file; "
-            f"set INVERTWIN_DATA to the folder that holds vehicle_prior/ ({_ORIGINAL})"
-        )
-    wanted = [f"{name}_{part}" for part in ("mean", "pc", "sv")]
-    arrays = read_arrays(file, f"load the original ({_ORIGINAL})", wanted)
-    missing = [key for key in wanted if key not in arrays]
-    if missing:
-        raise InputError(f"expected {missing[0]} in {file.name}, got none; load the original")
-    mean, components, singular = (arrays[key].astype(np.float64) for key in wanted)
-    mesh = load_mesh(Path(folder) / mean_file)
-    count = len(mesh.vertices)
-    # Rows hold the body's vertices, then the wheels', then points in the plane of images.
-    vertices = torch.from_numpy(mean[: 3 * count].reshape(count, 3))
-    return ShapeSpace(
-        vertices,
-        torch.from_numpy(components[: 3 * count].reshape(count, 3, -1)),
-        torch.from_numpy(singular / np.sqrt(_TRAINED)),
-        _reordered(mesh, vertices),
-    )
-
-
-def _reordered(mesh: Mesh, vertices: Tensor) -> Tensor:
-    """The mesh's triangles in the numbers of the same vertices in another order."""
-    gaps, index = torch.cdist(mesh.vertices, vertices).min(dim=1)
-    if float(gaps.max()) > 1e-4 or len(index.unique()) != len(vertices):
-        raise InputError(
-            "expected the mean shape and its mesh to have the same vertices, got some "
-            f"{float(gaps.max()):.3g} m apart; load files of one release"
-        )
-    return index[mesh.faces]

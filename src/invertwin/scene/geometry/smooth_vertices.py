@@ -1,21 +1,21 @@
 """Free vertices whose gradients are smoothed: large steps without crumpling."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float64
-from scipy.sparse import coo_array, csc_array, eye_array
+from scipy.sparse import coo_array, csc_array, csgraph, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.scene import Scene
+from invertwin.scene.parameters import ObjectModule
 
 
-class SmoothVertices(nn.Module):
+class SmoothVertices(ObjectModule):
     """Moves every vertex by ``(I + λL)⁻¹ u``, L the graph Laplacian of the mesh.
 
     A step of gradient descent on u is a step ``−η (I + λL)⁻² ∂loss/∂x`` of the vertices: rough
@@ -29,6 +29,8 @@ class SmoothVertices(nn.Module):
         latent: parameter u [v, 3] in the object's frame, metres.
     """
 
+    reported = ("offsets",)
+
     def __init__(self, object: str, mesh: Mesh, smoothing: float = 20.0) -> None:
         """Move the vertices of `object`, by zero at the start.
 
@@ -40,8 +42,7 @@ class SmoothVertices(nn.Module):
         Raises:
             InputError: a negative λ.
         """
-        super().__init__()
-        self.object = object
+        super().__init__(object)
         amount = checked_number(smoothing, "smoothing λ", 0.0)
         count = len(mesh.vertices)
         self._faces = mesh.faces.clone()
@@ -51,26 +52,21 @@ class SmoothVertices(nn.Module):
     @property
     def offsets(self) -> Float64[Tensor, "v 3"]:
         """Displacements of the vertices in the object's frame [m]."""
-        return smoothed(self.latent, self._smoother)
+        return _Smoothed.apply(self.latent, self._smoother)  # type: ignore[return-value]
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the vertices moved.
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The mesh with its vertices moved.
 
         Raises:
-            InputError: the object has other triangles than the mesh this was created with.
+            InputError: other triangles than those of the mesh this was created with.
         """
-        mesh = scene[self.object].mesh
         if len(mesh.vertices) != len(self.latent) or not torch.equal(mesh.faces, self._faces):
             raise InputError(
                 f"expected the triangles of {self.object!r} as they were "
                 f"({len(self.latent)} vertices), got {len(mesh.vertices)}; "
                 "create SmoothVertices with the object's own mesh"
             )
-        return scene.replace(self.object, mesh=Mesh(mesh.vertices + self.offsets, mesh.faces))
-
-    def values(self) -> dict[str, Tensor]:
-        """Vertex offsets [m] by name, for progress and reports."""
-        return {f"{self.object}.offsets": self.offsets.detach().clone()}
+        return Mesh(mesh.vertices + self.offsets, mesh.faces)
 
 
 class Smoother:
@@ -104,47 +100,26 @@ def laplacian(faces: Tensor, count: int) -> csc_array:
         faces: triangles [f, 3].
         count: number of vertices.
     """
-    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = pairs.sort(dim=1).values.unique(dim=0).numpy()
-    edges = edges[edges[:, 0] != edges[:, 1]]  # triangles that are a line
-    ends = np.concatenate([edges, edges[:, ::-1]])
-    joined = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    degree = np.bincount(ends[:, 0], minlength=count).astype(np.float64)
-    diagonal = coo_array((degree, (np.arange(count), np.arange(count))), shape=(count, count))
-    return csc_array(diagonal - joined)
-
-
-@runtime_checkable
-class Solver(Protocol):
-    """Whatever multiplies by a symmetric (I + λL)⁻¹."""
-
-    def solve(self, values: Tensor) -> Tensor:
-        """The product, without derivatives."""
-        ...
-
-
-def smoothed(latent: Tensor, solver: Solver) -> Tensor:
-    """(I + λL)⁻¹ u, with derivatives of any order in both modes.
-
-    Args:
-        latent: u.
-        solver: what multiplies by (I + λL)⁻¹.
-    """
-    return _Smoothed.apply(latent, solver)  # type: ignore[return-value]
+    ends = faces.flatten().numpy(), faces.roll(-1, dims=1).flatten().numpy()
+    joined = coo_array((np.ones(len(ends[0])), ends), shape=(count, count))
+    return csc_array(csgraph.laplacian(((joined + joined.T) > 0).astype(np.float64)))
 
 
 class _Smoothed(torch.autograd.Function):
-    """The matrix is symmetric, so its adjoint is itself."""
+    """(I + λL)⁻¹ u, with derivatives of any order in both modes.
+
+    The matrix is symmetric, so its adjoint is itself.
+    """
 
     @staticmethod
-    def forward(ctx: Any, latent: Tensor, solver: Solver) -> Tensor:
-        ctx.solver = solver
-        return solver.solve(latent)
+    def forward(ctx: Any, latent: Tensor, smoother: Smoother) -> Tensor:
+        ctx.smoother = smoother
+        return smoother.solve(latent)
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor, None]:
-        return _Smoothed.apply(outputs[0], ctx.solver), None  # type: ignore[return-value]
+        return _Smoothed.apply(outputs[0], ctx.smoother), None  # type: ignore[return-value]
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return ctx.solver.solve(tangents[0])
+        return ctx.smoother.solve(tangents[0])

@@ -186,7 +186,7 @@ class RoughDielectric(Medium, Material):
     lobe_width: Annotated[Value, RADIANS] = ROUGH_LOBE_WIDTH
 
     def surface(self, frequency: float) -> Surface:
-        """The reflectance at `frequency` [Hz]; differentiable in all values."""
+        """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
         weights = specular_weights(evaluated(self.diffuse), lobe_exponent(self.lobe_width))
         return Surface(fresnel_amplitude(epsilon[..., None], _cosines()), *weights)
@@ -205,7 +205,7 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     """
 
     def surface(self, frequency: float) -> Surface:
-        """The reflectance at `frequency` [Hz]; differentiable in all values."""
+        """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
         return Surface(fresnel_amplitude(epsilon[..., None], _cosines()), *self.weights())
 
@@ -226,7 +226,7 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
     """
 
     def surface(self, frequency: float) -> Surface:
-        """What one face does at `frequency` [Hz]; differentiable in all values."""
+        """What one face does at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon, cosine = self.complex_permittivity(frequency), _cosines()
         return Surface(
             fresnel_amplitude(epsilon[..., None], cosine),
@@ -275,7 +275,7 @@ class Slab(Layer, EffectiveRoughness, Material):
     """
 
     def surface(self, frequency: float) -> Surface:
-        """What it does at `frequency` [Hz]; differentiable in all values."""
+        """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
         return _slab_surface([self], self.weights(), frequency)
 
 
@@ -315,7 +315,7 @@ class Multilayer(_Values, EffectiveRoughness, Material):
         return row_count(named)
 
     def surface(self, frequency: float) -> Surface:
-        """What it does at `frequency` [Hz]; differentiable in all values."""
+        """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
         return _slab_surface(self.layers, self.weights(), frequency)
 
 

@@ -95,7 +95,7 @@ def slab_tables(
     """Reflectance, transmittance and extra length of a stack of layers in air.
 
     Power coefficients are the mean of both polarisations; so is the extra length, weighted by the
-    power that each lets through. Differentiable in the layers' values.
+    power that each lets through. Differentiable with respect to the layers' values.
 
     Args:
         layers: the layers in the order in which the wave meets them.

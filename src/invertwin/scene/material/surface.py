@@ -99,4 +99,4 @@ class Material(ABC):
 
     @abstractmethod
     def surface(self, frequency: float) -> Surface:
-        """What it does at `frequency` [Hz]; differentiable in the material's values."""
+        """What the surface does at `frequency` [Hz]; its values keep their gradients."""

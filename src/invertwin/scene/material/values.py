@@ -21,8 +21,8 @@ class Texture:
     """Values over a surface from an image, read at the middle of every triangle.
 
     The value is constant on each triangle, so detail finer than the mesh is lost: subdivide the
-    mesh for more. Between pixel centres the image is interpolated bilinearly, outside it goes on
-    as at its border. Differentiable in the image.
+    mesh for more. The image is interpolated bilinearly between pixel centres, and continued by its
+    border values outside. Values are differentiable with respect to the image.
 
     Attributes:
         image: values by row and column, the top row first.

@@ -8,7 +8,6 @@ from invertwin.cli.recordings import recorded
 from invertwin.cli.section import InputPath, about
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting
-from invertwin.radar.boards import board as preset
 from invertwin_studies.recordings import openradar, rail_sar
 
 _ORIGINALS = {
@@ -36,7 +35,7 @@ def openradar_data(folder: InputPath, board: Mounting | None = None) -> ChirpCap
     """
     with about("folder"):
         chirps = openradar.read_chirps(_holding(openradar.FILE, Path(folder)))
-    return replace(recorded(chirps, board or Mounting(preset("xWR1642"))), moving=True)
+    return replace(recorded(chirps, board or Mounting("xWR1642")), moving=True)
 
 
 def _holding(file: str, folder: Path) -> Path:

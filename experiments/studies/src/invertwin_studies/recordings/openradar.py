@@ -9,42 +9,12 @@ from pathlib import Path
 
 import torch
 
-from invertwin.capture.capture import Capture
 from invertwin.capture.chirps import ChirpData, ChirpSettings
-from invertwin.capture.elements import elements
 from invertwin.errors import InputError
-from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.files import read_arrays
 
 FILE = "openradar.npz"
 _TX, _RX = 2, 4
-
-
-def read(
-    folder: str | Path,
-    *,
-    chirps: int | str,
-    board: str = "xWR1642",
-    elevation: int | None = None,
-    azimuth: int = 1,
-    arrays: tuple[AntennaArray, AntennaArray] | None = None,
-) -> Capture:
-    """The recording as a `Capture` of one frame.
-
-    Args:
-        folder: where the file lies.
-        chirps: "mean" or a chirp number, see `ChirpData.capture`; the mean removes what moves.
-        board: preset; the file does not name one, OpenRadar's demos are for the xWR1642.
-        elevation: sign of elevation of the preset, where it has one.
-        azimuth: sign of azimuth of the preset.
-        arrays: TX and RX elements instead of a preset.
-
-    Raises:
-        InputError: what `read_chirps` and `ChirpData.capture` raise.
-    """
-    data = read_chirps(folder)
-    chosen = elements(data.settings, None if arrays else board, elevation, azimuth, arrays)
-    return data.capture(*chosen, chirps=chirps)
 
 
 def read_chirps(folder: str | Path) -> ChirpData:

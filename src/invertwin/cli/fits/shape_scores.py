@@ -17,29 +17,28 @@ from invertwin.inversion.metrics import (
     volume_iou,
 )
 from invertwin.scene import Mesh, Scene
-from invertwin.scene.geometry import without_clouds
+from invertwin.scene.geometry.density import without_clouds
 
 CURVE = "chamfer_m"
 """What the curves show."""
 _BEGINNINGS = ("chamfer", "fscore", "iou", "normal_consistency", "components", "euler_number")
-_WHOSE = {"start_": ", start", "true_": ", truth"}
+_WHOSE = {"start_": ", start", "true_": ", truth", "": ""}
+_PARTS = {"_whole": ", whole surface", "_seen": ", surface that is seen", "": ""}
 
 
 def is_shape_key(key: str) -> bool:
     """Whether a number of a fit is a measure of its shape."""
-    return _parted(key)[0].startswith(_BEGINNINGS)
+    return key.startswith(tuple(whose + name for whose in _WHOSE for name in _BEGINNINGS))
 
 
 def shape_label(key: str) -> str:
     """What a measure is, in words."""
-    name, whose = _parted(key)
-    ending = ""
-    for end, words in (("_whole", ", whole surface"), ("_seen", ", surface that is seen")):
-        if end in name:
-            name, ending = name.replace(end, ""), words
+    whose = next(whose for whose in _WHOSE if key.startswith(whose))
+    part = next(part for part in _PARTS if part in key)
+    name = key.removeprefix(whose).replace(part, "")
     if name.startswith("fscore"):
         name = f"F-score at {name.removeprefix('fscore_').removesuffix('cm')} cm"
-    return texts("shapes").get(name, name) + ending + whose
+    return texts("shapes").get(name, name) + _PARTS[part] + _WHOSE[whose]
 
 
 def short_label(key: str) -> str:
@@ -55,11 +54,11 @@ def check_measures(problem: Problem, start: Scene) -> None:
     Raises:
         InputError: Too many voxels or none, a start without area, or one that is not seen.
     """
-    table = problem.run.measures
-    if table is None or table.object not in problem.known:
+    table = problem.measures
+    if table is None:
         return
     with about("measures"):
-        _likeness(problem, start, table.seen)
+        _compared(problem, start, table.seen)
         truth = _placed(problem.truth, table.object)
         if is_watertight(truth):
             volume_iou(truth, truth, table.voxel)
@@ -72,81 +71,48 @@ def shape_scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     the whole surface, also of the truth, each where it is watertight. What a shape does not have,
     such as one that has collapsed, is left out.
     """
-    table = problem.run.measures
-    if table is None or table.object not in problem.known:
+    table = problem.measures
+    if table is None:
         return {}
-    whole, seen = (_tried(problem, twin, seen) for seen in (False, True))
-    rows = _rows(seen if table.seen else whole, "")
-    rows |= _rows(whole, "_whole") | _rows(seen, "_seen")
-    rows |= _topology(twin, table.object, "") | _topology(problem.truth, table.object, "true_")
-    before = _rows(_tried(problem, start, table.seen), "") | _topology(start, table.object, "")
+    rows = _rows(problem, twin, table.seen)
+    rows |= _rows(problem, twin, False, "_whole") | _rows(problem, twin, True, "_seen")
+    rows |= _topology(twin[table.object].mesh)
+    truth = _topology(problem.truth[table.object].mesh)
+    before = _rows(problem, start, table.seen) | _topology(start[table.object].mesh)
+    rows |= {f"true_{key}": value for key, value in truth.items()}
     return rows | {f"start_{key}": value for key, value in before.items()}
 
 
 def watch_of(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
     """What is noted of the twin during the fit, where the truth is known."""
-    table = problem.run.measures
-    if table is None or table.object not in problem.known:
+    table = problem.measures
+    if table is None:
         return None
 
     def watch(scene: Scene) -> dict[str, float]:
-        found = _placed(without_clouds(scene), table.object)
-        truth = _placed(problem.truth, table.object)
-        eyes = _eyes(problem, table.seen)
-        return {CURVE: compare_shapes(found, truth, seen_from=eyes, voxel=None).chamfer}
+        return {CURVE: _compared(problem, without_clouds(scene), table.seen, volume=False).chamfer}
 
     return watch
 
 
-def _likeness(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics:
-    table = problem.run.measures
+def _compared(problem: Problem, scene: Scene, seen: bool, volume: bool = True) -> ShapeMetrics:
+    table = problem.measures
     assert table is not None
+    eyes = [sight.radar.positions.detach() for sight in problem.sights.values()]
     return compare_shapes(
         _placed(scene, table.object),
         _placed(problem.truth, table.object),
-        seen_from=_eyes(problem, seen),
+        seen_from=torch.cat(eyes) if seen else None,
         thresholds=table.thresholds,
-        voxel=table.voxel,
+        voxel=table.voxel if volume else None,
     )
 
 
-def _tried(problem: Problem, scene: Scene, seen: bool) -> ShapeMetrics | None:
-    """Like ``_likeness``; None if the shape is empty or invisible."""
+def _rows(problem: Problem, scene: Scene, seen: bool, ending: str = "") -> dict[str, Any]:
+    """Measures as metrics keep them; none if the shape is empty or invisible."""
     try:
-        return _likeness(problem, scene, seen)
+        found = _compared(problem, scene, seen)
     except InputError:
-        return None
-
-
-def _eyes(problem: Problem, seen: bool) -> Any:
-    if not seen:
-        return None
-    return torch.cat([sight.radar.positions.detach() for sight in problem.sights.values()])
-
-
-def _placed(scene: Scene, name: str) -> Mesh:
-    """The object's mesh in the world."""
-    return Mesh(scene[name].vertices.detach(), scene[name].mesh.faces)
-
-
-def _topology(scene: Scene, name: str, whose: str) -> dict[str, Any]:
-    mesh = scene[name].mesh
-    if not is_watertight(mesh):
-        return {}
-    found = topology(mesh)
-    return {f"{whose}components": found.components, f"{whose}euler_number": found.euler_number}
-
-
-def _parted(key: str) -> tuple[str, str]:
-    """A measure without whose it is, and whose it is in words."""
-    for whose, words in _WHOSE.items():
-        if key.startswith(whose):
-            return key.removeprefix(whose), words
-    return key, ""
-
-
-def _rows(found: ShapeMetrics | None, ending: str) -> dict[str, Any]:
-    if found is None:
         return {}
     rows: dict[str, Any] = {f"chamfer{ending}_m": found.chamfer}
     for threshold, value in found.fscore.items():
@@ -154,3 +120,12 @@ def _rows(found: ShapeMetrics | None, ending: str) -> dict[str, Any]:
     if found.iou is not None:
         rows[f"iou{ending}"] = found.iou
     return rows | {f"normal_consistency{ending}": found.normal_consistency}
+
+
+def _topology(mesh: Mesh) -> dict[str, Any]:
+    return dict(vars(topology(mesh))) if is_watertight(mesh) else {}
+
+
+def _placed(scene: Scene, name: str) -> Mesh:
+    """The object's mesh in the world."""
+    return Mesh(scene[name].vertices.detach(), scene[name].mesh.faces)

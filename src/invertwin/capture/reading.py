@@ -1,0 +1,56 @@
+"""One function for all recordings that the library reads."""
+
+from pathlib import Path
+
+from invertwin.capture import described_arrays, ti
+from invertwin.capture.capture import Capture
+from invertwin.capture.chirp_capture import ChirpCapture
+from invertwin.capture.chirps import ChirpSettings
+from invertwin.errors import InputError
+from invertwin.radar.boards import Elements, Mounting
+
+
+def read(
+    path: str | Path,
+    settings: str | Path | ChirpSettings | None = None,
+    *,
+    board: Mounting | Elements | None = None,
+    lanes: int | None = None,
+) -> Capture | ChirpCapture:
+    """Read a recording, as the ending of its file says.
+
+    A `.nc` is a saved capture. A `.toml` describes samples in a file beside it
+    (`described_arrays.read_chirps`). A `.bin` or `.setup.json` comes from a DCA1000
+    (`ti.read_recording`).
+
+    Args:
+        path: the file.
+        settings: of a `.bin`, or their file: `.cfg` or `.mmwave.json`.
+        board: whose elements recorded, or (transmitters, receivers), see `ChirpData.recorded`;
+            None = as the description says.
+        lanes: lanes of the LVDS link, where the settings do not say.
+
+    Returns:
+        One signal per frame and channel, or every chirp of the frames: `ChirpCapture.capture`
+        makes one signal of them.
+
+    Raises:
+        InputError: another ending, no board, or what the reader raises.
+    """
+    ending = Path(path).suffix.lower()
+    if ending == ".nc":
+        return Capture.load(path)
+    if ending == ".toml":
+        chirps = described_arrays.read_chirps(path)
+        return chirps.recorded(board or described_arrays.described_board(path))
+    if ending not in (".bin", ".json"):
+        raise InputError(
+            f"expected a recording that ends in .bin, .setup.json, .toml or .nc, got {path}; "
+            "convert it"
+        )
+    if board is None:
+        raise InputError(
+            "expected the board that recorded, got none; name a preset of invertwin.radar.boards "
+            "as it was mounted"
+        )
+    return ti.read_recording(path, settings, lanes).recorded(board)

@@ -1,0 +1,141 @@
+"""Where an object stands by conventional processing, for a fit to start there."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from annotated_types import Gt, Lt
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.capture import Capture
+from invertwin.channel import Grid
+from invertwin.errors import InputError
+from invertwin.inversion.initial import (
+    Ground,
+    best_pose,
+    detected_points,
+    fit_rectangle,
+    guess_poses,
+    guess_position,
+    guess_scale,
+    image_points,
+    largest_group,
+    principal_rectangle,
+)
+from invertwin.limits import Positive
+from invertwin.radar.surrogate import Surrogate
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.pose import rigid
+from invertwin.scene.scene import Scene
+
+# Wide enough for a guess that is off by a cell, sharp enough to tell front from back.
+_KERNELS = Surrogate(range_width=1.0, angle_width=0.5)
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A scene with an object where conventional processing has found it.
+
+    Attributes:
+        scene: The scene.
+        points: Number of echoes that the object was found by.
+        losses: Of the poses that were tried, where there were several.
+        size: Of the rectangle around the echoes, where one was fitted [m].
+    """
+
+    scene: Scene
+    points: int = 0
+    losses: list[float] = field(default_factory=list)
+    size: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class FirstPose:
+    """How an object is found by conventional processing.
+
+    Attributes:
+        low: m, corner of the box of the world that is searched; needed unless the pose is known
+        high: m, its opposite corner
+        method: points = of a CFAR detector; image = backprojected power
+        pose: how it stands: the near sides of a rectangle, principal axes, no turn, or as the
+            scene says: then its density alone is guessed
+        scale: size from the rectangle, too
+        up: world axis of heights
+        false_alarm: of a cell of noise, for points
+        step: m, of the image
+        gap: m; echoes with wider gaps between them are not of one object
+
+    Raises:
+        InputError: A box that is missing, or not needed.
+    """
+
+    low: Float64[Tensor, "3"] | None = None
+    high: Float64[Tensor, "3"] | None = None
+    method: Literal["points", "image"] = "points"
+    pose: Literal["rectangle", "axes", "position", "known"] = "rectangle"
+    scale: bool = False
+    up: Literal["y", "z"] = "y"
+    false_alarm: Annotated[float, Gt(0), Lt(1)] = 1e-6
+    step: Positive = 0.1
+    gap: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high"):
+            if (getattr(self, name) is None) != (self.pose == "known"):
+                no, do = ("no ", "remove it") if self.pose == "known" else ("", "add it")
+                raise InputError(f'expected {no}`{name}` with pose = "{self.pose}"; {do}')
+
+    def find(
+        self,
+        scene: Scene,
+        name: str,
+        capture: Capture,
+        grid: Grid,
+        *,
+        loss: Callable[[Tensor, Tensor], Tensor],
+        seed: int = 0,
+    ) -> Guess:
+        """Put an object where its echoes are.
+
+        Args:
+            scene: With the object anywhere.
+            name: Of the object.
+            capture: The data.
+            grid: Bins of its maps.
+            loss: How maps are compared, where several poses are tried.
+            seed: Of their simulation.
+
+        Raises:
+            InputError: No echoes, or too few points.
+        """
+        if self.low is None or self.high is None:
+            return Guess(scene)
+        if self.method == "points":
+            points = detected_points(
+                capture, grid, self.low, self.high, false_alarm=self.false_alarm
+            )
+        else:
+            points = image_points(capture, grid, self.low, self.high, step=self.step)
+        points = largest_group(points, self.gap)
+        plane, item, radar = Ground(self.up), scene[name], capture.radar()
+        if self.pose == "position":
+            shift = guess_position(points) - item.center.detach()
+            shift[plane.vertical] = 0.0
+            moved = rigid(translation=shift) @ item.transform
+            return Guess(scene.replace(name, pose=moved), len(points))
+        if self.pose == "axes":
+            rectangle = principal_rectangle(points, ground=plane)
+        else:
+            resolution = radar.waveform.range_resolution
+            rectangle = fit_rectangle(points, radar, ground=plane, resolution=resolution)
+        if self.scale:
+            factor = guess_scale(item, rectangle, ground=plane)
+            middle = item.mesh.center
+            mesh = Mesh(middle + (item.mesh.vertices - middle) * factor, item.mesh.faces)
+            scene = scene.replace(name, mesh=mesh)
+        poses = guess_poses(scene[name], rectangle, radar, ground=plane)
+        scene, losses = best_pose(
+            scene, name, poses, radar, capture, grid, loss=loss, surrogate=_KERNELS, seed=seed
+        )
+        return Guess(scene, len(points), losses, rectangle.size)
