@@ -125,11 +125,12 @@ def music(
         values = torch.linalg.eigvalsh(covariance.detach())
         count = source_count(values, snapshots.values.shape[-2], sources)
     else:
-        most = min(elements - 1, snapshots.values.shape[-2])
-        if not 0 <= sources <= most:
+        seen = snapshots.values.shape[-2]
+        if not 0 <= sources <= min(elements - 1, seen):
             raise InputError(
-                f"expected at most {most} sources, fewer than the elements of a (sub)array and not "
-                f"more than the snapshots, got {sources}; give more chirps, or other smoothing"
+                f"expected 0 to {elements - 1} sources, so that a noise subspace remains, and at "
+                f"most {seen} sources from as many snapshots, got {sources}; give more chirps or "
+                "other smoothing"
             )
         count = torch.full(covariance.shape[:2], sources, device=covariance.device)
     # Eigenvalues ascend: the signal's are the last.

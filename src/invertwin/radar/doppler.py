@@ -87,8 +87,8 @@ def range_doppler(
     """
     expected = (radar.frame_count, chirps.count)
     bins = chirps.count if bins is None else bins
-    what, do = "a beat signal (frame, chirp, tx, rx, sample)", "use what recorded it"
-    check_shape(beat, (*expected, None, None, None), what, do)
+    what = f"signals (frame, chirp, tx, rx, sample) of {chirps.count} chirps"
+    check_shape(beat, (*expected, None, None, None), what, "use the timing that recorded them")
     if bins < chirps.count:
         raise InputError(
             f"expected at least {chirps.count} bins, one per chirp, got {bins}; use fewer chirps "
@@ -121,8 +121,9 @@ def compensate_tdm(
     Raises:
         InputError: Another number of transmitters in the spectrum than in the radar.
     """
-    what, do = "a spectrum (frame, velocity, tx, rx, range)", "use the radar that recorded it"
-    check_shape(spectrum, (None, None, radar.shape[1], None, None), what, do)
+    expected = None, None, radar.shape[1], None, None
+    what = f"a spectrum (frame, velocity, tx, rx, range) of {radar.shape[1]} transmitters"
+    check_shape(spectrum, expected, what, "use the radar that recorded it")
     frames, count, transmitters, _, ranges = spectrum.shape
     folds = torch.as_tensor(fold).cpu().expand(frames, count, ranges).to(torch.float64)
     rate = velocity_axis(radar, chirps, count)[:, None] + folds * velocity_span(radar, chirps)
