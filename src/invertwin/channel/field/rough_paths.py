@@ -24,11 +24,7 @@ from invertwin.channel.rays.arrays import (
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry, flatten
 from invertwin.channel.rays.scene import RayScene, face_areas
-from invertwin.channel.reference.radar_equation import (
-    SurfacePaths,
-    passed,
-    radar_equation,
-)
+from invertwin.channel.reference.radar_equation import SurfacePaths, passed, radar_equation
 from invertwin.scene.scene import Scene
 
 _LANES = 1 << 18  # walked at a time
