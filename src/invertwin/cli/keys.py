@@ -2,7 +2,7 @@
 
 import difflib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from invertwin.cli.report import Table
@@ -32,7 +32,7 @@ def key_tables(section: str | None = None) -> list[Table]:
     Raises:
         InputError: There is no such section.
     """
-    found = dict(_Reader(json_schema()).tables())
+    found = dict(_sections(json_schema()))
     if section is None:
         return [table for tables in found.values() for table in tables]
     wanted = section.strip("[]")
@@ -52,98 +52,81 @@ def _plain(name: str) -> str:
     return name.replace(".<name>", "").replace("[", "").replace("]", "")
 
 
-class _Reader:
-    """Walks the schema from the top; a table that comes again is referred to."""
+def _sections(top: Schema) -> Iterator[tuple[str, list[Table]]]:
+    """Path and tables of every section, each right before those inside it.
 
-    def __init__(self, schema: Schema) -> None:
-        self._top = schema
-        self._models: dict[str, Schema] = schema.get("$defs", {})
-        self._seen: dict[object, str] = {}
+    The top level comes first; its path is empty. A table that comes again is referred to.
+    """
+    defined: dict[str, Schema] = top.get("$defs", {})
+    seen: dict[frozenset[str], str] = {}
 
-    def tables(self) -> Iterator[tuple[str, list[Table]]]:
-        """Path and tables of every section, the top level first (its path is empty)."""
-        waiting: list[tuple[str, list[Schema]]] = [("", [self._top])]
-        while waiting:
-            path, models = waiting.pop(0)
-            inner: list[tuple[str, list[Schema]]] = []
-            yield path, list(self._section(path, models, inner))
-            # A section comes right before those inside it.
-            waiting = inner + waiting
-
-    def _section(
-        self, path: str, models: Sequence[Schema], inner: list[tuple[str, list[Schema]]]
-    ) -> Iterator[Table]:
+    def walk(path: str, models: Sequence[Schema]) -> Iterator[tuple[str, list[Table]]]:
         title = f"[{path}]" if path else "top of the file, and its sections"
         common = set.intersection(*map(_untagged, models)) if len(models) > 1 else set()
         shared = [key for key in models[0]["properties"] if (key, _note(models[0], key)) in common]
+        inner: list[tuple[str, list[Schema]]] = []
+        tables = []
         if shared:
-            rows = self._rows(path, models[0], shared, inner)
-            yield Table(f"{title}, all kinds", COLUMNS, rows, "")
+            rows = [row(path, models[0], key, inner) for key in shared]
+            tables.append(Table(f"{title}, all kinds", COLUMNS, rows, ""))
         for model in models:
             keys = [key for key in model.get("properties", {}) if key not in shared]
-            rows = self._rows(path, model, keys, inner)
+            rows = [row(path, model, key, inner) for key in keys]
             tag = "".join(f" {key} = {value}" for key, value in _tags(model).items())
             own = title if len(models) == 1 else f"{title}{tag or f' with {keys[0]}'}"
             document = " ".join(model.get("description", "").split())
             if rows or document:
-                yield Table(own, COLUMNS, rows, document)
+                tables.append(Table(own, COLUMNS, rows, document))
+        yield path, tables
+        for place, kinds in inner:
+            yield from walk(place, kinds)
 
-    def _rows(
-        self,
-        path: str,
-        model: Schema,
-        keys: Sequence[str],
-        inner: list[tuple[str, list[Schema]]],
-    ) -> list[list[Any]]:
-        rows = []
-        for key in keys:
-            value, note = model["properties"][key], _note(model, key)
-            below = self._below(value)
-            place = f"{path}.{key}" if path else key
-            if "additionalProperties" in value and below and not path:
-                place += ".<name>"
-            elif value.get("type") == "array" and below and not path:
-                place = f"[{key}]"
-            identity = frozenset(str(_tags(m) or m["title"]) for m in below)
-            if below and identity in self._seen:
-                note += f"; keys as in [{self._seen[identity]}]"
-            elif below:
-                inner.append((place, below))
-                self._seen[identity] = place
-            default = None if key in model.get("required", ()) else _default(value)
-            required = "required" if key in model.get("required", ()) else default
-            rows.append([key, self._described(value), required, note])
-        return rows
+    def row(path: str, model: Schema, key: str, inner: list[tuple[str, list[Schema]]]) -> list[Any]:
+        value, note = model["properties"][key], _note(model, key)
+        below = _below(value, defined)
+        place = f"{path}.{key}" if path else key
+        if "additionalProperties" in value and below and not path:
+            place += ".<name>"
+        elif value.get("type") == "array" and below and not path:
+            place = f"[{key}]"
+        identity = frozenset(str(_tags(found) or found["title"]) for found in below)
+        if below and identity in seen:
+            note += f"; keys as in [{seen[identity]}]"
+        elif below:
+            inner.append((place, below))
+            seen[identity] = place
+        required = key in model.get("required", ())
+        return [key, _described(value), "required" if required else _default(value), note]
 
-    def _below(self, value: Schema) -> list[Schema]:
-        """The tables that a value may be, or hold."""
-        if "$ref" in value:
-            model = self._models[value["$ref"].rpartition("/")[2]]
-            return [model] if "properties" in model else []
-        parts = [*value.get("anyOf", ()), *value.get("oneOf", ())]
-        parts += [value[k] for k in ("items", "additionalProperties") if _is_schema(value.get(k))]
-        found = {id(model): model for part in parts for model in self._below(part)}
-        return list(found.values())
-
-    def _described(self, value: Schema) -> str:
-        parts = [*value.get("anyOf", ()), *value.get("oneOf", ())]
-        if parts:
-            words = [self._described(part) for part in parts if part.get("type") != "null"]
-            return " or ".join(dict.fromkeys(words))
-        if "const" in value or "enum" in value:
-            return ", ".join(map(_shown, value.get("enum", [value.get("const")])))
-        if value.get("type") == "array":
-            item, least = self._described(value.get("items", {})), value.get("minItems")
-            exact = least is not None and least == value.get("maxItems")
-            return f"{least} × {item}" if exact else f"list of {item}"
-        if "$ref" in value or value.get("type", "object") == "object":
-            return "table"
-        signs = [f"{sign} {value[name]:.10g}" for name, sign in _SIGNS.items() if name in value]
-        return " ".join([_WORDS[value["type"]], ", ".join(signs)]).strip()
+    yield from walk("", [top])
 
 
-def _is_schema(value: Any) -> bool:
-    return isinstance(value, dict)
+def _below(value: Schema, defined: Mapping[str, Schema]) -> list[Schema]:
+    """The tables that a value may be, or hold."""
+    if "$ref" in value:
+        model = defined[value["$ref"].rpartition("/")[2]]
+        return [model] if "properties" in model else []
+    held = [value[key] for key in ("items", "additionalProperties") if key in value]
+    parts = [*value.get("anyOf", ()), *value.get("oneOf", ()), *held]
+    tables = (part for part in parts if isinstance(part, dict))
+    return list({id(model): model for part in tables for model in _below(part, defined)}.values())
+
+
+def _described(value: Schema) -> str:
+    parts = [*value.get("anyOf", ()), *value.get("oneOf", ())]
+    if parts:
+        words = [_described(part) for part in parts if part.get("type") != "null"]
+        return " or ".join(dict.fromkeys(words))
+    if "const" in value or "enum" in value:
+        return ", ".join(map(_shown, value.get("enum", [value.get("const")])))
+    if value.get("type") == "array":
+        item, least = _described(value.get("items", {})), value.get("minItems")
+        exact = least is not None and least == value.get("maxItems")
+        return f"{least} × {item}" if exact else f"list of {item}"
+    if "$ref" in value or value.get("type", "object") == "object":
+        return "table"
+    signs = [f"{sign} {value[name]:.10g}" for name, sign in _SIGNS.items() if name in value]
+    return " ".join([_WORDS[value["type"]], ", ".join(signs)]).strip()
 
 
 def _note(model: Schema, key: str) -> str:

@@ -1,7 +1,6 @@
 """Shapes of run files: objects and their parts, and what is sought of them."""
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import torch
@@ -13,11 +12,9 @@ from invertwin.cli.section import Counts, InputPath, Vector, about, key
 from invertwin.errors import InputError
 from invertwin.inversion.prior import LatentNorm
 from invertwin.inversion.regularization import Laplacian, Regularizer
-from invertwin.inversion.remeshing import signed_distance
-from invertwin.limits import RADIANS, Axes, Count, NonNegative, Positive
+from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.radar.parameters import RadarPose
 from invertwin.scene import (
-    BodyTemplate,
     DensityGrid,
     DistanceGrid,
     LatticeDeformation,
@@ -30,20 +27,14 @@ from invertwin.scene import (
     SkinnedBody,
     SmoothVertices,
     joined,
-    load_anny,
     load_prior,
-    load_smpl,
-    person,
     rigid,
     rotation_from_vector,
     shapes,
 )
 from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.geometry.body_models import body, body_template
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
-
-Angles = Annotated[dict[str, Vector], RADIANS]
-_AT_REST: dict[str, list[float]] = {}
 
 
 class Placement(Table):
@@ -134,9 +125,9 @@ def register(registry: Registry) -> None:
         ("scale", Scale, ("initial",)),
         ("vertices", vertices, ()),
         ("lattice", LatticeDeformation, ()),
-        ("distance_grid", distance_grid, ()),
+        ("distance_grid", DistanceGrid.of_mesh, ()),
         ("neural_distance", NeuralDistance, ("seed",)),
-        ("density", density, ()),
+        ("density", DensityGrid.of_object, ()),
         ("prior", prior, ()),
         ("body", joints, ()),
         ("material", MaterialValues.of, ()),
@@ -171,45 +162,6 @@ def vertices(
     return Vertices(object, len(mesh.vertices))
 
 
-def distance_grid(
-    object: str,
-    low: Vector,
-    high: Vector,
-    counts: Counts,
-    mesh: Mesh,
-    smooth: NonNegative = 0.0,
-) -> DistanceGrid:
-    """A signed distance on a grid, whose zero is the surface; starts as the object's mesh."""
-    distance: Callable[[Tensor], Tensor] = partial(signed_distance, mesh)
-    return DistanceGrid.sampled(object, low, high, counts, distance, smooth)
-
-
-def density(
-    object: str,
-    low: Vector,
-    high: Vector,
-    counts: Counts,
-    item: Object,
-    extinction: Positive | None = None,
-) -> DensityGrid:
-    """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else as
-    `extinction` says. Rates of about 0.1 suit it; measures and pictures show the surface of its
-    usual level.
-
-    Args:
-        extinction: 1/m, of a cloud that fills the object's mesh; without it the whole box is faint.
-    """
-    if item.cloud is not None:
-        cloud = item.cloud
-        return DensityGrid(object, cloud.low, cloud.high, cloud.density.detach())
-    if extinction is None:
-        return DensityGrid.even(object, low, high, counts)
-    lattice = Lattice.between(low, high, counts)
-    inside = -signed_distance(item.mesh, lattice.nodes.reshape(-1, 3)) / lattice.spacing.mean()
-    filled = extinction * torch.sigmoid(4 * inside).reshape(lattice.counts)
-    return DensityGrid(object, low, high, filled)
-
-
 def prior(
     object: str,
     table: ObjectTable | None = None,
@@ -226,37 +178,6 @@ def prior(
     known: Any = table
     same = _shape(known) == "prior" and known.prior == file
     return PriorShape(object, load_prior(file), known.latent if same else None, counts)
-
-
-def body(
-    model: Literal["person", "anny"] = "person",
-    file: InputPath | None = None,
-    height: Positive = 1.75,
-    spacing: Positive = 0.03,
-    angles: Angles = _AT_REST,
-) -> Mesh:
-    """A body with joints and one skin, y up, facing −z, in the frame of its model.
-
-    Args:
-        model: person = made of formulas, arms held out at rest; anny = of the extra `anny`.
-        file: SMPL's layout (.npz), from the run file's folder; in place of a model.
-        height: m, of `person`.
-        spacing: m, of the corners of its triangles.
-        angles: rotation vectors of joints by name, each in the frame of the joint before; others
-            at rest.
-
-    Raises:
-        InputError: A file is missing or broken, the extra `anny` is not installed, or no such
-            joint.
-    """
-    return _template(model, file, height, spacing).mesh(angles)
-
-
-@cache
-def _template(model: str, file: str | None, height: float, spacing: float) -> BodyTemplate:
-    if file is not None:
-        return load_smpl(file)
-    return load_anny() if model == "anny" else person(height, spacing)
 
 
 def joints(
@@ -279,8 +200,8 @@ def joints(
             f'expected an object with shape = "body", got {object}; give it this shape, or use '
             'kind = "pose"'
         )
-    found = _template(known.model, known.file, known.height, known.spacing).scaled(known.scale)
-    return SkinnedBody.of(object, found, mesh, joints)
+    found = body_template(known.model, known.file, known.height, known.spacing)
+    return SkinnedBody.of(object, found.scaled(known.scale), mesh, joints)
 
 
 def _shape(table: Any) -> str | None:

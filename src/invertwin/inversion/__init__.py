@@ -35,7 +35,6 @@ from invertwin.inversion.reconstruction import reconstruct as reconstruct
 from invertwin.inversion.regularization import Laplacian as Laplacian
 from invertwin.inversion.regularization import Regularizer as Regularizer
 from invertwin.inversion.remeshing import remeshed as remeshed
-from invertwin.inversion.remeshing import signed_distance as signed_distance
 from invertwin.inversion.schedule import Schedule as Schedule
 from invertwin.inversion.schedule import Stage as Stage
 from invertwin.inversion.starts import displaced as displaced

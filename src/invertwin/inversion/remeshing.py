@@ -1,4 +1,4 @@
-"""Remesh surfaces between the stages of a fit, and measure distances to them.
+"""Remesh surfaces between the stages of a fit.
 
 Remeshing is written out here because no library (in 2026) serves all platforms: gpytoolbox has
 no wheels for Linux on ARM, pymeshlab is GPL, trueform is for noncommercial use, pyacvd needs VTK
@@ -12,8 +12,6 @@ from typing import Any
 import igl
 import numpy as np
 import torch
-from jaxtyping import Float64
-from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import checked_number
@@ -52,24 +50,6 @@ def remeshed(mesh: Mesh, edge: float) -> Mesh:
         surface.flip()
         surface.relax(mesh)
     return surface.mesh()
-
-
-def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
-    """Distance of points to a surface [m], negative where it winds around them.
-
-    Overlapping parts of a closed mesh count as their union. Across a hole in a mesh the sign
-    changes where half of the directions meet the surface.
-
-    Args:
-        mesh: the surface.
-        points: positions in the mesh's frame [m].
-    """
-    if not len(points):
-        return torch.zeros(0, dtype=torch.float64)
-    places, surface = points.detach().numpy(), _arrays(mesh)
-    square = igl.point_mesh_squared_distance(places, *surface)[0]
-    inside = np.asarray(igl.winding_number(*surface, places)) > 0.5
-    return torch.from_numpy(np.where(inside, -1.0, 1.0) * np.sqrt(square))
 
 
 def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:

@@ -2,13 +2,16 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 
+import igl
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.limits import Count, Positive
+from invertwin.limits import Count, NonNegative, Positive
 from invertwin.scene.checks import (
     ArrayLike,
     Counts,
@@ -21,6 +24,25 @@ from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice, cubic
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
+
+
+def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
+    """Distance of points to a surface [m], negative where it winds around them.
+
+    Overlapping parts of a closed mesh count as their union. Across a hole in a mesh the sign
+    changes where half of the directions meet the surface.
+
+    Args:
+        mesh: the surface.
+        points: positions in the mesh's frame [m].
+    """
+    if not len(points):
+        return torch.zeros(0, dtype=torch.float64)
+    places = points.detach().numpy()
+    surface = mesh.vertices.detach().numpy(), mesh.faces.numpy()
+    square = igl.point_mesh_squared_distance(places, *surface)[0]
+    inside = np.asarray(igl.winding_number(*surface, places)) > 0.5
+    return torch.from_numpy(np.where(inside, -1.0, 1.0) * np.sqrt(square))
 
 
 class _Distance(ObjectModule):
@@ -111,6 +133,31 @@ class DistanceGrid(_Distance):
         with torch.no_grad():
             value = distance(lattice.nodes.reshape(-1, 3))
         return cls(object, low, high, value.reshape(lattice.counts), smoothing)
+
+    @classmethod
+    def of_mesh(
+        cls,
+        object: str,
+        low: Point,
+        high: Point,
+        counts: Counts,
+        mesh: Mesh,
+        smooth: NonNegative = 0.0,
+    ) -> "DistanceGrid":
+        """A signed distance on a grid, whose zero is the surface; starts as a mesh.
+
+        Args:
+            object: name of the object.
+            low: corner of the box in the object's frame [m].
+            high: the opposite corner [m].
+            counts: nodes along x, y and z.
+            mesh: in the object's frame.
+            smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = none.
+
+        Raises:
+            InputError: as above.
+        """
+        return cls.sampled(object, low, high, counts, partial(signed_distance, mesh), smooth)
 
     @property
     def distances(self) -> Float64[Tensor, "x y z"]:

@@ -1,0 +1,60 @@
+"""Bodies with joints by the name of their model, or from a file."""
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Literal
+
+from invertwin.limits import RADIANS, Positive
+from invertwin.scene.checks import Point
+from invertwin.scene.geometry.anny_body import load_anny
+from invertwin.scene.geometry.body import BodyTemplate, load_smpl
+from invertwin.scene.geometry.person import person
+from invertwin.scene.mesh import Mesh
+
+Model = Literal["person", "anny"]
+_AT_REST: dict[str, Point] = {}
+
+
+@cache
+def body_template(
+    model: Model = "person",
+    file: Path | str | None = None,
+    height: Positive = 1.75,
+    spacing: Positive = 0.03,
+) -> BodyTemplate:
+    """The template of a body, y up, facing −z; arguments as in `body`.
+
+    Args:
+        model: person or anny.
+        file: in place of a model.
+        height: m, of `person`.
+        spacing: m, of the corners of its triangles.
+    """
+    if file is not None:
+        return load_smpl(file)
+    return load_anny() if model == "anny" else person(height, spacing)
+
+
+def body(
+    model: Model = "person",
+    file: Path | str | None = None,
+    height: Positive = 1.75,
+    spacing: Positive = 0.03,
+    angles: Annotated[Mapping[str, Point], RADIANS] = _AT_REST,
+) -> Mesh:
+    """A body with joints and one skin, y up, facing −z, in the frame of its model.
+
+    Args:
+        model: person = made of formulas, arms held out at rest; anny = of the extra `anny`.
+        file: SMPL's layout (.npz), in place of a model.
+        height: m, of `person`.
+        spacing: m, of the corners of its triangles.
+        angles: rotation vectors of joints by name, each in the frame of the joint before; others
+            at rest.
+
+    Raises:
+        InputError: a file is missing or broken, the extra `anny` is not installed, or no such
+            joint.
+    """
+    return body_template(model, file, height, spacing).mesh(angles)
