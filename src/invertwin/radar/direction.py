@@ -128,9 +128,9 @@ def music(
         seen = snapshots.values.shape[-2]
         if not 0 <= sources <= min(elements - 1, seen):
             raise InputError(
-                f"expected 0 to {elements - 1} sources, so that a noise subspace remains, and at "
-                f"most {seen} sources from as many snapshots, got {sources}; give more chirps or "
-                "other smoothing"
+                f"expected 0 to {elements - 1} sources, fewer than the {elements} elements of a "
+                f"(sub)array, and at most {seen} sources from as many snapshots, got {sources}; "
+                "give more chirps or other smoothing"
             )
         count = torch.full(covariance.shape[:2], sources, device=covariance.device)
     # Eigenvalues ascend: the signal's are the last.
