@@ -24,6 +24,7 @@ from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 _GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
+_ROWS_AT_ONCE = 1 << 18  # frames × paths
 
 
 def trace_field(
@@ -91,15 +92,15 @@ def _fields(
     rays: RayScene, paths: SurfacePaths, kind: str, field: Callable[[SurfacePaths, Echo], Tensor]
 ) -> list[Paths]:
     """The paths in every frame in which their field does not vanish."""
-    found = []
-    for number in range(rays.link.frame_count):
-        frame = torch.full((len(paths.weight),), number)
-        seen = unblocked(rays, frame, paths)
-        kept = paths.keep(seen)
+    found, count = [], len(paths.weight)
+    frames = torch.arange(rays.link.frame_count)
+    for some in frames.split(max(1, _ROWS_AT_ONCE // max(1, count))):
+        frame, row = some.repeat_interleave(count), torch.arange(count).repeat(len(some))
+        seen = unblocked(rays, frame, paths.keep(row))
+        kept = paths.keep(row[seen])
         echo = path_view(rays, frame[seen], kept)
-        rows = echo.paths(
-            kind, coefficient=field(kept, echo), velocity=kept.velocity(rays.geometry)
-        )
+        velocity = kept.velocity(rays.geometry)
+        rows = echo.paths(kind, coefficient=field(kept, echo), velocity=velocity)
         found.append(rows.chosen(rows.coefficient != 0))
     return found
 

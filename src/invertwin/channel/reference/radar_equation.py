@@ -55,9 +55,9 @@ class SurfacePaths:
     weight: Float64[Tensor, " n"]
     phase: Float64[Tensor, " n"]
 
-    def keep(self, mask: Bool[Tensor, " n"]) -> "SurfacePaths":
-        """Some of the rows."""
-        return SurfacePaths(*(column[mask] for column in vars(self).values()))
+    def keep(self, rows: Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> "SurfacePaths":
+        """The rows of a mask, or of indices."""
+        return SurfacePaths(*(column[rows] for column in vars(self).values()))
 
     def places(self, geometry: Geometry) -> list[Place]:
         """Where the points are now."""
