@@ -1,6 +1,7 @@
 """Samples in NumPy, HDF5 or MATLAB files, described by a small TOML file beside them."""
 
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,11 @@ from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
 from invertwin.scene.files import UNREADABLE, existing_file, replacing
 
+# The data tell these settings by their shape and kind.
+_TOLD = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
 _KEYS = {
     "data": {"file", "variable", "dimensions", "conjugate"},
-    "settings": {
-        "start_frequency",
-        "slope",
-        "sample_rate",
-        "transmit_order",
-        "receivers",
-        "frame_period",
-        "idle_time",
-        "adc_start_time",
-        "ramp_end_time",
-        "bits",
-    },
+    "settings": {field.name for field in fields(ChirpSettings)} - _TOLD,
     "radar": {"board", "elevation", "azimuth", "tx_positions", "rx_positions"},
 }
 _ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")

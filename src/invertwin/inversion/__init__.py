@@ -29,10 +29,10 @@ from invertwin.inversion.mover import strongest_mover as strongest_mover
 from invertwin.inversion.observation import Observation as Observation
 from invertwin.inversion.observation import Unknown as Unknown
 from invertwin.inversion.optimizer import Optimizer as Optimizer
-from invertwin.inversion.prior import LatentNorm as LatentNorm
 from invertwin.inversion.reconstruction import Reconstruction as Reconstruction
 from invertwin.inversion.reconstruction import reconstruct as reconstruct
 from invertwin.inversion.regularization import Laplacian as Laplacian
+from invertwin.inversion.regularization import LatentNorm as LatentNorm
 from invertwin.inversion.regularization import Regularizer as Regularizer
 from invertwin.inversion.remeshing import remeshed as remeshed
 from invertwin.inversion.schedule import Schedule as Schedule

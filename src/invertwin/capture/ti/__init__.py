@@ -2,11 +2,11 @@
 
 from invertwin.capture.ti.dca1000 import read_recording as read_recording
 from invertwin.capture.ti.dca1000 import read_samples as read_samples
+from invertwin.capture.ti.dca1000 import read_settings as read_settings
+from invertwin.capture.ti.dca1000 import recorded_files as recorded_files
 from invertwin.capture.ti.dca1000 import write_samples as write_samples
 from invertwin.capture.ti.mmwave_studio import read_studio as read_studio
 from invertwin.capture.ti.mmwave_studio import write_setup as write_setup
 from invertwin.capture.ti.mmwave_studio import write_studio as write_studio
 from invertwin.capture.ti.sdk_cfg import read_cfg as read_cfg
 from invertwin.capture.ti.sdk_cfg import write_cfg as write_cfg
-from invertwin.capture.ti.settings_files import read_settings as read_settings
-from invertwin.capture.ti.settings_files import recorded_files as recorded_files

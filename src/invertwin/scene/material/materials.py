@@ -1,7 +1,8 @@
 """The materials that come with the library.
 
 Every value may be a number, one number per triangle of the mesh, or a `Texture`, and may carry
-gradients; permittivity and conductivity may also follow the ITU table (`Itu`).
+gradients; permittivity and conductivity may also follow the ITU table (`Itu`). A value outside of
+its range raises `InputError`.
 """
 
 from collections.abc import Sequence
@@ -156,9 +157,6 @@ class RoughConductor(_Values, EffectiveRoughness, Material):
     """A perfect conductor with a rough surface: all power comes back, spread by the roughness.
 
     Its fields are those of `EffectiveRoughness`.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     def surface(self, frequency: float) -> Surface:
@@ -177,9 +175,6 @@ class RoughDielectric(Medium, Material):
             into the lobe.
         lobe_width: full width at half maximum of the lobe around the mirror direction [rad],
             in (0, π].
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     diffuse: Value = 1.0
@@ -199,9 +194,6 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
             `EffectiveRoughness`.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     def surface(self, frequency: float) -> Surface:
@@ -220,9 +212,6 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
             `EffectiveRoughness`, of what the outside reflects.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     def surface(self, frequency: float) -> Surface:
@@ -244,9 +233,6 @@ class Layer(Medium):
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`.
         thickness: [m] ≥ 0.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     thickness: Value = field(kw_only=True)
@@ -269,9 +255,6 @@ class Slab(Layer, EffectiveRoughness, Material):
     Attributes:
         permittivity, conductivity, loss_tangent, thickness: see `Layer`; the other fields are
             those of `EffectiveRoughness`, of what it reflects.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     def surface(self, frequency: float) -> Surface:
@@ -289,9 +272,6 @@ class Multilayer(_Values, EffectiveRoughness, Material):
             the same from both sides.
         scattering, rms_slope, lambertian, directive, directive_exponent, backscatter_exponent: see
             `EffectiveRoughness`.
-
-    Raises:
-        InputError: no layers, or a value outside its range.
     """
 
     layers: Annotated[Sequence[Layer], MinLen(1)]
@@ -336,9 +316,5 @@ def _slab_surface(layers: Sequence[Layer], weights: Weights, frequency: float) -
     # The root's derivative is infinite at zero, where the amplitude has none.
     seen = tables.reflectance > _SAFE_POWER
     amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
-    return Surface(
-        amplitude,
-        *weights,
-        transmittance=tables.transmittance,
-        extra_length=tables.extra_length,
-    )
+    through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}
+    return Surface(amplitude, *weights, **through)
