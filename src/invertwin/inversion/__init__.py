@@ -23,6 +23,7 @@ from invertwin.inversion.metrics import topology as topology
 from invertwin.inversion.metrics import volume_iou as volume_iou
 from invertwin.inversion.mover import Echo as Echo
 from invertwin.inversion.mover import MoverMaps as MoverMaps
+from invertwin.inversion.mover import MoverTwin as MoverTwin
 from invertwin.inversion.mover import MovingBody as MovingBody
 from invertwin.inversion.mover import of_point as of_point
 from invertwin.inversion.mover import strongest_mover as strongest_mover

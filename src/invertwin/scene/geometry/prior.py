@@ -63,6 +63,8 @@ class ShapePrior:
     Attributes:
         decoder: the network, float64, without gradients.
         lattice: the decoder's nodes, both halves.
+        latent_size: number of coordinates of a shape.
+        low, high: corners of the box that holds all shapes [m].
 
     Raises:
         InputError: a network for another number of nodes, or nodes that do not mirror in y.
@@ -81,22 +83,9 @@ class ShapePrior:
             )
         self.decoder = decoder.double().requires_grad_(False)
         self.lattice = lattice
+        self.latent_size = decoder.enter.in_features
+        self.low, self.high = lattice.low, lattice.high
         self._last: tuple[tuple[int, ...], Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
-
-    @property
-    def latent_size(self) -> int:
-        """Coordinates of a shape."""
-        return self.decoder.enter.in_features
-
-    @property
-    def low(self) -> Float64[Tensor, "3"]:
-        """Corner of the box that holds all shapes [m]."""
-        return self.lattice.low
-
-    @property
-    def high(self) -> Float64[Tensor, "3"]:
-        """The opposite corner [m]."""
-        return self.lattice.high
 
     def nodes(self, counts: Sequence[int] | None = None) -> Lattice:
         """Nodes in the box, as many along x, y and z as told; None is about 0.1 m apart.
