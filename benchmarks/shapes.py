@@ -97,12 +97,11 @@ def fitted(run: RunFile) -> Car:
     """All fits of a car."""
     console = Console(quiet=True)
     problem = problem_of(run, console)
-    start = build.Start(problem.scene, {})
     found: Car = {}
     with tempfile.TemporaryDirectory() as scratch:
         folder = open_run(Path(scratch) / "car", {"car": run})
         for name, mode in MODES.items():
-            row, _ = fit(problem, start, 0, mode, folder, console, None)
+            row, _ = fit(problem, problem.scene, 0, mode, folder, console, None)
             kept = {key: row[key] for key in KEPT if key in row}
             found[name] = kept | {key: row[key] for key in ("steps", "loss", "seconds", "curve")}
     return found

@@ -41,15 +41,15 @@ def test_every_sought_joint_starts_that_far_off_and_only_these():
     run = run_file(scale=1.2)
     assert run.starts is not None
     scene = build.scene(run)
-    bodies = build.sought_bodies(run, scene)
+    body = build.body_of(run, scene, "person")
+    assert body is not None
     problem = Problem(run, scene, scene, frozenset())
     starts, again = starts_of(problem), starts_of(problem)
-    body = bodies["person"]
     truth = scene["person"].mesh
     true = body.template.rotations_of(truth.vertices)
     for start, same in zip(starts, again, strict=True):
-        mesh = start.scene["person"].mesh
-        assert torch.equal(mesh.vertices, same.scene["person"].mesh.vertices)
+        mesh = start["person"].mesh
+        assert torch.equal(mesh.vertices, same["person"].mesh.vertices)
         angles = joint_scores(body, mesh, truth, truth)
         assert angles["joint_error_before_deg"] == pytest.approx(20.0, abs=1e-4)
         assert angles["joint_error_after_deg"] == pytest.approx(0.0, abs=1e-4)
@@ -58,16 +58,17 @@ def test_every_sought_joint_starts_that_far_off_and_only_these():
         assert torch.allclose(found[hinge, [0, 2]], torch.zeros(2).double(), atol=1e-6)
         moved = (found - true).abs().amax(1) > 1e-6
         assert {body.template.names[int(k)] for k in moved.nonzero()[:, 0]} == set(LEFT)
-        (module,) = build.parameters(run.parameters, start.scene, run.scene)
-        assert torch.allclose(module(start.scene)["person"].mesh.vertices, mesh.vertices, atol=1e-9)
-    first, second = (start.scene["person"].mesh.vertices for start in starts)
+        (module,) = build.parameters(run.parameters, start, run.scene)
+        assert torch.allclose(module(start)["person"].mesh.vertices, mesh.vertices, atol=1e-9)
+    first, second = (start["person"].mesh.vertices for start in starts)
     assert not torch.allclose(first, second, atol=1e-3)
 
 
 def test_a_truth_may_have_other_angles():
     run = run_file(truth={"person": {"angles_deg": {"neck": [10.0, 0.0, 0.0]}}})
     scene, truth = build.scene(run), build.true_scene(run)
-    body, mesh = build.sought_bodies(run, scene)["person"], scene["person"].mesh
+    body, mesh = build.body_of(run, scene, "person"), scene["person"].mesh
+    assert body is not None
     angles = joint_scores(body, mesh, mesh, truth["person"].mesh)
     assert angles["joint_error_left_elbow_deg"] == pytest.approx(50.0, abs=1e-4)
     assert angles["joint_error_left_hip_deg"] == pytest.approx(0.0, abs=1e-4)
@@ -109,7 +110,9 @@ ELBOW = {"kind": "body", "joints": {"left_elbow": ["y"]}}
 def test_theta_turns_a_joint():
     start, moved = checked(ELBOW, {"left_elbow": [0.0, 1.0, 0.0]})
     run = run_file()
-    body = build.sought_bodies(run, build.scene(run))["person"].template
+    found = build.body_of(run, build.scene(run), "person")
+    assert found is not None
+    body = found.template
     before, after = (body.rotations_of(s["person"].mesh.vertices) for s in (start, moved))
     assert float((after - before)[body.joint("left_elbow"), 1]) == pytest.approx(0.01, abs=1e-9)
     assert float((after - before).abs().sum()) == pytest.approx(0.01, abs=1e-7)

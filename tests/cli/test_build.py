@@ -140,7 +140,7 @@ def test_starts_are_as_far_off_as_asked_and_repeat():
     scene, truth = build.scene(run), build.true_scene(run)
     problem = Problem(run, scene, truth, frozenset())
     found, again = starts_of(problem), starts_of(problem)
-    for start, same in zip([s.scene for s in found], [s.scene for s in again], strict=True):
+    for start, same in zip(found, again, strict=True):
         rest = residual(start["box"], truth["box"])
         assert rest is not None
         assert 0.3 <= rest.distance <= 0.4
@@ -161,8 +161,7 @@ def test_starts_in_a_plane_about_one_axis():
     run = read(starts=table, seed=7)
     assert run.starts is not None
     scene = build.scene(run)
-    for begun in starts_of(Problem(run, scene, scene, frozenset())):
-        start = begun.scene
+    for start in starts_of(Problem(run, scene, scene, frozenset())):
         assert abs(float(start["box"].center[1])) < 1e-12
         torch.testing.assert_close(start["box"].transform[1, :3], scene["box"].transform[1, :3])
 

@@ -332,7 +332,9 @@ def test_samples_are_kept_as_they_are(tmp_path):
     assert isinstance(data, ChirpData)
     arrays = (radar.transmitters, radar.receivers)
     described_arrays.write_chirps(tmp_path / "a.toml", data, "a.npy", arrays)
-    tx, rx = described_arrays.described_board(tmp_path / "a.toml")
+    described = described_arrays.described_board(tmp_path / "a.toml")
+    assert isinstance(described, tuple)
+    tx, rx = described
     assert torch.equal(tx.positions, radar.transmitters.positions)
     assert torch.equal(rx.positions, radar.receivers.positions)
     assert torch.equal(described_arrays.read_chirps(tmp_path / "a.toml").samples, beat)

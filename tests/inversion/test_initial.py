@@ -224,6 +224,7 @@ def test_the_density_is_where_the_echoes_are(seen: tuple[Scene, Capture, Grid]) 
     assert float(middle[[0, 2]].norm()) < 0.7
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_bad_input_is_refused() -> None:
     radar = radar_along()
     with pytest.raises(InputError, match="3 points"):

@@ -1,16 +1,20 @@
 """Stages: who is free when, what is built anew, and that an interruption changes nothing."""
 
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
 
 import fits
+from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, Schedule, Stage, Unknown
 from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.regularization import Laplacian
 from invertwin.inversion.remeshing import remeshed
+from invertwin.models import SurrogateMap
 from invertwin.scene import Mesh, SmoothVertices, plate
 from invertwin.scene.parameters import Scale, Translation, Vertices
 
@@ -47,6 +51,17 @@ def test_only_what_a_stage_names_is_free(case):
     assert last["plate.scale"] != first["plate.scale"]
     assert [row["stage"] for row in found.history] == [0, 0, 0, 1, 1, 1]
     assert [row["step"] for row in found.history] == list(range(6))
+
+
+def test_a_stage_may_have_models_of_its_own(case):
+    grid = case.settings()["grid"]
+    few: dict[str, Any] = {"depth": 1, "samples": 500, "boundary_samples": 500}
+    own = Stage(1, models=[SurrogateMap(grid, "response", Sampling(**few))])
+    (row,) = fit(case, [own]).history
+    (same,) = fit(case, [Stage(1)], surrogate="response", **few).history
+    assert row["loss"] == pytest.approx(same["loss"], rel=1e-4)
+    with pytest.raises(InputError, match="a model for each of 1 observations in a stage, got 2"):
+        fit(case, [replace(own, models=[*own.models] * 2)])
 
 
 def test_rates_of_parameters_are_their_own(case):

@@ -1,5 +1,7 @@
 """Images from range profiles by coherent summation, and calibration against a known target."""
 
+from collections.abc import Callable, Sequence
+
 import torch
 from jaxtyping import Complex128, Float64
 from scipy.optimize import minimize
@@ -13,6 +15,8 @@ from invertwin.radar.backprojection import backproject_beat, distances
 # alignment by hand, dense against a range cell and the time in which a radar moves one beamwidth.
 _CLOCK_SEARCH = (0.1, 0.01)
 _BIAS_SEARCH = (0.1, 0.01)
+
+Measure = Callable[[Tensor], Tensor]
 
 
 def backproject(
@@ -60,17 +64,14 @@ def locate(
         raise InputError(
             f"expected 0 < step < radius, got {step} and {radius}; give both in metres"
         )
-    side = torch.arange(-radius, radius + step / 2, step, dtype=torch.float64)
-    offsets = torch.cartesian_prod(side, side)
     interpolator, positions = capture.interpolator(), capture.radar().positions
 
     def brightness(offset: Float64[Tensor, "point 2"]) -> Float64[Tensor, " point"]:
         points = center + torch.nn.functional.pad(offset, (0, 1))
         return interpolator(distances(positions, points)).mean(0).abs()
 
-    # A column of the image at a time keeps the memory of frames × points small.
-    image = torch.cat([brightness(part) for part in offsets.split(len(side))])
-    found = _refined(brightness, offsets[image.argmax()], (step / 2, step / 2))
+    spans = (radius, step), (radius, step)
+    found = torch.tensor(_brightest(brightness, spans), dtype=torch.float64)
     return center + torch.nn.functional.pad(found, (0, 1))
 
 
@@ -96,23 +97,26 @@ def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
         distances = [(capture.positions(clock) - target).norm(dim=1) for clock in trial[:, 0]]
         return interpolator(torch.stack(distances, dim=1) + trial[:, 1]).mean(0).abs()
 
-    axes = [
-        torch.arange(-reach, reach + step / 2, step, dtype=torch.float64)
-        for reach, step in (_CLOCK_SEARCH, _BIAS_SEARCH)
-    ]
-    trials = torch.cartesian_prod(*axes)
-    best = trials[focus(trials).argmax()]
-    clock, bias = _refined(focus, best, (_CLOCK_SEARCH[1] / 2, _BIAS_SEARCH[1] / 2)).tolist()
+    clock, bias = _brightest(focus, (_CLOCK_SEARCH, _BIAS_SEARCH))
     return capture.recalibrated(capture.clock_offset + clock, capture.range_bias + bias)
 
 
-def _refined(measure, start: Tensor, sizes: tuple[float, float]) -> Float64[Tensor, "2"]:
-    """The local maximum of a measure of rows of two numbers, from a simplex of these sizes."""
-    x, y = start.tolist()
-    simplex = [(x, y), (x + sizes[0], y), (x, y + sizes[1])]
+def _brightest(measure: Measure, spans: Sequence[tuple[float, float]]) -> list[float]:
+    """The maximum of a measure of rows of two numbers: on a grid, then from there by a simplex.
+
+    The spans are half the width and the step of the grid along each axis.
+    """
+    axes = [
+        torch.arange(-reach, reach + step / 2, step, dtype=torch.float64) for reach, step in spans
+    ]
+    trials = torch.cartesian_prod(*axes)
+    # A column of the grid at a time keeps the memory of frames × points small.
+    values = torch.cat([measure(part) for part in trials.split(len(axes[1]))])
+    x, y = trials[values.argmax()].tolist()
+    simplex = [(x, y), (x + spans[0][1] / 2, y), (x, y + spans[1][1] / 2)]
 
     def loss(values) -> float:
         return -float(measure(torch.as_tensor(values, dtype=torch.float64)[None]).log())
 
     options = {"xatol": 1e-6, "fatol": 1e-12, "initial_simplex": simplex}
-    return torch.from_numpy(minimize(loss, (x, y), method="Nelder-Mead", options=options).x)
+    return minimize(loss, (x, y), method="Nelder-Mead", options=options).x.tolist()

@@ -18,11 +18,11 @@ from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
 from invertwin.scene.files import UNREADABLE, existing_file, replacing
 
-# Settings that samples tell themselves, or that files of the DCA1000 have alone.
-_OF_THE_DATA = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
+# The data tell these settings by their shape and kind.
+_TOLD = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
 _KEYS = {
     "data": {"file", "variable", "dimensions", "conjugate"},
-    "settings": {field.name for field in fields(ChirpSettings)} - _OF_THE_DATA,
+    "settings": {field.name for field in fields(ChirpSettings)} - _TOLD,
     "radar": {"board", "elevation", "azimuth", "tx_positions", "rx_positions"},
 }
 _ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")

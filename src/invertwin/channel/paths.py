@@ -1,5 +1,6 @@
 """Frozen values that leave or enter the channel: the bins, the antennas' places, the paths."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Protocol, runtime_checkable
 
@@ -9,6 +10,8 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import Count, Positive
+from invertwin.scene.checks import check_fields
 
 
 @runtime_checkable
@@ -33,23 +36,17 @@ class Grid:
     """
 
     range_start: float
-    range_step: float
-    range_count: int
+    range_step: Positive
+    range_count: Count
     u_start: float = 0.0
-    u_step: float = 1.0
-    u_count: int = 1
+    u_step: Positive = 1.0
+    u_count: Count = 1
     v_start: float = 0.0
-    v_step: float = 1.0
-    v_count: int = 1
+    v_step: Positive = 1.0
+    v_count: Count = 1
 
     def __post_init__(self) -> None:
-        for axis in ("range", "u", "v"):
-            count, step = getattr(self, f"{axis}_count"), getattr(self, f"{axis}_step")
-            if count < 1 or not step > 0:
-                raise InputError(
-                    f"expected a positive {axis}_count and {axis}_step, got {count} and {step}; "
-                    "build the grid with Radar.grid(range_min, range_max)"
-                )
+        check_fields(self)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -162,58 +159,16 @@ class Paths:
         return replace(self, **rows)
 
     def __add__(self, other: "Paths") -> "Paths":
-        names = [f.name for f in fields(self) if f.name not in ("kind", "velocity")]
-        joined = {n: torch.cat([getattr(self, n), getattr(other, n)]) for n in names}
-        velocity = None
-        if self.velocity is not None or other.velocity is not None:
-            rows = [
-                torch.zeros_like(p.last) if p.velocity is None else p.velocity
-                for p in (self, other)
-            ]
-            velocity = torch.cat(rows)
-        kind = self.kind if self.kind == other.kind else "field"
-        return Paths(**joined, kind=kind, velocity=velocity)
+        return joined([self, other])
 
 
-def listed(
-    frame: Int64[Tensor, " path"],
-    length: Float64[Tensor, " path"],
-    position: Float64[Tensor, "path 3"],
-    kind: str,
-    *,
-    first: Float64[Tensor, "path 3"] | None = None,
-    power: Float64[Tensor, " path"] | None = None,
-    coefficient: Complex128[Tensor, " path"] | None = None,
-    boundary: bool = False,
-    velocity: Float64[Tensor, "path 3"] | None = None,
-) -> Paths:
-    """Paths of one kind; what is not given is zero.
-
-    Args:
-        frame, kind, power, coefficient, velocity: See ``Paths``.
-        length: From antenna to antenna [m].
-        position: Of the last point [m].
-        first: Position of the first point; None = that of the last.
-        boundary: Whether all rows are boundary paths.
-    """
-    zero = torch.zeros(len(frame), dtype=torch.float64)
-    return Paths(
-        frame=frame,
-        delay=length / SPEED_OF_LIGHT,
-        coefficient=zero.to(torch.complex128) if coefficient is None else coefficient,
-        power=zero if power is None else power,
-        first=position if first is None else first,
-        last=position,
-        kind=kind,
-        boundary=torch.full((len(frame),), boundary),
-        velocity=velocity,
-    )
-
-
-def joined(parts: list[Paths]) -> Paths:
-    """All paths in order; added in pairs, so that no row is copied once for every part."""
-    while len(parts) > 1:
-        pairs = zip(parts[::2], parts[1::2], strict=False)
-        odd = parts[-1:] if len(parts) % 2 else []
-        parts = [first + second for first, second in pairs] + odd
-    return parts[0]
+def joined(parts: Sequence[Paths]) -> Paths:
+    """All paths in order."""
+    names = [f.name for f in fields(Paths) if f.name not in ("kind", "velocity")]
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    velocity = None
+    if any(part.velocity is not None for part in parts):
+        still = [torch.zeros_like(p.last) if p.velocity is None else p.velocity for p in parts]
+        velocity = torch.cat(still)
+    kinds = {part.kind for part in parts}
+    return Paths(**columns, kind=kinds.pop() if len(kinds) == 1 else "field", velocity=velocity)

@@ -1,7 +1,7 @@
 """From the tables of a run file to the library's values: scenes, parameters."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -99,14 +99,6 @@ def model(table: Any, grid: Grid, surrogate: Surrogate) -> Any:
         return table.build({Grid: grid, Surrogate: surrogate})
 
 
-@dataclass(frozen=True)
-class Start:
-    """Where a fit starts."""
-
-    scene: Scene
-    bodies: Mapping[str, SkinnedBody] = field(default_factory=dict)  # whose joints are sought
-
-
 def builders(
     tables: Sequence[Any], objects: Mapping[str, ObjectTable] | None = None
 ) -> dict[str, Callable[[Scene], nn.Module]]:
@@ -142,13 +134,17 @@ def parameters(
     return [make(scene) for make in builders(tables, objects).values()]
 
 
-def sought_bodies(run: RunFile, scene: Scene) -> dict[str, Any]:
-    """The bodies whose joints are sought: a `SkinnedBody` each, by object."""
-    return {
-        table.object: _module(table, f"parameters[{i}]", run.scene, scene)
-        for i, table in enumerate(run.parameters)
-        if table.kind == "body"
-    }
+def body_of(run: RunFile, scene: Scene, name: str) -> SkinnedBody | None:
+    """The body of an object whose joints are sought; None for other objects.
+
+    Args:
+        run: Tells what is sought.
+        scene: Where the body is as it was built.
+        name: Of the object.
+    """
+    sought = [table for table in run.parameters if table.kind == "body" and table.object == name]
+    found = parameters(sought[:1], scene, run.scene)
+    return found[0] if found else None  # type: ignore[return-value]
 
 
 def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, Change]]:

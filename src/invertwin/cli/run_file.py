@@ -23,15 +23,14 @@ from invertwin.errors import InputError
 _MOST_ERRORS = 4  # in one line
 # Sections and kinds of the package in experiments/studies.
 _STUDIES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
-_MOVED = {
-    "also_interior_only": "add [variants.interior_only] with reconstruct = { boundary = false }",
-    **dict.fromkeys(("rate", "final_rate"), "write it in `optimizer`"),
-    **dict.fromkeys(("range_width", "angle_width"), "write it in `surrogate`"),
-    **dict.fromkeys(
-        ("steps", "samples", "boundary_samples", "boundary", "annealing"),
-        "write it in `reconstruct`",
-    ),
+_BELONG = {
+    "reconstruct": "steps samples boundary_samples boundary annealing observations",
+    "optimizer": "rate final_rate",
+    "surrogate": "range_width angle_width",
+    "parameters": "smooth",
 }
+_MOVED = {key: f"write it in `{place}`" for place, keys in _BELONG.items() for key in keys.split()}
+_MOVED["also_interior_only"] = "add [variants.interior_only] with reconstruct.boundary = false"
 """Where keys belong that stand in the wrong table, or are gone."""
 _INSTALL = "install the studies: pip install -e ./experiments/studies"
 _WORDS = {

@@ -24,12 +24,12 @@ from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
 from invertwin.radar import (
     SampledWaveform,
     doppler_maps,
+    peak_of,
     points_csv,
     points_of,
     range_profile,
     sharp_map,
     snapshots_of,
-    still_peak,
     velocity_span,
 )
 from invertwin.radar.boards import Mounting
@@ -212,7 +212,7 @@ def _maps(
         }
     spectrum = capture.frames([frame]).spectrum(grid)[0].double()
     shown = direction_panels("range and direction", spectrum, grid)
-    numbers = still_peak(spectrum, grid).metrics("peak")
+    numbers = peak_of(spectrum, grid).metrics("peak")
     del numbers["peak_velocity_m_s"]
     if not shown:
         del numbers["peak_azimuth_deg"]

@@ -45,7 +45,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     problem, conventional = guessed(problem, console)
     starts, modes = starts_of(problem), [FULL, *run.variants]
     whole, problem = problem, varied(problem, FULL)
-    check_measures(problem, without_clouds(starts[0].scene))
+    check_measures(problem, without_clouds(starts[0]))
     single = len(starts) * len(modes) == 1
     rows: dict[str, list[dict[str, Any]]] = {}
     outcomes: dict[int, Callable[[], Reconstruction]] = {}
@@ -58,8 +58,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
             if mode == modes[0]:
                 outcomes[i] = outcome
     best = min(rows[modes[0]], key=lambda row: (row["status"] == "diverged", _finite(row["loss"])))
-    begun, found = starts[best["start"]], outcomes[best["start"]]()
-    start, twin, radars = begun.scene, found.scene, found.sensors
+    start, found = starts[best["start"]], outcomes[best["start"]]()
+    twin, radars = found.scene, found.sensors
     maps = {
         "measured": [s.capture.spectrum(s.grid).float() for s in problem.sights.values()],
         "start": sharp_maps(problem, start, [s.radar for s in problem.sights.values()]),

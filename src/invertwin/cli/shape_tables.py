@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from invertwin.cli.registry import Group, OneOf, Registry, Table
 from invertwin.cli.section import Counts, InputPath, Vector, about, key
 from invertwin.errors import InputError
-from invertwin.inversion.prior import LatentNorm
-from invertwin.inversion.regularization import Laplacian, Regularizer
+from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.radar.parameters import RadarPose
 from invertwin.scene import (

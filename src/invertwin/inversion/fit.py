@@ -251,7 +251,7 @@ class Fit:
             derived_seed(self._settings.seed, self.number, step, _SUBSETS + k)
         )
         chosen = np.sort(rng.choice(len(observed), count, replace=False))
-        return sensor.frames(chosen.tolist()), observed[torch.from_numpy(chosen)]
+        return sensor.frames(chosen.tolist()), observed.index_select(0, torch.from_numpy(chosen))
 
     def _descend(self, callbacks: Sequence[Callback]) -> Status:
         stage = self.stage

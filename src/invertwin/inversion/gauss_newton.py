@@ -9,6 +9,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Bool, Float64
 from torch import Tensor, nn
+from torch.autograd import grad
 
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Maps, Objective, SpectrumLoss
@@ -30,12 +31,24 @@ class GaussNewton:
     at least its mean. A step that raises the loss, on the same samples, is taken back and tried
     again with more damping μ.
 
-    Attributes:
-        damping: present μ.
-
     Source: the Levenberg–Marquardt method.
     Differs from the source: g and H are estimates from samples, and D keeps what the data hardly
     tell from drifting with their noise; H may serve several steps.
+
+    Args:
+        modules: what is fitted.
+        objective: how maps are compared, of `SpectrumLoss` only.
+        reach: the longest change of one parameter in a step, in its unit.
+        reaches: the reach of single parameters, in place of `reach`.
+        damping: μ at the first step.
+        every: steps from one H to the next; those between take the last one.
+
+    Attributes:
+        damping: present μ.
+
+    Raises:
+        InputError: no parameters, more than 64, another loss, or a reach, damping or number
+            of steps that is not positive.
     """
 
     def __init__(
@@ -48,20 +61,6 @@ class GaussNewton:
         damping: float = 0.01,
         every: int = 1,
     ) -> None:
-        """Fit the parameters of `modules` that require a gradient.
-
-        Args:
-            modules: what is fitted.
-            objective: how maps are compared, of `SpectrumLoss` only.
-            reach: the longest change of one parameter in a step, in its unit.
-            reaches: the reach of single parameters, in place of `reach`.
-            damping: μ at the first step.
-            every: steps from one H to the next; those between take the last one.
-
-        Raises:
-            InputError: no parameters, more than 64, another loss, or a reach, damping or number
-                of steps that is not positive.
-        """
         self._slots = [
             (module, name, parameter)
             for module in modules.modules()
@@ -110,11 +109,11 @@ class GaussNewton:
             value = value + penalty()
         found: Sequence[Tensor | None] = [None] * len(parameters)
         if value.requires_grad:
-            found = torch.autograd.grad(value, parameters, allow_unused=True)
+            found = grad(value, parameters, allow_unused=True)
         for (module, name, _), slopes in zip(self._slots, found, strict=True):
             if slopes is None:
                 raise without_effect(module, name)
-        slope = _flat(found, parameters)
+        slope = _row([part for part in found if part is not None])
         before = float(value.detach())
         if not bool(torch.isfinite(slope).all()) or before != before:
             return float("nan")
@@ -248,36 +247,22 @@ def without_effect(module: nn.Module, name: str) -> InputError:
     )
 
 
-def _flat(values: Sequence[Tensor | None], like: list[nn.Parameter]) -> Float64[Tensor, " q"]:
-    """Gradients in one row, zeros for those that are not there."""
-    return torch.cat(
-        [
-            (torch.zeros_like(p) if v is None else v).detach().flatten().double()
-            for v, p in zip(values, like, strict=True)
-        ]
-    )
+def _row(parts: Sequence[Tensor]) -> Float64[Tensor, " q"]:
+    """All numbers of some tensors one after the other."""
+    return torch.cat([part.flatten().double() for part in parts])
 
 
 def _penalty_curvature(
     penalty: Callable[[], Tensor], parameters: list[nn.Parameter], free: Bool[Tensor, " q"]
 ) -> Float64[Tensor, "p p"]:
     """Second derivatives of a term of the loss, as far as they are positive."""
-    total = torch.zeros(int(free.sum()), int(free.sum()), dtype=torch.float64)
-    value = penalty()
-    if not value.requires_grad:
-        return total
-    slopes = torch.autograd.grad(value, parameters, create_graph=True, allow_unused=True)
-    row = torch.cat(
-        [
-            (torch.zeros_like(p) if v is None else v).flatten()  # pyright: ignore[reportUnnecessaryComparison]
-            for v, p in zip(slopes, parameters, strict=True)
-        ]
-    )
-    for k, index in enumerate(free.nonzero()[:, 0].tolist()):
-        if row[index].requires_grad:
-            second = torch.autograd.grad(
-                row[index], parameters, retain_graph=True, allow_unused=True
-            )
-            total[k] = _flat(second, parameters)[free]
+    count, value = int(free.sum()), penalty()
+    total = torch.zeros(count, count, dtype=torch.float64)
+    if value.requires_grad:
+        slopes = _row(grad(value, parameters, create_graph=True, materialize_grads=True))[free]
+        for row, slope in zip(total, slopes, strict=True):
+            if slope.requires_grad:
+                second = grad(slope, parameters, retain_graph=True, materialize_grads=True)
+                row.copy_(_row(second)[free])
     values, vectors = torch.linalg.eigh((total + total.T) / 2)
     return vectors @ torch.diag(values.clamp_min(0.0)) @ vectors.T

@@ -7,6 +7,7 @@ tells how it stands. The fit does the rest. Nothing here is differentiable.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float64
@@ -23,7 +24,7 @@ from invertwin.radar.detection import ordered_statistics_cfar, peaks
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
 from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
-from invertwin.scene.checks import ArrayLike, checked_number
+from invertwin.scene.checks import ArrayLike, check_fields, checked_number
 from invertwin.scene.geometry.lattice import Lattice
 
 _TURNS = 91  # yaws that a rectangle is tried at, over a quarter turn
@@ -34,20 +35,12 @@ _CHUNK = 20_000  # points of an image at a time
 
 @dataclass(frozen=True)
 class Ground:
-    """The ground plane: which world axis points up.
+    """The ground plane, by the world axis that points up."""
 
-    Attributes:
-        up: "y" or "z".
-
-    Raises:
-        InputError: another axis.
-    """
-
-    up: str = "y"
+    up: Literal["y", "z"] = "y"
 
     def __post_init__(self) -> None:
-        if self.up not in ("y", "z"):
-            raise InputError(f'expected up to be "y" or "z", got {self.up!r}; choose one')
+        check_fields(self)
 
     @property
     def vertical(self) -> int:
@@ -64,6 +57,9 @@ class Ground:
         vector = torch.zeros(3, dtype=torch.float64)
         vector[self.vertical] = yaw
         return rotation_from_vector(vector)
+
+
+_UPRIGHT = Ground()
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +108,10 @@ def detected_points(
         [ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_RANK) for frame in strongest]
     )
     found = peaks(power, detections, capture.radar(), grid).position
-    kept = _level_box(found, box, capture.radar(), grid)
+    inside = (found >= box.low) & (found <= box.high)
+    if (height := _unresolved_height(capture.radar(), grid)) is not None:
+        inside[:, height] = True
+    kept = found[inside.all(1)]
     if not len(kept):
         raise InputError(
             f"expected echoes within the box from {box.low.tolist()} to {box.high.tolist()}, got "
@@ -171,12 +170,10 @@ def image_points(
     width = checked_number(step, "step of the image [m]", 0.0, open_low=True)
     counts = [max(2, round(float(side) / width) + 1) for side in size]
     nodes = Lattice.between(low, high, counts).nodes
-    if not _resolves_height(grid):
+    if (height := _unresolved_height(capture.radar(), grid)) is not None:
         # Nothing tells heights apart: the plane in the middle stands for all.
-        nodes = nodes.mean(_height(capture.radar()), keepdim=True)
-    image = echo_image(capture, grid, nodes)
-    if not float(image.max()) > 0:
-        raise InputError("expected echoes in the image, got none; move the box into the grid")
+        nodes = nodes.mean(height, keepdim=True)
+    image = _seen(echo_image(capture, grid, nodes))
     return nodes[image >= share * image.max()]
 
 
@@ -198,7 +195,7 @@ def fit_rectangle(
     points: Float64[Tensor, "point 3"],
     radar: Radar,
     *,
-    ground: Ground | None = None,
+    ground: Ground = _UPRIGHT,
     resolution: float = 0.1,
 ) -> Rectangle:
     """Fit a rectangle in the ground plane to points on its near sides, an L shape.
@@ -220,13 +217,12 @@ def fit_rectangle(
     Raises:
         InputError: fewer than three points.
     """
-    plane = ground or Ground()
     if len(points) < 3:
         raise InputError(f"expected at least 3 points, got {len(points)}; use pose = 'position'")
     best: tuple[float, Rectangle] | None = None
     for yaw in torch.linspace(0, math.pi / 2, _TURNS, dtype=torch.float64)[:-1].tolist():
-        found = _bounded(points, yaw, plane)
-        axes = plane.turn(yaw)[:, plane.level]
+        found = _bounded(points, yaw, ground)
+        axes = ground.turn(yaw)[:, ground.level]
         offsets = (points - found.center) @ axes
         away = (radar.positions.detach().mean(0) - found.center) @ axes
         half = torch.tensor(found.size).double() / 2
@@ -242,22 +238,21 @@ def fit_rectangle(
 
 
 def principal_rectangle(
-    points: Float64[Tensor, "point 3"], *, ground: Ground | None = None
+    points: Float64[Tensor, "point 3"], *, ground: Ground = _UPRIGHT
 ) -> Rectangle:
     """Fit a rectangle along the points' principal axes in the ground plane.
 
     Args:
         points: [m].
-        ground: the plane; None = the default `Ground`.
+        ground: the plane.
     """
-    plane = ground or Ground()
-    flat = points[:, plane.level]
+    flat = points[:, ground.level]
     _, axes = torch.linalg.eigh(torch.cov(flat.T))
     first = axes[:, 1]
     # The image of the first ground axis under a yaw about y is (cos, −sin) in (x, z).
-    sign = -1.0 if plane.up == "y" else 1.0
+    sign = -1.0 if ground.up == "y" else 1.0
     yaw = math.atan2(sign * float(first[1]), float(first[0]))
-    return _bounded(points, yaw, plane)
+    return _bounded(points, yaw, ground)
 
 
 def guess_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
@@ -266,7 +261,7 @@ def guess_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
 
 
 def guess_poses(
-    item: Object, found: Rectangle, radar: Radar, *, ground: Ground | None = None
+    item: Object, found: Rectangle, radar: Radar, *, ground: Ground = _UPRIGHT
 ) -> list[Float64[Tensor, "4 4"]]:
     """List the four poses in which an object of known size stands in a rectangle.
 
@@ -281,23 +276,22 @@ def guess_poses(
         radar: its positions.
         ground: the plane.
     """
-    plane = ground or Ground()
     center = item.center.detach()
     start = item.transform.detach()
     level = item.vertices.detach() - center
     where = radar.positions.detach().mean(0)
-    axes = plane.turn(found.yaw)[:, plane.level]
+    axes = ground.turn(found.yaw)[:, ground.level]
     half = torch.tensor(found.size).double() / 2
     away = (where - found.center) @ axes
     poses = []
     for quarter in range(4):
-        turn = plane.turn(found.yaw + quarter * math.pi / 2)
+        turn = ground.turn(found.yaw + quarter * math.pi / 2)
         own = (level @ turn.T) @ axes
         # Where the object's middle lies when its near side is the rectangle's.
         near = torch.where(away > 0, half - own.amax(0), -half - own.amin(0))
         middle = -0.5 * (own.amax(0) + own.amin(0))
         place = found.center + axes @ torch.where(away.abs() > half, near, middle)
-        place[plane.vertical] = center[plane.vertical]
+        place[ground.vertical] = center[ground.vertical]
         poses.append(rigid(turn, place - turn @ center) @ start)
     return poses
 
@@ -351,7 +345,7 @@ def best_pose(
     return scenes[losses.index(min(losses))], losses
 
 
-def guess_scale(item: Object, found: Rectangle, *, ground: Ground | None = None) -> float:
+def guess_scale(item: Object, found: Rectangle, *, ground: Ground = _UPRIGHT) -> float:
     """Guess a scale: the longer side of a rectangle over that of an object.
 
     The longer side is the one that is seen from most places; the other often hides its far end.
@@ -359,10 +353,9 @@ def guess_scale(item: Object, found: Rectangle, *, ground: Ground | None = None)
     Args:
         item: the object.
         found: rectangle around its points.
-        ground: the plane; None = the default `Ground`.
+        ground: the plane.
     """
-    plane = ground or Ground()
-    extent = item.vertices.detach()[:, plane.level]
+    extent = item.vertices.detach()[:, ground.level]
     longest = float((extent.amax(0) - extent.amin(0)).max())
     return max(found.size) / longest
 
@@ -395,16 +388,14 @@ def guess_density(
     """
     lattice = Lattice.between(low, high, counts)
     pose = item.transform.detach()
-    image = echo_image(capture, grid, lattice.nodes @ pose[:3, :3].T + pose[:3, 3])
-    if not float(image.max()) > 0:
-        raise InputError("expected echoes in the box, got none; move the box into the grid")
+    image = _seen(echo_image(capture, grid, lattice.nodes @ pose[:3, :3].T + pose[:3, 3]))
     density = depth / float(lattice.spacing.mean()) * image / image.max()
     return DensityGrid(name, low, high, density)
 
 
-def _bounded(points: Tensor, yaw: float, plane: Ground) -> Rectangle:
+def _bounded(points: Tensor, yaw: float, ground: Ground) -> Rectangle:
     """The rectangle of a yaw around all but the outermost points."""
-    axes = plane.turn(yaw)[:, plane.level]
+    axes = ground.turn(yaw)[:, ground.level]
     middle = points.median(0).values
     places = (points - middle) @ axes
     low, high = (torch.quantile(places, q, dim=0) for q in (_EDGE, 1 - _EDGE))
@@ -434,20 +425,15 @@ def _incoherent(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tenso
     return total / radar.frame_count
 
 
-def _resolves_height(grid: Grid) -> bool:
-    """Whether directions are resolved along more than one axis."""
-    return grid.u_count > 1 and grid.v_count > 1
+def _unresolved_height(radar: Radar, grid: Grid) -> int | None:
+    """The world axis nearest to the radar's y axis, where directions have one axis at most."""
+    if grid.u_count > 1 and grid.v_count > 1:
+        return None
+    return int(radar.link().rotations.detach()[0, :, 1].abs().argmax())
 
 
-def _height(radar: Radar) -> int:
-    """The world axis that is nearest to the radar's y axis: where heights lie."""
-    link = radar.link()
-    return int(link.rotations.detach()[0, :, 1].abs().argmax())
-
-
-def _level_box(points: Tensor, box: Lattice, radar: Radar, grid: Grid) -> Tensor:
-    """Points within a box; of its height only where heights are resolved."""
-    inside = (points >= box.low) & (points <= box.high)
-    if not _resolves_height(grid):
-        inside[:, _height(radar)] = True
-    return points[inside.all(1)]
+def _seen(image: Tensor) -> Tensor:
+    """An image, if there is something in it."""
+    if not float(image.max()) > 0:
+        raise InputError("expected echoes in the box, got none; move the box into the grid")
+    return image

@@ -8,15 +8,16 @@ from typing import Any, Literal
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
-from torch.nn.functional import avg_pool3d
 
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 
 _GAIN_STEPS = 8  # at most; three or four do
-_SETTLED = 1e-6  # of the gain: a step this small is the last
+_SETTLED = 1e-5  # of the gain: a step this small is the last, and what it leaves is far smaller
+_BLOCK = 2**16  # bins that are worked on at a time: what they need stays in a core's cache
 
 BACKGROUNDS = ("none", "level", "static")
+_Block = tuple[Tensor, Tensor, Tensor]  # of a simulated map, what it holds of power, the measured
 Maps = Sequence[tuple[Tensor, Tensor]]
 """The predicted and the observed map of every observation."""
 
@@ -102,9 +103,9 @@ class SpectrumLoss:
                 f"expected maps of one shape, got {tuple(simulated.shape)} and "
                 f"{tuple(measured.shape)}; use one grid for both"
             )
-        pairs = self._pyramid(simulated, measured)
         if self.kind == "likelihood":
-            return self._divergence(pairs)
+            return self._divergence(simulated, measured)
+        pairs = self._pyramid(simulated, measured)
         return self._error([(self._cleared(a), self._cleared(b)) for a, b in pairs])
 
     def curvature(
@@ -146,21 +147,29 @@ class SpectrumLoss:
             own = own - mixed @ mixed.T / total[-1, -1]
         return own
 
+    def _units(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+        """What the simulated and the measured map are divided by."""
+        scale = _mean_size(measured)
+        if not scale > 0:
+            raise InputError("expected a measured map with power in it, got zeros; check the grid")
+        unit = _mean_size(simulated) if self.gain == "fitted" else scale
+        return torch.where(unit > 0, unit, 1.0), scale
+
+    def _resolutions(self, power: Tensor) -> list[Tensor]:
+        """A map at all resolutions."""
+        found = [power]
+        while len(found) < self.levels:
+            found.append(_pooled(found[-1]))
+        return found
+
     def _pyramid(self, simulated: Tensor, measured: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Both maps at all resolutions, in units near one."""
         unit, scale = self._units(simulated, measured)
-        pairs = [(simulated / unit, measured.to(simulated) / scale)]
-        for _ in range(1, self.levels):
-            pairs.append((_pooled(pairs[-1][0]), _pooled(pairs[-1][1])))
-        return pairs
-
-    def _units(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
-        """What the simulated and the measured map are divided by."""
-        scale = measured.detach().abs().mean()
-        if not scale > 0:
-            raise InputError("expected a measured map with power in it, got zeros; check the grid")
-        unit = simulated.detach().abs().mean()
-        return torch.where(unit > 0, unit, 1.0) if self.gain == "fitted" else scale, scale
+        both = (
+            self._resolutions(simulated / unit),
+            self._resolutions(measured.to(simulated) / scale),
+        )
+        return list(zip(*both, strict=True))
 
     def _gain(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         """The gain that minimises the loss."""
@@ -174,36 +183,40 @@ class SpectrumLoss:
                 mixed = torch.stack([(a * b).mean() / n for (a, b), n in both]).sum()
                 power = torch.stack([(a * a).mean() / n for (a, _), n in both]).sum()
                 return (mixed / power.clamp_min(1e-30)).clamp_min(0.0)
-            return gain * self._likeliest(*self._floored(pairs))
+            return gain * self._likeliest([self._blocks(*pair) for pair in pairs])
 
-    def _floored(self, pairs: list[tuple[Tensor, Tensor]]) -> tuple[list[Tensor], list[Tensor]]:
-        """What both maps hold of power, the floor added to the measured one."""
-        lit = [a.detach().clamp_min(0.0) for a, _ in pairs]
-        return lit, [b.detach().clamp_min(0.0).add_(self.floor) for _, b in pairs]
+    def _blocks(self, a: Tensor, b: Tensor, unit: Any = 1.0, scale: Any = 1.0) -> list[_Block]:
+        """What both maps hold of power, in units, the floor added to the measured one."""
+        columns = (x.detach().flatten().split(_BLOCK) for x in (a, b))
+        return [
+            (x, (x / unit).clamp_min_(0.0), (y.to(x) / scale).clamp_min_(0.0).add_(self.floor))
+            for x, y in zip(*columns, strict=True)
+        ]
 
-    def _likeliest(self, lit: list[Tensor], data: list[Tensor]) -> float:
+    def _likeliest(self, levels: list[list[_Block]]) -> float:
         """The gain of the ``likelihood``, by a secant on its logarithm."""
         if self.gain == "one":
             return 1.0
-        # The maps are large, and new memory takes longer than the sums: it is used again.
-        levels = [
-            (a, a * b, torch.empty_like(a), torch.empty_like(a))
-            for a, b in zip(lit, data, strict=True)
-        ]
-        place, step, before, slope = 0.0, 0.0, 0.0, 1.0
-        for _ in range(_GAIN_STEPS):
-            up, down = 0.0, 0.0
-            for a, both, inverse, product in levels:
-                torch.mul(a, math.exp(place), out=inverse).add_(self.floor).reciprocal_()
-                down += float(torch.mul(a, inverse, out=product).mean())
-                up += float(inverse.square_().mul_(both).mean())
-            move = math.log(max(up, 1e-30) / max(down, 1e-30))
-            if step != 0:
-                slope = min(max((before - move) / step, 0.1), 1.0)
-            before, step = move, move / slope
-            place += step
-            if abs(step) < _SETTLED:
-                break
+        floor = torch.as_tensor(self.floor).to(levels[0][0][0])
+        counts = [sum(len(a) for a, *_ in blocks) for blocks in levels]
+        place, slope = 0.0, 1.0
+        # The coarse maps are quick, and their gain is nearly that of all.
+        for first in (1, 0):
+            step, before = 0.0, 0.0
+            for _ in range(_GAIN_STEPS):
+                up, down = 0.0, 0.0
+                for blocks, count in zip(levels[first:], counts[first:], strict=True):
+                    for _, a, b in blocks:
+                        inverse = torch.add(floor, a, alpha=math.exp(place)).reciprocal_()
+                        down += float(a @ inverse) / count
+                        up += float(inverse.square_().mul_(b) @ a) / count
+                move = math.log(max(up, 1e-30) / max(down, 1e-30))
+                if step != 0:
+                    slope = min(max((before - move) / step, 0.1), 1.0)
+                before, step = move, move / slope
+                place += step
+                if abs(step) < _SETTLED:
+                    break
         return math.exp(place)
 
     def _error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
@@ -212,22 +225,46 @@ class SpectrumLoss:
         terms = [(gain * a - b).square().mean() / n for (a, b), n in zip(pairs, norms, strict=True)]
         return torch.stack(terms).mean()
 
-    def _divergence(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-        lit, data = self._floored(pairs)
-        gain = self._likeliest(lit, data)
+    def _divergence(self, simulated: Tensor, measured: Tensor) -> Tensor:
         # torch has no public name for this question.
         transformed = torch._C._are_functorch_transforms_active()  # pyright: ignore[reportPrivateUsage]
-        if transformed:  # such as a second derivative
-            ratios = [
-                b / (gain * a.clamp_min(0.0) + self.floor)
-                for (a, _), b in zip(pairs, data, strict=True)
-            ]
-            return torch.stack([(q - q.log() - 1).mean() for q in ratios]).mean()
-        terms = [
-            _Divergence.apply(a, power, b, gain, self.floor)
-            for (a, _), power, b in zip(pairs, lit, data, strict=True)
+        if not transformed:
+            return _Known.apply(simulated, *self._divergence_and_slope(simulated, measured))
+        # Such as a second derivative.
+        pairs = self._pyramid(simulated, measured)
+        gain = self._gain(pairs)
+        ratios = [
+            (b.clamp_min(0.0) + self.floor) / (gain * a.clamp_min(0.0) + self.floor)
+            for a, b in pairs
         ]
-        return torch.stack(terms).mean()
+        return torch.stack([(q - q.log() - 1).mean() for q in ratios]).mean()
+
+    @torch.no_grad()
+    def _divergence_and_slope(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+        """The divergence, and its derivative with respect to the simulated map.
+
+        The maps are large, and torch's own derivative keeps and reads each of them several times.
+        """
+        units = self._units(simulated, measured)
+        maps = [self._resolutions(power) for power in (simulated.detach(), measured)]
+        levels = [self._blocks(a, b, *units) for a, b in zip(*maps, strict=True)]
+        gain = self._likeliest(levels)
+        value, slope = 0.0, None
+        for power, blocks in zip(reversed(maps[0]), reversed(levels), strict=True):
+            factor = gain / (units[0] * power.numel() * self.levels)
+            slopes = []
+            for a, lit, data in blocks:
+                inverse = lit.mul_(gain).add_(self.floor).reciprocal_()
+                ratio = data.mul_(inverse)
+                inverse.addcmul_(inverse, ratio, value=-1).mul_(factor)
+                # What is below zero counts as zero, and has no derivative; a dark bin has one.
+                least = -torch.finfo(a.dtype).tiny
+                slopes.append(torch.ops.aten.threshold_backward(inverse, a, least))
+                value += float(ratio.sum() - len(a) - ratio.log_().sum()) / power.numel()
+            own = torch.cat(slopes).reshape(power.shape)
+            slope = own if slope is None else _spread(slope, own)
+        assert slope is not None
+        return slope.new_tensor(value / self.levels), slope
 
     def _cleared(self, power: Tensor) -> Tensor:
         if self.background == "level":
@@ -237,36 +274,26 @@ class SpectrumLoss:
         return power
 
 
-class _Divergence(torch.autograd.Function):
-    """The mean of ``q − log q − 1``, with its derivative with respect to the predicted map.
-
-    The maps are large, and torch's own derivative keeps and reads each of them several times.
-    """
+class _Known(torch.autograd.Function):
+    """A number whose derivative with respect to a map is known."""
 
     @staticmethod
-    def forward(
-        ctx: Any, a: Tensor, lit: Tensor, data: Tensor, gain: float, floor: float
-    ) -> Tensor:
-        """The mean, of ``lit = max(a, 0)`` and ``data = b + n``, which it overwrites."""
-        inverse = lit.mul_(gain).add_(floor).reciprocal_()
-        ratio = data.mul_(inverse)
-        slope = inverse.addcmul_(inverse, ratio, value=-1).masked_fill_(a < 0, 0.0)
-        value = ratio.mean() - ratio.log_().mean() - 1
-        ctx.factor = gain / a.numel()
+    def forward(ctx: Any, power: Tensor, value: Tensor, slope: Tensor) -> Tensor:
+        """The number, of a map."""
         ctx.save_for_backward(slope)
         ctx.save_for_forward(slope)
-        return value
+        return value.clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         (slope,) = ctx.saved_tensors
-        return slope * (ctx.factor * grads[0]), None, None, None, None
+        return slope * grads[0], None, None
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:  # type: ignore[override]
         (slope,) = ctx.saved_tensors
-        return ctx.factor * (slope * tangents[0]).sum()
+        return (slope * tangents[0]).sum()
 
 
 Scale = Literal["magnitude", "power", "level"]
@@ -364,7 +391,27 @@ class Objective:
         return total / sum(self.weights)
 
 
+def _mean_size(power: Tensor) -> Tensor:
+    """The mean of the absolute values, detached."""
+    sums = [block.abs().sum() for block in power.detach().flatten().split(_BLOCK)]
+    return torch.stack(sums).sum() / power.numel()
+
+
 def _pooled(power: Tensor) -> Tensor:
     """Half the resolution along every axis that has two bins or more."""
-    window = tuple(2 if count > 1 else 1 for count in power.shape[1:])
-    return avg_pool3d(power[:, None], window)[:, 0]
+    # Axis by axis, since whole rows are added quickly: half the time of ``avg_pool3d``.
+    share = 1.0
+    for dim in range(1, power.ndim):
+        if half := power.shape[dim] // 2:
+            first, second = power.narrow(dim, 0, 2 * half).unflatten(dim, (half, 2)).unbind(dim + 1)
+            power, share = first + second, 0.5 * share
+    return share * power
+
+
+def _spread(coarse: Tensor, power: Tensor) -> Tensor:
+    """The adjoint of pooling, added to a map of twice the resolution."""
+    for dim in range(1, power.ndim):
+        if power.shape[dim] > 1:
+            coarse = (0.5 * coarse).repeat_interleave(2, dim)
+    power[tuple(map(slice, coarse.shape))] += coarse
+    return power

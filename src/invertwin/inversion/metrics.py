@@ -185,12 +185,8 @@ def volume_iou(found: Mesh, truth: Mesh, voxel: float = VOXEL) -> float:
     Raises:
         InputError: a mesh that is not watertight, or voxels that are too many.
     """
-    for name, mesh in (("found", found), ("true", truth)):
-        if not is_watertight(mesh):
-            raise InputError(
-                f"expected a watertight {name} mesh, whose edges all have two triangles that run "
-                "along them in opposite directions, got an open one; close it, or compare surfaces"
-            )
+    _check_watertight(found, "found mesh")
+    _check_watertight(truth, "true mesh")
     return _shared_volume(found, truth, voxel, None)
 
 
@@ -206,11 +202,7 @@ def topology(mesh: Mesh) -> Topology:
     Raises:
         InputError: a mesh that is not watertight.
     """
-    if not is_watertight(mesh):
-        raise InputError(
-            "expected a watertight mesh, whose edges all have two triangles that run along them in "
-            "opposite directions, got an open one; close it"
-        )
+    _check_watertight(mesh, "mesh")
     solid = _solid(mesh)
     parts = trimesh.graph.connected_components(solid.edges_unique)
     return Topology(len(parts), int(solid.euler_number))
@@ -270,6 +262,14 @@ def surface_points(
     points, rows = trimesh.sample.sample_surface(solid, number, seed=[seed, stream])[:2]
     normals = solid.face_normals[rows]
     return torch.from_numpy(np.array(points)), torch.from_numpy(np.array(normals))
+
+
+def _check_watertight(mesh: Mesh, name: str) -> None:
+    if not is_watertight(mesh):
+        raise InputError(
+            f"expected a watertight {name}, whose edges all have two triangles that run along them "
+            "in opposite directions, got an open one; close it, or compare surfaces"
+        )
 
 
 def _shared_volume(

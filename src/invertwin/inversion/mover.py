@@ -13,6 +13,7 @@ from invertwin.channel import Grid, Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.loss import CorrelationLoss, Scale
+from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.models import MotionMap
 from invertwin.radar.detection import ordered_statistics_cfar, point_cloud
 from invertwin.radar.doppler import compensate_tdm, range_doppler, velocity_axis
@@ -264,35 +265,6 @@ class MoverMaps:
     twin: Tensor
     point: Tensor
 
-    @classmethod
-    def near(
-        cls,
-        body: MovingBody,
-        scene: Scene,
-        radar: Radar,
-        model: MotionMap,
-        *,
-        cells: int = 4,
-        time: float = 0.0,
-        seed: int = 0,
-    ) -> "MoverMaps":
-        """The maps of a body and of a point, where the echo that it started at has moved to.
-
-        Args:
-            body: As fitted.
-            scene: With its object.
-            radar: What records.
-            model: Of the whole recording.
-            cells: To either side of the echo.
-            time: After the middle of the recording [s].
-            seed: Of the rays.
-        """
-        echo = body.echo
-        near = model.around(echo.range + echo.rate * time, echo.rate, cells, radar)
-        with torch.no_grad():
-            twin = near.sampled_by(samples=_RAYS).predict(body(scene, time), radar, seed)[0]
-        return cls(near, twin, of_point(near, radar, echo, time)[0])
-
     def correlations(self, recording: ChirpCapture) -> dict[str, dict[str, float]]:
         """Correlations of ``twin`` and ``bare_psf`` with a recording, on the same cells, by scale.
 
@@ -306,6 +278,38 @@ class MoverMaps:
             pair = ("twin", self.twin), ("bare_psf", self.point)
             found[scale] = {name: 1 - float(loss(power, seen)) for name, power in pair}
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class MoverTwin:
+    """A body that was fitted to the strongest mover of a recording.
+
+    Attributes:
+        recording: One frame of chirps.
+        model: Map of the whole recording.
+        body: As fitted.
+        outcome: Of the fit.
+    """
+
+    recording: ChirpCapture
+    model: MotionMap
+    body: MovingBody
+    outcome: Reconstruction
+
+    def maps(self, scene: Scene, cells: int, *, time: float = 0.0, seed: int = 0) -> MoverMaps:
+        """Maps about the place that the echo has moved to.
+
+        Args:
+            scene: With the body's object.
+            cells: To either side of the echo.
+            time: After the middle of the recording [s].
+            seed: Of the rays.
+        """
+        radar, echo = self.recording.radar(), self.body.echo
+        near = self.model.around(echo.range + echo.rate * time, echo.rate, cells, radar)
+        with torch.no_grad():
+            twin = near.sampled_by(samples=_RAYS).predict(self.body(scene, time), radar, seed)[0]
+        return MoverMaps(near, twin, of_point(near, radar, echo, time)[0])
 
 
 def _rough(scene: Scene, name: str) -> RoughDielectric:

@@ -1,10 +1,10 @@
-"""A regulariser that lets neighbouring vertices move alike."""
+"""Regularisers: neighbouring vertices move alike, and latents stay likely under their prior."""
 
 from collections.abc import Callable
 
 import torch
 from jaxtyping import Float64
-from torch import Tensor
+from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
@@ -45,6 +45,27 @@ class Laplacian:
         moved = (scene[self.object].mesh.vertices - self.start) / self.unit
         jump = moved[self.edges[:, 0]] - moved[self.edges[:, 1]]
         return 0.5 * self.weight * (self.weights * jump.square().sum(1)).sum()
+
+
+class LatentNorm:
+    """The term ½ weight |z|²: the negative logarithm of a latent's prior probability.
+
+    Args:
+        module: It has the parameter ``latent``, such as `PriorShape` or `LinearShape`.
+        weight: Factor of ½ |z|².
+    """
+
+    def __init__(self, module: nn.Module, weight: float) -> None:
+        if not isinstance(getattr(module, "latent", None), nn.Parameter):
+            raise InputError(
+                f"expected a module with a latent, got {type(module).__name__}; "
+                "give a PriorShape or a LinearShape"
+            )
+        self.module, self.weight = module, weight
+
+    def __call__(self, scene: Scene) -> Float64[Tensor, ""]:
+        """The term at the module's present latent."""
+        return 0.5 * self.weight * self.module.latent.square().sum()  # type: ignore[union-attr]
 
 
 def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float]:

@@ -166,20 +166,17 @@ class _Surface:
 
     def relax(self, onto: Mesh) -> None:
         """Move vertices along the surface to the middle of their neighbours."""
-        places, edges = np.array(self.places), self._edges()[0]
-        faces = np.array(list(self.faces.values()))
+        places, faces = np.array(self.places), np.array(list(self.faces.values()))
+        a, b, c = places[faces].transpose(1, 0, 2)
         normals = np.zeros_like(places)
-        across = np.cross(
-            places[faces[:, 1]] - places[faces[:, 0]], places[faces[:, 2]] - places[faces[:, 0]]
-        )
-        for k in range(3):
-            np.add.at(normals, faces[:, k], across)
+        for corner in faces.T:
+            np.add.at(normals, corner, np.cross(b - a, c - a))
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        middle, count = np.zeros_like(places), np.zeros((len(places), 1))
-        for one, other in ((0, 1), (1, 0)):
-            np.add.at(middle, edges[:, one], places[edges[:, other]])
-            np.add.at(count, edges[:, one], 1)
-        step = middle / np.maximum(count, 1) - places
+        ends = self._edges()[0]
+        one, other = np.concatenate([ends, ends[:, ::-1]]).T
+        middle, count = np.zeros_like(places), np.bincount(one, minlength=len(places))
+        np.add.at(middle, one, places[other])
+        step = middle / np.maximum(count, 1)[:, None] - places
         step -= (step * normals).sum(1, keepdims=True) * normals
         free = np.array([bool(ring) for ring in self.around])
         free[list(self.fixed)] = False

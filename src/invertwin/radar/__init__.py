@@ -23,11 +23,11 @@ from invertwin.radar.doppler import velocity_span as velocity_span
 from invertwin.radar.doppler_maps import DopplerMaps as DopplerMaps
 from invertwin.radar.doppler_maps import Peak as Peak
 from invertwin.radar.doppler_maps import doppler_maps as doppler_maps
+from invertwin.radar.doppler_maps import peak_of as peak_of
 from invertwin.radar.doppler_maps import points_csv as points_csv
 from invertwin.radar.doppler_maps import points_of as points_of
 from invertwin.radar.doppler_maps import sharp_map as sharp_map
 from invertwin.radar.doppler_maps import snapshots_of as snapshots_of
-from invertwin.radar.doppler_maps import still_peak as still_peak
 from invertwin.radar.impairments import ADC as ADC
 from invertwin.radar.impairments import Impairments as Impairments
 from invertwin.radar.impairments import Leakage as Leakage

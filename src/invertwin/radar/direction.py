@@ -125,7 +125,13 @@ def music(
         values = torch.linalg.eigvalsh(covariance.detach())
         count = source_count(values, snapshots.values.shape[-2], sources)
     else:
-        _check_sources(sources, elements, snapshots.values.shape[-2])
+        seen = snapshots.values.shape[-2]
+        if not 0 <= sources <= min(elements - 1, seen):
+            raise InputError(
+                f"expected 0 to {elements - 1} sources, fewer than the {elements} elements of a "
+                f"(sub)array, and at most {seen} sources from as many snapshots, got {sources}; "
+                "give more chirps or other smoothing"
+            )
         count = torch.full(covariance.shape[:2], sources, device=covariance.device)
     # Eigenvalues ascend: the signal's are the last.
     order = torch.arange(elements, device=covariance.device)
@@ -268,16 +274,3 @@ def _snapshots(
 def _uniform(places: Float64[Tensor, " place"]) -> bool:
     steps = places.diff()
     return len(steps) < 2 or bool((steps - steps.mean()).abs().max() <= _UNIFORMITY * steps.mean())
-
-
-def _check_sources(sources: int, elements: int, snapshots: int) -> None:
-    if not 0 <= sources < elements:
-        raise InputError(
-            f"expected 0 to {elements - 1} sources, fewer than the {elements} elements (of a "
-            f"subarray), got {sources}; a noise subspace must remain"
-        )
-    if sources > snapshots:
-        raise InputError(
-            f"expected at most {snapshots} sources from as many snapshots, got {sources}; give "
-            "more chirps as snapshots, or smoothing"
-        )

@@ -15,6 +15,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
 from invertwin.radar.spectrum import beamform
 from invertwin.radar.waveform import unit_window
+from invertwin.scene.checks import check_shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +87,8 @@ def range_doppler(
     """
     expected = (radar.frame_count, chirps.count)
     bins = chirps.count if bins is None else bins
-    if tuple(beat.shape[:2]) != expected:
-        raise InputError(
-            f"expected {expected[0]} frames of {expected[1]} chirps, got {tuple(beat.shape[:2])}; "
-            "use the radar and the timing that recorded them"
-        )
+    what = f"signals (frame, chirp, tx, rx, sample) of {chirps.count} chirps"
+    check_shape(beat, (*expected, None, None, None), what, "use the timing that recorded them")
     if bins < chirps.count:
         raise InputError(
             f"expected at least {chirps.count} bins, one per chirp, got {bins}; use fewer chirps "
@@ -123,12 +121,10 @@ def compensate_tdm(
     Raises:
         InputError: Another number of transmitters in the spectrum than in the radar.
     """
+    expected = None, None, radar.shape[1], None, None
+    what = f"a spectrum (frame, velocity, tx, rx, range) of {radar.shape[1]} transmitters"
+    check_shape(spectrum, expected, what, "use the radar that recorded it")
     frames, count, transmitters, _, ranges = spectrum.shape
-    if transmitters != radar.shape[1]:
-        raise InputError(
-            f"expected a spectrum of {radar.shape[1]} transmitters, got {transmitters}; "
-            "use the radar that recorded it"
-        )
     folds = torch.as_tensor(fold).cpu().expand(frames, count, ranges).to(torch.float64)
     rate = velocity_axis(radar, chirps, count)[:, None] + folds * velocity_span(radar, chirps)
     frequency = 2 / radar.waveform.wavelength * rate

@@ -1,9 +1,8 @@
 """Maps of one frame of chirps over range, range rate and direction, and where they peak."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from operator import attrgetter
 
 import numpy as np
 import torch
@@ -108,36 +107,24 @@ def doppler_maps(
     flat = cube.abs().square().mean((2, 3))[0]
     cube = compensate_tdm(cube, radar, chirps)[0]
     velocities = velocity_axis(radar, chirps)
-    still = (torch.arange(chirps.count) - chirps.count // 2).abs() <= _STILL_BINS
+    moving = (torch.arange(chirps.count) - chirps.count // 2).abs() > _STILL_BINS
     chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
-    sums = [torch.zeros(grid.shape, dtype=torch.float64) for _ in range(2)]
-    peaks: list[Peak | None] = [None, None]
+    everything, movers = torch.zeros(2, *grid.shape, dtype=torch.float64)
+    peaks = []
     seen = (grid.u[:, None].square() + grid.v.square()) <= 1
     for rows in torch.arange(chirps.count).split(chunk):
         power = beamform(cube[rows], radar.frames([0] * len(rows)), grid).double() * seen
-        for kind, kept in enumerate((torch.ones_like(still), ~still)):
-            chosen = rows[kept[rows]]
-            if len(chosen) == 0:
-                continue
-            part = power[kept[rows]]
-            sums[kind] += part.sum(0)
-            best, place = float(part.max()), int(part.argmax())
-            known = peaks[kind]
-            if known is None or best > known.power:
-                cell = np.unravel_index(place, part.shape)
-                peaks[kind] = _peak(best, float(velocities[chosen[int(cell[0])]]), cell[1:], grid)
-    strongest = peaks[0]
-    assert strongest is not None
-    moving = peaks[1] is not None
-    return DopplerMaps(
-        grid,
-        velocities,
-        flat,
-        sums[0],
-        sums[1] if moving else None,
-        strongest,
-        peaks[1],
-    )
+        everything += power.sum(0)
+        movers += power[moving[rows]].sum(0)
+        peaks += [
+            peak_of(part, grid, float(rate))
+            for part, rate in zip(power, velocities[rows], strict=True)
+        ]
+    fast = [peak for peak, moves in zip(peaks, moving, strict=True) if moves]
+    strongest = max(peaks, key=attrgetter("power"))
+    mover = max(fast, key=attrgetter("power"), default=None)
+    shown = movers if fast else None
+    return DopplerMaps(grid, velocities, flat, everything, shown, strongest, mover)
 
 
 def sharp_map(
@@ -224,12 +211,14 @@ def points_csv(points: PointCloud) -> str:
     return "\n".join(lines) + "\n"
 
 
-def still_peak(spectrum: Float[Tensor, "range u v"], grid: Grid) -> Peak:
-    """The strongest cell of a map without range rates."""
-    cell = np.unravel_index(int(spectrum.argmax()), spectrum.shape)
-    return _peak(float(spectrum.max()), 0.0, cell, grid)
+def peak_of(spectrum: Float[Tensor, "range u v"], grid: Grid, velocity: float = 0.0) -> Peak:
+    """The strongest cell of a map of one range rate.
 
-
-def _peak(power: float, velocity: float, cell: Sequence[Any], grid: Grid) -> Peak:
-    r, u, v = (int(index) for index in cell)
-    return Peak(float(grid.ranges[r]), velocity, float(grid.u[u]), float(grid.v[v]), power)
+    Args:
+        spectrum: Power.
+        grid: Bins of the map.
+        velocity: The range rate [m/s].
+    """
+    r, u, v = (int(index) for index in np.unravel_index(int(spectrum.argmax()), spectrum.shape))
+    place = float(grid.ranges[r]), velocity, float(grid.u[u]), float(grid.v[v])
+    return Peak(*place, float(spectrum[r, u, v]))

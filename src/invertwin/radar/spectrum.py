@@ -49,16 +49,6 @@ class Aperture:
         counts = self.counts
         return torch.equal(counts * counts.sum(), counts.sum(1)[:, None] * counts.sum(0)[None])
 
-    @property
-    def x_weight(self) -> Float64[Tensor, " x"]:
-        """Weight of each x position of a separable array."""
-        return self.x_taper * self.counts.sum(1)
-
-    @property
-    def y_weight(self) -> Float64[Tensor, " y"]:
-        """Weight of each y position of a separable array."""
-        return self.y_taper * self.counts.sum(0)
-
     def check_resolved(self, grid: Grid) -> None:
         """Raise if the grid resolves only one axis of an array that is not separable."""
         if not self.separable and (grid.u_count == 1 or grid.v_count == 1):
@@ -186,10 +176,10 @@ def _separable_power(
         return (array.steering(cosines, places) * (weight / weight.sum())).to(channels)
 
     if grid.v_count > 1:
-        v = steered(grid.v, array.y, array.y_weight)
+        v = steered(grid.v, array.y, array.y_taper * array.counts.sum(0))
         plane = torch.einsum("vy,frxy->frxv", v, plane)
     if grid.u_count > 1:
-        u = steered(grid.u, array.x, array.x_weight)
+        u = steered(grid.u, array.x, array.x_taper * array.counts.sum(1))
         plane = torch.einsum("ux,frxv->fruv", u, plane)
     power = plane.abs().square()
     if grid.u_count == 1:

@@ -288,9 +288,9 @@ class _Kernel:
     def _by_matrix(self, power: Tensor, transfer: Tensor) -> Tensor:
         # At these sizes a Toeplitz matrix per axis is some 30 times faster than a padded FFT.
         (dim,), (count,) = self.dims, self.counts
-        taps = torch.fft.irfft(transfer, _padded(count))
-        place = torch.arange(count)
-        matrix = taps[(place[:, None] - place[None]) % len(taps)].to(power)
+        taps = torch.fft.irfft(transfer, _padded(count)).to(power)
+        lags = taps.roll(count - 1)[: 2 * count - 1]
+        matrix = lags.flip(0).unfold(0, count, 1).flip(0)
         if dim == power.ndim - 1:
             return power @ matrix.T
         return (matrix @ power.flatten(dim + 1)).reshape(power.shape)

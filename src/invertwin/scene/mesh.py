@@ -36,7 +36,7 @@ class Mesh:
             self.vertices, (None, 3), "mesh vertices", "repair the mesh before loading it"
         )
         object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", _checked_faces(self.faces, len(vertices)))
+        object.__setattr__(self, "faces", checked_faces(self.faces, len(vertices)))
 
     @property
     def center(self) -> Float64[Tensor, "3"]:
@@ -55,7 +55,16 @@ def joined(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
     return Mesh(torch.cat([part.vertices for part in parts]), torch.cat(faces))
 
 
-def _checked_faces(faces: object, vertex_count: int) -> Tensor:
+def checked_faces(faces: object, vertex_count: int) -> Tensor:
+    """`faces` as vertex indices [f, 3].
+
+    Args:
+        faces: tensor, array or nested sequence of integers.
+        vertex_count: number of vertices that they point to.
+
+    Raises:
+        InputError: wrong type or shape, none, or an index that points to no vertex.
+    """
     try:
         indices = torch.as_tensor(faces)
     except (TypeError, ValueError, RuntimeError):

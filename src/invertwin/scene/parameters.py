@@ -5,7 +5,7 @@ Any torch module Scene → Scene serves as well.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, TypeVar
@@ -89,41 +89,48 @@ class ObjectModule(nn.Module):
 class Translation(ObjectModule):
     """Moves an object along the world axes.
 
+    Args:
+        object: name of the object.
+        initial: [m].
+        axes: world axes along which the fit may move it; the others keep their values.
+
     Attributes:
         translation: parameter [3], metres.
+
+    Raises:
+        InputError: `initial` is not three finite numbers, or an unknown axis.
     """
 
     reported = ("translation",)
 
     def __init__(self, object: str, initial: ArrayLike = ORIGIN, axes: Axes = "xyz") -> None:
-        """Move `object`, by `initial` [m] at the start.
-
-        Args:
-            object: name of the object.
-            initial: [m].
-            axes: world axes along which the fit may move it; the others keep their values.
-
-        Raises:
-            InputError: `initial` is not three finite numbers, or an unknown axis.
-        """
         super().__init__(object)
         self.translation = nn.Parameter(_vector(initial, "initial translation [m]"))
-        self._axes = _checked_axes(axes)
+        self._axes = axes_mask(axes)
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the object moved."""
-        motion = rigid(translation=_free(self.translation, self._axes))
+        motion = rigid(translation=free_part(self.translation, self._axes))
         return scene.replace(self.object, pose=compose(scene[self.object].transform, motion))
 
 
 class RigidMotion(nn.Module):
     """A translation and a rotation without singularities: quaternion ∝ (w, r/2).
 
+    Args:
+        translation: [m].
+        rotation: rotation vector of any angle [3] (rad), or q itself [4].
+        axes: world axes along which the fit may move it.
+        rotation_axes: components of the rotation vector that the fit may change.
+
     Attributes:
         translation: parameter [3], metres.
         rotation: parameter [4], q = (w, r) with the quaternion ∝ (w, r/2); near the identity
             (1, 0, 0, 0), r is the rotation vector in the world [rad]. Any q but zero is a
             rotation, and its derivative is finite everywhere.
+
+    Raises:
+        InputError: wrong shapes, NaN, q = 0, or an unknown axis.
     """
 
     def __init__(
@@ -133,21 +140,11 @@ class RigidMotion(nn.Module):
         axes: Axes = "xyz",
         rotation_axes: Axes = "xyz",
     ) -> None:
-        """Move from these values at the start.
-
-        Args:
-            translation: [m].
-            rotation: rotation vector of any angle [3] (rad), or q itself [4].
-            axes: world axes along which the fit may move it.
-            rotation_axes: components of the rotation vector that the fit may change.
-
-        Raises:
-            InputError: wrong shapes, NaN, q = 0, or an unknown axis.
-        """
         super().__init__()
         self.translation = nn.Parameter(_vector(translation, "initial translation [m]"))
         self.rotation = nn.Parameter(_rotation_numbers(rotation))
-        self._axes, self._rotation_axes = _checked_axes(axes), _checked_axes(rotation_axes)
+        self._axes = axes_mask(axes)
+        self._rotation_axes = torch.cat([torch.ones(1), axes_mask(rotation_axes)])
 
     @property
     def rotation_matrix(self) -> Float64[Tensor, "3 3"]:
@@ -157,14 +154,14 @@ class RigidMotion(nn.Module):
     @property
     def shift(self) -> Float64[Tensor, "3"]:
         """The translation [m], with a derivative along the free axes."""
-        return _free(self.translation, self._axes)
+        return free_part(self.translation, self._axes)
 
     @property
     def _quaternion(self) -> Tensor:
         # Halving r makes (1, r) the rotation vector r [rad] to first order, so that one learning
         # rate in rad serves all components.
         halves = self.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
-        return _free(self.rotation, self._rotation_axes) * halves
+        return free_part(self.rotation, self._rotation_axes) * halves
 
     def entries(self) -> dict[str, Entries]:
         """The rotation vector [rad], to first order from the identity."""
@@ -179,7 +176,11 @@ class RigidMotion(nn.Module):
 
 
 class Pose(RigidMotion):
-    """Turns an object about its centre, then moves it along the world axes."""
+    """Turns an object about its centre, then moves it along the world axes.
+
+    Args:
+        object: name of the object. The others are those of `RigidMotion`.
+    """
 
     def __init__(
         self,
@@ -189,11 +190,6 @@ class Pose(RigidMotion):
         axes: Axes = "xyz",
         rotation_axes: Axes = "xyz",
     ) -> None:
-        """Move an object. `RigidMotion` tells what the other arguments mean.
-
-        Args:
-            object: name of the object.
-        """
         super().__init__(translation, rotation, axes, rotation_axes)
         self.object = object
 
@@ -212,22 +208,20 @@ class Pose(RigidMotion):
 class Scale(ObjectModule):
     """Scales an object about its centre.
 
+    Args:
+        object: name of the object.
+        initial: factor.
+
     Attributes:
         log_scale: parameter, natural logarithm of the factor.
+
+    Raises:
+        InputError: `initial` is not positive.
     """
 
     reported = ("scale",)
 
     def __init__(self, object: str, initial: float = 1.0) -> None:
-        """Scale `object`, from this size at the start.
-
-        Args:
-            object: name of the object.
-            initial: factor.
-
-        Raises:
-            InputError: `initial` is not positive.
-        """
         super().__init__(object)
         factor = checked_number(initial, "initial scale", 0.0, open_low=True)
         self.log_scale = nn.Parameter(torch.tensor(math.log(factor), dtype=torch.float64))
@@ -245,22 +239,20 @@ class Scale(ObjectModule):
 class Vertices(ObjectModule):
     """Moves every vertex of an object freely.
 
+    Args:
+        object: name of the object.
+        count: number of its vertices.
+
     Attributes:
         offsets: parameter [v, 3] in the object's frame, metres.
+
+    Raises:
+        InputError: no vertices.
     """
 
     reported = ("offsets",)
 
     def __init__(self, object: str, count: int) -> None:
-        """Move the `count` vertices of `object`, by zero at the start.
-
-        Args:
-            object: name of the object.
-            count: number of its vertices.
-
-        Raises:
-            InputError: no vertices.
-        """
         super().__init__(object)
         rows = checked_count(count, "number of vertices", 1)
         self.offsets = nn.Parameter(torch.zeros(rows, 3, dtype=torch.float64))
@@ -285,26 +277,24 @@ class MaterialValues(nn.Module):
     A value that starts as one number is fitted as one, one that starts as a number per triangle
     or as a `Texture` is fitted triangle by triangle or pixel by pixel.
 
+    Args:
+        object: name of the object.
+        layer: of a `Multilayer`, the layer whose values are meant; None for values of the
+            material itself.
+        start: by the names of `RANGES` of the materials, inside their ranges, ends
+            excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
+            lobe_width [rad], scattering, rms_slope, lambertian, directive, directive_exponent,
+            backscatter_exponent.
+
     Attributes:
         raw: unbounded parameters by field: for values with one limit, such as the permittivity,
             the logarithm of what is above it; for values between two, the logit of their place.
+
+    Raises:
+        InputError: none given, an unknown name, or a value at or beyond the end of its range.
     """
 
     def __init__(self, object: str, *, layer: int | None = None, **start: Value | None) -> None:
-        """Fit the given values of the material of `object`, from these values at the start.
-
-        Args:
-            object: name of the object.
-            layer: of a `Multilayer`, the layer whose values are meant; None for values of the
-                material itself.
-            start: by the names of `RANGES` of the materials, inside their ranges, ends
-                excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
-                lobe_width [rad], scattering, rms_slope, lambertian, directive, directive_exponent,
-                backscatter_exponent.
-
-        Raises:
-            InputError: none given, an unknown name, or a value at or beyond the end of its range.
-        """
         super().__init__()
         self.object = object
         self.layer = None if layer is None else checked_count(layer, "number of a layer", 0)
@@ -412,9 +402,7 @@ class Compose(nn.Module):
         """Values of all modules by name, for progress and reports."""
         merged: dict[str, Tensor] = {}
         for part in self.parts:
-            values: Callable[[], dict[str, Tensor]] | None = getattr(part, "values", None)
-            if values is not None:
-                merged.update(values())
+            merged |= getattr(part, "values", dict)()
         return merged
 
 
@@ -453,16 +441,19 @@ def _unbounded(name: str, value: Tensor) -> Tensor:
     return above.log() if math.isinf(span.high) else torch.logit(above / (span.high - span.low))
 
 
-def _checked_axes(axes: str) -> str:
+def axes_mask(axes: str) -> Tensor:
+    """1 for the axes that are named, 0 for the others.
+
+    Raises:
+        InputError: an unknown axis.
+    """
     if set(axes) - set("xyz"):
         raise InputError(f"expected axes among x, y and z, got {axes!r}; write them as 'xy'")
-    return axes
+    return torch.tensor([float(axis in axes) for axis in "xyz"], dtype=torch.float64)
 
 
-def _free(parameter: Tensor, axes: str) -> Tensor:
-    """The parameter, with no derivative in its last three numbers along the other axes."""
-    mask = torch.ones_like(parameter)
-    mask[-3:] = torch.tensor([float(axis in axes) for axis in "xyz"])
+def free_part(parameter: Tensor, mask: Tensor) -> Tensor:
+    """The parameter, with no derivative where a mask is 0."""
     return parameter * mask + parameter.detach() * (1 - mask)
 
 

@@ -11,15 +11,15 @@ from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_tensor
 
 
-def quaternion_from_vector(vector: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
+def quaternion_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternion (w, x, y, z) of a rotation vector [rad] (axis times angle).
 
     Its first derivative is right everywhere, at the zero vector too.
     """
-    angle = torch.linalg.vector_norm(vector)
+    angle = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
     # sin(a/2)/a written as a sinc, which is smooth at a = 0.
     scaled = 0.5 * torch.sinc(angle / (2 * torch.pi)) * vector
-    return torch.cat([torch.cos(angle / 2)[None], scaled])
+    return torch.cat([torch.cos(angle / 2), scaled], dim=-1)
 
 
 def vector_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
@@ -32,27 +32,28 @@ def vector_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3"]
     return torch.where(sine > 0, 2 * torch.atan2(sine, unit[0]) / sine, 2.0) * unit[1:]
 
 
-def rotation_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3 3"]:
+def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a quaternion (w, x, y, z) of any length but zero.
 
     Raises:
         InputError: a quaternion of length zero, which is no rotation.
     """
-    if not bool(quaternion.detach().abs().max() > 0):
+    if not bool((quaternion.detach().abs().amax(-1) > 0).all()):
         raise InputError(
             f"expected a quaternion that is not zero, got {quaternion.tolist()}; "
             "start from (1, 0, 0, 0), the identity"
         )
-    w, x, y, z = torch.unbind(quaternion / torch.linalg.vector_norm(quaternion))
+    length = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
+    w, x, y, z = (quaternion / length).unbind(-1)
     rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     ]
-    return torch.stack(rows)
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
-def rotation_from_vector(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a rotation vector [rad] (axis times angle)."""
     return rotation_from_quaternion(quaternion_from_vector(vector))
 

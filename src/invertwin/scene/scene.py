@@ -57,7 +57,10 @@ class Object:
         if self.pose is not None:
             object.__setattr__(self, "pose", _checked_pose(self.pose))
         if self.velocity is not None:
-            velocity = _checked_velocity(self.velocity, len(self.mesh.vertices))
+            count = len(self.mesh.vertices)
+            do = f"give one vector [3] or one per vertex [{count}, 3]"
+            shape = (count, 3) if getattr(self.velocity, "ndim", 1) == 2 else (3,)
+            velocity = checked_tensor(self.velocity, shape, "velocity [m/s]", do)
             object.__setattr__(self, "velocity", velocity)
 
     @property
@@ -198,9 +201,3 @@ def _checked_pose(pose: object) -> Tensor:
             "and scale the mesh instead"
         )
     return matrix
-
-
-def _checked_velocity(velocity: object, vertex_count: int) -> Tensor:
-    do = f"give one vector [3] or one per vertex [{vertex_count}, 3]"
-    shape = (vertex_count, 3) if getattr(velocity, "ndim", 1) == 2 else (3,)
-    return checked_tensor(velocity, shape, "velocity [m/s]", do)

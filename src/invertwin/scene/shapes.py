@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from functools import reduce
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -147,7 +146,10 @@ def text(
     count = len(plane)
     front = np.column_stack([plane, np.full(count, -thickness / 2)])
     back = np.column_stack([plane, np.full(count, thickness / 2)])
-    start, end = _boundary(cap).T
+    # Open edges, which have one triangle, in its direction.
+    flat = trimesh.Trimesh(front, cap, process=False)
+    open_edges = trimesh.grouping.group_rows(flat.edges_sorted, require_count=1)
+    start, end = flat.edges[np.sort(open_edges)].T
     walls = [(start, end, end + count), (start, end + count, start + count)]
     faces = np.concatenate([cap[:, ::-1], cap + count, *(np.column_stack(w) for w in walls)])
     return _mesh(*_split_long_edges(np.concatenate([front, back]), faces, longest))
@@ -222,12 +224,6 @@ def _triangulated_outline(
     # Corners are copies of the outline's points, hence equal to the last bit where they meet.
     points, index = np.unique(triangles.reshape(-1, 2), axis=0, return_inverse=True)
     return points, index.reshape(-1, 3)
-
-
-def _boundary(faces: np.ndarray) -> np.ndarray:
-    """Directed edges [b, 2] whose opposite belongs to no face."""
-    directed = {(int(a), int(b)) for face in faces for a, b in pairwise([*face, face[0]])}
-    return np.array([(a, b) for a, b in sorted(directed) if (b, a) not in directed])
 
 
 def _split_long_edges(

@@ -284,10 +284,17 @@ def test_bad_links_are_named(tx, rotations, unchecked):
         link(tx, rotations=rotations)
 
 
-@pytest.mark.parametrize("bad", [{"range_count": 0}, {"range_step": 0.0}, {"u_step": -1.0}])
-def test_bad_grids_are_named(bad: dict[str, Any]):
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"range_count": 0}, "expected range_count of at least 1, got 0"),
+        ({"range_step": 0.0}, "expected range_step above 0, got 0"),
+        ({"u_step": -1.0}, "expected u_step above 0, got -1"),
+    ],
+)
+def test_bad_grids_are_named(bad: dict[str, Any], message: str):
     good = Grid(range_start=0.0, range_step=0.1, range_count=4)
-    with pytest.raises(InputError, match="expected a positive"):
+    with pytest.raises(InputError, match=message):
         replace(good, **bad)
 
 

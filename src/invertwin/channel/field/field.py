@@ -1,35 +1,30 @@
 """Fields: physical optics of conductors, fixed random-phase points and paths of rough surfaces."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from invertwin.channel.field.rough_paths import RoughPaths, draw_rough_paths
-from invertwin.channel.field.rough_points import RoughPoints, draw_rough_points
-from invertwin.channel.field.speckle import Speckle
-from invertwin.channel.paths import Link, Paths, joined, listed
+from invertwin.channel.field.speckle import Speckle, draw_speckle
+from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.rays.backend import use_backend
 from invertwin.channel.rays.geometry import flatten, require_edges, silhouettes_move
-from invertwin.channel.rays.scene import RayScene, face_areas, visible
+from invertwin.channel.rays.scene import RayScene, face_areas
 from invertwin.channel.reference.radar_equation import (
     Echo,
-    Place,
-    SurfacePoints,
+    SurfacePaths,
     mirror_field,
-    passed,
     path_view,
-    radar_equation,
+    unblocked,
 )
 from invertwin.channel.reference.shadows import ShadowEdge, boundary_rows
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
-_NO_ROUGH_DERIVATIVE = (
-    "expected no geometry derivative of rough field paths, got one: single points appear and "
-    "vanish; use power paths, or boundary=False for fixed visibility"
-)
 _GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
+_ROWS_AT_ONCE = 1 << 18  # frames × paths
 
 
 def trace_field(
@@ -48,8 +43,8 @@ def trace_field(
         sampling: How many paths are drawn. From the second bounce on, every surface scatters as a
             rough one does: a fixed phase for every ordered path, conductors by their lobe.
         seed: Places and phases.
-        speckle: The rough points and paths to use, so that they stay while the scene moves. What
-            is None in it is drawn from the seed.
+        speckle: The rough points and paths to use, so that they stay while the scene moves; None
+            draws them from the seed.
 
     Source: derivations §4.
     Differs from the source: rough fields have fixed points, not new phases every evaluation.
@@ -57,14 +52,14 @@ def trace_field(
     Raises:
         InputError: A derivative of rough field paths with ``boundary`` on: single points appear
             and vanish, so a realisation has no boundary term. Use power paths, or switch
-            ``boundary`` off to accept fixed visibility.
+            ``boundary`` off to accept fixed visibility. A speckle of fewer bounces.
     """
-    fixed, depth = speckle or Speckle(), sampling.depth
+    depth = sampling.depth
     with use_backend(sampling.backend):
         geometry = flatten(scene, link.wavelength, motion="fixed")
         moves = sampling.boundary and silhouettes_move(geometry, link)
         rays = RayScene(geometry, link)
-        parts = []
+        parts: list[Paths] = []
         if any(geometry.coherent):
             if sampling.boundary:
                 require_edges(geometry, link, sampling.boundary_samples)
@@ -75,141 +70,79 @@ def trace_field(
                 )
             parts += _conductors(rays, sampling, seed)
         if moves and (depth > 1 or not all(geometry.coherent)):
-            raise InputError(_NO_ROUGH_DERIVATIVE)
-        if not all(geometry.coherent):
-            points = fixed.points or draw_rough_points(scene, sampling.points_per_m2, seed)
-            parts.append(_rough(rays, points))
+            raise InputError(
+                "expected no geometry derivative of rough field paths, got one: single points "
+                "appear and vanish; use power paths, or boundary=False for fixed visibility"
+            )
         if depth > 1:
             geometry.require_rest(depth)
-            paths = fixed.paths or draw_rough_paths(
-                scene, link, count=sampling.rough_paths, depth=depth, seed=seed
+        fixed = speckle or draw_speckle(scene, link, sampling, seed)
+        if len(fixed.paths) < depth - 1:
+            raise InputError(
+                f"expected speckle of paths of up to {depth} bounces, got "
+                f"{len(fixed.paths) + 1}; draw it with this sampling"
             )
-            parts += _several_bounces(rays, paths, depth)
+        points = () if all(geometry.coherent) else (fixed.points,)
+        for paths in (*points, *fixed.paths[: depth - 1]):
+            parts += _fields(rays, paths, "rough", _rough_field)
         return joined(parts)
+
+
+def _fields(
+    rays: RayScene, paths: SurfacePaths, kind: str, field: Callable[[SurfacePaths, Echo], Tensor]
+) -> list[Paths]:
+    """The paths in every frame in which their field does not vanish."""
+    found, count = [], len(paths.weight)
+    frames = torch.arange(rays.link.frame_count)
+    for some in frames.split(max(1, _ROWS_AT_ONCE // max(1, count))):
+        frame, row = some.repeat_interleave(count), torch.arange(count).repeat(len(some))
+        seen = unblocked(rays, frame, paths.keep(row))
+        kept = paths.keep(row[seen])
+        echo = path_view(rays, frame[seen], kept)
+        velocity = kept.velocity(rays.geometry)
+        rows = echo.paths(kind, coefficient=field(kept, echo), velocity=velocity)
+        found.append(rows.chosen(rows.coefficient != 0))
+    return found
+
+
+def _rough_field(paths: SurfacePaths, echo: Echo) -> Tensor:
+    """Amplitude sqrt(f · weight), with the phase of the path."""
+    # A root of zero has no derivative.
+    lit = echo.power > 0
+    root = (torch.where(lit, echo.power, 1.0) * paths.weight).sqrt()
+    return torch.polar(torch.where(lit, root, 0.0), paths.phase)
 
 
 def _conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
     """Physical optics of the conductors, and its boundary paths."""
     coherent = torch.tensor(rays.geometry.coherent)[rays.geometry.face_object]
-    parts = [_coherent(rays, coherent, sampling.samples, seed)]
+
+    def field(paths: SurfacePaths, echo: Echo) -> Tensor:
+        return mirror_field(rays.link, echo) * paths.weight
 
     def row(edge: ShadowEdge, echo: Echo) -> Paths:
-        field = mirror_field(rays.link, edge.frame, edge.place, echo).detach()
-        amount = field * edge.speed
-        return listed(
-            edge.frame,
-            echo.length,
-            edge.place.position,
-            "coherent",
-            coefficient=(amount - amount.detach()) * coherent[edge.face],
-            boundary=True,
-        )
+        amount = mirror_field(rays.link, echo).detach() * edge.speed
+        coefficient = (amount - amount.detach()) * coherent[edge.face]
+        return echo.paths("coherent", coefficient=coefficient, boundary=True)
 
-    if sampling.boundary and sampling.boundary_samples:
-        parts.append(boundary_rows(rays, sampling.boundary_samples, seed, row))
+    points = _spread(face_areas(rays.geometry) * coherent, sampling.samples, seed)
+    parts = _fields(rays, points, "coherent", field)
+    if sampling.boundary:
+        parts += boundary_rows(rays, sampling.boundary_samples, seed, row)
     return parts
 
 
-def _coherent(rays: RayScene, coherent: Tensor, samples: int, seed: int) -> Paths:
-    """Physical optics by low-discrepancy area samples of the conductors (error 1/N)."""
+def _spread(areas: Tensor, count: int, seed: int) -> SurfacePaths:
+    """Low-discrepancy points over triangles of these areas (error of an integral: 1/count)."""
     rng = np.random.default_rng(seed)
     shift = rng.random(2)
-    index = np.arange(samples)
-    edges = np.cumsum((face_areas(rays.geometry) * coherent).numpy())
+    index = np.arange(count)
+    edges = np.cumsum(areas.numpy())
     # Jittered, not evenly spaced: even steps would beat with the order of a subdivided mesh.
-    place = (index + rng.random(samples)) / samples * edges[-1]
+    place = (index + rng.random(count)) / count * edges[-1]
     face = np.minimum(np.searchsorted(edges, place, side="right"), len(edges) - 1)
-    b1, b2 = ((shift[k] + index * _GOLDEN[k]) % 1.0 for k in range(2))
-    fold = b1 + b2 > 1
-    b1, b2 = np.where(fold, 1 - b1, b1), np.where(fold, 1 - b2, b2)
-    weight = np.full(samples, float(edges[-1]) / samples)
-    points, point, echo, transmittance, extra = _seen(
-        rays, *map(torch.from_numpy, (face, b1, b2, weight))
-    )
-    coefficient = mirror_field(rays.link, points.frame, point, echo)
-    coefficient = coefficient * (points.weight * transmittance.sqrt())
-    return listed(
-        points.frame,
-        echo.length + extra,
-        point.position,
-        "coherent",
-        coefficient=coefficient,
-        velocity=points.velocity(rays.geometry),
-    )
-
-
-def _rough(rays: RayScene, fixed: RoughPoints) -> Paths:
-    """Fields of the rough points: amplitude sqrt(f/ρ), phase of the material point."""
-    points, point, echo, transmittance, extra = _seen(
-        rays, fixed.face, fixed.b1, fixed.b2, fixed.phase
-    )
-    amplitude = (echo.power * transmittance / fixed.density).sqrt()
-    return listed(
-        points.frame,
-        echo.length + extra,
-        point.position,
-        "rough",
-        coefficient=torch.polar(amplitude, points.weight),
-        velocity=points.velocity(rays.geometry),
-    )
-
-
-def _several_bounces(rays: RayScene, drawn: RoughPaths, depth: int) -> list[Paths]:
-    """Fields of the rough paths: amplitude sqrt(f · weight), phase of the path."""
-    parts = []
-    for paths in drawn.by_length[: depth - 1]:
-        for number in range(rays.link.frame_count):
-            frame = torch.full((len(paths.weight),), number)
-            with torch.no_grad():
-                lit = path_view(rays, frame, paths).power > 0
-            kept, frame = paths.keep(lit), frame[lit]
-            found = path_view(rays, frame, kept)
-            coefficient = torch.polar((found.power * kept.weight).sqrt(), kept.phase)
-            parts.append(
-                listed(
-                    frame,
-                    found.length,
-                    found.last,
-                    "rough",
-                    coefficient=coefficient,
-                    first=found.first,
-                )
-            )
-    return parts
-
-
-def _seen(rays: RayScene, *columns: Tensor) -> tuple[SurfacePoints, Place, Echo, Tensor, Tensor]:
-    """Points in every frame whose antennas both see them from the same side, and their echoes.
-
-    Also what sheets let through on both segments, and the length that they add.
-    """
-    geometry, link = rays.geometry, rays.link
-    frame = torch.arange(link.frame_count).repeat_interleave(len(columns[0]))
-    points = SurfacePoints(frame, *(column.repeat(link.frame_count) for column in columns))
-    with torch.no_grad():
-        point = points.place(geometry)
-        position, normal = point.position, point.normal
-        to_tx, to_rx = link.tx[points.frame] - position, link.rx[points.frame] - position
-        keep = (normal * to_tx).sum(1) * (normal * to_rx).sum(1) > 0
-        if geometry.sheets:
-            keep &= _through_sheets(rays, points.frame, position)[0] > 0
-        else:
-            keep &= visible(rays, link.tx[points.frame], position)
-            if not link.shared_visibility:
-                keep &= visible(rays, link.rx[points.frame], position)
-    points = points.keep(keep)
-    point = points.place(geometry)
-    echo = radar_equation(geometry, link, points.frame, [point])
-    return points, point, echo, *_through_sheets(rays, points.frame, point.position)
-
-
-def _through_sheets(rays: RayScene, frame: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Transmittance of sheets on both segments (1 without any), and the length added."""
-    link = rays.link
-    if not rays.geometry.sheets:
-        return torch.ones_like(position[:, 0]), torch.zeros_like(position[:, 0])
-    transmittance, extra = passed(rays, link.tx[frame], position)
-    if link.shared_visibility and torch.equal(link.tx, link.rx):
-        return transmittance * transmittance, extra + extra
-    other, more = passed(rays, link.rx[frame], position)
-    return transmittance * other, extra + more
+    b = (shift[:, None] + index * np.array(_GOLDEN)[:, None]) % 1.0
+    b = np.where(b.sum(0) > 1, 1 - b, b)
+    b1, b2 = torch.from_numpy(b)[..., None]
+    weight = torch.full((count,), float(edges[-1]) / count, dtype=torch.float64)
+    return SurfacePaths(torch.from_numpy(face)[:, None], b1, b2, weight, torch.zeros_like(weight))

@@ -5,8 +5,7 @@ of its own (derivations §4). Nothing draws anew what is drawn here: a realisati
 and scene move.
 """
 
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -25,7 +24,7 @@ from invertwin.channel.rays.arrays import (
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry, flatten
 from invertwin.channel.rays.scene import RayScene, face_areas
-from invertwin.channel.reference.radar_equation import SurfacePaths, passed, scattered
+from invertwin.channel.reference.radar_equation import SurfacePaths, passed, radar_equation
 from invertwin.scene.scene import Scene
 
 _LANES = 1 << 18  # walked at a time
@@ -36,18 +35,9 @@ _BLIND = 0.1  # share that goes to paths whatever the reference frames see of th
 _AWAY = 0.125  # share of the first points that are lit from the side the antennas do not see
 
 
-@dataclass(frozen=True)
-class RoughPaths:
-    """The fixed paths of rough multiple scattering, from two points up.
-
-    Attributes:
-        by_length: Paths of two points, of three points, and so on.
-    """
-
-    by_length: tuple[SurfacePaths, ...]
-
-
-def draw_rough_paths(scene: Scene, link: Link, *, count: int, depth: int, seed: int) -> RoughPaths:
+def draw_rough_paths(
+    scene: Scene, link: Link, *, count: int, depth: int, seed: int
+) -> tuple[SurfacePaths, ...]:
     """Draw the paths that rough surfaces scatter along, once for all frames.
 
     The first point is spread over the surfaces, every object alike; the next ones follow the
@@ -56,7 +46,8 @@ def draw_rough_paths(scene: Scene, link: Link, *, count: int, depth: int, seed: 
     Every sequence of objects gets its share, so that a weak echo that takes a narrow way, by a
     wall to a hidden object and back, is made of many paths, too. One over the chance goes into
     the weight: the expected power is that of all paths. The antennas only suggest what is worth
-    while: nothing is lost that another pose could see.
+    while: nothing is lost that another pose could see. Returns paths of two points, of three
+    points, and so on.
 
     Args:
         scene: Surfaces.
@@ -68,12 +59,12 @@ def draw_rough_paths(scene: Scene, link: Link, *, count: int, depth: int, seed: 
     Source: derivations §4 (one independent phase per ordered path).
     """
     if depth < 2:
-        return RoughPaths(())
+        return ()
     with torch.no_grad():
         drawer = _Drawer(flatten(scene, link.wavelength, motion="fixed"), link, seed)
         rounds = -(-count // _LANES)
         parts = [drawer.draw(turn, count // rounds, depth) for turn in range(rounds)]
-        return RoughPaths(tuple(map(drawer.joined, zip(*parts, strict=True))))
+        return tuple(map(drawer.joined, zip(*parts, strict=True)))
 
 
 class _Drawer:
@@ -202,39 +193,21 @@ class _Drawer:
 
         What lies between points is left out: this changes only how well paths are chosen.
         """
-        places = paths.places(self.geometry)
-        points = [place.position for place in places]
-        segments = [end - start for start, end in pairwise(points)]
-        middle = torch.ones_like(paths.weight)
-        for segment in segments:
-            middle = middle / segment.square().sum(1)
-        ways = [normalize(segment, dim=1) for segment in segments]
-        for k in range(1, len(points) - 1):
-            middle = middle * scattered(self.geometry, places[k], -ways[k - 1], ways[k])
-        if segments and not received:
-            middle = middle * (places[-1].normal * ways[-1]).sum(1).abs()
-        total = torch.zeros_like(middle)
-        link = self.link
+        link, places = self.link, paths.places(self.geometry)
+        last, total = places[-1], torch.zeros_like(paths.weight)
         for number in self.frames.tolist():
-            value = middle
-            tx, rx = link.tx[number].detach(), link.rx[number].detach()
-            to_tx = normalize(tx - points[0], dim=1)
-            if segments:
-                value = value * scattered(self.geometry, places[0], to_tx, ways[0])
-            else:
-                value = value * (places[0].normal * to_tx).sum(1).abs()
-            ends = [(tx, points[0], link.tx_pattern)]
+            frame = torch.full((len(total),), number)
+            echo, ends = radar_equation(self.geometry, link, frame, places), [(link.tx, places[0])]
             if received:
-                to_rx = normalize(rx - points[-1], dim=1)
-                value = value * scattered(self.geometry, places[-1], -ways[-1], to_rx)
-                ends.append((rx, points[-1], link.rx_pattern))
-            for antenna, point, pattern in ends:
-                offset = point - antenna
-                distance = offset.norm(dim=1)
-                gain = pattern.gain(offset / distance[:, None] @ link.rotations[number].detach())
-                value = value * gain / distance**2
-                lit = value > 0
-                transmittance, _ = passed(self.rays, antenna.expand(int(lit.sum()), 3), point[lit])
-                value = value.masked_scatter(lit, value[lit] * transmittance)
-            total = total + value
+                power = echo.power
+                ends.append((link.rx, last))
+            else:
+                before = places[-2].position if len(places) > 1 else link.tx[frame]
+                back = normalize(before - last.position, dim=1)
+                power = echo.arriving * (last.normal * back).sum(1).abs()
+            for antenna, point in ends:
+                lit = power > 0
+                transmittance, _ = passed(self.rays, antenna[frame[lit]], point.position[lit])
+                power = power.masked_scatter(lit, power[lit] * transmittance)
+            total = total + power
         return total / len(self.frames)

@@ -1,44 +1,26 @@
 """Rough points: fixed material points whose phases give a rough surface its speckle."""
 
 import zlib
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
-from torch import Tensor
 
+from invertwin.channel.reference.radar_equation import SurfacePaths
 from invertwin.scene.scene import Scene
 
 
-@dataclass(frozen=True)
-class RoughPoints:
-    """The fixed material points of rough surfaces, with their phases.
+def draw_rough_points(scene: Scene, density: float, seed: int) -> SurfacePaths:
+    """Draw the material points of all rough objects, as paths of one point.
 
-    They belong to the surfaces: never drawn again between chirps, poses, looks or iterations.
-
-    Attributes:
-        face, b1, b2: Place on the surface.
-        phase: Uniform in [0, 2π), a hash of object, triangle, number of the point and seed.
-        density: Points per m² of the scene they were drawn on.
-    """
-
-    face: Int64[Tensor, " n"]
-    b1: Float64[Tensor, " n"]
-    b2: Float64[Tensor, " n"]
-    phase: Float64[Tensor, " n"]
-    density: float
-
-
-def draw_rough_points(scene: Scene, density: float, seed: int) -> RoughPoints:
-    """Draw the material points of all rough objects.
+    They belong to the surfaces: never drawn again between chirps, poses, looks or iterations. The
+    phase is uniform in [0, 2π), a hash of object, triangle, number of the point and seed.
 
     Args:
         scene: Surfaces to cover.
         density: Points per m².
         seed: Hash key.
     """
-    columns: list[list[np.ndarray]] = [[], [], [], []]
+    found: list[np.ndarray] = [np.zeros((4, 0))]
     offset = 0
     for name, item in scene.objects.items():
         triangles = item.vertices.detach()[item.mesh.faces]
@@ -51,18 +33,14 @@ def draw_rough_points(scene: Scene, density: float, seed: int) -> RoughPoints:
             count = np.floor(expected + _hash(key, face, face * 0, 0)).astype(np.int64)
             face = np.repeat(face, count)
             number = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
-            draws = [_hash(key, face, number.astype(np.uint64), stream) for stream in (1, 2, 3)]
-            fold = draws[0] + draws[1] > 1
-            columns[0].append(face.astype(np.int64) + offset)
-            columns[1].append(np.where(fold, 1 - draws[0], draws[0]))
-            columns[2].append(np.where(fold, 1 - draws[1], draws[1]))
-            columns[3].append(2 * np.pi * draws[2])
+            b1, b2, turn = (_hash(key, face, number.astype(np.uint64), k) for k in (1, 2, 3))
+            fold = b1 + b2 > 1
+            b1, b2 = np.where(fold, 1 - b1, b1), np.where(fold, 1 - b2, b2)
+            found.append(np.stack([face.astype(np.int64) + offset, b1, b2, 2 * np.pi * turn]))
         offset += len(area)
-    joined = [
-        torch.from_numpy(np.concatenate(c)) if c else torch.zeros(0, dtype=torch.float64)
-        for c in columns
-    ]
-    return RoughPoints(joined[0].long(), joined[1], joined[2], joined[3], density)
+    face, b1, b2, phase = torch.from_numpy(np.concatenate(found, axis=1))
+    weight = torch.full_like(phase, 1 / density)
+    return SurfacePaths(face.long()[:, None], b1[:, None], b2[:, None], weight, phase)
 
 
 def _hash(key: np.uint64, first: np.ndarray, second: np.ndarray, stream: int) -> np.ndarray:

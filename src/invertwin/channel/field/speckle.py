@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 
-from invertwin.channel.field.rough_paths import RoughPaths, draw_rough_paths
-from invertwin.channel.field.rough_points import RoughPoints, draw_rough_points
+from invertwin.channel.field.rough_paths import draw_rough_paths
+from invertwin.channel.field.rough_points import draw_rough_points
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.backend import use_backend
+from invertwin.channel.reference.radar_equation import SurfacePaths
 from invertwin.channel.sampling import Sampling
 from invertwin.scene.scene import Scene
 
@@ -15,12 +16,12 @@ class Speckle:
     """The fixed random parts of fields: they stay while radar and scene move.
 
     Attributes:
-        points: Points of rough surfaces, for paths of one bounce; None is drawn where needed.
-        paths: Rough paths of several bounces; None is drawn where needed.
+        points: Points of rough surfaces: paths of one bounce.
+        paths: Rough paths of two points, of three points, and so on.
     """
 
-    points: RoughPoints | None = None
-    paths: RoughPaths | None = None
+    points: SurfacePaths
+    paths: tuple[SurfacePaths, ...] = ()
 
 
 def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Speckle:
@@ -32,10 +33,8 @@ def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Spe
         sampling: Points per m², number and depth of rough paths.
         seed: Seed of places and phases.
     """
-    paths = None
-    if sampling.depth > 1:
-        with use_backend(sampling.backend):
-            paths = draw_rough_paths(
-                scene, link, count=sampling.rough_paths, depth=sampling.depth, seed=seed
-            )
+    with use_backend(sampling.backend):
+        paths = draw_rough_paths(
+            scene, link, count=sampling.rough_paths, depth=sampling.depth, seed=seed
+        )
     return Speckle(draw_rough_points(scene, sampling.points_per_m2, seed), paths)

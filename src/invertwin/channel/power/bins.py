@@ -34,47 +34,35 @@ class Contribution:
         return self.power, self.range, self.u, self.v
 
 
-def _axis(position: Any, start: float, step: float, count: int) -> tuple[Any, list, list]:
-    """First bin, weights and weights' derivatives of the quadratic B-spline along one axis."""
+def _axis(position: Any, start: float, step: float, count: int) -> list[tuple[Any, ...]]:
+    """Bin, whether it is on the axis, weight and weight's derivative of each tap of one axis."""
     if count == 1:
-        return mi.Int32(0), [mi.Float(1.0)], [mi.Float(0.0)]
-    t = (position - start) * (1 / step)
+        return [(mi.Int32(0), mi.Bool(True), mi.Float(1.0), mi.Float(0.0))]
+    t = (dr.detach(position) - start) * (1 / step)
     nearest = dr.round(t)
     d = t - nearest
-    weights = [0.5 * dr.square(0.5 - d), 0.75 - dr.square(d), 0.5 * dr.square(0.5 + d)]
-    slopes = [(d - 0.5) / step, -2 * d / step, (d + 0.5) / step]
-    return mi.Int32(nearest) - 1, weights, slopes
+    weights = 0.5 * dr.square(0.5 - d), 0.75 - dr.square(d), 0.5 * dr.square(0.5 + d)
+    slopes = (d - 0.5) / step, -2 * d / step, (d + 0.5) / step
+    places = [mi.Int32(nearest) + offset for offset in (-1, 0, 1)]
+    inside = [(place >= 0) & (place < count) for place in places]
+    return list(zip(places, inside, weights, slopes, strict=True))
 
 
-@dataclass(frozen=True)
-class _Taps:
-    """Where a path falls: first bins, weights and slopes of the three axes (all detached)."""
+def _taps(grid: Grid, found: Contribution) -> Iterator[tuple[Any, Any, Any, tuple[Any, Any, Any]]]:
+    """The bins that paths fall on (detached).
 
-    frame: Any
-    axes: tuple[tuple[Any, list, list], ...]
-    counts: tuple[int, int, int]
-
-    @staticmethod
-    def of(grid: Grid, found: Contribution) -> "_Taps":
-        g = grid
-        axes = (
-            _axis(dr.detach(found.range), g.range_start, g.range_step, g.range_count),
-            _axis(dr.detach(found.u), g.u_start, g.u_step, g.u_count),
-            _axis(dr.detach(found.v), g.v_start, g.v_step, g.v_count),
-        )
-        return _Taps(mi.Int32(found.frame), axes, g.shape)
-
-    def __iter__(self) -> Iterator[tuple[Any, Any, tuple[int, int, int]]]:
-        """Bin index, whether it is on the grid, and the tap along each axis."""
-        (r0, rw, _), (u0, uw, _), (v0, vw, _) = self.axes
-        nr, nu, nv = self.counts
-        for i in range(len(rw)):
-            ok_r = (r0 + i >= 0) & (r0 + i < nr)
-            for j in range(len(uw)):
-                ok_u = ok_r & (u0 + j >= 0) & (u0 + j < nu)
-                line = ((self.frame * nr + (r0 + i)) * nu + (u0 + j)) * nv + v0
-                for k in range(len(vw)):
-                    yield line + k, ok_u & (v0 + k >= 0) & (v0 + k < nv), (i, j, k)
+    Yields a bin's index, whether it is on the grid, the weight with which paths fall on it, and
+    the derivatives of the weight in range, u and v.
+    """
+    ranges = _axis(found.range, grid.range_start, grid.range_step, grid.range_count)
+    across = _axis(found.u, grid.u_start, grid.u_step, grid.u_count)
+    upwards = _axis(found.v, grid.v_start, grid.v_step, grid.v_count)
+    for i, on_range, wr, sr in ranges:
+        for j, on_u, wu, su in across:
+            row = (mi.Int32(found.frame) * grid.range_count + i) * grid.u_count + j
+            for k, on_v, wv, sv in upwards:
+                index, inside = mi.UInt32(row * grid.v_count + k), on_range & on_u & on_v
+                yield index, inside, wr * wu * wv, (sr * wu * wv, wr * su * wv, wr * wu * sv)
 
 
 class Bins:
@@ -97,10 +85,8 @@ class Bins:
             found: The paths.
             active: Which paths exist.
         """
-        taps = _Taps.of(self.grid, found)
-        (_, rw, _), (_, uw, _), (_, vw, _) = taps.axes
-        for index, ok, (i, j, k) in taps:
-            self._add(index, found.power * rw[i] * uw[j] * vw[k], ok & active)
+        for index, inside, weight, _ in _taps(self.grid, found):
+            dr.scatter_add(self.values, found.power * weight, index, inside & active)
 
     def add_derivative(self, found: Contribution, dots: tuple, active: Any) -> None:
         """Add the derivative of paths' deposit, given those of power, range, u and v.
@@ -110,21 +96,11 @@ class Bins:
             dots: Derivatives of power, range, u and v.
             active: Which paths exist.
         """
-        taps = _Taps.of(self.grid, found)
-        (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
         power = dr.detach(found.power)
-        dot_a, dot_r, dot_u, dot_v = dots
-        for index, ok, (i, j, k) in taps:
-            value = (
-                dot_a * rw[i] * uw[j] * vw[k]
-                + power * dot_r * rs[i] * uw[j] * vw[k]
-                + power * dot_u * rw[i] * us[j] * vw[k]
-                + power * dot_v * rw[i] * uw[j] * vs[k]
-            )
-            self._add(index, value, ok & active)
-
-    def _add(self, index: Any, value: Any, active: Any) -> None:
-        dr.scatter_add(self.values, value, mi.UInt32(index), active)
+        dot_power, *moves = dots
+        for index, inside, weight, slopes in _taps(self.grid, found):
+            moved = sum(dot * slope for dot, slope in zip(moves, slopes, strict=True))
+            dr.scatter_add(self.values, dot_power * weight + power * moved, index, inside & active)
 
     def map(self) -> Float32[Tensor, "frame range u v"]:
         """What all bins hold."""
@@ -140,14 +116,10 @@ def gather(seed: Any, grid: Grid, found: Contribution, active: Any) -> tuple[Any
         found: The paths.
         active: Which paths exist.
     """
-    taps = _Taps.of(grid, found)
-    (_, rw, rs), (_, uw, us), (_, vw, vs) = taps.axes
     bars = [mi.Float(0.0) for _ in range(4)]
-    for index, ok, (i, j, k) in taps:
-        g = dr.gather(mi.Float, seed, mi.UInt32(index), ok & active)
-        bars[0] += g * (rw[i] * uw[j] * vw[k])
-        bars[1] += g * (rs[i] * uw[j] * vw[k])
-        bars[2] += g * (rw[i] * us[j] * vw[k])
-        bars[3] += g * (rw[i] * uw[j] * vs[k])
+    for index, inside, weight, slopes in _taps(grid, found):
+        value = dr.gather(mi.Float, seed, index, inside & active)
+        for number, factor in enumerate((weight, *slopes)):
+            bars[number] += value * factor
     power = dr.detach(found.power)
     return bars[0], bars[1] * power, bars[2] * power, bars[3] * power

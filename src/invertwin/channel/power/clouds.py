@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import grid_sample
 
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins
@@ -29,12 +30,7 @@ _FLAT = 1e-12  # least component of a direction: a ray along a face of the box
 
 
 def deposit_density(
-    item: Object,
-    link: Link,
-    grid: Grid,
-    *,
-    sampling: Sampling,
-    seed: int,
+    item: Object, link: Link, grid: Grid, *, sampling: Sampling, seed: int
 ) -> Float32[Tensor, "frame range u v"]:
     """Expected received over transmitted power of an object's cloud in every bin, per frame.
 
@@ -199,78 +195,48 @@ class _Rays:
         return (self._density(between) * length).sum(1).reshape(points.shape[:2])
 
     def _density(self, points: Float64[Tensor, "ray step 3"]) -> Float64[Tensor, "ray step"]:
-        place = (points - self.cloud.low) / self.cloud.spacing
+        place = 2 * (points - self.cloud.low) / (self.cloud.high - self.cloud.low) - 1
         found = _Trilinear.apply(self.cloud.density, place.reshape(-1, 3))
         return found.reshape(points.shape[:2])
 
 
-class _Trilinear(torch.autograd.Function):
-    """Values between the nodes of a grid, at places counted in cells; outside the nearest cell.
+def _trilinear(values: Float64[Tensor, "x y z"], place: Float64[Tensor, "n 3"]) -> Tensor:
+    """Values between the nodes of a grid that spans [-1, 1] along each axis."""
+    nodes = place.flip(-1)[None, :, None, None]  # grid_sample counts axes from the last one
+    found = grid_sample(values[None, None], nodes, padding_mode="border", align_corners=True)
+    return found.flatten()
 
-    Written out, since the corners of every point would else be kept for the derivative.
-    """
+
+class _Trilinear(torch.autograd.Function):
+    """``_trilinear`` with the derivative in forward mode that torch 2.13 does not have."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, place: Tensor) -> Tensor:
-        ctx.shape = values.shape
-        ctx.first, ctx.inside = _cell(place.detach(), values.shape)
-        ctx.values = values.detach()
-        flat, total = ctx.values.reshape(-1), torch.zeros_like(ctx.inside[:, 0])
-        for index, weight, _ in _corners(values.shape, ctx.first, ctx.inside):
-            total += weight * flat[index]
-        return total
+        ctx.inputs = values.detach(), place.detach()
+        return _trilinear(*ctx.inputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:  # type: ignore[override]
-        flat = ctx.values.reshape(-1)
-        to_values = torch.zeros_like(flat) if ctx.needs_input_grad[0] else None
-        to_place = torch.zeros_like(ctx.inside) if ctx.needs_input_grad[1] else None
-        for index, weight, slopes in _corners(ctx.shape, ctx.first, ctx.inside):
-            if to_values is not None:
-                to_values.index_add_(0, index, grad * weight)
-            if to_place is not None:
-                to_place += (grad * flat[index])[:, None] * slopes()
-        return None if to_values is None else to_values.reshape(ctx.shape), to_place
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        pairs = zip(ctx.inputs, ctx.needs_input_grad, strict=True)
+        inputs = [tensor.detach().requires_grad_(wanted) for tensor, wanted in pairs]
+        wanted = [tensor for tensor in inputs if tensor.requires_grad]
+        with torch.enable_grad():
+            found = iter(torch.autograd.grad(_trilinear(*inputs), wanted, grad))
+        return tuple(next(found) if tensor.requires_grad else None for tensor in inputs)
 
     @staticmethod
     def jvp(ctx: Any, values: Tensor | None, place: Tensor | None) -> Tensor:  # type: ignore[override]
-        flat = ctx.values.reshape(-1)
-        total = torch.zeros_like(ctx.inside[:, 0])
-        for index, weight, slopes in _corners(ctx.shape, ctx.first, ctx.inside):
-            if values is not None:
-                total += weight * values.reshape(-1)[index]
-            if place is not None:
-                total += flat[index] * (slopes() * place).sum(1)
+        known, at = ctx.inputs
+        total = torch.zeros_like(at[:, 0])
+        if values is not None:
+            total = total + _trilinear(values, at)
+        if place is not None:
+            with torch.enable_grad():
+                at = at.detach().requires_grad_()
+                (slope,) = torch.autograd.grad(_trilinear(known, at).sum(), at)
+            total = total + (slope * place).sum(1)
         return total
-
-
-def _cell(place: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor]:
-    """The lowest corner of a place's cell, and the place within the cell."""
-    last = torch.tensor(shape, device=place.device) - 2
-    first = place.floor().long().clamp_min(0).minimum(last)
-    return first, (place - first).clamp(0.0, 1.0)
-
-
-def _corners(shape: torch.Size, first: Tensor, inside: Tensor) -> Iterator[tuple[Tensor, Any, Any]]:
-    """Flat index, weight, and a function that gives the weight's slopes, of the eight corners."""
-    strides = (shape[1] * shape[2], shape[2], 1)
-    x, y, z = (torch.stack([1 - part, part]) for part in inside.unbind(1))
-    base = (first * torch.tensor(strides, device=first.device)).sum(1)
-    for i in (0, 1):
-        for j in (0, 1):
-            for k in (0, 1):
-                index = base + i * strides[0] + j * strides[1] + k * strides[2]
-
-                def slopes(i: int = i, j: int = j, k: int = k) -> Tensor:
-                    columns = [
-                        (2 * i - 1) * y[j] * z[k],
-                        x[i] * (2 * j - 1) * z[k],
-                        x[i] * y[j] * (2 * k - 1),
-                    ]
-                    return torch.stack(columns, dim=1)
-
-                yield index, x[i] * y[j] * z[k], slopes
 
 
 class _Splat(torch.autograd.Function):

@@ -40,24 +40,14 @@ def passage(rays: RayScene, inputs: Inputs, start: Any, end: Any, active: Any) -
     if not inputs.surfaces.sheets:
         return Passage(dr.select(rays.clear(start, end, active), 1.0, 0.0), mi.Float(0.0))
     lanes = dr.width(active)
-    state = {
-        "active": mi.Bool(active),
-        "transmittance": dr.ones(mi.Float, lanes),
-        "extra": dr.zeros(mi.Float, lanes),
-    }
+    carry = {"transmittance": dr.ones(mi.Float, lanes), "extra": dr.zeros(mi.Float, lanes)}
 
-    def meet(state: dict[str, Any], face: Any, hit: Any) -> None:
-        transmittance, extra = _through(inputs, face, start, end, hit)
-        state["transmittance"] = dr.select(
-            hit, state["transmittance"] * transmittance, state["transmittance"]
-        )
-        state["extra"] = state["extra"] + dr.select(hit, extra, 0.0)
-        state["active"] = hit & (state["transmittance"] > 0)
+    def act(carry: dict[str, Any], transmittance: Any, extra: Any) -> None:
+        carry["transmittance"] = carry["transmittance"] * transmittance
+        carry["extra"] = carry["extra"] + extra
 
-    state = _along(rays, start, end, state, meet)
-    return Passage(
-        dr.select(active & ~state["active"], state["transmittance"], 0.0), state["extra"]
-    )
+    done = crossed(rays, inputs, lambda: start, lambda: end, active, carry, act)
+    return Passage(dr.select(active & ~done["active"], done["transmittance"], 0.0), done["extra"])
 
 
 def crossed(
@@ -72,7 +62,7 @@ def crossed(
     """Show every sheet between two attached points: ``act(carry, transmittance, extra)``, attached.
 
     The ends are functions, so that the loop over sheets gathers them anew: no derivative has to
-    cross the loop's border.
+    cross the loop's border. Returns the carry, and as ``active`` where the way has no end.
 
     Args:
         rays: The scene and its antennas.
@@ -83,16 +73,36 @@ def crossed(
         carry: Arrays that the loop carries.
         act: Called with what the loop carries, a transmittance and an extra length.
     """
-    fixed_start, fixed_end = dr.detach(start()), dr.detach(end())
-    state = {"active": mi.Bool(active), **carry}
+    origin = dr.detach(start())
+    offset = dr.detach(end()) - origin
+    lanes, most = dr.width(active), opaque(_MOST)
+    state = {"at": dr.full(mi.Float, NEAR, lanes), "count": dr.zeros(mi.UInt32, lanes)}
 
-    def meet(state: dict[str, Any], face: Any, hit: Any) -> None:
+    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
+        state = dict(state)
+        at, active = state["at"], state["active"]
+        hit = rays.scene.ray_intersect_preliminary(
+            mi.Ray3f(mi.Point3f(origin + offset * at), mi.Vector3f(offset), 1 - NEAR - at, 0.0, []),
+            active=active,
+        )
+        found = active & hit.is_valid()
+        face = dr.select(found, hit.prim_index, rays.sound_face)
         with dr.resume_grad():
-            transmittance, extra = _through(inputs, face, start(), end(), hit)
-            act(state, dr.select(hit, transmittance, 1.0), dr.select(hit, extra, 0.0))
-        state["active"] = hit & (dr.detach(transmittance) > 0)
+            transmittance, extra = _through(inputs, face, start(), end(), found)
+            act(state, dr.select(found, transmittance, 1.0), dr.select(found, extra, 0.0))
+        state["active"] = found & (dr.detach(transmittance) > 0)
+        state["at"] = dr.select(found, at + hit.t + NEAR, at)
+        state["count"] = state["count"] + 1
+        return (state,)
 
-    return _along(rays, fixed_start, fixed_end, state, meet)
+    (state,) = dr.while_loop(
+        ({**state, "active": mi.Bool(active), **carry},),
+        lambda state: state["active"] & (state["count"] < most),
+        body,
+        labels=("state",),
+        mode="symbolic",
+    )
+    return state
 
 
 def _through(inputs: Inputs, face: Any, start: Any, end: Any, active: Any) -> tuple[Any, Any]:
@@ -102,44 +112,6 @@ def _through(inputs: Inputs, face: Any, start: Any, end: Any, active: Any) -> tu
     cosine = dr.abs(dr.dot(normal, offset)) / (dr.norm(normal) * dr.norm(offset))
     row = dr.gather(mi.UInt32, inputs.face_surface, face, active)
     return inputs.surfaces.through(row, cosine, active)
-
-
-def _along(
-    rays: RayScene,
-    start: Any,
-    end: Any,
-    state: dict[str, Any],
-    meet: Callable[[dict[str, Any], Any, Any], None],
-) -> dict[str, Any]:
-    """Walk a segment from surface to surface until ``meet`` ends it or nothing is left."""
-    lanes = dr.width(state["active"])
-    state = {**state, "at": dr.full(mi.Float, NEAR, lanes), "count": dr.zeros(mi.UInt32, lanes)}
-    most = opaque(_MOST)
-
-    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
-        state = dict(state)
-        offset = end - start
-        at, active = state["at"], state["active"]
-        hit = rays.scene.ray_intersect_preliminary(
-            mi.Ray3f(mi.Point3f(start + offset * at), mi.Vector3f(offset), 1 - NEAR - at, 0.0, []),
-            active=active,
-        )
-        found = active & hit.is_valid()
-        face = dr.select(found, hit.prim_index, rays.sound_face)
-        state["active"] = found
-        meet(state, face, found)
-        state["at"] = dr.select(found, at + hit.t + NEAR, at)
-        state["count"] = state["count"] + 1
-        return (state,)
-
-    (state,) = dr.while_loop(
-        (state,),
-        lambda state: state["active"] & (state["count"] < most),
-        body,
-        labels=("state",),
-        mode="symbolic",
-    )
-    return state
 
 
 @dataclass(frozen=True)

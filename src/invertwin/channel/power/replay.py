@@ -182,18 +182,7 @@ def pull(
 
             crossed(rays, inputs, start, vertex.ends[1], active, {}, act)
 
-    zero = dr.zeros(mi.Float, records.lanes)
-    with dr.suspend_grad():
-        if records.depth == 1:
-            sweep(mi.UInt32(0), zero, zero)
-            return
-        first = dr.zeros(mi.UInt32, records.lanes) + depth
-        dr.while_loop(
-            (first, zero, dr.zeros(mi.Float, records.lanes)),
-            lambda left, *_: left > 0,
-            lambda left, power, length: (left - 1, *sweep(left - 1, power, length)),
-            mode="symbolic",
-        )
+    _swept(records, sweep, backwards=True)
 
 
 def push(
@@ -254,14 +243,22 @@ def push(
         done = crossed(rays, inputs, start, end, active, carry, act)
         return done["growth"], done["longer"]
 
-    zero = dr.zeros(mi.Float, records.lanes)
+    _swept(records, sweep)
+
+
+def _swept(
+    records: Records, sweep: Callable[[Any, Any, Any], tuple[Any, Any]], *, backwards: bool = False
+) -> None:
+    """Carry two sums along all paths, vertex by vertex, from the near end or from the far one."""
+    last = opaque(records.depth - 1)
+    first, second = (dr.zeros(mi.Float, records.lanes) for _ in range(2))
     with dr.suspend_grad():
         if records.depth == 1:
-            sweep(mi.UInt32(0), zero, zero)
+            sweep(mi.UInt32(0), first, second)
             return
         dr.while_loop(
-            (dr.zeros(mi.UInt32, records.lanes), zero, dr.zeros(mi.Float, records.lanes)),
-            lambda number, *_: number < depth,
-            lambda number, growth, longer: (number + 1, *sweep(number, growth, longer)),
+            (dr.zeros(mi.UInt32, records.lanes), first, second),
+            lambda done, *_: done <= last,
+            lambda done, *sums: (done + 1, *sweep(last - done if backwards else done, *sums)),
             mode="symbolic",
         )

@@ -145,11 +145,7 @@ class Trace:
         if not (sampling.boundary and sampling.boundary_samples):
             return None
         return BoundaryPoints(
-            self.rays,
-            self.fixed,
-            sampling,
-            self.seed,
-            chunks=lambda size: chunks(size, self.chunk),
+            self.rays, self.fixed, sampling, self.seed, chunks=lambda size: chunks(size, self.chunk)
         )
 
     def boundary(self, inputs: Inputs) -> Iterator[BoundaryPaths]:

@@ -5,6 +5,8 @@ fields are made of it, too. A path is a row of material points; its power is the
 segments' 1/R², the scattering at its points and the gains of both antennas.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -13,37 +15,12 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.paths import Link
+from invertwin.channel.paths import Link, Paths
 from invertwin.channel.rays.geometry import Geometry, mixed
 from invertwin.channel.rays.scene import RayScene, next_surface, visible
+from invertwin.constants import SPEED_OF_LIGHT
 
 _MOST_SHEETS = 8  # that a segment of an explicit path may pass
-
-
-@dataclass(frozen=True)
-class SurfacePaths:
-    """Paths over as many material points each, in order from the transmitter; one row a path.
-
-    Attributes:
-        face, b1, b2: Places, per point.
-        weight: One over (paths × probability per area of all points).
-        phase: Phase of the path's field [rad].
-    """
-
-    face: Int64[Tensor, "n k"]
-    b1: Float64[Tensor, "n k"]
-    b2: Float64[Tensor, "n k"]
-    weight: Float64[Tensor, " n"]
-    phase: Float64[Tensor, " n"]
-
-    def keep(self, mask: Bool[Tensor, " n"]) -> "SurfacePaths":
-        """Some of the rows."""
-        return SurfacePaths(*(column[mask] for column in vars(self).values()))
-
-    def places(self, geometry: Geometry) -> "list[Place]":
-        """Where the points are now."""
-        columns = zip(self.face.T, self.b1.T, self.b2.T, strict=True)
-        return [place(geometry, *column) for column in columns]
 
 
 @dataclass(frozen=True)
@@ -62,54 +39,45 @@ class Place:
     row: Int64[Tensor, " n"]
 
 
-def place(
-    geometry: Geometry,
-    face: Int64[Tensor, " n"],
-    b1: Float64[Tensor, " n"],
-    b2: Float64[Tensor, " n"],
-) -> Place:
-    """Where pairs of barycentric coordinates lie now.
-
-    Args:
-        geometry: The scene.
-        face: Triangles.
-        b1, b2: Barycentric coordinates.
-    """
-    p0, p1, p2 = geometry.corners(face)
-    normal = torch.linalg.cross(p1 - p0, p2 - p0)
-    double_area = normal.norm(dim=1)
-    return Place(
-        position=mixed((p0, p1, p2), b1, b2),
-        normal=normal / double_area[:, None],
-        jacobian=double_area / double_area.detach(),
-        row=geometry.face_surface[face],
-    )
-
-
 @dataclass(frozen=True)
-class SurfacePoints:
-    """Detached points of surfaces, each seen in one frame.
+class SurfacePaths:
+    """Paths over as many material points each, in order from the transmitter; one row a path.
 
-    ``weight`` is what the row counts: one over (samples × probability), or a phase.
+    Attributes:
+        face, b1, b2: Places, per point.
+        weight: One over (paths × probability per area of all points).
+        phase: Phase of the path's field [rad].
     """
 
-    frame: Int64[Tensor, " n"]
-    face: Int64[Tensor, " n"]
-    b1: Float64[Tensor, " n"]
-    b2: Float64[Tensor, " n"]
+    face: Int64[Tensor, "n k"]
+    b1: Float64[Tensor, "n k"]
+    b2: Float64[Tensor, "n k"]
     weight: Float64[Tensor, " n"]
+    phase: Float64[Tensor, " n"]
 
-    def keep(self, mask: Bool[Tensor, " n"]) -> "SurfacePoints":
-        """Some of the rows."""
-        return SurfacePoints(*(column[mask] for column in vars(self).values()))
+    def keep(self, rows: Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> "SurfacePaths":
+        """The rows of a mask, or of indices."""
+        return SurfacePaths(*(column[rows] for column in vars(self).values()))
 
-    def place(self, geometry: Geometry) -> Place:
+    def places(self, geometry: Geometry) -> list[Place]:
         """Where the points are now."""
-        return place(geometry, self.face, self.b1, self.b2)
+        found = []
+        for face, b1, b2 in zip(self.face.T, self.b1.T, self.b2.T, strict=True):
+            p0, p1, p2 = geometry.corners(face)
+            normal = torch.linalg.cross(p1 - p0, p2 - p0)
+            double_area = normal.norm(dim=1)
+            place = Place(
+                position=mixed((p0, p1, p2), b1, b2),
+                normal=normal / double_area[:, None],
+                jacobian=double_area / double_area.detach(),
+                row=geometry.face_surface[face],
+            )
+            found.append(place)
+        return found
 
-    def velocity(self, geometry: Geometry) -> Tensor | None:
-        """World velocity of the points [m/s]; None if all objects are at rest."""
-        return geometry.velocity(self.face, self.b1, self.b2)
+    def velocity(self, geometry: Geometry) -> Float64[Tensor, "n 3"] | None:
+        """World velocity of the last points [m/s]; None if all objects are at rest."""
+        return geometry.velocity(self.face[:, -1], self.b1[:, -1], self.b2[:, -1])
 
 
 @dataclass(frozen=True)
@@ -117,23 +85,52 @@ class Echo:
     """What paths carry, attached; one row a path.
 
     Attributes:
+        frame: Radar pose.
+        places: The points of the paths, in order from the transmitter.
         power: Received over transmitted power per m² of every point; Jacobians included.
+        arriving: The same at the last point, before it scatters.
         spread: Gains and 1/R² alone: the power without scattering, over (λ/4π)².
         length: Length from antenna to antenna [m].
-        ending: Scattering at the last point, gain and 1/R² of the last segment; detached.
-        first, last: World positions of the ends [m].
     """
 
+    frame: Int64[Tensor, " n"]
+    places: Sequence[Place]
     power: Float64[Tensor, " n"]
+    arriving: Float64[Tensor, " n"]
     spread: Float64[Tensor, " n"]
     length: Float64[Tensor, " n"]
-    ending: Float64[Tensor, " n"]
-    first: Float64[Tensor, "n 3"]
-    last: Float64[Tensor, "n 3"]
+
+    def paths(
+        self,
+        kind: str,
+        *,
+        power: Float64[Tensor, " n"] | None = None,
+        coefficient: Complex128[Tensor, " n"] | None = None,
+        boundary: bool = False,
+        velocity: Float64[Tensor, "n 3"] | None = None,
+    ) -> Paths:
+        """Paths of one kind, see ``Paths``; power or coefficient that are not given are zero.
+
+        Args:
+            kind, power, coefficient, velocity: What ``Paths`` holds.
+            boundary: Whether all of them are boundary paths.
+        """
+        zero = torch.zeros(len(self.frame), dtype=torch.float64)
+        return Paths(
+            frame=self.frame,
+            delay=self.length / SPEED_OF_LIGHT,
+            coefficient=zero.to(torch.complex128) if coefficient is None else coefficient,
+            power=zero if power is None else power,
+            first=self.places[0].position,
+            last=self.places[-1].position,
+            kind=kind,
+            boundary=torch.full((len(self.frame),), boundary),
+            velocity=velocity,
+        )
 
 
 def radar_equation(
-    geometry: Geometry, link: Link, frame: Int64[Tensor, " n"], places: list[Place]
+    geometry: Geometry, link: Link, frame: Int64[Tensor, " n"], places: Sequence[Place]
 ) -> Echo:
     """Evaluate the radar equation of paths from antenna to antenna; nothing is in their way.
 
@@ -149,29 +146,26 @@ def radar_equation(
     offsets = [end - start for start, end in pairwise(stops)]
     distances = [offset.norm(dim=1) for offset in offsets]
     ways = [offset / r[:, None] for offset, r in zip(offsets, distances, strict=True)]
-    gains = [
-        link.tx_pattern.gain(seen_from(link, frame, ways[0])),
-        link.rx_pattern.gain(seen_from(link, frame, -ways[-1])),
-    ]
-    spread, length = gains[0] * gains[1], distances[0] + distances[-1]
-    for distance in distances:
-        spread = spread / distance**2
+
+    def seen(direction: Tensor) -> Tensor:
+        return torch.einsum("nij,ni->nj", link.rotations[frame], direction)
+
+    spread = link.tx_pattern.gain(seen(ways[0])) / distances[0] ** 2
+    ending = link.rx_pattern.gain(seen(-ways[-1])) / distances[-1] ** 2
+    length = distances[0] + distances[-1]
     for number, (start, end) in enumerate(pairwise(places), start=1):
         index, attenuation = _medium(geometry, start, end, ways[number])
-        spread = spread * torch.exp(-attenuation * distances[number])
+        spread = spread * torch.exp(-attenuation * distances[number]) / distances[number] ** 2
         length = length + index * distances[number]
-    power = (link.wavelength / (4 * torch.pi)) ** 2 * spread
-    scattering = torch.ones_like(power)
-    for point, back, on in zip(places, ways, ways[1:], strict=False):
-        scattering = scattered(geometry, point, -back, on)
-        power = power * (point.jacobian * scattering)
-    ending = (scattering * gains[1] / distances[-1] ** 2).detach()
-    return Echo(power, spread, length, ending, stops[1], stops[-2])
+    *earlier, last = (
+        point.jacobian * _scattered(geometry, point, -back, on)
+        for point, back, on in zip(places, ways, ways[1:], strict=False)
+    )
+    arriving = math.prod(earlier, start=(link.wavelength / (4 * torch.pi)) ** 2 * spread)
+    return Echo(frame, places, arriving * last * ending, arriving, spread * ending, length)
 
 
-def mirror_field(
-    link: Link, frame: Int64[Tensor, " n"], point: Place, echo: Echo
-) -> Complex128[Tensor, " n"]:
+def mirror_field(link: Link, echo: Echo) -> Complex128[Tensor, " n"]:
     """Field coefficient per m² of a perfect conductor by physical optics; Jacobians included.
 
     ``a = (λ/4π) S / (R_t R_r)`` with ``S = −(jk/2π) ∫ (n·d)₊ V dA`` (derivations §4); for separate
@@ -180,12 +174,11 @@ def mirror_field(
 
     Args:
         link: Antennas.
-        frame: Radar pose of every point.
-        point: The points.
-        echo: Their radar equation.
+        echo: The radar equation of single points.
     """
+    (point,) = echo.places
     cosines = [
-        (point.normal * normalize(antenna[frame] - point.position, dim=1)).sum(1)
+        (point.normal * normalize(antenna[echo.frame] - point.position, dim=1)).sum(1)
         for antenna in (link.tx, link.rx)
     ]
     lit = (cosines[0] * cosines[1] > 0).to(point.position)
@@ -193,44 +186,24 @@ def mirror_field(
     return -1j / (4 * torch.pi) * (echo.spread.sqrt() * lit * facing)
 
 
-def seen_from(
-    link: Link, frame: Int64[Tensor, " n"], direction: Float64[Tensor, "n 3"]
-) -> Float64[Tensor, "n 3"]:
-    """World directions in the radar frame.
-
-    Args:
-        link: Antennas.
-        frame: Radar pose.
-        direction: Unit directions in the world.
-    """
-    return torch.einsum("nij,ni->nj", link.rotations[frame], direction)
-
-
-def scattered(
-    geometry: Geometry, point: Place, back: Float64[Tensor, "n 3"], on: Float64[Tensor, "n 3"]
-) -> Float64[Tensor, " n"]:
+def _scattered(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Tensor:
     """``f |cosθ| |cosθ'|`` between unit directions that point away from the surface.
 
     On one side, ``f`` is the distribution of ``scene.material``; through the skin of a body, see
     ``Surfaces.refracted``.
-
-    Args:
-        geometry: The scene.
-        point: Points on surfaces.
-        back: Unit directions from which paths come.
-        on: Unit directions in which they go on.
     """
     surfaces, row, normal = geometry.surfaces, point.row, point.normal
     first, second, between = ((a * b).sum(1) for a, b in ((normal, back), (normal, on), (back, on)))
     product = first * second
     shape = surfaces.diffuse[row] / torch.pi
     for number, cosine in enumerate((2 * product - between, 2 * product - between, between)):
-        half = (0.5 * (1 + cosine)).clamp_min(1e-7)
-        shape = shape + surfaces.lobes[row, number] * half ** surfaces.exponents[row, number]
+        if geometry.lobed[number]:
+            half = (0.5 * (1 + cosine)).clamp_min(1e-7)
+            shape = shape + surfaces.lobes[row, number] * half ** surfaces.exponents[row, number]
     outer = [_outside(geometry, row, cosine) for cosine in (first, second)]
     reflectance = torch.ones_like(product)
     for cosine, total in outer:
-        amplitude = tabulated(surfaces.amplitude, row, cosine)
+        amplitude = _tabulated(surfaces.amplitude, row, cosine)
         reflectance = reflectance * torch.where(total, 1.0, amplitude)
     value = torch.where(product > 0, reflectance * shape * product, 0.0)
     if not geometry.bodies:
@@ -239,7 +212,7 @@ def scattered(
     root, index = torch.ones_like(product), torch.ones_like(product)
     mismatch = torch.zeros_like(normal)
     for (cosine, total), direction, tilt in zip(outer, (back, on), (first, second), strict=True):
-        passing = tabulated(surfaces.refraction, row, cosine)
+        passing = _tabulated(surfaces.refraction, row, cosine)
         open_ = ~total & (passing > 0)
         root = root * torch.where(open_, torch.where(open_, passing, 1.0).sqrt(), 0.0)
         index = torch.where(tilt < 0, surfaces.index[row], 1.0)
@@ -271,16 +244,10 @@ def _medium(geometry: Geometry, start: Place, end: Place, way: Tensor) -> tuple[
     return index, attenuation
 
 
-def tabulated(
+def _tabulated(
     table: Float64[Tensor, "row cos"], row: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
 ) -> Float64[Tensor, " n"]:
-    """A table over |cosθ|, linear between its entries.
-
-    Args:
-        table: One row a surface.
-        row: Rows.
-        cosine: Places within them.
-    """
+    """A table over |cosθ|, linear between its entries."""
     entries = table.shape[1]
     t = cosine.abs().clamp_max(1.0) * (entries - 1)
     low = t.detach().long().clamp_max(entries - 2)
@@ -318,32 +285,61 @@ def passed(
         normal = normalize(torch.linalg.cross(p1 - p0, p2 - p0), dim=1)
         cosine = (normal * normalize(offset[rows], dim=1)).sum(1)
         factor = torch.ones_like(transmittance).index_copy(
-            0, rows, tabulated(surfaces.transmittance, row, cosine)
+            0, rows, _tabulated(surfaces.transmittance, row, cosine)
         )
         transmittance = transmittance * factor
-        extra = extra.index_add(0, rows, tabulated(surfaces.extra_length, row, cosine))
+        extra = extra.index_add(0, rows, _tabulated(surfaces.extra_length, row, cosine))
         rows = rows[transmittance.detach()[rows] > 0]
     return transmittance * torch.ones_like(transmittance).index_fill(0, rows, 0.0), extra
 
 
-def path_view(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -> Echo:
-    """Evaluate the radar equation along paths; those that are blocked carry nothing.
+def unblocked(
+    rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths
+) -> Bool[Tensor, " n"]:
+    """Which paths have nothing but sheets in their way.
 
     Args:
         rays: The scene and its antennas.
         frame: Radar pose of every path.
-        paths: Their points.
+        paths: The points of the paths.
     """
-    geometry, link = rays.geometry, rays.link
-    places = paths.places(geometry)
-    echo = radar_equation(geometry, link, frame, places)
-    stops = [link.tx[frame], *(p.position for p in places), link.rx[frame]]
-    power, length, transmittance = echo.power, echo.length, torch.ones_like(echo.power)
-    for number, (start, end) in enumerate(pairwise(stops)):
-        if number and link.shared_visibility and len(places) == 1:
-            # What the transmitter sees, the receiver sees too.
-            start, end = (end, start) if geometry.sheets else stops[:2]
-        transmittance, extra = passed(rays, start, end)
-        power, length = power * transmittance, length + extra
-    ending = echo.ending * transmittance.detach()
-    return replace(echo, power=power, length=length, ending=ending)
+    with torch.no_grad():
+        passes = _passes(rays, frame, paths.places(rays.geometry))
+        return torch.stack([transmittance > 0 for transmittance, _ in passes]).all(0)
+
+
+def path_view(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -> Echo:
+    """Evaluate the radar equation along unblocked paths, past the sheets in their way.
+
+    Args:
+        rays: The scene and its antennas.
+        frame: Radar pose of every path.
+        paths: The points of the paths.
+    """
+    echo = radar_equation(rays.geometry, rays.link, frame, paths.places(rays.geometry))
+    if not rays.geometry.sheets:
+        return echo
+    (*earlier, last), extras = zip(*_passes(rays, frame, echo.places), strict=True)
+    before = math.prod(earlier)
+    return replace(
+        echo,
+        power=echo.power * before * last,
+        arriving=echo.arriving * before,
+        spread=echo.spread * before * last,
+        length=echo.length + sum(extras),
+    )
+
+
+def _passes(rays: RayScene, frame: Tensor, places: Sequence[Place]) -> list[tuple[Tensor, Tensor]]:
+    """What all segments of paths pass, see ``passed``."""
+    link = rays.link
+    stops = [link.tx[frame], *(place.position for place in places), link.rx[frame]]
+    found: list[tuple[Tensor, Tensor]] = []
+    for start, end in pairwise(stops):
+        # What the transmitter sees of a single point, the receiver sees too.
+        again = bool(found) and link.shared_visibility and len(places) == 1
+        if again and not rays.geometry.sheets:
+            found += found
+        else:
+            found.append(passed(rays, end, start) if again else passed(rays, start, end))
+    return found

@@ -1,38 +1,21 @@
 """Boundary paths of one bounce in torch: how fast a shadow's edge moves over a surface."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.paths import Paths, joined
-from invertwin.channel.power.edges import EdgeSampler
+from invertwin.channel.paths import Paths
+from invertwin.channel.power.edges import EdgePoints, EdgeSampler
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import mixed
 from invertwin.channel.rays.scene import RayScene, visible
 from invertwin.channel.reference.radar_equation import Echo, Place, radar_equation
-
-
-@dataclass(frozen=True)
-class SilhouettePoints:
-    """Detached points on silhouettes: edge, place along it, triangle behind, weight."""
-
-    frame: Int64[Tensor, " n"]
-    first: Int64[Tensor, " n"]
-    second: Int64[Tensor, " n"]
-    opposite: Int64[Tensor, " n"]
-    along: Float64[Tensor, " n"]
-    face: Int64[Tensor, " n"]
-    weight: Float64[Tensor, " n"]
-
-    def keep(self, mask: Bool[Tensor, " n"]) -> "SilhouettePoints":
-        """Some of the points."""
-        return SilhouettePoints(*(column[mask] for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -55,33 +38,7 @@ class ShadowEdge:
     speed: Float64[Tensor, " n"]
 
 
-def silhouette_points(
-    rays: RayScene, centres: Sequence[str], samples: int, seed: int
-) -> list[tuple[str, SilhouettePoints]]:
-    """Sample the silhouettes seen from ``tx``, or from ``tx`` and ``rx``, apart.
-
-    Args:
-        rays: The scene and its antennas.
-        centres: Antennas.
-        samples: Points over all antennas and frames.
-        seed: Seed of the points.
-    """
-    sampler = EdgeSampler(rays, Inputs.of(rays), centres, samples, seed)
-    if not sampler.size:
-        none, nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
-        return [("tx", SilhouettePoints(none, none, none, none, nothing, none, nothing))]
-    drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept()
-    columns = {f.name: to_torch(getattr(drawn, f.name)) for f in fields(SilhouettePoints)}
-    points = SilhouettePoints(
-        **{n: c.double() if n in ("along", "weight") else c.long() for n, c in columns.items()}
-    )
-    if drawn.receiver is False:
-        return [("tx", points)]
-    receiver = to_torch(drawn.receiver).bool()
-    return [("tx", points.keep(~receiver)), ("rx", points.keep(receiver))]
-
-
-def shadow_edge(rays: RayScene, points: SilhouettePoints, centre: str) -> ShadowEdge:
+def shadow_edge(rays: RayScene, points: EdgePoints) -> ShadowEdge:
     """Turn edge points into shadow points with the attached speed of the shadow's edge.
 
     ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
@@ -90,11 +47,12 @@ def shadow_edge(rays: RayScene, points: SilhouettePoints, centre: str) -> Shadow
 
     Args:
         rays: The scene and its antennas.
-        points: Points on silhouettes.
-        centre: The antenna from which the shadows are cast.
+        points: Points on silhouettes, as torch tensors.
     """
     geometry, link = rays.geometry, rays.link
-    c = getattr(link, centre)[points.frame]
+    tx, rx = link.tx[points.frame], link.rx[points.frame]
+    from_receiver = torch.as_tensor(points.receiver, dtype=torch.bool).reshape(-1, 1)
+    c, other = torch.where(from_receiver, rx, tx), torch.where(from_receiver, tx, rx)
     y0, y1 = geometry.vertices[points.first], geometry.vertices[points.second]
     y = y0 + (y1 - y0) * points.along[:, None]
     p0, p1, p2 = geometry.corners(points.face)
@@ -102,7 +60,7 @@ def shadow_edge(rays: RayScene, points: SilhouettePoints, centre: str) -> Shadow
     moving = c + (y - c) * (_dot(plane, p0 - c) / _dot(plane, y - c))[:, None]
 
     shadow, normal = moving.detach(), normalize(plane.detach(), dim=1)
-    b1, b2 = barycentric(shadow, p0.detach(), p1.detach(), p2.detach())
+    b1, b2 = _barycentric(shadow, p0.detach(), p1.detach(), p2.detach())
     material = mixed((p0, p1, p2), b1, b2)
 
     ray, edge = (y - c).detach(), (y1 - y0).detach()
@@ -117,7 +75,6 @@ def shadow_edge(rays: RayScene, points: SilhouettePoints, centre: str) -> Shadow
     tangent = tangent * _dot(tangent, projected(covered)).sign()[:, None]
     weight = points.weight
     if not link.shared_visibility:
-        other = (link.rx if centre == "tx" else link.tx)[points.frame]
         weight = weight * visible(rays, shadow, other)
     speed = _dot(tangent, moving - material) * weight
     ones = torch.ones_like(b1)
@@ -127,8 +84,8 @@ def shadow_edge(rays: RayScene, points: SilhouettePoints, centre: str) -> Shadow
 
 def boundary_rows(
     rays: RayScene, samples: int, seed: int, row: Callable[[ShadowEdge, Echo], Paths]
-) -> Paths:
-    """Boundary paths of one bounce, of the segments at all antennas.
+) -> list[Paths]:
+    """Boundary paths of one bounce, of the segments at all antennas; none without silhouettes.
 
     Args:
         rays: The scene and its antennas.
@@ -138,27 +95,20 @@ def boundary_rows(
     """
     centres = ("tx",) if rays.link.shared_visibility else ("tx", "rx")
     count = samples // len(centres) * len(centres)
-    parts = []
-    for centre, points in silhouette_points(rays, centres, count, seed):
-        edge = shadow_edge(rays, points, centre)
-        with torch.no_grad():
-            echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.place])
-        parts.append(row(edge, echo))
-    return joined(parts)
+    sampler = EdgeSampler(rays, Inputs.of(rays), centres, count, seed)
+    if not sampler.size:
+        return []
+    drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept()
+    columns = {n: to_torch(column) for n, column in vars(drawn).items() if column is not False}
+    wide = {n: c.double() if c.is_floating_point() else c.long() for n, c in columns.items()}
+    edge = shadow_edge(rays, replace(drawn, **wide))
+    with torch.no_grad():
+        echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.place])
+    return [row(edge, echo)]
 
 
-def barycentric(
-    point: Float64[Tensor, "n 3"],
-    p0: Float64[Tensor, "n 3"],
-    p1: Float64[Tensor, "n 3"],
-    p2: Float64[Tensor, "n 3"],
-) -> tuple[Float64[Tensor, " n"], Float64[Tensor, " n"]]:
-    """Second and third barycentric coordinates of points in the planes of triangles.
-
-    Args:
-        point: Points.
-        p0, p1, p2: Corners.
-    """
+def _barycentric(point: Tensor, p0: Tensor, p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor]:
+    """Second and third barycentric coordinates of points in the planes of triangles."""
     a, b, r = p1 - p0, p2 - p0, point - p0
     aa, ab, bb, ra, rb = _dot(a, a), _dot(a, b), _dot(b, b), _dot(r, a), _dot(r, b)
     determinant = aa * bb - ab * ab

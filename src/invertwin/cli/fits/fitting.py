@@ -88,7 +88,7 @@ def calibrated(
 
 def fit(
     problem: Problem,
-    start: build.Start,
+    start: Scene,
     index: int,
     mode: str,
     folder: RunFolder,
@@ -140,7 +140,7 @@ def fit(
 
 def _staged(
     problem: Problem,
-    start: build.Start,
+    start: Scene,
     index: int,
     folder: RunFolder,
     checkpoint: str,
@@ -151,7 +151,7 @@ def _staged(
         folder.file(str(stage_file(Path(checkpoint), k)))
     every = run.measures.every if run.measures else 1
     return reconstruct(
-        start.scene,
+        start,
         observations_of(problem),
         unknowns_of(run),
         loss=build.loss(run.loss),

@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -27,9 +26,9 @@ from invertwin.errors import InputError
 from invertwin.inversion import (
     CorrelationLoss,
     MoverMaps,
+    MoverTwin,
     MovingBody,
     Observation,
-    Reconstruction,
     Schedule,
     reconstruct,
     strongest_mover,
@@ -49,24 +48,6 @@ _SCALES = {
 }
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """A body that was fitted to the strongest mover of a recording."""
-
-    recording: ChirpCapture
-    model: MotionMap  # of the whole recording
-    body: MovingBody
-    found: Reconstruction
-    seconds: float
-
-    def maps(self, scene: Scene, cells: int, seed: int, time: float = 0.0) -> MoverMaps:
-        """Twin and point about the echo, a time after the middle of the recording [s]."""
-        radar = self.recording.radar()
-        return MoverMaps.near(
-            self.body, scene, radar, self.model, cells=cells, time=time, seed=seed
-        )
-
-
 def _scores(maps: MoverMaps, recording: ChirpCapture, prefix: str = "") -> dict[str, Any]:
     """Correlations with a recording, by scale."""
     rows = maps.correlations(recording)
@@ -83,11 +64,13 @@ def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
     begin = time.perf_counter()
     table, recording = _mover(run), _recorded(run)
     scene = build.scene(run)
+    started = time.perf_counter()
     whole = _fitted(run, table, scene, recording, "twin", console)
     # The first half of the chirps predicts the second; nothing is taken from that.
     count = recording.chirps.count // 2
     first, second = recording.loops(0, count), recording.loops(count, count)
     half = _fitted(run, table, scene, first, "twin of the first half", console)
+    seconds = time.perf_counter() - started
     later = float(_times(recording)[count, 0])
     values = whole.body.values()
     metrics: dict[str, Any] = {
@@ -96,14 +79,14 @@ def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
         "mover_velocity_m_s": whole.body.echo.rate,
         "mover_azimuth_deg": math.degrees(math.asin(max(-1.0, min(1.0, whole.body.echo.u)))),
         "phase_coherence": whole.body.echo.coherence,
-        **_scores(whole.maps(scene, _CELLS, run.seed), recording),
-        **_scores(half.maps(scene, _CELLS, run.seed, later), second, "heldout_"),
+        **_scores(whole.maps(scene, _CELLS, seed=run.seed), recording),
+        **_scores(half.maps(scene, _CELLS, time=later, seed=run.seed), second, "heldout_"),
         "twin": {name: value.tolist() for name, value in values.items()},
         **_errors(run, table.object, recording, values),
-        "loss": whole.found.history[-1]["loss"],
-        "steps": whole.found.steps,
-        "status": whole.found.status,
-        "fit_seconds": whole.seconds + half.seconds,
+        "loss": whole.outcome.history[-1]["loss"],
+        "steps": whole.outcome.steps,
+        "status": whole.outcome.status,
+        "fit_seconds": seconds,
     }
     drawn = _pictures(run, folder, whole, half, scene)
     with torch.no_grad():
@@ -153,7 +136,7 @@ def _recorded(run: RunFile) -> ChirpCapture:
 
 def _fitted(
     run: RunFile, table: Mover, scene: Scene, recording: ChirpCapture, name: str, console: Console
-) -> _Fit:
+) -> MoverTwin:
     settings, grid = need(run, "reconstruct", "reconstruct"), need(run, "grid", "reconstruct")
     radar = recording.radar()
     model = MotionMap.of(
@@ -164,7 +147,6 @@ def _fitted(
         Sampling(depth=1, samples=settings.samples, boundary=False),
     )
     echo = strongest_mover(recording, model)
-    begin = time.perf_counter()
     with about(f"scene.{table.object}"):
         body = MovingBody(table.object, scene, radar, echo, table.free)
     near = model.around(echo.range, echo.rate, table.cells, radar)
@@ -179,7 +161,7 @@ def _fitted(
             callbacks=callbacks,
             seed=run.seed,
         )
-    return _Fit(recording, model, body, found, time.perf_counter() - begin)
+    return MoverTwin(recording, model, body, found)
 
 
 def _times(recording: ChirpCapture) -> Tensor:
@@ -207,10 +189,10 @@ def _errors(
 
 
 def _pictures(
-    run: RunFile, folder: RunFolder, whole: _Fit, half: _Fit, scene: Scene
+    run: RunFile, folder: RunFolder, whole: MoverTwin, half: MoverTwin, scene: Scene
 ) -> list[Picture]:
     recording, radar = whole.recording, whole.recording.radar()
-    wide = whole.maps(scene, _DRAWN_CELLS, run.seed)
+    wide = whole.maps(scene, _DRAWN_CELLS, seed=run.seed)
     grid, rates = wide.model.grid, wide.model.rates
     maps = {
         "recorded": wide.model.observe(recording)[0],
@@ -229,7 +211,7 @@ def _pictures(
         begun = MovingBody(whole.body.object, scene, radar, whole.body.echo)(scene)
         scenes = {"start": begun, "twin": whole.body(scene)}
     losses = {
-        name: [[row["loss"] for row in fit.found.history]]
+        name: [[row["loss"] for row in fit.outcome.history]]
         for name, fit in (("twin", whole), ("twin of the first half", half))
     }
     seen = doppler_maps(recording.beat, radar, whole.model.grid, recording.chirps)

@@ -88,6 +88,9 @@ def problem_of(run: RunFile, console: Console) -> Problem:
             )
     # Their errors come before any work.
     build.parameters(run.parameters, scene, run.scene)
+    for name, variant in run.variants.items():
+        with about(f"variants.{name}"):
+            build.parameters(variant.parameters or [], scene, run.scene)
     sights, observed = {}, observed_runs(run)
     for name, own in observed.items():
         with about(f"observations.{name}") if name else nullcontext():
@@ -139,13 +142,12 @@ def sought_objects(run: RunFile) -> list[str]:
     return [p.object for p in run.parameters if getattr(p, "object", None)]
 
 
-def starts_of(problem: Problem) -> list[build.Start]:
+def starts_of(problem: Problem) -> list[Scene]:
     """Where fits start: about the truth as `[starts]` says, or where the scene is."""
-    run, scene = problem.run, problem.scene
-    bodies = build.sought_bodies(run, scene)
-    table = run.starts
+    run, scene, table = problem.run, problem.scene, problem.run.starts
     if table is None:
-        return [build.Start(scene, bodies)]
+        return [scene]
+    body = build.body_of(run, scene, table.object)
     name, truth, found = table.object, problem.truth[table.object], []
     seed = run.seed if table.seed is None else table.seed
     generator = torch.Generator().manual_seed(seed)
@@ -153,10 +155,10 @@ def starts_of(problem: Problem) -> list[build.Start]:
         # The object as known may have another size: it is its centre that is placed.
         turn = moved.transform[:3, :3]
         begun = scene.replace(name, pose=rigid(turn, moved.center - turn @ scene[name].mesh.center))
-        if name in bodies and table.joint_deg > 0:
-            mesh = bodies[name].turned(truth.mesh, math.radians(table.joint_deg), generator)
+        if body is not None and table.joint_deg > 0:
+            mesh = body.turned(truth.mesh, math.radians(table.joint_deg), generator)
             begun = begun.replace(name, mesh=mesh, pose=moved.transform)
-        found.append(build.Start(begun, bodies))
+        found.append(begun)
     return found
 
 
@@ -266,29 +268,21 @@ def sharp_models(problem: Problem) -> list[SurrogateMap]:
 
 
 def observations_of(problem: Problem) -> list[Observation]:
-    """What is fitted of every sensor: data, model and the sensor's own unknowns."""
+    """What is fitted of every sensor: data, model and what is unknown of the sensor."""
     poses = {
         name: Unknown(lambda _: RadarPose(), getattr(table, "rate", None))
         for name, table in sought_of(problem.run).items()
         if table.kind == "radar_pose"
     }
-    return [
-        Observation(
-            model,
-            sight.radar,
-            sight.capture,
-            sight.weight,
-            {**poses, **_nuisances(problem.run, sight, name)},
-        )
-        for model, (name, sight) in zip(models_of(problem), problem.sights.items(), strict=True)
-    ]
-
-
-def _nuisances(run: RunFile, sight: Sight, name: str) -> dict[str, nn.Module]:
-    """Modules of what is wrong with a measurement, fitted along."""
-    made = {"range_bias": RangeBias, "clock_offset": lambda: ClockOffset(sight.capture.positions)}
-    kinds = settings_of(run).nuisances
-    return {f"{name}.{kind}" if name else kind: made[kind]() for kind in kinds}
+    found = []
+    for model, (name, sight) in zip(models_of(problem), problem.sights.items(), strict=True):
+        unknowns: dict[str, Unknown | nn.Module] = {**poses}
+        for kind in settings_of(problem.run).nuisances:
+            unknowns[f"{name}.{kind}" if name else kind] = (
+                RangeBias() if kind == "range_bias" else ClockOffset(sight.capture.positions)
+            )
+        found.append(Observation(model, sight.radar, sight.capture, sight.weight, unknowns))
+    return found
 
 
 def unknowns_of(run: RunFile) -> dict[str, Unknown]:

@@ -29,7 +29,7 @@ from invertwin.scene import Mesh, Scene, SkinnedBody
 from invertwin.scene.geometry.density import without_clouds
 
 
-def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
+def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     """How far start and twin are from the truth, where it is known."""
     name, twin = problem.target, without_clouds(twin)
     if name is None:
@@ -37,15 +37,15 @@ def scores(problem: Problem, start: build.Start, twin: Scene) -> dict[str, Any]:
     place = twin[name].center.detach().tolist()
     if name not in problem.known:
         return {"position": place}
-    shapes = shape_scores(problem, without_clouds(start.scene), twin)
-    before = residual(start.scene[name], problem.truth[name])
+    shapes = shape_scores(problem, without_clouds(start), twin)
+    before = residual(start[name], problem.truth[name])
     after = residual(twin[name], problem.truth[name])
     if before is None or after is None:
         return {"position": place, **shapes}
     settings = settings_of(problem.run)
-    if name in start.bodies:
-        scenes = (start.scene, twin, problem.truth)
-        angles = joint_scores(start.bodies[name], *(scene[name].mesh for scene in scenes))
+    body = build.body_of(problem.run, problem.scene, name)
+    if body is not None:
+        angles = joint_scores(body, *(s[name].mesh for s in (start, twin, problem.truth)))
         good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
         return {**angles, "success": good, "position": place, **shapes}
     rows: dict[str, Any] = {

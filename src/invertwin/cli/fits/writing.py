@@ -18,7 +18,6 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
-from invertwin.cli.run_file import need
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion.metrics import residual
@@ -33,6 +32,7 @@ _CONVENTIONAL = (
     ("size, share off the truth", "initial_scale_error", "scale_error"),
     ("loss without extra width", "start_loss_sharp", "loss_sharp"),
 )
+_BEGUN = f"start_{CURVE}"
 COLUMNS = texts("starts") | {key: f"{name} off by" for key, name in _MATERIAL.items()}
 """Heads of the table of starts; what metrics.json says of the best one."""
 
@@ -169,19 +169,24 @@ def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
         file = f"spectra_{name}" if name else "spectra"
         found.append(picture(folder, file, plotting.spectrum(titled, sight.grid), note="spectra"))
     losses = {way: [row["losses"] for row in fits] for way, fits in fitted.ways}
-    annealed = annealed_until(run)
+    annealed, notes = annealed_until(run), texts("notes")
     before = metrics["start_loss_sharp"] if annealed else None
-    figure = plotting.convergence(losses, annealed=annealed, before=before)
-    found.append(picture(folder, "loss", figure, note=_loss_note(run, metrics)))
+    figure, note = plotting.convergence(losses, annealed=annealed, before=before), ""
+    if annealed is not None:
+        told = None not in (before, metrics["loss_sharp"])
+        note = notes["loss"] + (notes["loss_sharp"].format(**metrics) if told else "")
+    found.append(picture(folder, "loss", figure, note=note))
     if run.measures is not None:
         folder.write_bytes("turntable.gif", _turntable(fitted, run.measures.object))
         curves = {way: [_curve(row) for row in fits] for way, fits in fitted.ways}
         if any(curve for fits in curves.values() for curve in fits):
             figure = plotting.convergence(losses, curves)
             found.append(picture(folder, "convergence", figure))
-    if "landscape" in metrics:
-        png = (folder.path / "landscape.png").read_bytes()
-        found.append(Picture("Landscape", png, _landscape_note(run, metrics)))
+    if run.landscape is not None and "landscape" in metrics:
+        minima = metrics["landscape"]["local_minima"]["exact"]
+        span = {"span_mm": run.landscape.exact_span * 1e3}
+        note = notes["landscape"].format(object=run.landscape.object, exact=minima, **span)
+        found.append(Picture("Landscape", (folder.path / "landscape.png").read_bytes(), note))
     return found
 
 
@@ -199,26 +204,8 @@ def _turntable(fitted: Fitted, name: str) -> bytes:
 
 def _curve(row: dict[str, Any]) -> list[list[float]]:
     """How the measure went, from the start on where that is scored."""
-    begun = row.get(f"start_{CURVE}")
-    first: list[list[float]] = [] if begun is None or not row["curve"] else [[0, begun]]
-    return [*first, *row["curve"]]
-
-
-def _loss_note(run: RunFile, metrics: dict[str, Any]) -> str:
-    if annealed_until(run) is None:
-        return ""
-    sharp = None not in (metrics["start_loss_sharp"], metrics["loss_sharp"])
-    notes = texts("notes")
-    return notes["loss"] + (notes["loss_sharp"].format(**metrics) if sharp else "")
-
-
-def _landscape_note(run: RunFile, metrics: dict[str, Any]) -> str:
-    table = need(run, "landscape", "its note")
-    return texts("notes")["landscape"].format(
-        object=table.object,
-        exact=metrics["landscape"]["local_minima"]["exact"],
-        span_mm=table.exact_span * 1e3,
-    )
+    begun: list[list[float]] = [[0, row[_BEGUN]]] if row["curve"] and _BEGUN in row else []
+    return [*begun, *row["curve"]]
 
 
 def status(run: RunFile, metrics: dict[str, Any]) -> str:

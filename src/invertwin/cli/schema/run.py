@@ -162,16 +162,26 @@ class _RunFile(Section):
 
     @model_validator(mode="after")
     def _names_are_known(self) -> "_RunFile":
-        known = self.parameter_names
-        doubled = next((name for name in known if known.count(name) > 1), None)
+        names = [table.name or table.kind for table in self.parameters]
+        free = {n for n, t in zip(names, self.parameters, strict=True) if t.kind == "vertices"}
+        doubled = next((name for name in names if names.count(name) > 1), None)
         if doubled and (self.stages or self.variants):
             fail(f'expected parameters of different names, got "{doubled}" twice; add `name`')
+        own = set(names)
         if self.reconstruct is not None:
-            _named("parameters", self.reconstruct.parameters, known, "reconstruct.parameters")
-            sensors, used = [*self.observations], self.reconstruct.observations
-            _named("observations", used, sensors, "reconstruct.observations")
+            sensors, used = [*self.observations], self.reconstruct
+            _named("parameters", used.parameters, names, "reconstruct.parameters")
+            _named("observations", used.observations, sensors, "reconstruct.observations")
+            own = set(used.parameters) or own
         for i, stage in enumerate(self.stages):
-            _named("parameters", stage.parameters, known, f"stages[{i}].parameters")
+            _named("parameters", stage.parameters, names, f"stages[{i}].parameters")
+            sought = own & set(stage.parameters or names)
+            if stage.remesh and sought and not sought & free:
+                fail(
+                    'expected a parameter with kind = "vertices" among those of the stage, got '
+                    "none; add one, or remove `remesh`",
+                    f"stages[{i}].remesh",
+                )
         return self
 
     @model_validator(mode="after")
@@ -183,21 +193,6 @@ class _RunFile(Section):
                     f'expected a parameter with kind = "body" of {name}, whose joints it turns, '
                     "got none; add one, or remove `joint_deg`",
                     "starts.joint_deg",
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _stages_remesh_what_they_seek(self) -> "_RunFile":
-        names = self.parameter_names
-        own = set(self.reconstruct.parameters if self.reconstruct else []) or set(names)
-        kinds = dict(zip(names, self.parameters, strict=True))
-        for i, stage in enumerate(self.stages):
-            sought = own & set(stage.parameters or names)
-            if stage.remesh and sought and all(kinds[n].kind != "vertices" for n in sought):
-                fail(
-                    'expected a parameter with kind = "vertices" among those of the stage, got '
-                    "none; add one, or remove `remesh`",
-                    f"stages[{i}].remesh",
                 )
         return self
 
@@ -240,11 +235,6 @@ class _RunFile(Section):
                 if getattr(table, name, None) is not None:
                     found["observations"][sensor][name] = _merged(getattr(table, name), change)
         return found
-
-    @property
-    def parameter_names(self) -> list[str]:
-        """What stages and variants call the parameters."""
-        return [p.name or p.kind for p in self.parameters]
 
     @property
     def unknowns(self) -> dict[str, Any]:

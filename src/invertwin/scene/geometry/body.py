@@ -14,9 +14,8 @@ from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.scene.files import read_arrays
 from invertwin.scene.mesh import Mesh, joined
-from invertwin.scene.parameters import Entries
+from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
 from invertwin.scene.pose import rotation_angle, rotation_from_vector
-from invertwin.scene.scene import Scene
 
 _DO = "give arrays of one template"
 _ALONE = 0.95  # share of a vertex that a joint moves nearly alone
@@ -148,8 +147,7 @@ class BodyTemplate:
         Raises:
             InputError: no such joint, or not three finite numbers.
         """
-        rows = [rotation_from_vector(turn) for turn in self.rotations(turns)]
-        return Mesh(self.posed(torch.stack(rows))[0], self.faces)
+        return Mesh(self.posed(rotation_from_vector(self.rotations(turns)))[0], self.faces)
 
     def scaled(self, factor: float) -> "BodyTemplate":
         """The body in another size."""
@@ -170,8 +168,7 @@ class BodyTemplate:
         turns = self._rigid_turns(given)
 
         def skin(flat: Tensor) -> Tensor:
-            rows = flat.reshape(-1, 3).unbind()
-            return self.posed(torch.stack([rotation_from_vector(row) for row in rows]))[0].flatten()
+            return self.posed(rotation_from_vector(flat.reshape(-1, 3)))[0].flatten()
 
         with torch.no_grad():
             for _ in range(_REFINED):
@@ -228,13 +225,26 @@ class BodyTemplate:
         return torch.einsum("vab,vb->va", blended, rest) + self.weights @ shifts, posed
 
 
-class SkinnedBody(nn.Module):
+class SkinnedBody(ObjectModule):
     """Replaces an object's mesh by a body template with turned joints.
+
+    Args:
+        object: name of the object; its pose places the body.
+        template: the body.
+        rotation: rotation vectors [j, 3] (rad); None is the rest pose.
+        shape: shape coordinates [n]; None is zero.
+        sought: joints that the fit may turn, by name or number, or a mapping from their names
+            to the components of the rotation vector that it may change, such as "y" for an
+            elbow; None is all.
 
     Attributes:
         rotation: parameter [j, 3], rotation vector of every joint in the frame of its parent
             [rad].
         shape: parameter [n], shape coordinates of the template.
+
+    Raises:
+        InputError: wrong shapes, NaN, a joint that the template does not have, or axes that
+            are not some of x, y and z.
     """
 
     def __init__(
@@ -245,23 +255,8 @@ class SkinnedBody(nn.Module):
         shape: ArrayLike | None = None,
         sought: Sequence[str | int] | Mapping[str, str] | None = None,
     ) -> None:
-        """Shape `object` by a body, from these joint angles at the start.
-
-        Args:
-            object: name of the object; its pose places the body.
-            template: the body.
-            rotation: rotation vectors [j, 3] (rad); None is the rest pose.
-            shape: shape coordinates [n]; None is zero.
-            sought: joints that the fit may turn, by name or number, or a mapping from their names
-                to the components of the rotation vector that it may change, such as "y" for an
-                elbow; None is all.
-
-        Raises:
-            InputError: wrong shapes, NaN, a joint that the template does not have, or axes that
-                are not some of x, y and z.
-        """
-        super().__init__()
-        self.object, self.template = object, template
+        super().__init__(object)
+        self.template = template
         count, shapes = len(template.parents), template.shape_count
         turns = torch.zeros(count, 3) if rotation is None else rotation
         turns = checked_tensor(turns, (count, 3), "joint rotations [rad]", "give one per joint")
@@ -272,14 +267,15 @@ class SkinnedBody(nn.Module):
         self._sought = torch.zeros(count, 3, dtype=torch.float64)
         self._joints = {str(name): template.joint(name) for name in free}
         for name, axes in free.items():
-            self._sought[template.joint(name)] = _axes_mask(axes)
+            if not axes:
+                raise InputError(f"expected axes among x, y and z for {name}, got none; give some")
+            self._sought[template.joint(name)] = axes_mask(axes)
         self.rotation = nn.Parameter(turns.detach().clone())
         self.shape = nn.Parameter(given.detach().clone(), requires_grad=shapes > 0)
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the object's mesh replaced."""
-        vertices, _ = self._posed()
-        return scene.replace(self.object, mesh=Mesh(vertices, self.template.faces))
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The template's skin as it is posed, whatever was there before."""
+        return Mesh(self._posed()[0], self.template.faces)
 
     @classmethod
     def of(
@@ -311,7 +307,7 @@ class SkinnedBody(nn.Module):
             generator: of the axes.
         """
         turns = self.template.rotations_of(mesh.vertices)
-        rotations = torch.stack([rotation_from_vector(turn) for turn in turns])
+        rotations = rotation_from_vector(turns)
         for joint in self._joints.values():
             free = self._sought[joint]
             axis = torch.randn(3, generator=generator, dtype=torch.float64) * free
@@ -331,12 +327,12 @@ class SkinnedBody(nn.Module):
             found: the result.
             truth: what it should be.
         """
-        ends = [self.template.rotations_of(mesh.vertices.detach()) for mesh in (found, truth)]
-        errors = {}
-        for name, joint in self._joints.items():
-            a, b = (rotation_from_vector(end[joint]) for end in ends)
-            errors[name] = float(rotation_angle(a.T @ b))
-        return errors
+        a, b = (
+            rotation_from_vector(self.template.rotations_of(mesh.vertices.detach()))
+            for mesh in (found, truth)
+        )
+        angles = rotation_angle(a.mT @ b).tolist()
+        return {name: angles[joint] for name, joint in self._joints.items()}
 
     def joints(self) -> Float64[Tensor, "j 3"]:
         """Present places of the joints in the object's frame [m]."""
@@ -359,16 +355,8 @@ class SkinnedBody(nn.Module):
         return {name: Entries("rotation", k) for k, name in joints if self._sought[k].any()}
 
     def _posed(self) -> tuple[Tensor, Tensor]:
-        free = self.rotation * self._sought + self.rotation.detach() * (1 - self._sought)
-        rotations = torch.stack([rotation_from_vector(vector) for vector in free])
+        rotations = rotation_from_vector(free_part(self.rotation, self._sought))
         return self.template.posed(rotations, self.shape)
-
-
-def _axes_mask(axes: str) -> Tensor:
-    """1 for the axes that are named, 0 for the others."""
-    if not axes or set(axes) - set("xyz"):
-        raise InputError(f"expected axes among x, y and z, got {axes!r}; write them as 'xy'")
-    return torch.tensor([float(axis in axes) for axis in "xyz"], dtype=torch.float64)
 
 
 def articulated_template(

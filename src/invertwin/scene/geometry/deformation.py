@@ -17,23 +17,21 @@ class LatticeDeformation(ObjectModule):
     The displacement field is twice continuously differentiable, whatever the mesh; equal offsets
     everywhere are a translation by them.
 
+    Args:
+        object: name of the object.
+        low: corner of a box that holds the object's mesh, in its frame [m].
+        high: the opposite corner [m].
+        counts: nodes of the lattice along x, y and z.
+
     Attributes:
         offsets: parameter [x+2, y+2, z+2, 3] in the object's frame, metres: those of the
             lattice's nodes and of one more on every side.
+
+    Raises:
+        InputError: a box without volume, or fewer than two nodes along an axis.
     """
 
     def __init__(self, object: str, low: Point, high: Point, counts: Counts = (4, 4, 4)) -> None:
-        """Deform `object`, by zero at the start.
-
-        Args:
-            object: name of the object.
-            low: corner of a box that holds the object's mesh, in its frame [m].
-            high: the opposite corner [m].
-            counts: nodes of the lattice along x, y and z.
-
-        Raises:
-            InputError: a box without volume, or fewer than two nodes along an axis.
-        """
         super().__init__(object)
         self.lattice = Lattice.between(low, high, counts)
         shape = [n + 2 for n in self.lattice.counts]

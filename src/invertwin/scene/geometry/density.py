@@ -29,9 +29,20 @@ class DensityGrid(ObjectModule):
     ``σ = softplus(value) / h``, with h the mean spacing of the nodes. At a value of 0 one cell
     holds back half of the power. Learning rates of about 0.1 suit all grids.
 
+    Args:
+        object: name of the object; its mesh is not seen any more.
+        low: corner of the box in the object's frame [m].
+        high: the opposite corner [m].
+        density: extinction at the nodes [1/m], at least two along each axis. What is below
+            0.001 of one over a spacing starts there.
+        albedo: see ``Cloud``.
+
     Attributes:
         value: parameter [x, y, z].
         albedo: albedo of the cloud, see ``Cloud``.
+
+    Raises:
+        InputError: wrong shapes, NaN, a negative density, or a box without volume.
     """
 
     def __init__(
@@ -42,19 +53,6 @@ class DensityGrid(ObjectModule):
         density: Float64[Tensor, "x y z"],
         albedo: float = 1.0,
     ) -> None:
-        """Let `object` be a cloud, of these densities at the start.
-
-        Args:
-            object: name of the object; its mesh is not seen any more.
-            low: corner of the box in the object's frame [m].
-            high: the opposite corner [m].
-            density: extinction at the nodes [1/m], at least two along each axis. What is below
-                0.001 of one over a spacing starts there.
-            albedo: see ``Cloud``.
-
-        Raises:
-            InputError: wrong shapes, NaN, a negative density, or a box without volume.
-        """
         super().__init__(object)
         self.albedo = checked_number(albedo, "albedo", 0.0, open_low=True)
         self.lattice = Lattice.between(low, high, density.shape)
@@ -114,9 +112,6 @@ class DensityGrid(ObjectModule):
             high: the opposite corner [m].
             counts: nodes along x, y and z.
             depth: that ∫σ ds. Keep it small: what is opaque hides what lies behind it from the fit.
-
-        Raises:
-            InputError: as above.
         """
         lattice = Lattice.between(low, high, counts)
         whole = checked_number(depth, "optical depth", 0.0, open_low=True)

@@ -75,8 +75,18 @@ class DistanceGrid(_Distance):
     and a continuous gradient. With smoothing λ the distances are ``(I + λL)⁻¹ value``, L the graph
     Laplacian of the grid: rough parts of a gradient are held back, as by ``SmoothVertices``.
 
+    Args:
+        object: name of the object.
+        low: corner of the grid in the object's frame [m].
+        high: the opposite corner [m].
+        value: signed distances at the nodes [m], at least two along each axis.
+        smoothing: λ; detail of steps below about √λ spacings is held back.
+
     Attributes:
         value: parameter [x, y, z], metres; without smoothing the distances, negative inside.
+
+    Raises:
+        InputError: wrong shapes, NaN, a box without volume, or a negative λ.
     """
 
     def __init__(
@@ -87,18 +97,6 @@ class DistanceGrid(_Distance):
         value: Float64[Tensor, "x y z"],
         smoothing: float = 0.0,
     ) -> None:
-        """Shape `object` by a grid, from these distances at the start.
-
-        Args:
-            object: name of the object.
-            low: corner of the grid in the object's frame [m].
-            high: the opposite corner [m].
-            value: signed distances at the nodes [m], at least two along each axis.
-            smoothing: λ; detail of steps below about √λ spacings is held back.
-
-        Raises:
-            InputError: wrong shapes, NaN, a box without volume, or a negative λ.
-        """
         given = checked_tensor(
             value, (None, None, None), "signed distances [m]", "give one for each node"
         )
@@ -125,9 +123,6 @@ class DistanceGrid(_Distance):
             counts: nodes along x, y and z.
             distance: signed distance [m] of points [p, 3], negative inside.
             smoothing: λ, as above.
-
-        Raises:
-            InputError: as above.
         """
         lattice = Lattice.between(low, high, counts)
         with torch.no_grad():
@@ -170,15 +165,14 @@ class DistanceGrid(_Distance):
 
 
 class GridSmoother:
-    """I + λL of a grid, L its graph Laplacian, by cosine transforms, which diagonalise it."""
+    """I + λL of a grid, L its graph Laplacian, by cosine transforms, which diagonalise it.
+
+    Args:
+        shape: nodes along each axis.
+        amount: λ.
+    """
 
     def __init__(self, shape: Sequence[int], amount: float) -> None:
-        """Prepare I + λL.
-
-        Args:
-            shape: nodes along each axis.
-            amount: λ.
-        """
         self.amount = amount
         modes = [torch.arange(count, dtype=torch.float64) for count in shape]
         waves = [torch.cos(torch.pi * k * (k[:, None] + 0.5) / len(k)) for k in modes]
@@ -207,9 +201,24 @@ class NeuralDistance(_Distance):
     ``f(x) = |x − c| − r + h · net((x − c)/h)``, c and h the middle and the half diagonal of the
     box; the network's last layer starts at zero.
 
+    Args:
+        object: name of the object.
+        low: corner of the box in the object's frame [m].
+        high: the opposite corner [m].
+        counts: nodes along x, y and z at which the field is meshed.
+        radius: radius of the ball [m].
+        width: sines of a layer.
+        depth: layers of sines.
+        frequency: of the first layer's sines, in radians over the box's half diagonal: higher
+            for finer detail.
+        seed: seed of the network's first weights.
+
     Attributes:
         layers: linear layers of the network, sin(frequency · layer) after the first, sin(layer)
             after the others.
+
+    Raises:
+        InputError: a box without volume, or a number that is not positive.
     """
 
     def __init__(
@@ -225,23 +234,6 @@ class NeuralDistance(_Distance):
         frequency: Positive = 8.0,
         seed: int = 0,
     ) -> None:
-        """Shape `object` by a network, from a ball in the middle of the box at the start.
-
-        Args:
-            object: name of the object.
-            low: corner of the box in the object's frame [m].
-            high: the opposite corner [m].
-            counts: nodes along x, y and z at which the field is meshed.
-            radius: radius of the ball [m].
-            width: sines of a layer.
-            depth: layers of sines.
-            frequency: of the first layer's sines, in radians over the box's half diagonal: higher
-                for finer detail.
-            seed: seed of the network's first weights.
-
-        Raises:
-            InputError: a box without volume, or a number that is not positive.
-        """
         super().__init__(object, low, high, counts)
         self.radius = checked_number(radius, "radius [m]", 0.0, open_low=True)
         self.frequency = checked_number(frequency, "frequency", 0.0, open_low=True)

@@ -51,9 +51,6 @@ def surface_of(
         field: the signed distance at points in the box.
         lattice: nodes on which the field is known.
         values: there.
-
-    Raises:
-        InputError: as above.
     """
     if not bool(torch.isfinite(values).all()):
         raise InputError("expected a finite field, got NaN or infinity; lower the learning rate")

@@ -28,17 +28,15 @@ class Decoder(nn.Module):
 
     ``d = mean + basis · (straight · z + leave · tanh(enter · z))``: a network of the latent weighs
     learned fields, so that decoding costs one product with a matrix.
+
+    Args:
+        latent: number of coordinates.
+        width: size of the hidden layer.
+        features: number of learned fields.
+        nodes: number of nodes in half a grid.
     """
 
     def __init__(self, latent: int, width: int, features: int, nodes: int) -> None:
-        """A network with random weights.
-
-        Args:
-            latent: number of coordinates.
-            width: size of the hidden layer.
-            features: number of learned fields.
-            nodes: number of nodes in half a grid.
-        """
         super().__init__()
         self.enter = nn.Linear(latent, width)
         self.leave = nn.Linear(width, features)
@@ -58,24 +56,24 @@ class ShapePrior:
     so ½ |z|² is the negative logarithm of their probability density, and z = 0 is the mean shape.
     Coordinates come in order of how much they change.
 
+    Args:
+        decoder: the network.
+        lattice: its nodes, both halves.
+
     Attributes:
         decoder: the network, float64, without gradients.
         lattice: the decoder's nodes, both halves.
+        latent_size: number of coordinates of a shape.
+        low, high: corners of the box that holds all shapes [m].
+
+    Raises:
+        InputError: a network for another number of nodes, or nodes that do not mirror in y.
     """
 
     limit = 6.0
     """Standard deviations within which a latent decodes to something like its kind."""
 
     def __init__(self, decoder: Decoder, lattice: Lattice) -> None:
-        """A prior from its network and the nodes that it decodes to.
-
-        Args:
-            decoder: the network.
-            lattice: its nodes, both halves.
-
-        Raises:
-            InputError: a network for another number of nodes, or nodes that do not mirror in y.
-        """
         x, y, z = lattice.counts
         mirrors = y % 2 == 1 and bool(torch.isclose(lattice.low[1], -lattice.high[1]))
         if not mirrors or decoder.basis.out_features != x * (y + 1) // 2 * z:
@@ -85,22 +83,9 @@ class ShapePrior:
             )
         self.decoder = decoder.double().requires_grad_(False)
         self.lattice = lattice
+        self.latent_size = decoder.enter.in_features
+        self.low, self.high = lattice.low, lattice.high
         self._last: tuple[tuple[int, ...], Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
-
-    @property
-    def latent_size(self) -> int:
-        """Coordinates of a shape."""
-        return self.decoder.enter.in_features
-
-    @property
-    def low(self) -> Float64[Tensor, "3"]:
-        """Corner of the box that holds all shapes [m]."""
-        return self.lattice.low
-
-    @property
-    def high(self) -> Float64[Tensor, "3"]:
-        """The opposite corner [m]."""
-        return self.lattice.high
 
     def nodes(self, counts: Sequence[int] | None = None) -> Lattice:
         """Nodes in the box, as many along x, y and z as told; None is about 0.1 m apart.
@@ -130,9 +115,6 @@ class ShapePrior:
         Args:
             points: [m].
             latent: coordinates in standard deviations.
-
-        Raises:
-            InputError: as above.
         """
         return cubic(self.values(latent), self.lattice, points)
 
@@ -160,9 +142,6 @@ class ShapePrior:
         Args:
             latent: coordinates in standard deviations.
             counts: nodes along x, y and z.
-
-        Raises:
-            InputError: as above.
         """
         return torch.stack(list(self.slices(latent, counts)))
 
@@ -172,9 +151,6 @@ class ShapePrior:
         Args:
             latent: coordinates in standard deviations.
             counts: nodes along x, y and z at which the field is meshed, see `nodes`.
-
-        Raises:
-            InputError: as above.
         """
         values = self.values(latent)
         points, faces, slope = self._surface(values.detach(), self.nodes(counts))
@@ -224,8 +200,17 @@ class PriorShape(ObjectModule):
 
     The material must not have values per triangle, nor the object velocities per vertex.
 
+    Args:
+        object: name of the object; its pose is kept.
+        prior: the prior; None is the packaged one of vehicles.
+        initial: coordinates in standard deviations; None is the mean shape.
+        counts: nodes along x, y and z at which the field is meshed; None = the prior's.
+
     Attributes:
         latent: parameter [k], in standard deviations.
+
+    Raises:
+        InputError: coordinates of another number, not finite, or out of range.
     """
 
     reported = ("latent",)
@@ -237,17 +222,6 @@ class PriorShape(ObjectModule):
         initial: ArrayLike | None = None,
         counts: Sequence[int] | None = None,
     ) -> None:
-        """Shape `object` by a prior, from these coordinates at the start.
-
-        Args:
-            object: name of the object; its pose is kept.
-            prior: the prior; None is the packaged one of vehicles.
-            initial: coordinates in standard deviations; None is the mean shape.
-            counts: nodes along x, y and z at which the field is meshed; None = the prior's.
-
-        Raises:
-            InputError: coordinates of another number, not finite, or out of range.
-        """
         super().__init__(object)
         self.prior = load_prior() if prior is None else prior
         self.lattice = self.prior.nodes(counts)

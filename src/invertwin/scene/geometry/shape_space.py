@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.scene import Scene
+from invertwin.scene.parameters import ObjectModule
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,26 +68,26 @@ class ShapeSpace:
         return torch.linalg.lstsq(basis, (vertices - self.mean).reshape(-1, 1)).solution[:, 0]
 
 
-class LinearShape(nn.Module):
+class LinearShape(ObjectModule):
     """Replaces an object's mesh by one of a linear shape space.
+
+    Args:
+        object: name of the object; its pose is kept.
+        space: the shape space.
+        initial: coordinates in standard deviations, or how many, from the mean shape.
 
     Attributes:
         latent: parameter [k], in standard deviations.
+
+    Raises:
+        InputError: none or too many coordinates, or NaN.
     """
 
+    reported = ("latent",)
+
     def __init__(self, object: str, space: ShapeSpace, initial: ArrayLike | int) -> None:
-        """Shape `object` by a space, from these coordinates at the start.
-
-        Args:
-            object: name of the object; its pose is kept.
-            space: the shape space.
-            initial: coordinates in standard deviations, or how many, from the mean shape.
-
-        Raises:
-            InputError: none or too many coordinates, or NaN.
-        """
-        super().__init__()
-        self.object, self.space = object, space
+        super().__init__(object)
+        self.space = space
         start = (
             torch.zeros(checked_count(initial, "coordinates", 1), dtype=torch.float64)
             if isinstance(initial, int)
@@ -96,10 +96,6 @@ class LinearShape(nn.Module):
         space.mesh(start.detach())
         self.latent = nn.Parameter(start.detach().clone())
 
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the object's mesh replaced."""
-        return scene.replace(self.object, mesh=self.space.mesh(self.latent))
-
-    def values(self) -> dict[str, Tensor]:
-        """Coordinates by name, for progress and reports."""
-        return {f"{self.object}.latent": self.latent.detach().clone()}
+    def reshaped(self, mesh: Mesh) -> Mesh:
+        """The space's mesh, whatever was there before."""
+        return self.space.mesh(self.latent)

@@ -25,23 +25,21 @@ class SmoothVertices(ObjectModule):
     Differs from the source: u belongs to the displacement, not to the positions, so that zero is
     the first shape; the optimiser is whichever fits u.
 
+    Args:
+        object: name of the object.
+        mesh: its mesh, whose edges say which vertices are neighbours.
+        smoothing: λ; detail below about √λ edge lengths is held back.
+
     Attributes:
         latent: parameter u [v, 3] in the object's frame, metres.
+
+    Raises:
+        InputError: a negative λ.
     """
 
     reported = ("offsets",)
 
     def __init__(self, object: str, mesh: Mesh, smoothing: float = 20.0) -> None:
-        """Move the vertices of `object`, by zero at the start.
-
-        Args:
-            object: name of the object.
-            mesh: its mesh, whose edges say which vertices are neighbours.
-            smoothing: λ; detail below about √λ edge lengths is held back.
-
-        Raises:
-            InputError: a negative λ.
-        """
         super().__init__(object)
         amount = checked_number(smoothing, "smoothing λ", 0.0)
         count = len(mesh.vertices)
@@ -70,16 +68,15 @@ class SmoothVertices(ObjectModule):
 
 
 class Smoother:
-    """The factorised matrix I + λL, symmetric and positive definite; copies factorise anew."""
+    """The factorised matrix I + λL, symmetric and positive definite; copies factorise anew.
+
+    Args:
+        faces: triangles [f, 3].
+        count: number of vertices.
+        amount: λ.
+    """
 
     def __init__(self, faces: Tensor, count: int, amount: float) -> None:
-        """Factorise I + λL.
-
-        Args:
-            faces: triangles [f, 3].
-            count: number of vertices.
-            amount: λ.
-        """
         self._given = faces, count, amount
         self._factors: SuperLU = splu(
             csc_array(eye_array(count) + amount * laplacian(faces, count))

@@ -1,7 +1,8 @@
 """The materials that come with the library.
 
 Every value may be a number, one number per triangle of the mesh, or a `Texture`, and may carry
-gradients; permittivity and conductivity may also follow the ITU table (`Itu`).
+gradients; permittivity and conductivity may also follow the ITU table (`Itu`). A value outside of
+its range raises `InputError`.
 """
 
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 import torch
 from annotated_types import MinLen
-from jaxtyping import Float64, Shaped
+from jaxtyping import Shaped
 from torch import Tensor
 
 from invertwin.errors import InputError
@@ -38,6 +39,8 @@ from invertwin.scene.material.values import RANGES, Value, checked_value, evalua
 
 AnyMedium = TypeVar("AnyMedium", bound="Medium")
 _SAFE_POWER = 1e-30  # below it a reflectance is zero, and its root has no derivative
+_COSINES = torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
+_MIRROR = torch.ones_like(_COSINES)
 
 
 class _Values:
@@ -148,7 +151,7 @@ class PerfectConductor(_Values, Material):
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         nothing = torch.zeros((), dtype=torch.float64)
-        return Surface(_mirror(), *specular_weights(nothing, lobe_exponent(self.lobe_width)))
+        return Surface(_MIRROR, *specular_weights(nothing, lobe_exponent(self.lobe_width)))
 
 
 @dataclass(frozen=True)
@@ -156,15 +159,12 @@ class RoughConductor(_Values, EffectiveRoughness, Material):
     """A perfect conductor with a rough surface: all power comes back, spread by the roughness.
 
     Its fields are those of `EffectiveRoughness`.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-        return Surface(_mirror(), *self.weights())
+        return Surface(_MIRROR, *self.weights())
 
 
 @dataclass(frozen=True)
@@ -177,9 +177,6 @@ class RoughDielectric(Medium, Material):
             into the lobe.
         lobe_width: full width at half maximum of the lobe around the mirror direction [rad],
             in (0, π].
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     diffuse: Value = 1.0
@@ -189,7 +186,7 @@ class RoughDielectric(Medium, Material):
         """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
         weights = specular_weights(evaluated(self.diffuse), lobe_exponent(self.lobe_width))
-        return Surface(fresnel_amplitude(epsilon[..., None], _cosines()), *weights)
+        return Surface(fresnel_amplitude(epsilon[..., None], _COSINES), *weights)
 
 
 @dataclass(frozen=True)
@@ -199,15 +196,12 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
             `EffectiveRoughness`.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
-        return Surface(fresnel_amplitude(epsilon[..., None], _cosines()), *self.weights())
+        return Surface(fresnel_amplitude(epsilon[..., None], _COSINES), *self.weights())
 
 
 @dataclass(frozen=True)
@@ -220,18 +214,15 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
             `EffectiveRoughness`, of what the outside reflects.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     def surface(self, frequency: float) -> Surface:
         """What one face does at `frequency` [Hz]; differentiable with respect to all values."""
-        epsilon, cosine = self.complex_permittivity(frequency), _cosines()
+        epsilon = self.complex_permittivity(frequency)
         return Surface(
-            fresnel_amplitude(epsilon[..., None], cosine),
+            fresnel_amplitude(epsilon[..., None], _COSINES),
             *self.weights(),
-            refraction=fresnel_transmittance(epsilon[..., None], cosine),
+            refraction=fresnel_transmittance(epsilon[..., None], _COSINES),
             index=refractive_index(epsilon),
             attenuation=attenuation(epsilon, frequency),
         )
@@ -244,9 +235,6 @@ class Layer(Medium):
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`.
         thickness: [m] ≥ 0.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     thickness: Value = field(kw_only=True)
@@ -269,9 +257,6 @@ class Slab(Layer, EffectiveRoughness, Material):
     Attributes:
         permittivity, conductivity, loss_tangent, thickness: see `Layer`; the other fields are
             those of `EffectiveRoughness`, of what it reflects.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     def surface(self, frequency: float) -> Surface:
@@ -289,9 +274,6 @@ class Multilayer(_Values, EffectiveRoughness, Material):
             the same from both sides.
         scattering, rms_slope, lambertian, directive, directive_exponent, backscatter_exponent: see
             `EffectiveRoughness`.
-
-    Raises:
-        InputError: no layers, or a value outside its range.
     """
 
     layers: Annotated[Sequence[Layer], MinLen(1)]
@@ -323,22 +305,10 @@ def _value_names(holder: object) -> list[str]:
     return [entry.name for entry in fields(holder) if entry.name in RANGES]  # type: ignore[arg-type]
 
 
-def _cosines() -> Float64[Tensor, "256"]:
-    return torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
-
-
-def _mirror() -> Tensor:
-    return torch.ones(ANGLE_COUNT, dtype=torch.float64)
-
-
 def _slab_surface(layers: Sequence[Layer], weights: Weights, frequency: float) -> Surface:
-    tables = slab_tables([layer.sheet(frequency) for layer in layers], _cosines(), frequency)
+    tables = slab_tables([layer.sheet(frequency) for layer in layers], _COSINES, frequency)
     # The root's derivative is infinite at zero, where the amplitude has none.
     seen = tables.reflectance > _SAFE_POWER
     amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
-    return Surface(
-        amplitude,
-        *weights,
-        transmittance=tables.transmittance,
-        extra_length=tables.extra_length,
-    )
+    through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}
+    return Surface(amplitude, *weights, **through)

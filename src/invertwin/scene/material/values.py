@@ -13,7 +13,7 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.limits import Among
 from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
-from invertwin.scene.mesh import Mesh
+from invertwin.scene.mesh import Mesh, checked_faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +49,7 @@ class Texture:
         else:
             do = "give u, v of every vertex"
             vertices = checked_tensor(self.uv, (None, 2), "uv of a texture", do)
-            index = torch.as_tensor(faces)
-            fits = index.ndim == 2 and index.shape[1] == 3 and not index.is_floating_point()
-            if not fits or bool((index < 0).any() or (index >= len(vertices)).any()):
-                raise InputError(
-                    f"expected faces as indices [f, 3] below {len(vertices)}, "
-                    f"got shape {list(index.shape)}; give those of the mesh that `uv` belongs to"
-                )
-            uv = vertices[index]
+            uv = vertices[checked_faces(faces, len(vertices))]
         object.__setattr__(self, "image", image)
         object.__setattr__(self, "uv", uv.detach())
 
