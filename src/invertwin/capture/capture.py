@@ -307,12 +307,12 @@ def _checked(dataset: xr.Dataset) -> Radar:
             f"expected a capture with either beat or range_profile, got {held or 'neither'}; "
             "the file is no capture or was written by another program"
         )
-    for name, dims in (("beat", BEAT_DIMS), ("range_profile", PROFILE_DIMS)):
-        if name in held and (dataset[name].dims != dims or dataset[name].dtype.kind != "c"):
-            raise InputError(
-                f"expected complex {name} with dimensions {dims}, got {dataset[name].dtype} with "
-                f"{dataset[name].dims}; label the data that way"
-            )
+    data, dims = dataset[held[0]], BEAT_DIMS if "beat" in held else PROFILE_DIMS
+    if data.dims != dims or data.dtype.kind != "c":
+        raise InputError(
+            f"expected complex {held[0]} with dimensions {dims}, got {data.dtype} with "
+            f"{data.dims}; label the data that way"
+        )
     for name, variable in dataset.variables.items():
         bad = int((~np.isfinite(variable.values)).sum())
         if bad:

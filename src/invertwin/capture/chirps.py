@@ -71,9 +71,7 @@ class ChirpSettings:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        order, receivers = tuple(self.transmit_order), tuple(self.receivers)
-        object.__setattr__(self, "transmit_order", order)
-        object.__setattr__(self, "receivers", receivers)
+        order, receivers = self.transmit_order, self.receivers
         if not order or min(order) < 1 or len(set(order)) < len(order):
             raise InputError(
                 f"expected each transmitter (from 1) once per loop, got the order {order}; "

@@ -60,28 +60,24 @@ def radar_from_fields(dataset: xr.Dataset) -> Radar:
     return Radar(
         transmitters=_array_from_fields("tx", dataset),
         receivers=_array_from_fields("rx", dataset),
-        waveform=waveform_from_attributes(dataset.attrs),
+        waveform=_waveform(dataset.attrs),
         positions=tensor(dataset, "position"),
         rotations=tensor(dataset, "rotation"),
-        window=str(attribute(dataset.attrs, "window")),
-        array_window=str(attribute(dataset.attrs, "array_window")),
+        window=str(_held(dataset.attrs, "window")),
+        array_window=str(_held(dataset.attrs, "array_window")),
         shared_visibility=_named(
             dataset.attrs, "visibility", {v: k for k, v in _VISIBILITY.items()}
         ),
     )
 
 
-def waveform_from_attributes(attributes: Mapping[Hashable, Any]) -> Waveform:
-    """The waveform named by the attribute ``waveform``, with its fields.
-
-    Raises:
-        InputError: an unknown waveform or a missing field.
-    """
+def _waveform(attributes: Mapping[Hashable, Any]) -> Waveform:
+    """The waveform named by the attribute ``waveform``, with its fields."""
     kind = _named(attributes, "waveform", WAVEFORMS)
     # Numbers come back from a file as NumPy scalars.
     types = get_type_hints(kind)  # without the limits that annotations may have
     values = {
-        field.name: (int if types[field.name] is int else float)(attribute(attributes, field.name))
+        field.name: (int if types[field.name] is int else float)(_held(attributes, field.name))
         for field in fields(kind)
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
@@ -119,20 +115,7 @@ def tensor(dataset: xr.Dataset, name: str) -> Tensor:
     return torch.from_numpy(np.array(_held(dataset.variables, name, "a variable").values))
 
 
-def attribute(attributes: Mapping[Hashable, Any], name: str) -> Any:
-    """An attribute of a capture.
-
-    Args:
-        attributes: attributes of a capture.
-        name: name of the attribute.
-
-    Raises:
-        InputError: the attribute is missing.
-    """
-    return _held(attributes, name, "an attribute")
-
-
-def _held(entries: Mapping[Any, Any], name: str, what: str) -> Any:
+def _held(entries: Mapping[Any, Any], name: str, what: str = "an attribute") -> Any:
     if name not in entries:
         raise InputError(
             f"expected a capture with {what} {name!r}, got none; "
@@ -142,7 +125,7 @@ def _held(entries: Mapping[Any, Any], name: str, what: str) -> Any:
 
 
 def _named(attributes: Mapping[Hashable, Any], name: str, choices: Mapping[str, Any]) -> Any:
-    value = attribute(attributes, name)
+    value = _held(attributes, name)
     if value not in choices:
         raise InputError(
             f"expected {name} to be one of {', '.join(choices)}, got {value!r}; "
@@ -173,7 +156,7 @@ def _pattern_fields(end: str, pattern: Pattern) -> tuple[dict[str, xr.DataArray]
 def _array_from_fields(end: str, dataset: xr.Dataset) -> AntennaArray:
     patterns = {
         "isotropic": Isotropic,
-        "cosine": lambda: Cosine(float(attribute(dataset.attrs, f"{end}_pattern_exponent"))),
+        "cosine": lambda: Cosine(float(_held(dataset.attrs, f"{end}_pattern_exponent"))),
         "table": lambda: Table(*(tensor(dataset, f"{end}_{k}") for k in ("theta", "phi", "gain"))),
     }
     pattern = _named(dataset.attrs, f"{end}_pattern", patterns)()

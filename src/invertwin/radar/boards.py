@@ -18,7 +18,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Among, Positive
 from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern
-from invertwin.scene.checks import checked_number
+from invertwin.scene.checks import checked_number, checked_tensor
 
 Elements = tuple[AntennaArray, AntennaArray]  # TX and RX
 Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
@@ -57,18 +57,11 @@ class Board:
     source: str = "user"
 
     def __post_init__(self) -> None:
+        do = "give one pair in half wavelengths per element"
         for end in ("transmitters", "receivers"):
-            places = getattr(self, end)
-            try:
-                pairs = tuple((float(column), float(row)) for column, row in places)
-            except (TypeError, ValueError):
-                pairs = ()
-            if not pairs:
-                raise InputError(
-                    f"expected {end} of {self.name} as pairs (column, row), got {places!r}; "
-                    "give one pair in half wavelengths per element"
-                )
-            object.__setattr__(self, end, pairs)
+            what = f"{end} of {self.name} as pairs (column, row)"
+            pairs = checked_tensor(getattr(self, end), (None, 2), what, do)
+            object.__setattr__(self, end, tuple(map(tuple, pairs.tolist())))
         frequency = checked_number(self.design_frequency, "design frequency [Hz]", 1e6)
         object.__setattr__(self, "design_frequency", frequency)
 

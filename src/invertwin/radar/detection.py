@@ -18,6 +18,7 @@ from invertwin.errors import InputError
 from invertwin.radar.doppler import velocity_axis, velocity_span
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
+from invertwin.scene.checks import check_shape
 
 _QUADRATURE = 4096  # nodes over the distribution of an order statistic
 
@@ -202,12 +203,9 @@ def peaks(
 
 
 def _check_shapes(power: Tensor, detections: Tensor, expected: tuple[int, ...], axes: str) -> None:
-    if tuple(power.shape) != expected or tuple(detections.shape) != expected[:3]:
-        raise InputError(
-            f"expected power of shape {expected} ({axes}) and detections of shape {expected[:3]}, "
-            f"got {tuple(power.shape)} and {tuple(detections.shape)}; use the radar and grid that "
-            "the map was made with"
-        )
+    do = f"its axes are {axes}: use the radar and grid that the map was made with"
+    check_shape(power, expected, "power", do)
+    check_shape(detections, expected[:3], "detections beside power", do)
 
 
 def _within_sphere(power: Tensor, grid: Grid) -> Tensor:

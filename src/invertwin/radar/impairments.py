@@ -9,6 +9,7 @@ errors of the channels, thermal noise, then the converter.
 import math
 import warnings
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import pairwise
 from typing import Annotated
 
@@ -279,19 +280,20 @@ def noisy_oscillator_beat(
     intervals = math.ceil((last - first) * 2 * math.pi * highest / _DELAY_STEP)
     spacing = (last - first) / max(intervals, 1)
     place = (paths.delay - first) / spacing if intervals else torch.zeros_like(paths.delay)
-    total = None
-    for node in range(intervals + 1):
+
+    def near(node: int) -> Tensor:
+        """What the paths near one of the delays add."""
         weight = (1 - (place - node).abs()).clamp_min(0)
-        part = _share(paths, weight)
+        chosen = weight > 0
+        part = paths.chosen(chosen)
         with warnings.catch_warnings():
             # All paths have been judged together.
             warnings.simplefilter("ignore", PhysicsWarning)
-            beat = clean(part)
+            beat = clean(replace(part, coefficient=part.coefficient * weight[chosen]))
         residual = residual_phase(noise, radar, first + node * spacing, seed=seed, chirps=chirps)
-        beat = beat * _turn(residual).unsqueeze(-2).to(beat.device)
-        total = beat if total is None else total + beat
-    assert total is not None
-    return total
+        return beat * _turn(residual).unsqueeze(-2).to(beat.device)
+
+    return reduce(torch.add, map(near, range(intervals + 1)))
 
 
 def residual_phase(
@@ -420,13 +422,6 @@ def quantize(
 
 def _turn(phase: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(phase), phase)
-
-
-def _share(paths: Paths, weight: Tensor) -> Paths:
-    """The paths whose weight is not zero, with their coefficients times it."""
-    chosen = weight > 0
-    part = paths.chosen(chosen)
-    return replace(part, coefficient=part.coefficient * weight[chosen])
 
 
 def _sampled_in_time(radar: Radar) -> FMCW | SteppedFrequency:

@@ -181,23 +181,15 @@ def _transform(kind: int, turns: Tensor, values: Tensor, samples: int, tolerance
         return values.new_zeros(len(values), samples if kind == 1 else 0)
     rate = (2 * math.pi) * (turns - turns.round()).detach().contiguous()
     values = values.detach().resolve_conj().contiguous()
-    sign = 1 if kind == 1 else -1
+    task = (kind, (samples,), len(values), tolerance, 1 if kind == 1 else -1)
     library = _cufinufft() if values.is_cuda else None
     if library is not None:
         out = values.new_empty(len(values), samples if kind == 1 else len(rate))
-        plan = library.Plan(
-            kind,
-            (samples,),
-            len(values),
-            tolerance,
-            sign,
-            dtype="complex128",
-            gpu_device_id=values.device.index,
-        )
+        plan = library.Plan(*task, dtype="complex128", gpu_device_id=values.device.index)
         plan.setpts(rate)
         return plan.execute(values, out=out)
     threads = torch.get_num_threads() if len(rate) > _SHARED_PATHS else 1
-    plan = finufft.Plan(kind, (samples,), len(values), eps=tolerance, isign=sign, nthreads=threads)
+    plan = finufft.Plan(*task, nthreads=threads)
     plan.setpts(rate.cpu().numpy())
     found = torch.from_numpy(plan.execute(values.cpu().numpy())).to(values.device)
     return found.reshape(len(values), -1)

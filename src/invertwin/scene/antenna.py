@@ -287,10 +287,8 @@ def _resampled(theta: Tensor, phi: Tensor, gains: Tensor) -> Tensor:
         # A multiple of the given number, so that evenly spaced angles stay nodes.
         count = len(phi) * -(-360 // len(phi))
         around = -np.pi + 2 * np.pi * np.arange(count) / count
-        rows: Sequence[np.ndarray | Tensor] = [
-            np.interp(around, phi.detach().numpy(), row, period=2 * np.pi) for row in given
-        ]
-        given = np.stack(rows)
+        known = phi.detach().numpy()
+        given = np.stack([np.interp(around, known, row, period=2 * np.pi) for row in given])
     angle, known = np.arccos(cosine), theta.detach().numpy()
     columns = [np.interp(angle, known, column, right=0.0) for column in given.T]
     return torch.from_numpy(np.stack(columns, axis=1))

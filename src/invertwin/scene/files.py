@@ -90,11 +90,18 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         raise InputError(
             f"expected a file name ending in .ply or .glb, got {file.name}; rename the output"
         )
+    parts = (
+        {"mesh": (shape.vertices, shape.faces)}
+        if isinstance(shape, Mesh)
+        else {name: (item.vertices, item.mesh.faces) for name, item in shape.objects.items()}
+    )
+    written = trimesh.Scene()
+    for name, (vertices, faces) in parts.items():
+        mesh = trimesh.Trimesh(vertices.detach().cpu().numpy(), faces.cpu().numpy(), process=False)
+        written.add_geometry(mesh, geom_name=name, node_name=name)
     with replacing(file) as part:
-        if file.suffix.lower() == ".glb":
-            part.write_bytes(_glb(shape))
-        else:
-            part.write_bytes(_ply(_joined(shape) if isinstance(shape, Scene) else shape))
+        glb = file.suffix.lower() == ".glb"
+        part.write_bytes(export_glb(written) if glb else _ply(written.to_mesh()))
 
 
 @contextmanager
@@ -203,40 +210,16 @@ def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     rank = np.argsort(order)
     renumbered = np.empty(len(vertices), dtype=np.int64)
     renumbered[used] = rank[group.ravel()]
-    return _mesh(vertices[used][first[order]], renumbered[faces])
+    merged = vertices[used][first[order]]
+    return Mesh(torch.from_numpy(merged), torch.from_numpy(renumbered[faces]))
 
 
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    return Mesh(torch.from_numpy(vertices), torch.from_numpy(faces))
-
-
-def _joined(scene: Scene) -> Mesh:
-    vertices, faces, count = [], [], 0
-    for item in scene.objects.values():
-        vertices.append(item.vertices.detach())
-        faces.append(item.mesh.faces + count)
-        count += len(item.mesh.vertices)
-    return Mesh(torch.cat(vertices), torch.cat(faces))
-
-
-def _glb(shape: Mesh | Scene) -> bytes:
-    parts = (
-        {"mesh": (shape.vertices, shape.faces)}
-        if isinstance(shape, Mesh)
-        else {name: (item.vertices, item.mesh.faces) for name, item in shape.objects.items()}
-    )
-    written = trimesh.Scene()
-    for name, (vertices, faces) in parts.items():
-        mesh = trimesh.Trimesh(vertices.detach().numpy(), faces.numpy(), process=False)
-        written.add_geometry(mesh, geom_name=name, node_name=name)
-    return export_glb(written)
-
-
-def _ply(mesh: Mesh) -> bytes:
-    vertices = mesh.vertices.detach().cpu().numpy().astype("<f8")
+def _ply(mesh: trimesh.Trimesh) -> bytes:
+    """PLY with all bits of the vertices, of which trimesh writes half."""
+    vertices = np.asarray(mesh.vertices, dtype="<f8")
     faces = np.empty(len(mesh.faces), dtype=[("count", "<u1"), ("index", "<i4", 3)])
     faces["count"] = 3
-    faces["index"] = mesh.faces.cpu().numpy()
+    faces["index"] = mesh.faces
     header = [
         "ply",
         "format binary_little_endian 1.0",
