@@ -97,7 +97,7 @@ def test_elements_can_be_chosen():
 
 
 def test_the_unit_follows_the_design_frequency():
-    tx, _ = board("xWR1642").arrays(design_frequency=60e9)
+    tx, _ = board("xWR1642", 60e9).arrays()
     assert float(tx.positions[:, 0].diff()) == pytest.approx(2 * 299792458.0 / 60e9)
 
 
@@ -137,7 +137,7 @@ def test_a_table_of_ones_own():
         (lambda: board("xWR1642").arrays(azimuth=0), "azimuth to be"),
         (lambda: board("xWR1642").arrays(transmitters=[3]), "TX numbers of xWR1642 from 1 to 2"),
         (lambda: board("xWR1642").arrays(receivers=[1, 1]), "different RX numbers"),
-        (lambda: board("xWR1642").arrays(design_frequency=79.0), "design frequency"),
+        (lambda: board("xWR1642", 79.0), "design frequency"),
         (lambda: board("xWR1234"), "expected a board of xWR1443"),
         (lambda: Board("mine", (), ((0.0, 0.0),), 77e9), "transmitters of mine as pairs"),
         (lambda: Board("mine", ((0.0, 0.0),), ((0.0, 0.0),), 77.0), "design frequency"),

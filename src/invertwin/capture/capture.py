@@ -11,19 +11,14 @@ from jaxtyping import Complex, Float, Float64, Int64
 from torch import Tensor
 
 from invertwin.capture.files import read_dataset, write_dataset
-from invertwin.capture.radar_fields import (
-    attribute,
-    labelled,
-    radar_fields,
-    radar_from_fields,
-    tensor,
-)
+from invertwin.capture.radar_fields import labelled, radar_fields, radar_from_fields, tensor
 from invertwin.capture.range_interpolation import RangeInterpolator
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.spectrum import exact_spectrum
+from invertwin.radar.waveform import SampledWaveform
 
 BEAT_DIMS = ("frame", "tx", "rx", "sample")
 PROFILE_DIMS = ("frame", "range")
@@ -334,23 +329,18 @@ def _checked(dataset: xr.Dataset) -> Radar:
 
 
 def _check_beat(dataset: xr.Dataset, radar: Radar) -> None:
-    expected = attribute(dataset.attrs, "samples") if "samples" in dataset.attrs else None
-    if expected != dataset.sizes["sample"]:
+    waveform, got = radar.waveform, dataset.sizes["sample"]
+    expected = waveform.samples if isinstance(waveform, SampledWaveform) else None
+    if expected != got:
         raise InputError(
-            f"expected {expected} samples per ramp as in the waveform "
-            f"{type(radar.waveform).__name__}, got {dataset.sizes['sample']}; "
-            "beat samples need an FMCW waveform that says how many there are"
+            f"expected {expected} samples per ramp as in the waveform {type(waveform).__name__}, "
+            f"got {got}; beat samples need an FMCW waveform that says how many there are"
         )
 
 
 def _check_profile(dataset: xr.Dataset) -> None:
-    ranges = tensor(dataset, "range")
-    steps = ranges.diff()
-    if (
-        len(ranges) < 2
-        or not (steps > 0).all()
-        or (steps - steps.mean()).abs().max() > (1e-3 * steps.mean())
-    ):
+    steps = tensor(dataset, "range").diff()
+    if not len(steps) or not ((steps / steps.mean() - 1).abs() <= 1e-3).all() or steps[0] <= 0:
         raise InputError(
             "expected at least 2 uniform, ascending ranges, got others; "
             "resample the profiles onto uniform ranges in metres"

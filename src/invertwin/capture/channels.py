@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
-from jaxtyping import Complex, Complex128, Float64
+from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.capture.capture import Capture
+from invertwin.capture.capture import BEAT_DIMS, Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.radar_fields import labelled
 from invertwin.constants import SPEED_OF_LIGHT
@@ -97,20 +97,16 @@ class ChannelCalibration:
         Raises:
             InputError: range profiles, or another number of channels.
         """
-        beat = self._corrected(capture.beat)
-        if isinstance(capture, ChirpCapture):
-            return replace(capture, beat=beat)
-        variable = labelled(("frame", "tx", "rx", "sample"), beat, "1")
-        return type(capture)(capture.dataset.assign(beat=variable))
-
-    def _corrected(self, samples: Complex[Tensor, "*batch tx rx sample"]) -> Tensor:
-        expected = tuple(self.gains.shape)
-        if tuple(samples.shape[-3:-1]) != expected:
+        beat, expected = capture.beat, tuple(self.gains.shape)
+        if tuple(beat.shape[-3:-1]) != expected:
             raise InputError(
                 f"expected data of {expected} TX and RX elements as in the calibration, got "
-                f"{tuple(samples.shape[-3:-1])}; calibrate with the same elements"
+                f"{tuple(beat.shape[-3:-1])}; calibrate with the same elements"
             )
-        return (samples / self.gains[:, :, None]).to(samples.dtype)
+        beat = (beat / self.gains[:, :, None]).to(beat.dtype)
+        if isinstance(capture, ChirpCapture):
+            return replace(capture, beat=beat)
+        return type(capture)(capture.dataset.assign(beat=labelled(BEAT_DIMS, beat, "1")))
 
 
 def estimate_channels(

@@ -254,11 +254,12 @@ def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], in
         order: transmitters in their order of sending.
         loops: how often the order is sent.
     """
-    for length in range(1, len(order) + 1):
-        repeats = len(order) // length
-        if length * repeats == len(order) and tuple(order) == tuple(order[:length]) * repeats:
-            return tuple(order[:length]), loops * repeats
-    return tuple(order), loops
+    whole = tuple(order)
+    for length in range(1, len(whole)):
+        repeats = len(whole) // length
+        if whole == whole[:length] * repeats:
+            return whole[:length], loops * repeats
+    return whole, loops
 
 
 def settings_of(

@@ -45,12 +45,11 @@ def read_dataset(path: Path) -> xr.Dataset:
 
 
 def _split(dataset: xr.Dataset) -> xr.Dataset:
-    for name in [str(key) for key in dataset.data_vars]:
-        variable = dataset[name]
-        if variable.dtype.kind == "c":
-            parts = {f"{name}_real": variable.real, f"{name}_imag": variable.imag}
-            parts = {key: part.assign_attrs(variable.attrs) for key, part in parts.items()}
-            dataset = dataset.drop_vars(name).assign(parts)
+    for name, whole in dataset.data_vars.items():
+        if whole.dtype.kind == "c":
+            parts = {f"{name}_real": whole.real, f"{name}_imag": whole.imag}
+            parts = {key: part.assign_attrs(whole.attrs) for key, part in parts.items()}
+            dataset = dataset.drop_vars([name]).assign(parts)
     return dataset
 
 

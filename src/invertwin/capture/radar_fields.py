@@ -11,14 +11,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
-from invertwin.radar.waveform import (
-    FMCW,
-    OFDM,
-    Impulse,
-    SampledWaveform,
-    SteppedFrequency,
-    Waveform,
-)
+from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, Table
 
 WAVEFORMS: dict[str, type[Waveform]] = {
@@ -35,8 +28,8 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     Raises:
         InputError: a waveform or pattern of one's own, which a file cannot hold.
     """
-    kind = type(radar.waveform).__name__
     waveform = radar.waveform
+    kind = type(waveform).__name__
     if kind not in WAVEFORMS or not isinstance(waveform, tuple(WAVEFORMS.values())):
         raise InputError(f"expected a waveform of {', '.join(WAVEFORMS)}, got {kind}; use those")
     variables = {
@@ -50,8 +43,6 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
         "array_window": radar.array_window,
         "visibility": _VISIBILITY[radar.shared_visibility],
     }
-    if isinstance(waveform, SampledWaveform):
-        attributes["samples"] = waveform.samples
     for end, array in (("tx", radar.transmitters), ("rx", radar.receivers)):
         variables[f"{end}_position"] = labelled((end, "radar_axis"), array.positions, "m")
         arrays, named = _pattern_fields(end, array.pattern)
@@ -180,12 +171,10 @@ def _pattern_fields(end: str, pattern: Pattern) -> tuple[dict[str, xr.DataArray]
 
 
 def _array_from_fields(end: str, dataset: xr.Dataset) -> AntennaArray:
-    def table() -> Pattern:
-        return Table(*(tensor(dataset, f"{end}_{part}") for part in ("theta", "phi", "gain")))
-
-    def cosine() -> Pattern:
-        return Cosine(float(attribute(dataset.attrs, f"{end}_pattern_exponent")))
-
-    patterns = {"isotropic": Isotropic, "cosine": cosine, "table": table}
+    patterns = {
+        "isotropic": Isotropic,
+        "cosine": lambda: Cosine(float(attribute(dataset.attrs, f"{end}_pattern_exponent"))),
+        "table": lambda: Table(*(tensor(dataset, f"{end}_{k}") for k in ("theta", "phi", "gain"))),
+    }
     pattern = _named(dataset.attrs, f"{end}_pattern", patterns)()
     return AntennaArray(tensor(dataset, f"{end}_position"), pattern)

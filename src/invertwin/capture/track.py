@@ -7,6 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.scene.checks import checked_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,17 +26,13 @@ class Track:
     positions: Float64[Tensor, "sample 3"]
 
     def __post_init__(self) -> None:
-        count = len(self.times)
-        if self.times.ndim != 1 or tuple(self.positions.shape) != (count, 3) or count < 2:
+        do = "give one position per time, and drop samples that are not finite"
+        times = checked_tensor(self.times, (None,), "track times", do)
+        checked_tensor(self.positions, (len(times), 3), "track positions", do)
+        if len(times) < 2 or not bool((times.diff() > 0).all()):
             raise InputError(
-                f"expected a track of at least 2 times and positions (times, 3), got "
-                f"{tuple(self.times.shape)} and {tuple(self.positions.shape)}; "
-                "give one position per time"
+                "expected at least 2 ascending track times, got others; sort the track by time"
             )
-        if not (torch.isfinite(self.times).all() and torch.isfinite(self.positions).all()):
-            raise InputError("expected a finite track, got NaN or infinity; drop those samples")
-        if not bool((self.times.diff() > 0).all()):
-            raise InputError("expected ascending track times, got others; sort the track by time")
 
     def at(self, times: Float64[Tensor, " frame"]) -> Float64[Tensor, "frame 3"]:
         """Interpolate positions linearly at these times; differentiable with respect to the times.

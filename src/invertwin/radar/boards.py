@@ -82,7 +82,6 @@ class Board:
         *,
         elevation: int | None = None,
         azimuth: int = 1,
-        design_frequency: float | None = None,
         transmitters: Sequence[int] | None = None,
         receivers: Sequence[int] | None = None,
         pattern: Pattern | None = None,
@@ -97,7 +96,6 @@ class Board:
         Args:
             elevation: +1 = rows grow upwards (y), −1 = downwards; required if the board has rows.
             azimuth: +1 = columns grow to the right (x), −1 = to the left.
-            design_frequency: whose half wavelength is the unit [Hz]; None = the board's own.
             transmitters: numbers from 1 of the elements in use, in this order; None = all.
             receivers: the same for RX.
             pattern: gain of every element, isotropic by default.
@@ -117,10 +115,7 @@ class Board:
         for name, sign in zip(("azimuth", "elevation"), signs, strict=True):
             if sign not in (-1, 1):
                 raise InputError(f"expected {name} to be +1 or -1, got {sign!r}; it is a sign")
-        frequency = self.design_frequency
-        if design_frequency is not None:
-            frequency = checked_number(design_frequency, "design frequency [Hz]", 1e6)
-        unit = SPEED_OF_LIGHT / frequency / 2
+        unit = SPEED_OF_LIGHT / self.design_frequency / 2
         pattern = Isotropic() if pattern is None else pattern
 
         def array(places: Places, chosen: Sequence[int] | None, name: str) -> AntennaArray:
@@ -209,74 +204,71 @@ _CASCADE_TX = (
 )
 _CASCADE_RX = (_row(11, 12, 13, 14), _row(50, 51, 52, 53), _row(46, 47, 48, 49), _FOUR)
 
-BOARDS: Mapping[str, Board] = MappingProxyType(
-    {
-        board.name: board
-        for board in (
-            Board(
-                "xWR1443",
-                _RAISED_MIDDLE,
-                _FOUR,
-                79e9,
-                "M. E. Yanik and M. Torlak, MIMO-SAR toolbox, getAntennaLocations.m (there turned "
-                "by 90°, with the middle TX at −λ/2; 79 GHz)",
-            ),
-            Board(
-                "xWR1642",
-                _row(0, 4),
-                _FOUR,
-                79e9,
-                "OpenRadar's recording, whose 8 channels are a plane wave on this grid, and its "
-                "issue 15 (no elevation)",
-            ),
-            Board(
-                "xWR1843",
-                _RAISED_MIDDLE,
-                _FOUR,
-                79e9,
-                "OpenRadar, dsp/angle_estimation.py and issue 61: in the order TX1, TX3, TX2, "
-                "channels 9 to 12 are the raised row over channels 3 to 6",
-            ),
-            Board(
-                "IWR6843ISK",
-                _RAISED_MIDDLE,
-                _FOUR,
-                62e9,
-                "mmWave SDK 3D people tracking, ISK_6m_default.cfg: antGeometry0 0 -1 -2 -3 -2 -3 "
-                "-4 -5 -4 -5 -6 -7, antGeometry1 -1 -1 -1 -1 0 0 0 0 -1 -1 -1 -1",
-            ),
-            Board(
-                "IWR6843AOP",
-                ((0.0, 2.0), (2.0, 0.0), (0.0, 0.0)),
-                ((1.0, 0.0), (1.0, 1.0), (0.0, 0.0), (0.0, 1.0)),
-                62e9,
-                "mmWave SDK 3D people tracking, AOP_6m_default.cfg: antGeometry0 -1 -1 0 0 -3 -3 "
-                "-2 -2 -1 -1 0 0, antGeometry1 -1 0 -1 0 -3 -2 -3 -2 -3 -2 -3 -2; the signs of "
-                "its antPhaseRot (half of the elements are fed from the other side) are a channel "
-                "calibration, not a place",
-            ),
-            Board(
-                "AWR2944",
-                # Rows are 0.8 λ apart, not λ/2.
-                ((0.0, 0.0), (2.0, 1.6), (4.0, 0.0), (8.0, 0.0)),
-                _FOUR,
-                77e9,
-                "mmWave MCU+ SDK, AWR294X profiles: antGeometryCfg 1 0 1 1 1 2 1 3 0 2 0 3 0 4 0 5 "
-                "1 4 1 5 1 6 1 7 1 8 1 9 1 10 1 11 0.5 0.8",
-            ),
-            Board(
-                "MMWCAS-RF",
-                sum(_CASCADE_TX, ()),
-                sum(_CASCADE_RX, ()),
-                76.8e9,
-                "TI mmWave Studio, 4chip_cascade_MIMO_example, module_param.m: "
-                "TI_Cascade_TX_position_azi/ele and RX_position_azi, in the order of the devices; "
-                "86 azimuth places as in TI's JAJU737A, whose text has the last two RX groups "
-                "farther apart",
-            ),
-        )
-    }
+_PRESETS = (
+    Board(
+        "xWR1443",
+        _RAISED_MIDDLE,
+        _FOUR,
+        79e9,
+        "M. E. Yanik and M. Torlak, MIMO-SAR toolbox, getAntennaLocations.m (there turned "
+        "by 90°, with the middle TX at −λ/2; 79 GHz)",
+    ),
+    Board(
+        "xWR1642",
+        _row(0, 4),
+        _FOUR,
+        79e9,
+        "OpenRadar's recording, whose 8 channels are a plane wave on this grid, and its "
+        "issue 15 (no elevation)",
+    ),
+    Board(
+        "xWR1843",
+        _RAISED_MIDDLE,
+        _FOUR,
+        79e9,
+        "OpenRadar, dsp/angle_estimation.py and issue 61: in the order TX1, TX3, TX2, "
+        "channels 9 to 12 are the raised row over channels 3 to 6",
+    ),
+    Board(
+        "IWR6843ISK",
+        _RAISED_MIDDLE,
+        _FOUR,
+        62e9,
+        "mmWave SDK 3D people tracking, ISK_6m_default.cfg: antGeometry0 0 -1 -2 -3 -2 -3 "
+        "-4 -5 -4 -5 -6 -7, antGeometry1 -1 -1 -1 -1 0 0 0 0 -1 -1 -1 -1",
+    ),
+    Board(
+        "IWR6843AOP",
+        ((0.0, 2.0), (2.0, 0.0), (0.0, 0.0)),
+        ((1.0, 0.0), (1.0, 1.0), (0.0, 0.0), (0.0, 1.0)),
+        62e9,
+        "mmWave SDK 3D people tracking, AOP_6m_default.cfg: antGeometry0 -1 -1 0 0 -3 -3 "
+        "-2 -2 -1 -1 0 0, antGeometry1 -1 0 -1 0 -3 -2 -3 -2 -3 -2 -3 -2; the signs of "
+        "its antPhaseRot (half of the elements are fed from the other side) are a channel "
+        "calibration, not a place",
+    ),
+    Board(
+        "AWR2944",
+        # Rows are 0.8 λ apart, not λ/2.
+        ((0.0, 0.0), (2.0, 1.6), (4.0, 0.0), (8.0, 0.0)),
+        _FOUR,
+        77e9,
+        "mmWave MCU+ SDK, AWR294X profiles: antGeometryCfg 1 0 1 1 1 2 1 3 0 2 0 3 0 4 0 5 "
+        "1 4 1 5 1 6 1 7 1 8 1 9 1 10 1 11 0.5 0.8",
+    ),
+    Board(
+        "MMWCAS-RF",
+        sum(_CASCADE_TX, ()),
+        sum(_CASCADE_RX, ()),
+        76.8e9,
+        "TI mmWave Studio, 4chip_cascade_MIMO_example, module_param.m: "
+        "TI_Cascade_TX_position_azi/ele and RX_position_azi, in the order of the devices; "
+        "86 azimuth places as in TI's JAJU737A, whose text has the last two RX groups "
+        "farther apart",
+    ),
 )
+
+BOARDS: Mapping[str, Board] = MappingProxyType({board.name: board for board in _PRESETS})
 """Name → preset. xWR boards serve the AWR and the IWR of that number."""
 
 

@@ -31,10 +31,16 @@ class Waveform(ABC):
     Attributes:
         center_frequency: [Hz].
         bandwidth: [Hz].
+
+    Raises:
+        InputError: A value is not positive or its unit is evidently wrong.
     """
 
     center_frequency: float
     bandwidth: float
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def wavelength(self) -> float:
@@ -117,18 +123,12 @@ class FMCW(SampledWaveform):
         bandwidth: Bandwidth that is swept during ``duration`` [Hz].
         duration: Sampled part of the ramp [s].
         samples: Samples per ramp.
-
-    Raises:
-        InputError: A value is not positive or its unit is evidently wrong.
     """
 
     start_frequency: Frequency
     bandwidth: Bandwidth
     duration: Duration
     samples: Several
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def center_frequency(self) -> float:
@@ -170,18 +170,12 @@ class SteppedFrequency(SampledWaveform):
         step: Frequency step from one tone to the next [Hz].
         samples: Number of tones.
         dwell: Time on each tone, over which its sample is averaged [s].
-
-    Raises:
-        InputError: A value is not positive or its unit is evidently wrong.
     """
 
     start_frequency: Frequency
     step: Step
     samples: Several
     dwell: Duration
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def bandwidth(self) -> float:
@@ -216,17 +210,11 @@ class OFDM(SampledWaveform):
         start_frequency: Frequency of the lowest subcarrier [Hz].
         spacing: Frequency step between neighbouring subcarriers [Hz].
         subcarriers: Number of subcarriers.
-
-    Raises:
-        InputError: A value is not positive or its unit is evidently wrong.
     """
 
     start_frequency: Frequency
     spacing: Step
     subcarriers: Several
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def samples(self) -> int:
@@ -265,8 +253,7 @@ class OFDM(SampledWaveform):
         Raises:
             InputError: Another number of symbols than subcarriers.
         """
-        self._check_symbols(symbols)
-        return beat.conj() * symbols
+        return beat.conj() * self._checked(symbols)
 
     def beat(
         self, received: Complex[Tensor, "*batch sample"], symbols: Complex[Tensor, "*#batch sample"]
@@ -280,8 +267,7 @@ class OFDM(SampledWaveform):
         Raises:
             InputError: Another number of symbols than subcarriers, or one that is zero.
         """
-        self._check_symbols(symbols)
-        silent = int((symbols == 0).sum())
+        silent = int((self._checked(symbols) == 0).sum())
         if silent:
             raise InputError(
                 f"expected symbols other than zero, got {silent} zeros of {symbols.numel()}; "
@@ -289,12 +275,13 @@ class OFDM(SampledWaveform):
             )
         return (received / symbols).conj()
 
-    def _check_symbols(self, symbols: Tensor) -> None:
+    def _checked(self, symbols: Tensor) -> Tensor:
         if symbols.shape[-1] != self.subcarriers:
             raise InputError(
                 f"expected {self.subcarriers} symbols, got {symbols.shape[-1]}; "
                 "give one per subcarrier"
             )
+        return symbols
 
 
 @dataclass(frozen=True)
@@ -307,16 +294,10 @@ class Impulse(Waveform):
     Attributes:
         center_frequency: [Hz].
         bandwidth: [Hz].
-
-    Raises:
-        InputError: A value is not positive or its unit is evidently wrong.
     """
 
     center_frequency: Frequency
     bandwidth: Bandwidth
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str

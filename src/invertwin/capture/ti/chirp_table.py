@@ -1,7 +1,7 @@
 """What both kinds of settings file share: numbers in other units, masks, turns of transmitters."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,19 @@ from invertwin.scene.files import existing_file
 
 # By the first two digits of the device; later ones record through several kinds of link.
 _LANES = {"12": 4, "14": 4, "16": 2, "18": 2, "68": 2}
+# Numbers of a profile, and the power of ten of the units in which both kinds of file have them.
+_PROFILE = {
+    "start_frequency": 9,
+    "idle_time": -6,
+    "adc_start_time": -6,
+    "ramp_end_time": -6,
+    "slope": 12,
+    "samples": 0,
+    "sample_rate": 3,
+}
+BITS = {0: 12, 1: 14, 2: 16}
+"""Code → resolution of the ADC."""
+BIT_CODES = {bits: code for code, bits in BITS.items()}
 
 
 def scaled(number: str | float | Decimal, exponent: int) -> float:
@@ -69,32 +82,74 @@ def lanes_of(device: str) -> int | None:
     return _LANES.get(match.group(1)) if match else None
 
 
-def transmit_order(
-    chirps: Mapping[int, tuple[int, int]], first: int, last: int, profiles: Sequence[int]
-) -> tuple[tuple[int, ...], int]:
-    """Find which transmitter sends in each chirp of a loop, and in which profile.
+def profile_texts(chirp_settings: ChirpSettings) -> list[str]:
+    """The numbers of a profile as files have them; `settings` reads them in this order."""
+    numbers = vars(chirp_settings) | {"ramp_end_time": chirp_settings.ramp_time}
+    return [text(numbers[name], -exponent) for name, exponent in _PROFILE.items()]
+
+
+def settings(
+    profiles: Mapping[int, Any],
+    keys: Sequence[Any],
+    chirps: Iterable[tuple[int, int, int, int, bool]],
+    frame: Sequence[Any],
+    **values: Any,
+) -> ChirpSettings:
+    """Make settings of one frame as files describe it.
 
     Args:
-        chirps: chirp number → profile, transmitter mask.
-        first: first chirp of the loop.
-        last: last chirp of the loop.
-        profiles: those that the file defines.
-
-    Returns:
-        transmitter numbers in the order of the chirps, and the profile.
+        profiles: profile number → its numbers.
+        keys: where a profile has the numbers of `profile_texts`.
+        chirps: first and last chirp, their profile, mask of their transmitters, and whether they
+            vary from the profile.
+        frame: first and last chirp, loops, frames (0 = endless), period [ms].
+        values: further fields of `ChirpSettings`.
 
     Raises:
-        InputError: a chirp that is not defined, with no or several transmitters, or several
-            profiles in one loop.
+        InputError: a chirp that is not defined or varies, with no or several transmitters, or
+            several profiles in one loop.
     """
+    defined: dict[int, tuple[int, int]] = {}
+    for first, last, profile, senders, varies in chirps:
+        if varies:
+            raise InputError(
+                f"expected chirps {first} to {last} as their profile, got variations; "
+                "chirps that differ are not supported"
+            )
+        defined |= dict.fromkeys(range(first, last + 1), (profile, senders))
+    first, last, loops, frames = (int(number) for number in frame[:4])
+    order, used = _turns(defined, first, last)
+    if len(used) != 1 or not used <= set(profiles):
+        raise InputError(
+            f"expected one defined profile in all chirps of the frame, got {sorted(used)} of "
+            f"{sorted(profiles)}; several profiles in one frame are not supported"
+        )
+    profile = profiles[used.pop()]
+    for (name, exponent), key in zip(_PROFILE.items(), keys, strict=True):
+        values[name] = scaled(profile[key], exponent)
+    values["samples"] = int(values["samples"])
+    order, loops = shortest_loop(order, loops)
+    return ChirpSettings(
+        transmit_order=order,
+        loops=loops,
+        frames=frames or None,
+        frame_period=scaled(frame[4], -3) or None,
+        **values,
+    )
+
+
+def _turns(
+    defined: Mapping[int, tuple[int, int]], first: int, last: int
+) -> tuple[list[int], set[int]]:
+    """Which transmitter sends in each chirp of a loop, and the profiles in use."""
     order, used = [], set()
     for chirp in range(first, last + 1):
-        if chirp not in chirps:
+        if chirp not in defined:
             raise InputError(
                 f"expected chirps {first} to {last} of the frame to be defined, got none for "
                 f"{chirp}; the settings are incomplete"
             )
-        profile, enabled = chirps[chirp]
+        profile, enabled = defined[chirp]
         senders = numbers(enabled)
         if len(senders) != 1:
             raise InputError(
@@ -103,31 +158,4 @@ def transmit_order(
             )
         order.append(senders[0])
         used.add(profile)
-    if len(used) != 1 or not used <= set(profiles):
-        raise InputError(
-            f"expected one defined profile in all chirps of the frame, got {sorted(used)} of "
-            f"{sorted(profiles)}; several profiles in one frame are not supported"
-        )
-    return tuple(order), used.pop()
-
-
-def settings(
-    order: tuple[int, ...], loops: int, frames: int, period_ms: Any, **values: Any
-) -> ChirpSettings:
-    """Make settings of a frame as files count: 0 frames are endless, repeated orders are loops.
-
-    Args:
-        order: transmitters in their order of sending.
-        loops: how often the order is sent in a frame.
-        frames: number of frames; 0 = endless.
-        period_ms: time between the starts of two frames [ms].
-        values: further fields of `ChirpSettings`.
-    """
-    order, loops = shortest_loop(order, loops)
-    return ChirpSettings(
-        transmit_order=order,
-        loops=loops,
-        frames=frames or None,
-        frame_period=scaled(period_ms, -3) or None,
-        **values,
-    )
+    return order, used

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from invertwin.capture.chirps import ChirpData, ChirpSettings
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
@@ -91,7 +90,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
             settings contradict; the message says which settings fit.
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(part) for part in path]
-    settings = _with_lanes(settings)
+    _check_layout(settings)
     for part in paths:
         existing_file(part, "a recording")
     # Files are split anywhere, so only their sum counts.
@@ -104,12 +103,13 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
         )
     frames = _whole_frames(size, settings, name)
     stream = b"".join(part.read_bytes() for part in paths)
-    frame_words = _frame_words(settings)
-    words = np.frombuffer(stream, _WORD, frames * frame_words).astype(np.float32)
+    words = np.frombuffer(stream, _WORD, frames * _frame_words(settings)).astype(np.float32)
     if settings.bits < 16:
         # Negative numbers may come without their sign bits.
         words[words > 2 ** (settings.bits - 1) - 1] -= 2**settings.bits
-    data = ChirpData(_separated(words, settings, frames), replace(settings, frames=frames))
+    parts = words.reshape(frames, -1).take(_places(settings), axis=1)
+    samples = parts.astype(np.complex64) if settings.real else parts.view(np.complex64)
+    data = ChirpData(torch.from_numpy(samples[..., 0]), replace(settings, frames=frames))
     data.warn_if_saturated()
     return data
 
@@ -125,8 +125,8 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
         InputError: samples that are no counts of the ADC, real samples with an imaginary part,
             or settings without lanes.
     """
-    settings = _with_lanes(data.settings)
-    _check_parity(settings)
+    settings = data.settings
+    _check_layout(settings)
     samples = data.samples.detach().cpu().resolve_conj().numpy().astype(np.complex128)
     parts = np.stack([samples.real, samples.imag], axis=-1)
     top = 2 ** (settings.bits - 1) - 1
@@ -140,11 +140,13 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
             "expected samples without imaginary part from a real ADC, got some with; "
             "take their real part or set real=False"
         )
+    words = np.zeros((len(parts), _frame_words(settings)), _WORD)
+    words[:, _places(settings)] = parts[..., :1] if settings.real else parts
     with replacing(path) as part:
-        _joined(parts, settings).astype(_WORD).tofile(part)
+        words.tofile(part)
 
 
-def _with_lanes(settings: ChirpSettings) -> ChirpSettings:
+def _check_layout(settings: ChirpSettings) -> None:
     if settings.lanes is None:
         raise InputError(
             "expected settings with 2 or 4 LVDS lanes, got none; set lanes: 4 for xWR12xx and "
@@ -155,7 +157,12 @@ def _with_lanes(settings: ChirpSettings) -> ChirpSettings:
             f"expected receivers 1 to {_LANE_COUNT}, one per lane, got {settings.receivers}; "
             "the DCA1000 records one device"
         )
-    return settings
+    count = settings.samples * len(settings.receivers)
+    if settings.lanes == 2 and not settings.real and count % 2:
+        raise InputError(
+            f"expected an even number of samples per chirp through 2 lanes, got {count}; "
+            "they come in pairs, the settings are those of another recording"
+        )
 
 
 def _frame_words(settings: ChirpSettings) -> int:
@@ -165,120 +172,76 @@ def _frame_words(settings: ChirpSettings) -> int:
     return chirps * receivers * settings.samples * parts
 
 
-def _check_parity(settings: ChirpSettings) -> None:
-    count = settings.samples * len(settings.receivers)
-    if settings.lanes == 2 and not settings.real and count % 2:
-        raise InputError(
-            f"expected an even number of samples per chirp through 2 lanes, got {count}; "
-            "they come in pairs, the settings are those of another recording"
-        )
-
-
 def _whole_frames(size: int, settings: ChirpSettings, name: str) -> int:
     """Count the frames to read, and warn of what is missing."""
-    _check_parity(settings)
     frame = _frame_words(settings) * _WORD.itemsize
     frames, rest = divmod(size, frame)
     expected = settings.frames
     if expected is not None and size != expected * frame:
-        fitting = _fitting(size, settings)
-        if size > expected * frame or (fitting and frames) or not frames:
+        fitting = _fitting(size, settings, expected)
+        if size > expected * frame or fitting or not frames:
+            if frames and not rest:
+                fitting = [f"frames={frames}", *fitting]
+            found = " or ".join(fitting) or (
+                "no single change of the settings, find those of this recording"
+            )
             raise InputError(
                 f"expected {expected * frame} bytes in {name} ({expected} frames of {frame}), got "
-                f"{size}; what fits: {_listed(size, frame, fitting)}"
+                f"{size}; what fits: {found}"
             )
     if not frames:
         raise InputError(
             f"expected at least one frame of {frame} bytes in {name}, got {size} bytes; "
             "nothing was recorded, or the settings are those of another recording"
         )
+    missing = ""
     if rest:
-        warnings.warn(
+        missing = (
             f"{name} ends within a frame: {frames} whole frames are read, 1 incomplete frame "
             f"({rest} of {frame} bytes) is dropped; unless it was stopped there, the settings are "
-            "those of another recording",
-            PhysicsWarning,
-            stacklevel=4,
+            "those of another recording"
         )
     elif expected is not None and frames < expected:
-        warnings.warn(
+        missing = (
             f"{name} holds {frames} of the {expected} frames in its settings: "
-            "the recording was stopped early",
-            PhysicsWarning,
-            stacklevel=4,
+            "the recording was stopped early"
         )
+    if missing:
+        warnings.warn(missing, PhysicsWarning, stacklevel=4)
     return frames
 
 
-def _fitting(size: int, settings: ChirpSettings) -> list[str]:
+def _fitting(size: int, settings: ChirpSettings, frames: int) -> list[str]:
     """Single changes of the settings with which the size is exact."""
-    assert settings.frames is not None
-    found = []
-    changes: list[tuple[str, ChirpSettings]] = [
-        (f"lanes={6 - (settings.lanes or 2)}", replace(settings, lanes=6 - (settings.lanes or 2))),
-        (f"real={not settings.real}", replace(settings, real=not settings.real)),
-        *(
-            (f"{count} receivers", replace(settings, receivers=tuple(range(1, count + 1))))
-            for count in range(1, _LANE_COUNT + 1)
-            if count != len(settings.receivers)
-        ),
-        *(
-            (f"{count} transmitters", replace(settings, transmit_order=tuple(range(1, count + 1))))
-            for count in range(1, 5)
-            if count != len(settings.transmit_order)
-        ),
-    ]
-    for text, changed in changes:
-        if _frame_words(changed) * _WORD.itemsize * settings.frames == size:
-            found.append(text)
+    other = 6 - (settings.lanes or 2)
+    changes = {
+        f"lanes={other}": replace(settings, lanes=other),
+        f"real={not settings.real}": replace(settings, real=not settings.real),
+    }
+    for key, name in (("receivers", "receivers"), ("transmit_order", "transmitters")):
+        for count in range(1, 5):
+            chosen = {key: tuple(range(1, count + 1))}
+            changes[f"{count} {name}"] = replace(settings, **chosen)
+    unit = _WORD.itemsize * frames
+    found = [text for text, changed in changes.items() if _frame_words(changed) * unit == size]
     for field in ("samples", "loops"):
-        value = getattr(settings, field)
-        unit = _frame_words(settings) // value * _WORD.itemsize * settings.frames
-        whole = size // unit
-        if size % unit == 0 and whole > 1 and whole != value:
+        # A frame grows in proportion to either.
+        whole, rest = divmod(size * getattr(settings, field), _frame_words(settings) * unit)
+        if rest == 0 and whole > 1:
             found.append(f"{field}={whole}")
     return found
 
 
-def _listed(size: int, frame: int, fitting: list[str]) -> str:
-    if size and size % frame == 0:
-        fitting = [f"frames={size // frame}", *fitting]
-    if not fitting:
-        return "no single change of the settings, find those of this recording"
-    return " or ".join(fitting)
-
-
-def _separated(words: np.ndarray, settings: ChirpSettings, frames: int) -> Tensor:
-    """(frame, chirp, tx, rx, sample) of words in the order of the file."""
+def _places(settings: ChirpSettings) -> np.ndarray:
+    """Which words of a frame are I and Q: numbers from 0 [chirp, tx, rx, sample, I and Q]."""
     s, parts = settings, 1 if settings.real else 2
-    chirps = (frames, s.loops, len(s.transmit_order))
+    chirps = s.loops, len(s.transmit_order)
+    words = np.arange(_frame_words(s))
     if s.lanes == _LANE_COUNT:
         sides = words.reshape(*chirps, s.samples, parts, _LANE_COUNT)
         sides = sides[..., [number - 1 for number in s.receivers]]
         sides = np.moveaxis(sides, (-1, -2), (-3, -1))
-    elif s.real:
-        sides = words.reshape(*chirps, len(s.receivers), s.samples, 1)
     else:
-        pairs = words.reshape(-1, parts, 2).swapaxes(1, 2)
+        pairs = words.reshape(-1, parts, 2).swapaxes(1, 2) if parts == 2 else words
         sides = pairs.reshape(*chirps, len(s.receivers), s.samples, parts)
-    samples = np.zeros(sides.shape[:-1], np.complex64)
-    samples.real = sides[..., 1 if s.swap_iq and not s.real else 0]
-    if not s.real:
-        samples.imag = sides[..., 0 if s.swap_iq else 1]
-    return torch.from_numpy(samples)
-
-
-def _joined(parts: np.ndarray, settings: ChirpSettings) -> np.ndarray:
-    """The words of (frame, chirp, tx, rx, sample, I and Q): the inverse of `_separated`."""
-    s = settings
-    if s.real:
-        parts = parts[..., :1]
-    elif s.swap_iq:
-        parts = parts[..., ::-1]
-    if s.lanes == _LANE_COUNT:
-        lanes = np.zeros((*parts.shape[:3], _LANE_COUNT, *parts.shape[4:]))
-        lanes[:, :, :, [number - 1 for number in s.receivers]] = parts
-        return np.moveaxis(lanes, (-3, -1), (-1, -2)).ravel()
-    if s.real:
-        return parts.ravel()
-    return parts.reshape(-1, 2, 2).swapaxes(1, 2).ravel()
+    return sides[..., ::-1] if s.swap_iq else sides

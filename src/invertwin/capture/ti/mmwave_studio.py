@@ -8,19 +8,30 @@ from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.ti.chirp_table import (
+    BIT_CODES,
+    BITS,
     lanes_of,
     mask,
     numbers,
+    profile_texts,
     read_text,
-    scaled,
     settings,
     text,
-    transmit_order,
 )
 from invertwin.errors import InputError
 from invertwin.scene.files import replacing
 
-_BITS = {0: 12, 1: 14, 2: 16}
+# Names of the numbers of a profile, and of the frame.
+_PROFILE = (
+    "startFreqConst_GHz",
+    "idleTimeConst_usec",
+    "adcStartTimeConst_usec",
+    "rampEndTime_usec",
+    "freqSlopeConst_MHz_usec",
+    "numAdcSamples",
+    "digOutSampleRate",
+)
+_FRAME = ("chirpStartIdx", "chirpEndIdx", "numLoops", "numFrames", "framePeriodicity_msec")
 _VARIATIONS = (
     "startFreqVar_MHz",
     "freqSlopeVar_KHz_usec",
@@ -113,46 +124,31 @@ def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
     kind = radio.get("waveformType", "legacyFrameChirp")
     if kind != "legacyFrameChirp":
         raise InputError(f"expected legacyFrameChirp, got {kind}; other frames are not supported")
-    profiles = {
-        int(item["rlProfileCfg_t"]["profileId"]): item["rlProfileCfg_t"]
-        for item in radio["rlProfiles"]
-    }
-    chirps: dict[int, tuple[int, int]] = {}
-    for item in radio["rlChirps"]:
-        chirp = item["rlChirpCfg_t"]
-        first, last = int(chirp["chirpStartIdx"]), int(chirp["chirpEndIdx"])
-        if any(float(chirp.get(name, 0)) for name in _VARIATIONS):
-            raise InputError(
-                f"expected chirps {first} to {last} as their profile, got variations; "
-                "chirps that differ are not supported"
-            )
-        for number in range(first, last + 1):
-            chirps[number] = (int(chirp["profileId"]), _integer(chirp["txEnable"]))
-    frame, channel = radio["rlFrameCfg_t"], radio["rlChanCfg_t"]
-    order, used = transmit_order(
-        chirps, int(frame["chirpStartIdx"]), int(frame["chirpEndIdx"]), list(profiles)
-    )
-    profile, output = profiles[used], radio["rlAdcOutCfg_t"]["fmt"]
+    profiles = [item["rlProfileCfg_t"] for item in radio["rlProfiles"]]
+    chirps = [item["rlChirpCfg_t"] for item in radio["rlChirps"]]
+    frame, output = radio["rlFrameCfg_t"], radio["rlAdcOutCfg_t"]["fmt"]
     _check_transfer(record)
     layout = record["rlDevDataFmtCfg_t"]
     lanes = _lanes(record, device)
     _check_interleave(int(layout["chInterleave"]), lanes)
     return settings(
-        order,
-        int(frame["numLoops"]),
-        int(frame["numFrames"]),
-        frame["framePeriodicity_msec"],
-        start_frequency=scaled(profile["startFreqConst_GHz"], 9),
-        idle_time=scaled(profile["idleTimeConst_usec"], -6),
-        adc_start_time=scaled(profile["adcStartTimeConst_usec"], -6),
-        ramp_end_time=scaled(profile["rampEndTime_usec"], -6),
-        slope=scaled(profile["freqSlopeConst_MHz_usec"], 12),
-        samples=int(profile["numAdcSamples"]),
-        sample_rate=scaled(profile["digOutSampleRate"], 3),
-        receivers=numbers(_integer(channel["rxChannelEn"])),
+        {int(profile["profileId"]): profile for profile in profiles},
+        _PROFILE,
+        [
+            (
+                int(chirp["chirpStartIdx"]),
+                int(chirp["chirpEndIdx"]),
+                int(chirp["profileId"]),
+                _integer(chirp["txEnable"]),
+                any(float(chirp.get(name, 0)) for name in _VARIATIONS),
+            )
+            for chirp in chirps
+        ],
+        [frame[key] for key in _FRAME],
+        receivers=numbers(_integer(radio["rlChanCfg_t"]["rxChannelEn"])),
         real=int(output["b2AdcOutFmt"]) in (0, 3),
         swap_iq=bool(int(layout["iqSwapSel"])),
-        bits=_BITS[int(output["b2AdcBits"])],
+        bits=BITS[int(output["b2AdcBits"])],
         lanes=lanes,
     )
 
@@ -208,9 +204,9 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
     if s.lanes is None:
         raise InputError("expected settings with 2 or 4 lanes, got none; set lanes")
 
-    def number(value: float, exponent: int) -> float:
-        return float(text(value, exponent))
-
+    profile = dict(zip(_PROFILE, map(float, profile_texts(s)), strict=True))
+    frame = (0, len(s.transmit_order) - 1, s.loops, s.frames or 0)
+    period = float(text(s.frame_period or 0.0, 3))
     radio = {
         "waveformType": "legacyFrameChirp",
         "MIMOScheme": "TDM",
@@ -221,25 +217,12 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
         },
         "rlAdcOutCfg_t": {
             "fmt": {
-                "b2AdcBits": {value: key for key, value in _BITS.items()}[s.bits],
+                "b2AdcBits": BIT_CODES[s.bits],
                 "b2AdcOutFmt": 0 if s.real else 1,
                 "b8FullScaleReducFctr": 0,
             }
         },
-        "rlProfiles": [
-            {
-                "rlProfileCfg_t": {
-                    "profileId": 0,
-                    "startFreqConst_GHz": number(s.start_frequency, -9),
-                    "idleTimeConst_usec": number(s.idle_time, 6),
-                    "adcStartTimeConst_usec": number(s.adc_start_time, 6),
-                    "rampEndTime_usec": number(s.ramp_time, 6),
-                    "freqSlopeConst_MHz_usec": number(s.slope, -12),
-                    "numAdcSamples": s.samples,
-                    "digOutSampleRate": number(s.sample_rate, -3),
-                }
-            }
-        ],
+        "rlProfiles": [{"rlProfileCfg_t": profile | {"profileId": 0, "numAdcSamples": s.samples}}],
         "rlChirps": [
             {
                 "rlChirpCfg_t": {
@@ -252,13 +235,7 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
             }
             for index, tx in enumerate(s.transmit_order)
         ],
-        "rlFrameCfg_t": {
-            "chirpStartIdx": 0,
-            "chirpEndIdx": len(s.transmit_order) - 1,
-            "numLoops": s.loops,
-            "numFrames": s.frames or 0,
-            "framePeriodicity_msec": number(s.frame_period or 0.0, 3),
-        },
+        "rlFrameCfg_t": dict(zip(_FRAME, (*frame, period), strict=True)),
     }
     record = {
         "rlDevDataFmtCfg_t": {"iqSwapSel": int(s.swap_iq), "chInterleave": int(s.lanes == 2)},

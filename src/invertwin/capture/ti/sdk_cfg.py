@@ -5,14 +5,15 @@ from pathlib import Path
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.ti.chirp_table import (
+    BIT_CODES,
+    BITS,
     lanes_of,
     mask,
     numbers,
+    profile_texts,
     read_text,
-    scaled,
     settings,
     text,
-    transmit_order,
 )
 from invertwin.errors import InputError
 from invertwin.scene.files import replacing
@@ -28,7 +29,8 @@ _ARGUMENTS = {
     "lvdsStreamCfg": 2,
 }
 _ONCE = ("channelCfg", "adcCfg", "frameCfg")
-_BITS = {0: 12, 1: 14, 2: 16}
+# Places of the numbers of a profile in its command.
+_PROFILE = (1, 2, 3, 4, 7, 9, 10)
 
 
 def read_cfg(path: str | Path) -> ChirpSettings:
@@ -87,62 +89,46 @@ def _settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSett
                     "the line is incomplete"
                 )
     channel, adc, frame = (found[command][-1] for command in _ONCE)
-    chirps: dict[int, tuple[int, int]] = {}
-    for arguments in found["chirpCfg"]:
-        first, last, profile = (int(value) for value in arguments[:3])
-        if any(float(value) for value in arguments[3:7]):
-            raise InputError(
-                f"expected chirps {first} to {last} as their profile, got variations "
-                f"{' '.join(arguments[3:7])}; chirps that differ are not supported"
-            )
-        for chirp in range(first, last + 1):
-            chirps[chirp] = (profile, int(arguments[7], 0))
-    profiles = {int(arguments[0]): arguments for arguments in found["profileCfg"]}
-    order, used = transmit_order(chirps, int(frame[0]), int(frame[1]), list(profiles))
-    profile = profiles[used]
-    unused = set(order) - set(numbers(int(channel[1], 0)))
-    if unused:
-        raise InputError(
-            f"expected chirps of the transmitters that channelCfg enables, got TX {unused}; "
-            "enable them or correct chirpCfg"
-        )
-    samples = int(profile[9])
+    chirps = [
+        (int(first), int(last), int(profile), int(tx, 0), any(map(float, variations)))
+        for first, last, profile, *variations, tx in (chirp[:8] for chirp in found["chirpCfg"])
+    ]
     # MCU+ SDK: first, last, loops, frames, samples, period, trigger, delay.
-    period = frame[5] if len(frame) >= 8 else frame[4]
-    if len(frame) >= 8 and int(frame[4]) != samples:
-        raise InputError(
-            f"expected {samples} samples in frameCfg as in profileCfg, got {frame[4]}; "
-            "the two commands contradict each other"
-        )
+    samples = int(frame.pop(4)) if len(frame) >= 8 else None
     for arguments in found.get("lvdsStreamCfg", []):
         if int(arguments[1]):
             raise InputError(
                 "expected a stream of samples only, got headers (lvdsStreamCfg); record without"
             )
     bits, kind = int(adc[0]), int(adc[1])
-    if bits not in _BITS or kind not in (0, 1, 2):
+    if bits not in BITS or kind not in (0, 1, 2):
         raise InputError(
             f"expected adcCfg with bits 0 to 2 and format 0 to 2, got {bits} and {kind}; "
             "see the SDK's user guide"
         )
-    return settings(
-        order,
-        int(frame[2]),
-        int(frame[3]),
-        period,
-        start_frequency=scaled(profile[1], 9),
-        idle_time=scaled(profile[2], -6),
-        adc_start_time=scaled(profile[3], -6),
-        ramp_end_time=scaled(profile[4], -6),
-        slope=scaled(profile[7], 12),
-        samples=samples,
-        sample_rate=scaled(profile[10], 3),
+    read = settings(
+        {int(profile[0]): profile for profile in found["profileCfg"]},
+        _PROFILE,
+        chirps,
+        frame,
         receivers=numbers(int(channel[0], 0)),
         real=kind == 0,
         swap_iq=_swapped(found.get("adcbufCfg", [])),
-        bits=_BITS[bits],
+        bits=BITS[bits],
         lanes=lanes,
     )
+    unused = set(read.transmit_order) - set(numbers(int(channel[1], 0)))
+    if unused:
+        raise InputError(
+            f"expected chirps of the transmitters that channelCfg enables, got TX {unused}; "
+            "enable them or correct chirpCfg"
+        )
+    if samples not in (None, read.samples):
+        raise InputError(
+            f"expected {read.samples} samples in frameCfg as in profileCfg, got {samples}; "
+            "the two commands contradict each other"
+        )
+    return read
 
 
 def _swapped(commands: Sequence[list[str]]) -> bool:
@@ -163,22 +149,19 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
     """
     s = chirp_settings
     devices = {2: "xWR18xx", 4: "xWR1443"}
-    bits = {value: key for key, value in _BITS.items()}[s.bits]
-    count = len(s.transmit_order)
-    kind = 0 if s.real else 1
+    start, idle, adc, end, slope, samples, rate = profile_texts(s)
     lines = [
         *([f"% Platform:{devices[s.lanes]}"] if s.lanes else []),
         "sensorStop",
         "flushCfg",
         "dfeDataOutputMode 1",
         f"channelCfg {mask(s.receivers)} {mask(s.transmit_order)} 0",
-        f"adcCfg {bits} {kind}",
+        f"adcCfg {BIT_CODES[s.bits]} {int(not s.real)}",
         f"adcbufCfg -1 {int(s.real)} {int(s.swap_iq)} 1 1",
-        f"profileCfg 0 {text(s.start_frequency, -9)} {text(s.idle_time, 6)} "
-        f"{text(s.adc_start_time, 6)} {text(s.ramp_time, 6)} 0 0 {text(s.slope, -12)} 0 "
-        f"{s.samples} {text(s.sample_rate, -3)} 0 0 30",
+        f"profileCfg 0 {start} {idle} {adc} {end} 0 0 {slope} 0 {samples} {rate} 0 0 30",
         *(f"chirpCfg {i} {i} 0 0 0 0 0 {mask([tx])}" for i, tx in enumerate(s.transmit_order)),
-        f"frameCfg 0 {count - 1} {s.loops} {s.frames or 0} {text(s.frame_period or 0, 3)} 1 0",
+        f"frameCfg 0 {len(s.transmit_order) - 1} {s.loops} {s.frames or 0} "
+        f"{text(s.frame_period or 0, 3)} 1 0",
         "lvdsStreamCfg -1 0 1 0",
         "sensorStart",
     ]
