@@ -32,7 +32,6 @@ def test_a_name_stands_for_the_table(name, tmp_path):
     [
         ('surrogate = "bessel"', "surrogate: expected a Surrogate or one of exact, .* 'bessel'"),
         ("surrogate = 3", "surrogate: expected a table, got 3"),
-        ('surrogate = { phases = "random" }', "surrogate: expected range_kernel 'gaussian'"),
         ('surrogate = { range_kernel = "sinc" }', "surrogate.range_kernel: expected .*dirichlet"),
     ],
 )

@@ -417,20 +417,10 @@ def test_wrong_input(planar):
         Surrogate(range_kernel="sinc")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="angle_kernel"):
         Surrogate(angle_kernel="gaussian")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="widths >= 0"):
+    with pytest.raises(InputError, match="range_width of at least 0"):
         Surrogate(range_width=-1.0)
-    with pytest.raises(InputError, match="positive aperture_radius"):
+    with pytest.raises(InputError, match="aperture_radius above 0"):
         Surrogate(aperture_radius=0.0)
-    with pytest.raises(InputError, match="phases"):
-        Surrogate(phases="coherent")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="'gaussian', angle_kernel 'airy'"):
-        Surrogate(phases="random")
-    with pytest.raises(InputError, match="angle_width 0 with random"):
-        Surrogate("gaussian", "airy", angle_width=1.0, phases="random")
-    with pytest.raises(InputError, match="phases='mean' to shape"):
-        Surrogate("gaussian", "airy", phases="random").shape(
-            torch.zeros(1, *grid.shape), planar, grid
-        )
     pulse = replace(planar, waveform=Impulse(77e9, 1e9))
     with pytest.raises(InputError, match="sampled waveform for the Dirichlet kernel, got Impulse"):
         Surrogate(range_kernel="dirichlet").shape(torch.zeros(1, *grid.shape), pulse, grid)

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import nn
 
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.cli.fit_tables import surrogate as surrogate
 from invertwin.cli.registry import Table
 from invertwin.cli.run_file import about as about
@@ -93,10 +93,10 @@ def optimizer(table: Any) -> Any:
         return table.build()
 
 
-def model(table: Any, grid: Grid, surrogate: Surrogate) -> Any:
+def model(table: Any, grid: Grid, surrogate: Surrogate, sampling: Sampling) -> Any:
     """The forward model of a `[model]` table, which plugins add; it may ask for the others."""
     with about("model"):
-        return table.build({Grid: grid, Surrogate: surrogate})
+        return table.build({Grid: grid, Surrogate: surrogate, Sampling: sampling})
 
 
 def builders(

@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import model_validator
 
-from invertwin.channel import Grid
+from invertwin.channel import Grid, Sampling
 from invertwin.cli.registry import Group, Registry, Table
 from invertwin.cli.section import fail, key
 from invertwin.errors import InputError
@@ -16,8 +16,8 @@ from invertwin.radar.surrogate import Surrogate, chosen_surrogate
 class SurrogateTable(Table):
     """Kernels of the smooth model; the extra widths anneal to zero, in cells.
 
-    A name may stand for the table: surrogate = "exact", "response", "annealed", "gaussian",
-    "dirichlet" or "random_phase", before the first table.
+    A name may stand for the table: surrogate = "exact", "response", "annealed", "gaussian" or
+    "dirichlet", before the first table.
     """
 
     exact: bool = key("fit exact signals instead; rough surfaces need boundary = false", False)
@@ -39,7 +39,7 @@ def register(registry: Registry) -> None:
     registry.groups["loss"] = Group(default="mse")
     registry.groups["optimizer"] = Group(default="adam")
     registry.groups["model"] = Group()
-    registry.given |= {Grid, Surrogate}
+    registry.given |= {Grid, Surrogate, Sampling}
     registry.add("loss", "mse", SpectrumLoss, without=("floor",))
     registry.add("loss", "likelihood", SpectrumLoss)
     for name in ("adam", "sgd", "gauss_newton"):

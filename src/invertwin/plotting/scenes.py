@@ -48,7 +48,10 @@ def scene(
     radars = [] if radar is None else [radar] if isinstance(radar, Radar) else list(radar)
     places = np.concatenate([numbers(r.positions) for r in radars]) if radars else None
     views = _views(radars[0] if radars else None)
-    windows = [_window([*drawn.values(), edges], places, view) for view in views]
+    # Seen from the radar, its own marks would only hide the scene.
+    marks = [None if view.title == "from the radar" else places for view in views]
+    shown = [*drawn.values(), edges]
+    windows = [_window(shown, own, view) for own, view in zip(marks, views, strict=True)]
     ratios = [min(max(h / w, 0.3), 1.3) for _, _, w, h in windows]
     if len(drawn) == 1:
         cells = [[(k, title) for k in range(len(views)) for title in drawn]]
@@ -63,7 +66,7 @@ def scene(
     )
     for axes, (k, title) in zip(grid.flat, (c for row in cells for c in row), strict=True):
         colors = _colors(drawn[title], highlight)
-        _draw(axes, drawn[title], colors, edges, places, views[k], windows[k])
+        _draw(axes, drawn[title], colors, edges, marks[k], views[k], windows[k])
         axes.set_title(f"{title}, {views[k].title}", fontsize=9)
     names = {name: c for shapes in drawn.values() for name, c in _colors(shapes, highlight).items()}
     _legend(figure, names, bool(edges), places)
@@ -87,11 +90,6 @@ class _View:
     @property
     def plane(self) -> list[int]:
         return list(self.axes[:2])
-
-    @property
-    def hides_the_radar(self) -> bool:
-        """Seen from the radar, its own marks would only hide the scene."""
-        return self.title == "from the radar"
 
 
 def _views(radar: Radar | None) -> list[_View]:
@@ -129,7 +127,7 @@ def _window(
 ) -> tuple[float, float, float, float]:
     """Centre and size of what a view shows, equal for all scenes."""
     points = [vertices for shapes in drawn for vertices, _ in shapes.values()]
-    if places is not None and not view.hides_the_radar:
+    if places is not None:
         points.append(places)
     flat = np.concatenate(points)[:, view.plane]
     low, high = flat.min(axis=0), flat.max(axis=0)
@@ -164,7 +162,7 @@ def _draw(
     for vertices, mark in small_marks:
         if np.ptp(vertices[:, plane], axis=0).max() < smallest:
             axes.plot(*vertices[:, plane].mean(axis=0), linestyle="", **mark)
-    if places is not None and not view.hides_the_radar:
+    if places is not None:
         axes.plot(*places[:, plane].T, color="black", linestyle="", mew=0, **_mark(places))
     for set_limits, c in ((axes.set_xlim, 0), (axes.set_ylim, 1)):
         ends = window[c] + window[c + 2] / 2 * np.array([-1, 1])

@@ -47,7 +47,6 @@ from invertwin.radar.point_spread import airy as airy
 from invertwin.radar.point_spread import dirichlet as dirichlet
 from invertwin.radar.point_spread import normalized_gaussian as normalized_gaussian
 from invertwin.radar.radar import Radar as Radar
-from invertwin.radar.random_phase import random_phase_spectrum as random_phase_spectrum
 from invertwin.radar.range_profile import add_noise as add_noise
 from invertwin.radar.range_profile import beat_signal as beat_signal
 from invertwin.radar.range_profile import range_profile as range_profile

@@ -4,13 +4,13 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
+from invertwin.channel import Grid, Link, Sampling, deposit_power
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.point_spread import (
@@ -20,9 +20,9 @@ from invertwin.radar.point_spread import (
     range_point_spread,
 )
 from invertwin.radar.radar import Radar
-from invertwin.radar.random_phase import random_phase_spectrum
 from invertwin.radar.spectrum import Aperture, aperture
 from invertwin.radar.waveform import Waveform
+from invertwin.scene.checks import check_fields
 from invertwin.scene.scene import Scene
 
 # Kernels are tabulated at least this far out, so that short grids do not truncate them.
@@ -40,7 +40,7 @@ class Surrogate:
 
     Source: §3.4 of the paper; derivations §5.
     Differs from the source: power is spread, not a field with random phases, whose boundary
-    gradient has mean zero (``phases="random"`` is that field); the Airy argument is k r |Δ(u, v)|,
+    gradient has mean zero (docs/limitations.md); the Airy argument is k r |Δ(u, v)|,
     which is shift invariant, not k r sin ψ; the Gaussian has peak 1, which inside of a grid is
     ``normalized_gaussian`` times a constant.
 
@@ -52,13 +52,9 @@ class Surrogate:
         range_width: Standard deviation of the extra Gaussian [range cells].
         angle_width: Standard deviation of the extra Gaussian in u and v [beamwidths λ/D].
         aperture_radius: Radius for "airy" [m]; None = half the virtual aperture along x and y.
-        phases: "mean" over random phases, or "random": one draw of them, new with every seed,
-            as ``random_phase_spectrum`` does with the kernels "gaussian" and "airy". Its gradient
-            knows nothing of silhouettes on average: for comparison only.
 
     Raises:
-        InputError: An unknown kernel, a negative width or radius, random phases with other
-            kernels than the paper's or an extra angular width.
+        InputError: An unknown kernel, a negative width, or a radius that is not positive.
     """
 
     range_kernel: Literal["response", "gaussian", "dirichlet"] = "response"
@@ -66,30 +62,9 @@ class Surrogate:
     range_width: NonNegative = 0.0
     angle_width: NonNegative = 0.0
     aperture_radius: Positive | None = None
-    phases: Literal["mean", "random"] = "mean"
 
     def __post_init__(self) -> None:
-        for name in ("range_kernel", "angle_kernel", "phases"):
-            allowed = get_args(type(self).__annotations__[name])
-            if getattr(self, name) not in allowed:
-                raise InputError(
-                    f"expected {name} to be one of {', '.join(allowed)}, "
-                    f"got {getattr(self, name)!r}; choose one of them"
-                )
-        radius = 1.0 if self.aperture_radius is None else self.aperture_radius
-        if not (self.range_width >= 0 and self.angle_width >= 0 and radius > 0):
-            raise InputError(
-                "expected widths >= 0 and a positive aperture_radius, got "
-                f"{self.range_width}, {self.angle_width} and {self.aperture_radius}; "
-                "widths are in range cells and beamwidths, the radius in metres"
-            )
-        kernels = (self.range_kernel, self.angle_kernel)
-        if self.phases == "random" and (kernels != ("gaussian", "airy") or self.angle_width > 0):
-            raise InputError(
-                "expected range_kernel 'gaussian', angle_kernel 'airy' and angle_width 0 with "
-                f"random phases, got {kernels[0]!r}, {kernels[1]!r} and {self.angle_width}; "
-                "phases='mean' takes all kernels"
-            )
+        check_fields(self)
 
     def shape(
         self,
@@ -109,15 +84,9 @@ class Surrogate:
             grid: Bins.
 
         Raises:
-            InputError: The map does not have the grid's shape; random phases, which belong to
-                paths.
+            InputError: The map does not have the grid's shape.
         """
         _check_map(deposit, grid)
-        if self.phases == "random":
-            raise InputError(
-                "expected phases='mean' to shape deposited power, got 'random'; a field has phases "
-                "path by path: use surrogate_spectrum"
-            )
         sigmas = self._extra(radar, grid)
         for kernel in self._kernels(radar, grid):
             offset = None
@@ -174,7 +143,6 @@ SURROGATES = MappingProxyType(
         "annealed": Surrogate(range_width=3.0, angle_width=1.5),
         "gaussian": Surrogate(range_kernel="gaussian", angle_kernel="airy"),
         "dirichlet": Surrogate(range_kernel="dirichlet"),
-        "random_phase": Surrogate("gaussian", "airy", phases="random"),
     }
 )
 """What a ``surrogate`` argument may name; "exact" means exact signals, as None does."""
@@ -209,8 +177,6 @@ def surrogate_spectrum(
 ) -> Float[Tensor, "frame range u v"]:
     """Power spectrum of a scene, differentiable in it: deposit, then shape.
 
-    With ``phases="random"`` paths of one bounce are listed one by one, each with its random phase.
-
     Args:
         scene: What is seen.
         radar: Arrays, waveform and poses.
@@ -222,23 +188,8 @@ def surrogate_spectrum(
         reference: See ``deposit_power``.
 
     Raises:
-        InputError: See ``deposit_power``; random phases on paths of several bounces.
+        InputError: See ``deposit_power``.
     """
-    if surrogate.phases == "random":
-        if sampling.depth != 1:
-            raise InputError(
-                f"expected depth 1 with random phases, got {sampling.depth}; give depth=1, or a "
-                "surrogate with phases='mean'"
-            )
-        paths = trace_power(scene, radar.link(), sampling=sampling, seed=seed)
-        return random_phase_spectrum(
-            paths,
-            radar,
-            grid,
-            seed=seed,
-            range_width=surrogate.range_width,
-            aperture_radius=surrogate.aperture_radius,
-        )
     deposit = deposit_power(
         scene,
         radar.link(),

@@ -24,6 +24,7 @@ def register(registry: Any) -> None:
     registry.add("shape", "vehicle", "invertwin_studies.vehicle_space:vehicle")
     coordinates = "invertwin_studies.vehicle_space:vehicle_coordinates"
     registry.add("parameter", "shape_space", coordinates)
+    registry.add("model", "random_phase", "invertwin_studies.random_phase:RandomPhaseMap")
     for kind, file, board in (
         ("openradar", "openradar.npz", "xWR1642"),
         ("rail_sar", "bwsi_rail_trial6.npz", None),

@@ -249,7 +249,7 @@ def models_of(problem: Problem) -> list[ForwardModel]:
     for run, sight in problem.sensors:
         kernels = build.surrogate(run.surrogate)
         if run.model is not None:
-            found.append(build.model(run.model, sight.grid, kernels))
+            found.append(build.model(run.model, sight.grid, kernels, sampling))
         elif run.surrogate.exact:
             found.append(ExactMap(sight.grid, sampling))
         else:
@@ -259,7 +259,7 @@ def models_of(problem: Problem) -> list[ForwardModel]:
 
 def sharp_models(problem: Problem) -> list[SurrogateMap]:
     """The smooth model of every sensor without extra widths, mean over phases."""
-    sharp = {"range_width": 0.0, "angle_width": 0.0, "phases": "mean"}
+    sharp = {"range_width": 0.0, "angle_width": 0.0}
     sampling = sampling_of(problem.run)
     return [
         SurrogateMap(sight.grid, replace(build.surrogate(run.surrogate), **sharp), sampling)

@@ -182,19 +182,16 @@ class BodyTemplate:
 
     def _rigid_turns(self, given: Tensor) -> Tensor:
         """Rotation vectors, roughly, from the vertices that one joint moves nearly alone."""
-        frames: list[Tensor] = []
+        frames: list[Rotation] = []
         for joint, parent in enumerate(self.parents):
-            frames.append(frames[parent] if joint else torch.eye(3, dtype=torch.float64))
+            frames.append(frames[parent] if joint else Rotation.identity())
             own = self.weights[:, joint] > _ALONE
             if int(own.sum()) >= 3:
-                rest, now = (points[own] - points[own].mean(0) for points in (self.vertices, given))
-                u, _, vt = torch.linalg.svd(now.T @ rest)
-                flip = torch.diag(u.new_tensor([1.0, 1.0, float(torch.det(u @ vt).sign())]))
-                frames[joint] = u @ flip @ vt
-        above = [frames[max(parent, 0)] for parent in self.parents]
-        turns = [a.T @ f for a, f in zip(above[1:], frames[1:], strict=True)]
-        matrices = torch.stack([frames[0], *turns]).numpy()
-        return torch.from_numpy(Rotation.from_matrix(matrices).as_rotvec())
+                rest, now = ((p[own] - p[own].mean(0)).numpy() for p in (self.vertices, given))
+                frames[joint] = Rotation.align_vectors(now, rest)[0]
+        pairs = zip(self.parents[1:], frames[1:], strict=True)
+        turns = [frames[0], *(frames[parent].inv() * frame for parent, frame in pairs)]
+        return torch.from_numpy(np.stack([turn.as_rotvec() for turn in turns]))
 
     def posed(
         self, rotations: Float64[Tensor, "j 3 3"], shape: Float64[Tensor, " n"] | None = None

@@ -7,8 +7,10 @@ import torch
 
 from invertwin.channel import Paths, Sampling
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.radar import Surrogate, random_phase_spectrum, surrogate_spectrum
-from invertwin.scene import Translation
+from invertwin.errors import InputError
+from invertwin.radar import FMCW, Radar, Surrogate
+from invertwin.scene import Translation, linear_array
+from invertwin_studies.random_phase import RandomPhaseMap, random_phase_spectrum
 from oracles.bspline import deposit
 from scenes import occluder
 from scenes import radar as small_radar
@@ -18,9 +20,12 @@ POINTS, EDGE = 120, 30
 
 
 @pytest.fixture(scope="module")
-def view(linear):
-    """A radar whose frames are draws of the phases, and a grid."""
-    radar = replace(linear, positions=linear.positions.expand(DRAWS, 3))
+def view():
+    """A radar of 16 receivers in a row, whose frames are draws of the phases, and a grid."""
+    waveform = FMCW(76.5e9, 1e9, 40e-6, 64)
+    half = 0.5 * waveform.wavelength
+    places = torch.zeros(DRAWS, 3, dtype=torch.float64)
+    radar = Radar(linear_array(1, half), linear_array(16, half), waveform, places)
     return radar, radar.grid(3.5, 5.5, 0.7)
 
 
@@ -142,27 +147,44 @@ def test_extra_width_and_offset(view):
 
 
 def test_of_a_scene():
-    """By the switch: a draw a seed, and silhouettes that move it."""
+    """As a model: a draw a seed, and silhouettes that move it."""
     radar = small_radar()
     grid = radar.grid(0.5, 2.5, 0.8)
-    field = Surrogate("gaussian", "airy", phases="random")
     drawn = Sampling(depth=1, samples=1_500, boundary_samples=300)
+    model = RandomPhaseMap(grid, Surrogate("gaussian", "airy"), drawn)
     move = Translation("occluder")
-    first, again, other = (
-        surrogate_spectrum(move(occluder()), radar, grid, field, sampling=drawn, seed=seed)
-        for seed in (1, 1, 2)
-    )
+    first, again, other = (model.predict(move(occluder()), radar, seed) for seed in (1, 1, 2))
     assert first.shape == (1, *grid.shape)
     assert torch.allclose(first, again, rtol=1e-5)
     assert (first - other).norm() > 0.3 * first.norm()
-    still = surrogate_spectrum(
-        move(occluder()),
-        radar,
-        grid,
-        field,
-        sampling=Sampling(depth=1, samples=1_500, boundary_samples=0, boundary=False),
-        seed=1,
-    )
+    interior = model.sampled_by(boundary_samples=0, boundary=False)
+    still = interior.predict(move(occluder()), radar, 1)
     assert torch.allclose(first, still, rtol=1e-5)
     slopes = [torch.autograd.grad(m.sum(), move.translation)[0] for m in (first, still)]
     assert (slopes[0] - slopes[1]).norm() > 0.1 * slopes[1].norm()
+
+
+def test_its_width_is_taken_away(view):
+    radar, grid = view
+    model = RandomPhaseMap(grid, Surrogate("gaussian", "airy", range_width=2.0), Sampling(depth=1))
+    assert model.widened
+    assert model.narrowed(0.5).surrogate.range_width == 1.0
+    assert not model.narrowed(0.0).widened
+    one = torch.zeros(1, *grid.shape)
+    one[:, grid.range_count // 2] = 1.0
+    torch.testing.assert_close(
+        model.blurred(one, radar), Surrogate(range_width=2.0).blur(one, radar, grid)
+    )
+
+
+@pytest.mark.parametrize(
+    ("kernels", "depth", "message"),
+    [
+        (Surrogate(), 1, "got 'response' and 'response'"),
+        (Surrogate("gaussian", "airy", angle_width=1.0), 1, "angle_width 0 and depth 1 .* 1.0 and"),
+        (Surrogate("gaussian", "airy"), 2, "got 0.0 and 2"),
+    ],
+)
+def test_what_it_cannot_do_is_refused(view, kernels, depth, message):
+    with pytest.raises(InputError, match=message):
+        RandomPhaseMap(view[1], kernels, Sampling(depth=depth))

@@ -1,17 +1,83 @@
-"""The paper's own surrogate: a field with a random phase per path, not mean power."""
+"""The paper's own surrogate as a forward model: a field with a random phase per path."""
 
 import math
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, Paths
+from invertwin.capture import Capture
+from invertwin.channel import Grid, Paths, Sampling, trace_power
+from invertwin.errors import InputError
+from invertwin.models import ForwardModel
 from invertwin.radar.point_spread import airy_field, airy_radii, normalized_gaussian
 from invertwin.radar.radar import Radar
+from invertwin.radar.surrogate import Surrogate
 from invertwin.radar.waveform import SIGMA_PER_FWHM
+from invertwin.scene import Scene
 
 _CHUNK = 4096  # paths at a time: what is kept grows with paths × directions
+
+
+@dataclass(frozen=True)
+class RandomPhaseMap(ForwardModel):
+    """One draw of the paper's field, with new phases for every seed: `random_phase_spectrum`.
+
+    Attributes:
+        grid: Bins.
+        surrogate: Its kernels are "gaussian" and "airy"; its range width is the extra width.
+        sampling: How paths of one bounce are sampled.
+
+    Raises:
+        InputError: Other kernels, an extra angular width, or paths of several bounces.
+    """
+
+    grid: Grid
+    surrogate: Surrogate
+    sampling: Sampling
+
+    def __post_init__(self) -> None:
+        kernels = self.surrogate
+        if (kernels.range_kernel, kernels.angle_kernel) != ("gaussian", "airy"):
+            raise InputError(
+                "expected range_kernel 'gaussian' and angle_kernel 'airy' with random phases, got "
+                f"{kernels.range_kernel!r} and {kernels.angle_kernel!r}; choose these"
+            )
+        if kernels.angle_width > 0 or self.sampling.depth != 1:
+            raise InputError(
+                "expected angle_width 0 and depth 1 with random phases, got "
+                f"{kernels.angle_width} and {self.sampling.depth}; correct them"
+            )
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """A draw of the field's power. See `ForwardModel.predict`."""
+        return random_phase_spectrum(
+            trace_power(scene, sensor.link(), sampling=self.sampling, seed=seed),
+            sensor,
+            self.grid,
+            seed=seed,
+            range_width=self.surrogate.range_width,
+            aperture_radius=self.surrogate.aperture_radius,
+        )
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
+        """The measured power spectrum of a capture."""
+        return recording.spectrum(self.grid).to(torch.float32)
+
+    @property
+    def widened(self) -> bool:
+        """Whether the kernels have an extra width."""
+        return self.surrogate.range_width > 0
+
+    def narrowed(self, share: float) -> "RandomPhaseMap":
+        """The model with this share of its extra width."""
+        width = share * self.surrogate.range_width
+        return replace(self, surrogate=replace(self.surrogate, range_width=width))
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Tensor:
+        """An observed map with the extra width."""
+        return self.surrogate.blur(observed, sensor, self.grid)
 
 
 def random_phase_spectrum(
