@@ -37,7 +37,7 @@ from invertwin.channel.power.edges import InteriorEdgeSampler
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.walk import Walk
 from invertwin.channel.rays.arrays import from_points
-from invertwin.channel.rays.backend import mi, one_torch_thread
+from invertwin.channel.rays.backend import mi, torch_threads
 from invertwin.channel.rays.geometry import flatten
 from invertwin.channel.rays.scene import RayScene
 from invertwin.radar import FMCW, Radar
@@ -167,7 +167,7 @@ def compare(body: Mesh, samples: int, seeds: int) -> dict[str, Any]:
     estimate = Estimator(Task.build(body))
     values: dict[str, list[np.ndarray]] = {name: [] for name in WAYS}
     times: dict[str, list[float]] = {name: [] for name in WAYS}
-    with one_torch_thread():
+    with torch_threads(1):
         for seed in range(WARM_UP + seeds):
             for name, weighted in WAYS.items():
                 value, seconds = estimate(samples, seed, weighted=weighted)

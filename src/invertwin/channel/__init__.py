@@ -10,6 +10,7 @@ from invertwin.channel.paths import Pattern as Pattern
 from invertwin.channel.power.clouds import deposit_density as deposit_density
 from invertwin.channel.power.deposit import deposit_power as deposit_power
 from invertwin.channel.rays.backend import backend as backend
+from invertwin.channel.rays.backend import torch_threads as torch_threads
 from invertwin.channel.rays.backend import use_backend as use_backend
 from invertwin.channel.rays.geometry import differentiated as differentiated
 from invertwin.channel.rays.scene import visible_points as visible_points

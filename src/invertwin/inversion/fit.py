@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from invertwin.channel import torch_threads
 from invertwin.errors import InputError
 from invertwin.inversion.fingerprint import Fingerprint
 from invertwin.inversion.gauss_newton import GaussNewton, without_effect
@@ -142,7 +143,8 @@ class Fit:
         for callback in callbacks:
             callback.begin(self)
         if self.progress.ended is None:
-            status = self._descend(callbacks)
+            with torch_threads(max(1, torch.get_num_threads() // 2)):
+                status = self._descend(callbacks)
             self._note(ended=self._judged(status))
         for callback in callbacks:
             callback.end(self)

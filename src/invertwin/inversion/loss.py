@@ -13,7 +13,7 @@ from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 
 _GAIN_STEPS = 8  # at most; three or four do
-_SETTLED = 1e-5  # of the gain: a step this small is the last, and what it leaves is far smaller
+_SETTLED = 1e-3  # of the gain: a step this small is the last, and leaves less than 1e-5
 _BLOCK = 2**16  # bins that are worked on at a time: what they need stays in a core's cache
 
 BACKGROUNDS = ("none", "level", "static")
@@ -252,16 +252,16 @@ class SpectrumLoss:
         value, slope = 0.0, None
         for power, blocks in zip(reversed(maps[0]), reversed(levels), strict=True):
             factor = gain / (units[0] * power.numel() * self.levels)
-            slopes = []
-            for a, lit, data in blocks:
+            own = torch.empty_like(power, memory_format=torch.contiguous_format)
+            slopes = own.flatten().split(_BLOCK)
+            for (a, lit, data), out in zip(blocks, slopes, strict=True):
                 inverse = lit.mul_(gain).add_(self.floor).reciprocal_()
                 ratio = data.mul_(inverse)
                 inverse.addcmul_(inverse, ratio, value=-1).mul_(factor)
                 # What is below zero counts as zero, and has no derivative; a dark bin has one.
                 least = -torch.finfo(a.dtype).tiny
-                slopes.append(torch.ops.aten.threshold_backward(inverse, a, least))
+                torch.ops.aten.threshold_backward(inverse, a, least, grad_input=out)
                 value += float(ratio.sum() - len(a) - ratio.log_().sum()) / power.numel()
-            own = torch.cat(slopes).reshape(power.shape)
             slope = own if slope is None else _spread(slope, own)
         assert slope is not None
         return slope.new_tensor(value / self.levels), slope
@@ -393,8 +393,7 @@ class Objective:
 
 def _mean_size(power: Tensor) -> Tensor:
     """The mean of the absolute values, detached."""
-    sums = [block.abs().sum() for block in power.detach().flatten().split(_BLOCK)]
-    return torch.stack(sums).sum() / power.numel()
+    return torch.linalg.vector_norm(power.detach(), 1) / power.numel()
 
 
 def _pooled(power: Tensor) -> Tensor:

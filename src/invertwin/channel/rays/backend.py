@@ -62,17 +62,18 @@ def use_backend(name: str | None) -> Iterator[None]:
 
 
 @contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Keep torch to one thread inside a ``with`` block.
+def torch_threads(count: int) -> Iterator[None]:
+    """Keep torch to so many threads inside a ``with`` block.
 
-    What it does here is small, and its idle threads would spin on the cores that trace rays.
+    Between its operations they spin for a while, on the cores that trace rays. So torch has one
+    where what it does is small, and leaves half of the cores alone where both work by turns.
     """
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(count)
+        torch.set_num_threads(before)
 
 
 @cache
