@@ -7,7 +7,6 @@ Any torch module Scene → Scene serves as well.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated, Any, TypeVar
 
 import torch
@@ -369,12 +368,8 @@ class MaterialValues(nn.Module):
 
     def entries(self) -> dict[str, Entries]:
         """The values in their own units."""
-        found = {}
-        for name, raw in self.raw.items():
-            at, one = (raw.detach(),), (torch.ones_like(raw),)
-            slope = torch.func.jvp(partial(_bounded, name), at, one)[1]
-            found[name] = Entries(f"raw.{name}", slope=slope)
-        return found
+        slopes = {name: _slope(name, raw.detach()) for name, raw in self.raw.items()}
+        return {name: Entries(f"raw.{name}", slope=slope) for name, slope in slopes.items()}
 
     def _bounded(self) -> dict[str, Tensor | Texture]:
         values = {name: _bounded(name, raw) for name, raw in self.raw.items()}
@@ -425,6 +420,15 @@ def _bounded(name: str, raw: Tensor) -> Tensor:
     if math.isinf(span.high):
         return span.low + raw.exp()
     return span.low + (span.high - span.low) * torch.sigmoid(raw)
+
+
+def _slope(name: str, raw: Tensor) -> Tensor:
+    """The derivative of `_bounded` with respect to the parameter."""
+    span = RANGES[name]
+    if math.isinf(span.high):
+        return raw.exp()
+    place = torch.sigmoid(raw)
+    return (span.high - span.low) * place * (1 - place)
 
 
 def _unbounded(name: str, value: Tensor) -> Tensor:
