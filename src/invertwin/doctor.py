@@ -252,15 +252,14 @@ def gpu_name() -> str | None:
 
 def install_command() -> str:
     """The one line that installs a libLLVM that works, and what else Dr.Jit needs of the system."""
-    if os.environ.get("CONDA_PREFIX"):
-        return "conda install -c conda-forge libllvm19"
-    if sys.platform == "darwin":
-        return "brew install llvm@19"
     sudo = "" if getattr(os, "geteuid", lambda: 1)() == 0 else "sudo "
-    if shutil.which("apt-get"):
-        return f"{sudo}apt-get update && {sudo}apt-get install -y libllvm19 libatomic1"
-    if shutil.which("dnf"):
-        return f"{sudo}dnf install -y llvm-libs libatomic"
+    if not os.environ.get("CONDA_PREFIX"):
+        if sys.platform == "darwin":
+            return "brew install llvm@19"
+        if shutil.which("apt-get"):
+            return f"{sudo}apt-get update && {sudo}apt-get install -y libllvm19 libatomic1"
+        if shutil.which("dnf"):
+            return f"{sudo}dnf install -y llvm-libs libatomic"
     return "conda install -c conda-forge libllvm19"
 
 
@@ -275,16 +274,12 @@ def report() -> dict[str, Any]:
     """
     requested = os.environ.get(BACKEND_VARIABLE, "auto")
     prepare()
-    examined = [
-        {
-            "path": candidate.path,
-            "version": ".".join(map(str, candidate.version)),
-            "usable": verdict.usable,
-            "verdict": verdict.reason,
-        }
-        for candidate in _with_explicit(candidates())
-        for verdict in (_remembered(candidate.path, probe_library),)
-    ]
+    examined = []
+    for candidate in _with_explicit(candidates()):
+        verdict = _remembered(candidate.path, probe_library)
+        version = ".".join(map(str, candidate.version))
+        told = {"usable": verdict.usable, "verdict": verdict.reason}
+        examined.append({"path": candidate.path, "version": version, **told})
     gpu, fix = gpu_name(), None
     try:
         require(requested)
@@ -454,10 +449,9 @@ def _write_cache(verdicts: dict[str, Verdict]) -> None:
     # Without a place to write, the next import probes again: slower, not wrong.
     with contextlib.suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=file.name)
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            json.dump(entries, stream, indent=1)
-        os.replace(temporary, file)
+        part = file.with_name(f"{file.name}.{os.getpid()}")
+        part.write_text(json.dumps(entries, indent=1), encoding="utf-8")
+        part.replace(file)
 
 
 def _self_test(requested: str) -> dict[str, Any]:

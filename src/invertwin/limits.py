@@ -30,9 +30,9 @@ class Letters:
 
 @dataclass(frozen=True)
 class Among:
-    """Marks a text that is one of these names."""
+    """Marks a text or a number that is one of these."""
 
-    names: tuple[str, ...]
+    names: tuple[str | int, ...]
 
     def __get_pydantic_core_schema__(self, _: Any, handler: Any) -> Any:
         return handler.generate_schema(Literal[self.names])

@@ -137,10 +137,13 @@ def test_a_table_of_ones_own():
         (lambda: board("xWR1642").arrays(azimuth=0), "azimuth to be"),
         (lambda: board("xWR1642").arrays(transmitters=[3]), "TX numbers of xWR1642 from 1 to 2"),
         (lambda: board("xWR1642").arrays(receivers=[1, 1]), "different RX numbers"),
-        (lambda: board("xWR1642", 79.0), "design frequency"),
+        (lambda: board("xWR1642", 79.0), "design_frequency in Hz, got 79"),
         (lambda: board("xWR1234"), "expected a board of xWR1443"),
         (lambda: Board("mine", (), ((0.0, 0.0),), 77e9), "transmitters of mine as pairs"),
-        (lambda: Board("mine", ((0.0, 0.0),), ((0.0, 0.0),), 77.0), "design frequency"),
+        (
+            lambda: Board("mine", ((0.0, 0.0),), ((0.0, 0.0),), 77.0),
+            "design_frequency in Hz, got 77",
+        ),
     ],
 )
 def test_what_no_board_has_is_refused(call, message, unchecked):

@@ -11,6 +11,7 @@ from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar, sampled
+from invertwin.scene.checks import check_shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +98,7 @@ class ChirpCapture:
         Raises:
             InputError: Another number of positions than of frames.
         """
-        if len(positions) != self.frame_count:
-            raise InputError(
-                f"expected {self.frame_count} positions along frame, one for each, got "
-                f"{len(positions)}; give as many as were recorded"
-            )
+        check_shape(positions, (self.frame_count, 3), "positions along frame", "give one each")
         return replace(self, device=replace(self.device, positions=positions, rotations=rotations))
 
     def capture(self, chirp: int | str = "mean") -> Capture:

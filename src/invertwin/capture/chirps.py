@@ -14,7 +14,7 @@ from torch import Tensor
 
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.errors import InputError
-from invertwin.limits import Count, Frequency, NonNegative, Positive, Several, Usual
+from invertwin.limits import Among, Count, Frequency, NonNegative, Positive, Several, Usual
 from invertwin.radar.boards import Elements, Mounting
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
@@ -66,8 +66,8 @@ class ChirpSettings:
     ramp_end_time: float | None = None
     real: bool = False
     swap_iq: bool = False
-    bits: int = 16
-    lanes: int | None = None
+    bits: Annotated[int, Among((12, 14, 16))] = 16
+    lanes: Annotated[int, Among((2, 4))] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -82,13 +82,6 @@ class ChirpSettings:
                 f"expected ascending receiver numbers from 1, got {receivers}; "
                 "name the receivers that were recorded"
             )
-        if self.lanes not in (None, 2, 4):
-            raise InputError(
-                f"expected 2 or 4 LVDS lanes, got {self.lanes}; xWR12xx and xWR14xx have 4, "
-                "later devices record through 2"
-            )
-        if self.bits not in (12, 14, 16):
-            raise InputError(f"expected an ADC of 12, 14 or 16 bits, got {self.bits}; see adcCfg")
         last = self.adc_start_time + self.samples / self.sample_rate
         if self.ramp_end_time is not None and self.ramp_end_time < last * (1 - 1e-9):
             raise InputError(

@@ -26,7 +26,6 @@ _KEYS = {
     "radar": {"board", "elevation", "azimuth", "tx_positions", "rx_positions"},
 }
 _ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def described_board(
@@ -237,9 +236,7 @@ def _loaded(path: Path, ending: str, variable: str | None) -> np.ndarray:
         with path.open("rb") as opened:
             loaded = np.load(opened, allow_pickle=False)
             return loaded if ending == ".npy" else loaded[variable]
-    with path.open("rb") as opened:
-        start = opened.read(520)
-    if ending == ".mat" and _HDF5 not in start[:8] + start[512:]:
+    if ending == ".mat" and not h5py.is_hdf5(path):
         return np.asarray(scipy.io.loadmat(path, variable_names=[str(variable)])[str(variable)])
     with h5py.File(path, "r") as opened:
         array = np.asarray(opened[str(variable)])

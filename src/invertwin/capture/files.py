@@ -54,9 +54,7 @@ def _split(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _joined(dataset: xr.Dataset) -> xr.Dataset:
-    for name in [str(key) for key in dataset.data_vars]:
-        if not name.endswith("_real"):
-            continue
+    for name in [str(key) for key in dataset.data_vars if str(key).endswith("_real")]:
         real, whole = dataset[name], name.removesuffix("_real")
         imaginary = dataset.get(f"{whole}_imag")
         if imaginary is None or imaginary.dims != real.dims:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.limits import Among, Positive
+from invertwin.limits import Among, Frequency, Positive
 from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern
-from invertwin.scene.checks import checked_number, checked_tensor
+from invertwin.scene.checks import check_fields, checked_tensor
 
 Elements = tuple[AntennaArray, AntennaArray]  # TX and RX
 Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
@@ -53,17 +53,16 @@ class Board:
     name: str
     transmitters: Places
     receivers: Places
-    design_frequency: float
+    design_frequency: Frequency
     source: str = "user"
 
     def __post_init__(self) -> None:
+        check_fields(self)
         do = "give one pair in half wavelengths per element"
         for end in ("transmitters", "receivers"):
             what = f"{end} of {self.name} as pairs (column, row)"
             pairs = checked_tensor(getattr(self, end), (None, 2), what, do)
             object.__setattr__(self, end, tuple(map(tuple, pairs.tolist())))
-        frequency = checked_number(self.design_frequency, "design frequency [Hz]", 1e6)
-        object.__setattr__(self, "design_frequency", frequency)
 
     @property
     def has_rows(self) -> bool:

@@ -100,10 +100,7 @@ def ordered_statistics_cfar(
 
     Args:
         power: Maps over the last two axes, such as range rate and range.
-        guard: Cells to either side along both axes that the target itself fills.
-        training: Cells beyond those to either side.
-        false_alarm: Probability that a cell of noise is detected.
-        looks: Independent looks in the mean that is a cell's power.
+        guard, training, false_alarm, looks: As in ``cell_averaging_cfar``.
         rank: Place of the chosen cell in ascending order, as a part of their number.
 
     Raises:

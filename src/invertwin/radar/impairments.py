@@ -184,10 +184,8 @@ class Impairments:
         if self.phase_noise is not None:
             stream = _streams(seed)[0]
             beat = noisy_oscillator_beat(paths, radar, self.phase_noise, seed=stream, chirps=chirps)
-        elif chirps is None:
-            beat = beat_signal(paths, radar)
         else:
-            beat = moving_beat(paths, radar, chirps)
+            beat = _clean_beat(paths, radar, chirps)
         return self._after_mixing(beat, radar, seed, chirps)
 
     def apply(
@@ -270,11 +268,8 @@ def noisy_oscillator_beat(
     waveform = _sampled_in_time(radar)
     check_paths(paths, radar, waveform)
 
-    def clean(part: Paths) -> Tensor:
-        return beat_signal(part, radar) if chirps is None else moving_beat(part, radar, chirps)
-
     if len(paths) == 0:
-        return clean(paths)
+        return _clean_beat(paths, radar, chirps)
     first, last = (float(end) for end in paths.delay.detach().aminmax())
     highest = 0.5 / float(waveform.sample_times[1])
     intervals = math.ceil((last - first) * 2 * math.pi * highest / _DELAY_STEP)
@@ -289,7 +284,8 @@ def noisy_oscillator_beat(
         with warnings.catch_warnings():
             # All paths have been judged together.
             warnings.simplefilter("ignore", PhysicsWarning)
-            beat = clean(replace(part, coefficient=part.coefficient * weight[chosen]))
+            part = replace(part, coefficient=part.coefficient * weight[chosen])
+            beat = _clean_beat(part, radar, chirps)
         residual = residual_phase(noise, radar, first + node * spacing, seed=seed, chirps=chirps)
         return beat * _turn(residual).unsqueeze(-2).to(beat.device)
 
@@ -418,6 +414,10 @@ def quantize(
             stacklevel=2,
         )
     return torch.view_as_complex(codes.clamp(lowest, highest) * adc.step)
+
+
+def _clean_beat(paths: Paths, radar: Radar, chirps: Chirps | None) -> Tensor:
+    return beat_signal(paths, radar) if chirps is None else moving_beat(paths, radar, chirps)
 
 
 def _turn(phase: Tensor) -> Tensor:

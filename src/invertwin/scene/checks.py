@@ -124,7 +124,7 @@ def checked_count(value: object, what: str, low: int) -> int:
 def check_fields(holder: object) -> None:
     """Raise unless the fields of a dataclass keep to the limits in their annotations.
 
-    Fields that are None have no limits. In a tuple every item is checked.
+    A field that is None, where it may be, has no limits. In a tuple every item is checked.
 
     Raises:
         InputError: a word that is not one of those allowed; a number that is beyond a limit, not
@@ -132,15 +132,17 @@ def check_fields(holder: object) -> None:
     """
     for name, found in _marks_of_fields(type(holder)).items():
         value = getattr(holder, name)
+        if value is None and type(None) in found:
+            continue
         allowed = [word for mark in found for word in _words(mark)]
-        if allowed and value not in allowed:
+        if not allowed:
+            for number in value if isinstance(value, tuple) else (value,):
+                _check_number(holder, name, number, found)
+        elif value not in allowed:
             raise InputError(
-                f"expected {name} to be one of {', '.join(allowed)}, got {value!r}; "
+                f"expected {name} to be one of {', '.join(map(str, allowed))}, got {value!r}; "
                 "choose one of them"
             )
-        for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not allowed:
-                _check_number(holder, name, number, found)
 
 
 @cache
@@ -153,7 +155,7 @@ def _marks_of_fields(kind: type) -> dict[str, tuple[Any, ...]]:
     }
 
 
-def _words(mark: Any) -> tuple[str, ...]:
+def _words(mark: Any) -> tuple[str | int, ...]:
     if isinstance(mark, Among):
         return mark.names
     return get_args(mark) if get_origin(mark) is Literal else ()

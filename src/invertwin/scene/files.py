@@ -263,11 +263,8 @@ def _scene_of(
 
 
 def _material_id(shape: ElementTree.Element) -> str:
-    for tag in ("ref", "bsdf"):
-        element = shape.find(tag)
-        if element is not None:
-            return element.get("id", "")
-    return ""
+    found = [element for element in map(shape.find, ("ref", "bsdf")) if element is not None]
+    return found[0].get("id", "") if found else ""
 
 
 def _shape(element: ElementTree.Element, folder: Path) -> Mesh:

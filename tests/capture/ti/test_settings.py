@@ -214,7 +214,7 @@ def test_a_setup_names_its_settings(studio, tmp_path):
         ),
         (
             lambda d: d["rawDataCaptureConfig"]["rlDevLaneEnable_t"].update(laneEn="0x7"),
-            "2 or 4 LVDS lanes, got 3",
+            "lanes to be one of 2, 4, got 3",
         ),
     ],
 )

@@ -41,9 +41,7 @@ def read_recording(
         InputError: other lanes than the settings say, or what `read_settings` and `read_samples`
             raise.
     """
-    if settings is None:
-        settings = path
-    known = settings if isinstance(settings, ChirpSettings) else read_settings(settings)
+    known = settings if isinstance(settings, ChirpSettings) else read_settings(settings or path)
     if lanes is not None:
         if known.lanes not in (None, lanes):
             raise InputError(

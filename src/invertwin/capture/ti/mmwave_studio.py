@@ -19,7 +19,7 @@ from invertwin.capture.ti.chirp_table import (
     text,
 )
 from invertwin.errors import InputError
-from invertwin.scene.files import replacing
+from invertwin.scene.files import existing_file, replacing
 
 # Names of the numbers of a profile, and of the frame.
 _PROFILE = (
@@ -56,7 +56,9 @@ def read_studio(path: str | Path) -> ChirpSettings:
     device = ""
     if "configUsed" in content:
         device = str(content.get("mmWaveDevice", ""))
-        _check_logging(content)
+        mode = (content.get("DCA1000Config") or {}).get("dataLoggingMode", "raw")
+        do = "files of other modes have headers and are not read"
+        _expect(mode, "raw", "a recording in raw mode (dataLoggingMode)", do)
         path = _beside(path, str(content["configUsed"]))
         content = _json(path)
     try:
@@ -115,22 +117,24 @@ def _beside(path: Path, named: str) -> Path:
 
 def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
     devices = content["mmWaveDevices"]
-    if len(devices) != 1:
-        raise InputError(
-            f"expected settings of one device, got {len(devices)}; recordings of a cascade are "
-            "not read, give its samples as arrays"
-        )
+    do = "recordings of a cascade are not read, give its samples as arrays"
+    _expect(len(devices), 1, "settings of one device", do)
     radio, record = devices[0]["rfConfig"], devices[0]["rawDataCaptureConfig"]
     kind = radio.get("waveformType", "legacyFrameChirp")
-    if kind != "legacyFrameChirp":
-        raise InputError(f"expected legacyFrameChirp, got {kind}; other frames are not supported")
+    _expect(kind, "legacyFrameChirp", "legacyFrameChirp", "other frames are not supported")
+    sent = (record.get("rlDevDataPathCfg_t") or {}).get("transferFmtPkt0", "0x1")
+    do = "record without chirp parameters and quality data"
+    _expect(_integer(sent), 1, "packets of samples only (transferFmtPkt0 1)", do)
+    layout, lanes = record["rlDevDataFmtCfg_t"], lanes_of(device)
+    if "rlDevLaneEnable_t" in record:
+        lanes = len(numbers(_integer(record["rlDevLaneEnable_t"]["laneEn"])))
+    if lanes in (2, 4):
+        # 0 = receivers interleaved, as through 4 lanes; 1 = one after the other, as through 2.
+        order, what = int(lanes == 2), f"chInterleave {int(lanes == 2)} with {lanes} LVDS lanes"
+        _expect(int(layout["chInterleave"]), order, what, "other orders are not supported")
     profiles = [item["rlProfileCfg_t"] for item in radio["rlProfiles"]]
     chirps = [item["rlChirpCfg_t"] for item in radio["rlChirps"]]
     frame, output = radio["rlFrameCfg_t"], radio["rlAdcOutCfg_t"]["fmt"]
-    _check_transfer(record)
-    layout = record["rlDevDataFmtCfg_t"]
-    lanes = _lanes(record, device)
-    _check_interleave(int(layout["chInterleave"]), lanes)
     return settings(
         {int(profile["profileId"]): profile for profile in profiles},
         _PROFILE,
@@ -153,37 +157,9 @@ def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
     )
 
 
-def _lanes(record: dict[str, Any], device: str) -> int | None:
-    if "rlDevLaneEnable_t" in record:
-        return len(numbers(_integer(record["rlDevLaneEnable_t"]["laneEn"])))
-    return lanes_of(device)
-
-
-def _check_logging(setup: dict[str, Any]) -> None:
-    mode = (setup.get("DCA1000Config") or {}).get("dataLoggingMode", "raw")
-    if mode != "raw":
-        raise InputError(
-            f"expected a recording in raw mode (dataLoggingMode), got {mode}; "
-            "files of other modes have headers and are not read"
-        )
-
-
-def _check_transfer(record: dict[str, Any]) -> None:
-    content = (record.get("rlDevDataPathCfg_t") or {}).get("transferFmtPkt0", "0x1")
-    if _integer(content) != 1:
-        raise InputError(
-            f"expected packets of samples only (transferFmtPkt0 0x1), got {content}; "
-            "record without chirp parameters and quality data"
-        )
-
-
-def _check_interleave(interleave: int, lanes: int | None) -> None:
-    """0 = receivers interleaved, as through 4 lanes; 1 = one after the other, as through 2."""
-    if lanes in (2, 4) and interleave != (0 if lanes == 4 else 1):
-        raise InputError(
-            f"expected chInterleave {0 if lanes == 4 else 1} with {lanes} LVDS lanes, got "
-            f"{interleave}; this order of samples is not supported"
-        )
+def _expect(found: Any, known: Any, what: str, do: str) -> None:
+    if found != known:
+        raise InputError(f"expected {what}, got {found}; {do}")
 
 
 def _integer(value: Any) -> int:
@@ -203,7 +179,6 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
     s = chirp_settings
     if s.lanes is None:
         raise InputError("expected settings with 2 or 4 lanes, got none; set lanes")
-
     profile = dict(zip(_PROFILE, map(float, profile_texts(s)), strict=True))
     frame = (0, len(s.transmit_order) - 1, s.loops, s.frames or 0)
     period = float(text(s.frame_period or 0.0, 3))
@@ -259,12 +234,8 @@ def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str
     """
     path = Path(path)
     with replacing(path) as part:
-        for file in (settings, *recordings):
-            if not (path.parent / Path(file).name).is_file():
-                raise InputError(
-                    f"expected {Path(file).name} beside {path}, got no such file; write it there "
-                    "first"
-                )
+        for name in (Path(file).name for file in (settings, *recordings)):
+            existing_file(path.parent / name, f"{name} beside {path}")
         names = [{"rawFileName": Path(file).name, "processedFileName": ""} for file in recordings]
         files = {"numFilesCollected": len(names), "fileBasePath": "", "files": names}
         setup = {
