@@ -12,6 +12,7 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 
+_LEAST = 1e-38  # keeps logarithms finite
 _GAIN_STEPS = 8  # at most; three or four do
 _SETTLED = 1e-3  # of the gain: a step this small is the last, and leaves less than 1e-5
 _BLOCK = 2**16  # bins that are worked on at a time: what they need stays in a core's cache
@@ -185,21 +186,21 @@ class SpectrumLoss:
                 return (mixed / power.clamp_min(1e-30)).clamp_min(0.0)
             return gain * self._likeliest([self._blocks(*pair) for pair in pairs])
 
-    def _blocks(self, a: Tensor, b: Tensor, unit: Any = 1.0, scale: Any = 1.0) -> list[_Block]:
-        """What both maps hold of power, in units, the floor added to the measured one."""
+    def _blocks(self, a: Tensor, b: Tensor, scale: Any = 1.0) -> list[_Block]:
+        """What both maps hold of power, the measured one in its unit with the floor added."""
         columns = (x.detach().flatten().split(_BLOCK) for x in (a, b))
         return [
-            (x, (x / unit).clamp_min_(0.0), (y.to(x) / scale).clamp_min_(0.0).add_(self.floor))
+            (x, x.clamp_min(0.0), (y.to(x) / scale).clamp_min_(0.0).add_(self.floor))
             for x, y in zip(*columns, strict=True)
         ]
 
-    def _likeliest(self, levels: list[list[_Block]]) -> float:
-        """The gain of the ``likelihood``, by a secant on its logarithm."""
+    def _likeliest(self, levels: list[list[_Block]], unit: float = 1.0) -> float:
+        """The gain of the ``likelihood`` over the unit, by a secant on its logarithm."""
         if self.gain == "one":
-            return 1.0
+            return 1.0 / unit
         floor = torch.as_tensor(self.floor).to(levels[0][0][0])
         counts = [sum(len(a) for a, *_ in blocks) for blocks in levels]
-        place, slope = 0.0, 1.0
+        place, slope = -math.log(unit), 1.0
         # The coarse maps are quick, and their gain is nearly that of all.
         for first in (1, 0):
             step, before = 0.0, 0.0
@@ -210,7 +211,7 @@ class SpectrumLoss:
                         inverse = torch.add(floor, a, alpha=math.exp(place)).reciprocal_()
                         down += float(a @ inverse) / count
                         up += float(inverse.square_().mul_(b) @ a) / count
-                move = math.log(max(up, 1e-30) / max(down, 1e-30))
+                move = math.log(max(up, _LEAST) / max(down, _LEAST))
                 if step != 0:
                     slope = min(max((before - move) / step, 0.1), 1.0)
                 before, step = move, move / slope
@@ -245,13 +246,13 @@ class SpectrumLoss:
 
         The maps are large, and torch's own derivative keeps and reads each of them several times.
         """
-        units = self._units(simulated, measured)
+        unit, scale = self._units(simulated, measured)
         maps = [self._resolutions(power) for power in (simulated.detach(), measured)]
-        levels = [self._blocks(a, b, *units) for a, b in zip(*maps, strict=True)]
-        gain = self._likeliest(levels)
+        levels = [self._blocks(a, b, scale) for a, b in zip(*maps, strict=True)]
+        gain = self._likeliest(levels, float(unit))
         value, slope = 0.0, None
         for power, blocks in zip(reversed(maps[0]), reversed(levels), strict=True):
-            factor = gain / (units[0] * power.numel() * self.levels)
+            factor = gain / (power.numel() * self.levels)
             own = torch.empty_like(power, memory_format=torch.contiguous_format)
             slopes = own.flatten().split(_BLOCK)
             for (a, lit, data), out in zip(blocks, slopes, strict=True):
@@ -409,8 +410,11 @@ def _pooled(power: Tensor) -> Tensor:
 
 def _spread(coarse: Tensor, power: Tensor) -> Tensor:
     """The adjoint of pooling, added to a map of twice the resolution."""
-    for dim in range(1, power.ndim):
+    for dim in reversed(range(2, power.ndim)):
         if power.shape[dim] > 1:
             coarse = (0.5 * coarse).repeat_interleave(2, dim)
-    power[tuple(map(slice, coarse.shape))] += coarse
+    target = power[(slice(None), slice(None), *map(slice, coarse.shape[2:]))]
+    if half := power.shape[1] // 2:
+        target, coarse = target[:, : 2 * half].unflatten(1, (half, 2)), 0.5 * coarse[:, :, None]
+    target += coarse
     return power
