@@ -315,11 +315,11 @@ def test_loss_and_optimizer_pass_on_what_is_given():
         loss={"kind": "likelihood", "floor": 0.05, "levels": 2},
         optimizer={"rate": 0.02, "rotation_rate": 0.2},
     )
-    loss, optimizer = build.loss(run.loss), build.optimizer(run.optimizer)
+    loss, optimizer = build.made(run, "loss"), build.made(run, "optimizer")
     assert (loss.kind, loss.floor, loss.levels) == ("likelihood", 0.05, 2)
     assert (optimizer.rate, optimizer.rotation_rate) == (0.02, 0.2)
-    assert build.loss(read().loss) == SpectrumLoss()
-    assert build.optimizer(read().optimizer) == Optimizer()
+    assert build.made(read(), "loss") == SpectrumLoss()
+    assert build.made(read(), "optimizer") == Optimizer()
 
 
 @pytest.mark.parametrize(

@@ -233,7 +233,7 @@ def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
     assert varied_run(run, FULL).optimizer.kind == "adam"
     scene = build.scene(run)
     first, second = schedule_of(Problem(run, scene, scene, frozenset()))
-    assert first.optimizer == build.optimizer(run.optimizer)
+    assert first.optimizer == build.made(run, "optimizer")
     assert (first.steps, first.annealing) == (3, 0.7)
     assert second.optimizer is not None
     assert second.optimizer.kind == "sgd"

@@ -43,7 +43,7 @@ def check_run(
     told = settings.build()
     module, tangent = build.tangent(run, scene)
     return gradcheck(
-        SurrogateMap(grid, surrogate or build.surrogate(run.surrogate), drawn),
+        SurrogateMap(grid, surrogate or build.made(run, "surrogate"), drawn),
         module,
         tangent,
         scene=scene,

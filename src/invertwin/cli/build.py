@@ -7,8 +7,6 @@ from typing import Any
 
 from torch import nn
 
-from invertwin.channel import Grid, Sampling
-from invertwin.cli.fit_tables import surrogate as surrogate
 from invertwin.cli.registry import Table
 from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import need, unknown_object
@@ -18,7 +16,6 @@ from invertwin.cli.sensors import radar as radar
 from invertwin.cli.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.tangents import Change, changes_of
-from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Mesh, Object, Scene, SkinnedBody, joined
 from invertwin.scene.files import CONCRETE, load_scene_xml
 
@@ -81,22 +78,16 @@ def _from_file(table: SceneFile) -> Scene:
     return load_scene_xml(table.file, materials, others)
 
 
-def loss(table: Any) -> Any:
-    """How maps are compared, from the `[loss]` table."""
-    with about("loss"):
-        return table.build()
+def made(run: RunFile, section: str, given: Mapping[type, object] | None = None) -> Any:
+    """What the constructor of a section of the run file makes of it.
 
-
-def optimizer(table: Any) -> Any:
-    """How a gradient becomes a step, from the `[optimizer]` table."""
-    with about("optimizer"):
-        return table.build()
-
-
-def model(table: Any, grid: Grid, surrogate: Surrogate, sampling: Sampling) -> Any:
-    """The forward model of a `[model]` table, which plugins add; it may ask for the others."""
-    with about("model"):
-        return table.build({Grid: grid, Surrogate: surrogate, Sampling: sampling})
+    Args:
+        run: The run file.
+        section: Such as "loss".
+        given: Values that a constructor may ask for, by their type.
+    """
+    with about(section):
+        return getattr(run, section).build(given)
 
 
 def builders(

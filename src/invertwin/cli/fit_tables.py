@@ -44,11 +44,3 @@ def register(registry: Registry) -> None:
     registry.add("loss", "likelihood", SpectrumLoss)
     for name in ("adam", "sgd", "gauss_newton"):
         registry.add("optimizer", name, Optimizer, without=("module_rates",))
-
-
-def surrogate(table: Any) -> Surrogate:
-    """The smooth model of the `[surrogate]` table, at its starting widths.
-
-    For exact signals it is the "response", which is their mean over phases.
-    """
-    return table.build()

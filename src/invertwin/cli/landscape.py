@@ -33,7 +33,7 @@ def landscape(problem: Problem) -> tuple[Figure, dict[str, Any]]:
     model, first = BeatMap(sight.grid, channels=(slice(1), slice(1))), sight.radar.frames([0])
     beat = Observation(model, first, sight.capture.beat[:1, :1, :1], loss=relative_error)
     exact = exact_losses(run, line, fine, beat)
-    model, loss = models_of(problem)[0], build.loss(run.loss)
+    model, loss = models_of(problem)[0], build.made(run, "loss")
     smooth = {}
     for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
         seen = Observation(model.narrowed(share), sight.radar, sight.capture, loss=loss)

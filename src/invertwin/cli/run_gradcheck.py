@@ -149,7 +149,7 @@ def _check(
     drawn = {key: getattr(settings, key) for key in ("depth", "samples", "boundary_samples")}
     check = settings.build()
     report = gradcheck(
-        SurrogateMap(grid, build.surrogate(run.surrogate), Sampling(**drawn)),
+        SurrogateMap(grid, build.made(run, "surrogate"), Sampling(**drawn)),
         module,
         tangent,
         scene=scene,

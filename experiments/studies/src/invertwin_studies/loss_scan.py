@@ -95,8 +95,8 @@ def _losses(
     """The four curves near the truth, and the surrogate's farther away."""
     capture = Capture.from_beat(measured, radar)
     sampling = Sampling(depth=1, samples=settings.samples)
-    model = SurrogateMap(grid, build.surrogate(run.surrogate), sampling)
-    smooth = Observation(model, radar, capture, loss=build.loss(run.loss))
+    model = SurrogateMap(grid, build.made(run, "surrogate"), sampling)
+    smooth = Observation(model, radar, capture, loss=build.made(run, "loss"))
     first = radar.frames([0])
     views = _views(settings, first, grid)
 

@@ -50,7 +50,7 @@ def compare(settings: Methods, checked: Checked) -> tuple[dict[str, Any], Figure
     """
     run, scene, radar, grid = checked.run, checked.scene, checked.radar, checked.grid
     direction, report, say = checked.direction, checked.report, checked.say
-    surrogate = build.surrogate(run.surrogate)
+    surrogate = build.made(run, "surrogate")
     truth = report.difference
     say("MUSIC")
     music = MusicMap(

@@ -36,7 +36,7 @@ def guessed(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]
             name,
             sight.capture,
             sight.grid,
-            loss=build.loss(run.loss),
+            loss=build.made(run, "loss"),
             seed=run.seed,
         )
         scene = _clouded(problem, guess.scene, name)

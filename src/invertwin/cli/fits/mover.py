@@ -156,7 +156,7 @@ def _fitted(
             Observation(near, radar, recording),
             body,
             loss=CorrelationLoss(),
-            optimizer=build.optimizer(run.optimizer),
+            optimizer=build.made(run, "optimizer"),
             schedule=Schedule(settings.steps),
             callbacks=callbacks,
             seed=run.seed,

@@ -25,6 +25,7 @@ from invertwin.inversion import Observation, Stage, Unknown, remeshed
 from invertwin.models import ExactMap, ForwardModel, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.radar.radar import Radar
+from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Object, Scene, rigid
 from invertwin.seeds import derived_seed
 
@@ -214,7 +215,7 @@ def schedule_of(problem: Problem) -> list[Stage]:
             unknowns=tuple(names),
             rebuild=table.rebuild,
             remesh={t.object: finer for t in free if table.remesh and t.kind == "vertices"},
-            optimizer=build.optimizer(run.optimizer),
+            optimizer=build.made(run, "optimizer"),
             models=[model.sampled_by(**counts) if counts else model for model in models],
         )
         found.append(stage)
@@ -247,9 +248,11 @@ def models_of(problem: Problem) -> list[ForwardModel]:
     sampling = sampling_of(problem.run)
     found: list[ForwardModel] = []
     for run, sight in problem.sensors:
-        kernels = build.surrogate(run.surrogate)
+        kernels = build.made(run, "surrogate")
         if run.model is not None:
-            found.append(build.model(run.model, sight.grid, kernels, sampling))
+            found.append(
+                build.made(run, "model", {Grid: sight.grid, Surrogate: kernels, Sampling: sampling})
+            )
         elif run.surrogate.exact:
             found.append(ExactMap(sight.grid, sampling))
         else:
@@ -262,7 +265,7 @@ def sharp_models(problem: Problem) -> list[SurrogateMap]:
     sharp = {"range_width": 0.0, "angle_width": 0.0}
     sampling = sampling_of(problem.run)
     return [
-        SurrogateMap(sight.grid, replace(build.surrogate(run.surrogate), **sharp), sampling)
+        SurrogateMap(sight.grid, replace(build.made(run, "surrogate"), **sharp), sampling)
         for run, sight in problem.sensors
     ]
 

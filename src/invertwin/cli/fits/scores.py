@@ -161,7 +161,7 @@ def misfit(
     problem: Problem, simulated: Sequence[torch.Tensor], measured: Sequence[torch.Tensor]
 ) -> float | None:
     """The weighted mean of the losses of all sensors; None where a map without power has none."""
-    loss = build.loss(problem.run.loss)
+    loss = build.made(problem.run, "loss")
     weights = tuple(sight.weight for sight in problem.sights.values())
     try:
         pairs = list(zip(simulated, measured, strict=True))
