@@ -32,7 +32,8 @@ ALLOWED = {
     "models": MODELS,
     "inversion": INVERSION,
     "plotting": INVERSION | {"plotting"},
-    "cli": INVERSION | {"doctor", "plotting", "cli", "__init__"},
+    "registry": FOUNDATION | {"registry"},
+    "cli": INVERSION | {"doctor", "plotting", "registry", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from invertwin.cli.registry import PLUGINS
 from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
+from invertwin.registry.kinds import PLUGINS
 from invertwin_studies.recordings import rail_sar
 
 REPOSITORY = Path(__file__).resolve().parents[1]

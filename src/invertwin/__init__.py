@@ -4,7 +4,8 @@ Data flows one way. ``scene`` turns parameters θ (``scene/parameters.py``) into
 and antennas; ``channel`` traces them into paths; ``radar`` makes beat signals and spectra of paths,
 or their smooth mean, the surrogate; ``inversion`` compares spectra with a capture and moves θ.
 ``simulation.py`` is the way from scene to spectrum on one page. Beside it, ``capture`` holds
-measured data, ``plotting`` draws figures and ``cli`` has the commands.
+measured data, ``plotting`` draws figures, ``registry`` says what run files may name and ``cli`` has
+the commands.
 
 The names below are the public menu. Each is loaded when it is first used, so ``import invertwin``
 is quick, and ``invertwin doctor`` runs where no ray tracer can.

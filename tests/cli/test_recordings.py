@@ -12,7 +12,7 @@ from cli.test_build import RADAR, read
 from invertwin.capture import Capture, ChannelCalibration, ChirpData, described_arrays
 from invertwin.capture.ti import read_cfg, read_recording, read_settings
 from invertwin.cli import build, schema, sensors
-from invertwin.cli.raw_files import chirp_data
+from invertwin.cli.raw_files import settings_of_run
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
@@ -328,7 +328,7 @@ def test_samples_are_kept_as_they_are(tmp_path):
     radar = radar_of(table)
     run = read(radar=table, chirps={"count": 2, "interval": 6e-5})
     beat = torch.randn(1, 2, 3, 4, 64, dtype=torch.complex128, generator=torch.Generator())
-    data = chirp_data(run, radar, beat)
+    data = ChirpData(beat, replace(settings_of_run(run, radar), real=False))
     assert isinstance(data, ChirpData)
     arrays = (radar.transmitters, radar.receivers)
     described_arrays.write_chirps(tmp_path / "a.toml", data, "a.npy", arrays)

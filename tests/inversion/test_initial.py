@@ -78,7 +78,7 @@ def seen() -> tuple[Scene, Capture, Grid]:
 
 def sides(yaw_deg: float, length: float = 4.0, width: float = 1.8, up: str = "y") -> Tensor:
     """Points on the two sides of a rectangle at PLACE that face the origin, with 2 cm of noise."""
-    plane, generator = Ground(up), torch.Generator().manual_seed(1)
+    plane, generator = Ground(up), torch.Generator().manual_seed(1)  # pyright: ignore[reportArgumentType]
     axes = plane.turn(math.radians(yaw_deg))[:, plane.level]
     center = float64(PLACE)
     if up == "z":
@@ -99,7 +99,7 @@ def sides(yaw_deg: float, length: float = 4.0, width: float = 1.8, up: str = "y"
 @pytest.mark.parametrize("yaw", [10.0, 35.0, 70.0])
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_a_rectangle_is_found_by_its_near_sides(yaw: float, up: str) -> None:
-    found = fit_rectangle(sides(yaw, up=up), radar_along(), ground=Ground(up), resolution=0.05)
+    found = fit_rectangle(sides(yaw, up=up), radar_along(), ground=Ground(up), resolution=0.05)  # pyright: ignore[reportArgumentType]
     assert math.degrees(found.yaw) == pytest.approx(yaw, abs=1.01)
     assert found.size == pytest.approx((4.0, 1.8), abs=0.25)
 
@@ -128,7 +128,7 @@ def test_one_of_four_poses_is_the_true_one(yaw: float) -> None:
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_principal_axes_turn_with_the_points(up: str) -> None:
     generator = torch.Generator().manual_seed(0)
-    plane = Ground(up)
+    plane = Ground(up)  # pyright: ignore[reportArgumentType]
     axes = plane.turn(math.radians(25))[:, plane.level]
     spread = torch.randn(500, 2, generator=generator, dtype=torch.float64) * float64([2.0, 0.3])
     found = principal_rectangle(spread @ axes.T + 1.0, ground=plane)
@@ -230,4 +230,4 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match="3 points"):
         fit_rectangle(torch.zeros(2, 3).double(), radar)
     with pytest.raises(InputError, match="up"):
-        Ground("x")
+        Ground("x")  # pyright: ignore[reportArgumentType]

@@ -21,16 +21,15 @@ from invertwin.cli.options import (
     console,
     with_options,
 )
-from invertwin.cli.registry import load_plugins
 from invertwin.cli.run_file import about_file
 from invertwin.cli.running import (
-    default_folder,
     load_runs,
     now_and_then,
     print_tables,
     run_folder,
 )
 from invertwin.errors import InputError
+from invertwin.registry.kinds import load_plugins
 
 app = typer.Typer(
     name="invertwin",
@@ -64,7 +63,7 @@ def invertwin(
 def simulate(options: Options, file: FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra."""
     runs = load_runs([file], options, "simulate", ("radar", "grid", "data"))
-    with run_folder(options, default_folder(file), runs) as folder:
+    with run_folder(options, Path("out", file.stem), runs) as folder:
         from invertwin.cli.run_simulate import run_simulate
 
         with about_file(file):
@@ -76,7 +75,7 @@ def simulate(options: Options, file: FileArgument) -> None:
 @with_options(Resumable)
 def reconstruct(options: Resumable, file: FileArgument) -> None:
     """Fit the parameters of a scene to radar data."""
-    _reconstruct(file, options, default_folder(file))
+    _reconstruct(file, options, Path("out", file.stem))
 
 
 @app.command()
@@ -104,7 +103,7 @@ def look(options: Look) -> None:
 def gradcheck(options: Resumable, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
     runs = load_runs(files, options, "gradcheck", ("gradcheck", "radar", "grid"))
-    default = default_folder(files[0]) if len(files) == 1 else Path("out/gradcheck")
+    default = Path("out", files[0].stem if len(files) == 1 else "gradcheck")
     with run_folder(options, default, runs) as folder:
         if folder.complete:
             return

@@ -7,7 +7,6 @@ from typing import Any
 
 from torch import nn
 
-from invertwin.cli.registry import Table
 from invertwin.cli.run_file import about as about
 from invertwin.cli.run_file import need, unknown_object
 from invertwin.cli.schema import RunFile, SceneFile
@@ -16,6 +15,7 @@ from invertwin.cli.sensors import radar as radar
 from invertwin.cli.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.tangents import Change, changes_of
+from invertwin.registry.kinds import Table
 from invertwin.scene import Mesh, Object, Scene, SkinnedBody, joined
 from invertwin.scene.files import CONCRETE, load_scene_xml
 

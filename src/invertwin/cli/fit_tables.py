@@ -5,12 +5,12 @@ from typing import Any
 from pydantic import model_validator
 
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.registry import Group, Registry, Table
-from invertwin.cli.section import fail, key
 from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate
+from invertwin.registry.kinds import Group, Registry, Table
+from invertwin.registry.section import fail, key
 
 
 class SurrogateTable(Table):

@@ -11,9 +11,9 @@ import torch
 from annotated_types import Ge, Gt, Le, MinLen
 from pydantic import model_validator
 
-from invertwin.cli.registry import Form, Group, Registry, Table, number_or_list
-from invertwin.cli.section import InputPath, Section, fail, key
 from invertwin.errors import InputError
+from invertwin.registry.kinds import Form, Group, Registry, Table, number_or_list
+from invertwin.registry.section import InputPath, Section, fail, key
 from invertwin.scene import (
     Dielectric,
     Itu,

@@ -5,9 +5,8 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 from rich.console import Console
@@ -16,22 +15,14 @@ from rich.console import Console
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 
 
-class Backend(StrEnum):
-    """Where rays are traced."""
-
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
-
-
-def _use_backend(value: Backend | None) -> Backend | None:
+def _use_backend(value: str | None) -> str | None:
     if value is not None:
-        os.environ["INVERTWIN_BACKEND"] = value.value
+        os.environ["INVERTWIN_BACKEND"] = value
     return value
 
 
 BackendOption = Annotated[
-    Backend | None,
+    Literal["auto", "cpu", "cuda"] | None,
     typer.Option(
         "--backend",
         callback=_use_backend,
@@ -76,14 +67,6 @@ class Resumable(Options):
     ] = False
 
 
-class Method(StrEnum):
-    """How directions are told apart."""
-
-    bartlett = "bartlett"
-    capon = "capon"
-    music = "music"
-
-
 @dataclass(frozen=True, kw_only=True)
 class Look(Where):
     """What to look at, as the options of `invertwin look` say it."""
@@ -118,8 +101,9 @@ class Look(Where):
     range_min: Annotated[float | None, typer.Option(help="m; default: 3 range cells.")] = None
     range_max: Annotated[float | None, typer.Option(help="m; default: all.")] = None
     method: Annotated[
-        Method, typer.Option(help="Of directions; others than bartlett are shown beside it.")
-    ] = Method.bartlett
+        Literal["bartlett", "capon", "music"],
+        typer.Option(help="Of directions; others than bartlett are shown beside it."),
+    ] = "bartlett"
     sources: Annotated[
         int | None, typer.Option(help="For music; default: counted in each range.")
     ] = None

@@ -1,12 +1,10 @@
 """Simulated samples as the files that boards and their tools write."""
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Complex
 from torch import Tensor
 
-from invertwin.capture import ChirpData, ChirpSettings, adc_counts, settings_of, ti
+from invertwin.capture import ChirpSettings, adc_counts, settings_of, ti
 from invertwin.cli.run_file import about
 from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import Raw, RunFile
@@ -85,10 +83,3 @@ def write_raw(
         ti.write_studio(studio, settings)
         ti.write_setup(folder.file("raw/capture.setup.json"), studio, [samples])
     return {"raw_full_scale": full_scale, "raw_bytes": samples.stat().st_size}
-
-
-def chirp_data(
-    run: RunFile, radar: Radar, beat: Complex[Tensor, "frame chirp tx rx sample"]
-) -> ChirpData:
-    """Simulated chirps as they are, not rounded to counts."""
-    return ChirpData(beat, replace(settings_of_run(run, radar), real=False))

@@ -14,12 +14,12 @@ from invertwin.capture import (
     ti,
 )
 from invertwin.capture.radar_fields import WAVEFORMS
-from invertwin.cli.registry import Group, Registry, Table, registry
-from invertwin.cli.section import Depth, InputPath, Section, Seed, about, fail, key
 from invertwin.cli.sensors import Posed
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.boards import Mounting
+from invertwin.registry.kinds import Group, Registry, Table, registry
+from invertwin.registry.section import Depth, InputPath, Section, Seed, about, fail, key
 
 
 class SimulatedData(Section):

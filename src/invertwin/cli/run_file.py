@@ -16,9 +16,9 @@ import tomli_w
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from invertwin.cli.section import TAG_MARK
-from invertwin.cli.section import about as about
 from invertwin.errors import InputError
+from invertwin.registry.section import TAG_MARK
+from invertwin.registry.section import about as about
 
 _MOST_ERRORS = 4  # in one line
 # Sections and kinds of the package in experiments/studies.

@@ -16,7 +16,6 @@ from invertwin.capture import (
 )
 from invertwin.channel import Grid
 from invertwin.cli.options import Look
-from invertwin.cli.registry import load_plugins, registry
 from invertwin.cli.report import Table, finish, picture, quantities, texts
 from invertwin.cli.runs import RunFolder
 from invertwin.errors import InputError
@@ -33,6 +32,7 @@ from invertwin.radar import (
     velocity_span,
 )
 from invertwin.radar.boards import Mounting
+from invertwin.registry.kinds import load_plugins, registry
 
 Recording = Capture | ChirpCapture
 _ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"

@@ -10,10 +10,10 @@ import torch
 from matplotlib.figure import Figure
 
 from invertwin import plotting
-from invertwin.capture import Capture, described_arrays
+from invertwin.capture import Capture, ChirpData, described_arrays
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build, sensors
-from invertwin.cli.raw_files import chirp_data, settings_of_run, write_raw
+from invertwin.cli.raw_files import settings_of_run, write_raw
 from invertwin.cli.report import Table, finish, picture, quantities
 from invertwin.cli.run_file import about, need
 from invertwin.cli.runs import RunFolder
@@ -136,9 +136,8 @@ def _chirps(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: G
         arrays = (radar.transmitters, radar.receivers)
         folder.file("chirps.npy")
         with about("chirps"):
-            described_arrays.write_chirps(
-                folder.file("chirps.toml"), chirp_data(run, radar, beat), "chirps.npy", arrays
-            )
+            data = ChirpData(beat, replace(settings_of_run(run, radar), real=False))
+            described_arrays.write_chirps(folder.file("chirps.toml"), data, "chirps.npy", arrays)
     metrics = {
         "chirps": chirps.count,
         "velocity_span_m_s": velocity_span(radar, chirps),

@@ -84,11 +84,6 @@ def now_and_then() -> Callable[[str], None]:
     return say
 
 
-def default_folder(file: Path) -> Path:
-    """Where the results of a run file go unless the user says otherwise."""
-    return Path("out") / file.stem
-
-
 def print_tables(tables: Sequence[Table]) -> None:
     """Prints tables with their notes."""
     for table in tables:

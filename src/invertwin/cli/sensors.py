@@ -11,8 +11,6 @@ from torch import Tensor
 
 from invertwin.capture.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
-from invertwin.cli.registry import Group, OneOf, Registry, Table, TableOf
-from invertwin.cli.section import TAG_MARK, Section, Vector, about, check_presence, key, tag_by
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar import boards, tracks
@@ -20,6 +18,8 @@ from invertwin.radar.impairments import Impairments
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
+from invertwin.registry.kinds import Group, OneOf, Registry, Table, TableOf
+from invertwin.registry.section import TAG_MARK, Section, Vector, about, check_presence, key, tag_by
 from invertwin.scene import (
     AntennaArray,
     Cosine,

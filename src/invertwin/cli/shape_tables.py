@@ -7,12 +7,12 @@ import torch
 from annotated_types import MinLen
 from torch import Tensor, nn
 
-from invertwin.cli.registry import Group, OneOf, Registry, Table
-from invertwin.cli.section import Counts, InputPath, Vector, about, key
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.radar.parameters import RadarPose
+from invertwin.registry.kinds import Group, OneOf, Registry, Table
+from invertwin.registry.section import Counts, InputPath, Vector, about, key
 from invertwin.scene import (
     DensityGrid,
     DistanceGrid,

@@ -12,10 +12,10 @@ from invertwin.cli.options import FileArgument, Options, Where, with_options
 def loss_scan(options: Options, file: FileArgument) -> None:
     """Show the losses of signals and of the surrogate along a line."""
     from invertwin.cli.run_file import about_file
-    from invertwin.cli.running import default_folder, load_runs, print_tables, run_folder
+    from invertwin.cli.running import load_runs, print_tables, run_folder
 
     runs = load_runs([file], options, "loss-scan", ("loss_scan", "radar", "grid", "data"))
-    with run_folder(options, default_folder(file), runs) as folder:
+    with run_folder(options, Path("out", file.stem), runs) as folder:
         from invertwin_studies.loss_scan import run_loss_scan
 
         with about_file(file):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from invertwin.cli.section import Section
+from invertwin.registry.section import Section
 
 if TYPE_CHECKING:  # run files are read in milliseconds, the rest takes seconds to import
     from matplotlib.figure import Figure

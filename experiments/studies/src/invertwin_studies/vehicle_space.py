@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from invertwin.cli.section import InputPath
 from invertwin.cli.shape_tables import ObjectTable
 from invertwin.errors import InputError
 from invertwin.inversion.remeshing import remeshed
 from invertwin.limits import Count, Positive
+from invertwin.registry.section import InputPath
 from invertwin.scene import LinearShape, Mesh, ShapeSpace
 from invertwin.scene.files import load_mesh, read_arrays
 

@@ -232,13 +232,7 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
 
 
 def _ended(metrics: dict[str, Any]) -> str:
-    steps = metrics["steps"]
-    match metrics["status"]:
-        case "budget":
-            return f"all {steps} steps used"
-        case "converged":
-            return f"converged: the loss no longer falls after {steps} steps"
-    return f"diverged after {steps} steps: the best state is kept"
+    return texts("outcomes")[metrics["status"]].format(steps=metrics["steps"])
 
 
 def _limits(run: RunFile, metrics: dict[str, Any]) -> str:

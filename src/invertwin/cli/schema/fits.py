@@ -8,13 +8,13 @@ from pydantic import PlainSerializer, WrapValidator
 
 from invertwin.channel import Sampling
 from invertwin.cli.fit_tables import SurrogateTable
-from invertwin.cli.registry import OneOf, Table, TableOf, registry
-from invertwin.cli.section import Section, Seed, Vector, key
 from invertwin.inversion.first_pose import FirstPose
 from invertwin.inversion.schedule import Schedule
 from invertwin.inversion.starts import nearby
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
+from invertwin.registry.kinds import OneOf, Table, TableOf, registry
+from invertwin.registry.section import Section, Seed, Vector, key
 
 
 class _StartsTable(Table):

@@ -10,7 +10,6 @@ from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.cli.fit_tables import SurrogateTable
-from invertwin.cli.registry import NameOf, OneOf, TableOf, load_plugins, registry
 from invertwin.cli.schema.fits import (
     AnyInitial,
     AnyStarts,
@@ -23,13 +22,14 @@ from invertwin.cli.schema.fits import (
     Variant,
 )
 from invertwin.cli.schema.gradcheck import Gradcheck
-from invertwin.cli.section import InputPath, Section, Seed, Vector, fail, key
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.shape_tables import LearnedTable
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
+from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
+from invertwin.registry.section import InputPath, Section, Seed, Vector, fail, key
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "whole", "seen", "count", "m", "number", "consistency")

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.cli.recordings import recorded
-from invertwin.cli.section import InputPath, about
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting
+from invertwin.registry.section import InputPath, about
 from invertwin_studies.recordings import openradar, rail_sar
 
 _ORIGINALS = {

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from invertwin.cli.keys import json_schema
 from invertwin.cli.recordings import chirp_capture
-from invertwin.cli.registry import registry
 from invertwin.cli.run_file import need, to_toml, validate
 from invertwin.errors import InputError
 from invertwin.limits import Angle, Axes, Positive
+from invertwin.registry.kinds import registry
 from invertwin.scene import Mesh, box
 
 REPOSITORY = Path(__file__).parents[2]

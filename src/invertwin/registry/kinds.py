@@ -32,9 +32,9 @@ from typing import (
 from annotated_types import Len, MinLen
 from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, model_validator
 
-from invertwin.cli.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Letters
+from invertwin.registry.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
 
 BUILT_IN = (
     "invertwin.cli.sensors",

@@ -1,0 +1,3 @@
+"""Tables of run files are made of constructors; plugins add theirs to the `Registry`."""
+
+from invertwin.registry.kinds import Registry as Registry
