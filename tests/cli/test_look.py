@@ -207,7 +207,10 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
         (["adc.bin", "-c", "long.cfg", *BOARD], ["what fits: ", "samples=64"]),
         (["adc.bin", "-c", "bench.cfg", *BOARD, "--lanes", "4"], ["2 LVDS lanes", "lanes=4"]),
         (["adc.bin", "-c", "bench.cfg", *BOARD, "--lanes", "3"], ["lanes=3"]),
-        (["adc.bin", "-c", "plain.cfg", *BOARD, "--lanes", "3"], ["lanes to be one of 2, 4, got 3"]),
+        (
+            ["adc.bin", "-c", "plain.cfg", *BOARD, "--lanes", "3"],
+            ["lanes to be one of 2, 4, got 3"],
+        ),
         (["adc.bin", "-c", "plain.cfg", *BOARD], ["2 or 4 LVDS lanes", "set lanes"]),
         (["adc.toml", "--frame", "2"], ["--frame from 0 to 1"]),
         (["adc.toml", "--chirp", "16"], ["number from 0 to 15"]),
