@@ -29,7 +29,7 @@ class SimulatedData(Section):
     density: Positive = key("rough points per m²")
     samples: Count = key("coherent paths", 200_000)
     depth: Depth = key("most bounces of a path; with [chirps] it is one", 3)
-    chains: Count = key("paths of two bounces to draw, and of each number above", 200_000)
+    rough_paths: Count = key("paths of two bounces to draw, and of each number above", 200_000)
     snr_db: float | None = key("signal to noise per sample; without it no noise", None)
     noise_figure_db: float | None = key("thermal noise of a receiver instead of snr_db", None)
     seed: Seed | None = key("without it the run's", None)

@@ -165,7 +165,7 @@ def _sampling(data: SimulatedData, depth: int) -> Sampling:
         boundary_samples=0,
         boundary=False,
         points_per_m2=data.density,
-        rough_paths=data.chains,
+        rough_paths=data.rough_paths,
     )
 
 
