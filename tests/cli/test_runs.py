@@ -43,7 +43,7 @@ def broken_run(path, error, files, **flags):
     with open_run(path, {"a": make_run()}, **flags) as folder:
         for name, text in files.items():
             folder.write_text(name, text)
-        raise error
+        raise error("broken")
 
 
 def test_run_file_as_used_reads_back_equal():
