@@ -63,7 +63,9 @@ def seen() -> dict[str, Observation]:
     return found
 
 
-def place_of(observations: Any, kind: Any = "adam", steps: int = 40, **changes: Any) -> Tensor:
+def place_of(
+    observations: Any, kind: Any = "adam", steps: int = 40, seed: int = 1, **changes: Any
+) -> Tensor:
     fit = reconstruct(
         scene(),
         observations,
@@ -71,7 +73,7 @@ def place_of(observations: Any, kind: Any = "adam", steps: int = 40, **changes: 
         loss=SpectrumLoss(),
         optimizer=Optimizer(kind, rate=0.01 if kind == "adam" else 0.08),
         schedule=Schedule(steps),
-        seed=1,
+        seed=seed,
         **changes,
     )
     return fit.scene["ball"].center.detach()
@@ -80,14 +82,16 @@ def place_of(observations: Any, kind: Any = "adam", steps: int = 40, **changes: 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "steps"), [("adam", 50), ("gauss_newton", 8)])
 def test_two_ranges_find_what_each_alone_cannot(seen, kind, steps):
-    """A range pins one coordinate to 0.4 cells; two at right angles pin both."""
-    alone = {name: place_of(one, kind, steps) for name, one in seen.items()}
-    both = place_of(list(seen.values()), kind, steps)
+    """A range pins one coordinate to 0.4 cells; two at right angles pin both.
+
+    What a range does not see wanders with the random numbers, and may end anywhere.
+    """
     truth = float64(BALL)
-    assert abs(float(alone["ahead"][2] - truth[2])) < 0.03
-    assert abs(float(alone["ahead"][0] - truth[0])) > 0.05
-    assert abs(float(alone["beside"][0] - truth[0])) < 0.03
-    assert abs(float(alone["beside"][2] - truth[2])) > 0.05
+    for name, pinned, wandering in (("ahead", 2, 0), ("beside", 0, 2)):
+        off = torch.stack([place_of(seen[name], kind, steps, seed) - truth for seed in (1, 2, 3)])
+        assert float(off[:, pinned].abs().max()) < 0.03
+        assert float(off[:, wandering].abs().max()) > 0.05
+    both = place_of(list(seen.values()), kind, steps)
     assert float((both - truth).norm()) < 0.03
 
 
