@@ -1,1 +1,11 @@
 """The command line: run files in, run folders out."""
+
+from invertwin.registry.kinds import registry
+
+registry.built_in = (
+    "invertwin.cli.sensors",
+    "invertwin.cli.materials",
+    "invertwin.cli.shape_tables",
+    "invertwin.cli.recordings",
+    "invertwin.cli.fit_tables",
+)

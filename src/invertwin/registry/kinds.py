@@ -36,13 +36,6 @@ from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Letters
 from invertwin.registry.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
 
-BUILT_IN = (
-    "invertwin.cli.sensors",
-    "invertwin.cli.materials",
-    "invertwin.cli.shape_tables",
-    "invertwin.cli.recordings",
-    "invertwin.cli.fit_tables",
-)
 PLUGINS = "invertwin.plugins"
 _MEANINGS = {
     "object": "name in the scene",
@@ -186,6 +179,7 @@ class Registry:
     """All that a run file may name. `register` functions get it and add to it.
 
     Attributes:
+        built_in: Modules whose ``register`` adds the library's own kinds.
         sections: Of run files: dataclasses or pydantic models, by name.
         commands: Of the command line: functions as typer takes them, by name; each is a task, too.
         recordings: What `invertwin look` knows by the name of a file: the kind of its data, whose
@@ -198,6 +192,7 @@ class Registry:
     """
 
     def __init__(self) -> None:
+        self.built_in: tuple[str, ...] = ()
         self.sections: dict[str, Any] = {}
         self.commands: dict[str, Callable[..., Any]] = {}
         self.recordings: dict[str, tuple[str, str | None]] = {}
@@ -419,7 +414,7 @@ class Registry:
         """The groups, the library's own kinds before those of plugins."""
         if self._waiting is not None:
             waiting, self._waiting = self._waiting, None
-            for module in BUILT_IN:
+            for module in self.built_in:
                 pkgutil.resolve_name(f"{module}:register")(self)
             for entry in waiting:
                 self._enter(*entry)

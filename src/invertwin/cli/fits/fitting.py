@@ -38,6 +38,7 @@ from invertwin.inversion import (
     Observation,
     Reconstruction,
     Report,
+    Stage,
     Watch,
     reconstruct,
 )
@@ -112,15 +113,15 @@ def fit(
     part = f"{PARTS}/{mode}_{index:02d}"
     checkpoint = checkpoint or f"{part}.pt"
     own = varied(problem, mode)
-    again = partial(_staged, own, start, index, folder, checkpoint)
+    stages = schedule_of(own)
+    again = partial(_staged, own, stages, start, index, folder, checkpoint)
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
         return row, again
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    steps = sum(stage.steps for stage in schedule_of(own))
-    with watched(console, name, steps) as shown:
+    with watched(console, name, sum(stage.steps for stage in stages)) as shown:
         found = again(shown)
     row = {
         "start": index,
@@ -140,13 +141,14 @@ def fit(
 
 def _staged(
     problem: Problem,
+    stages: Sequence[Stage],
     start: Scene,
     index: int,
     folder: RunFolder,
     checkpoint: str,
     shown: Sequence[Report] = (),
 ) -> Reconstruction:
-    run, stages, watch = problem.run, schedule_of(problem), watch_of(problem)
+    run, watch = problem.run, watch_of(problem)
     for k in range(len(stages) - 1):
         folder.file(str(stage_file(Path(checkpoint), k)))
     every = run.measures.every if run.measures else 1
