@@ -27,7 +27,7 @@ nan 0 0
 3 0 1 2
 """
 MEASURED = (RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]).replace(
-    'kind = "simulated"\ndepth = 1\ndensity = 2e3\nsnr_db = 20.0',
+    'kind = "simulated"\ndepth = 1\npoints_per_m2 = 2e3\nsnr_db = 20.0',
     'kind = "capture"\nfile = "data.nc"',
 )
 RAIL = MEASURED.replace('"capture"\nfile = "data.nc"', '"rail_sar"\nfolder = "rail_sar"')

@@ -26,7 +26,7 @@ class SimulatedData(Section):
     """Exact signals of the true scene, with noise."""
 
     kind: Literal["simulated"]
-    density: Positive = key("rough points per m²")
+    points_per_m2: Positive = key("rough points per m²")
     samples: Count = key("coherent paths", 200_000)
     depth: Depth = key("most bounces of a path; with [chirps] it is one", 3)
     rough_paths: Count = key("paths of two bounces to draw, and of each number above", 200_000)

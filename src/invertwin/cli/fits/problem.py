@@ -240,7 +240,7 @@ def sampling_of(run: RunFile) -> Sampling:
 
 def points_per_m2(run: RunFile) -> float:
     """Points per m² of rough surfaces in exact signals: those of simulated data, or enough."""
-    return run.data.density if isinstance(run.data, SimulatedData) else _POINTS_PER_M2
+    return run.data.points_per_m2 if isinstance(run.data, SimulatedData) else _POINTS_PER_M2
 
 
 def models_of(problem: Problem) -> list[ForwardModel]:
