@@ -239,7 +239,12 @@ def _value(
 
 
 def without_effect(module: nn.Module, name: str) -> InputError:
-    """Make the error for a parameter that the loss does not depend on."""
+    """Make the error for a parameter that the loss does not depend on.
+
+    Args:
+        module: It has the parameter.
+        name: Of the parameter.
+    """
     return InputError(
         f"expected parameters that change the map, got {name} of {type(module).__name__}, which "
         "has no gradient; probably a later module overwrites this mesh: give one shape of each "

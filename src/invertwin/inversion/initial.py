@@ -93,8 +93,7 @@ def detected_points(
     Args:
         capture: the data.
         grid: bins of its maps.
-        low: corner of the box [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the box [m].
         false_alarm: probability that a cell of noise is detected.
 
     Raises:
@@ -158,8 +157,7 @@ def image_points(
     Args:
         capture: the data.
         grid: bins of its maps.
-        low: corner of the image in the world [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the image in the world [m].
         step: distance of neighbouring nodes, about [m].
         share: least brightness of a node, relative to the strongest.
 
@@ -378,8 +376,7 @@ def guess_density(
         grid: bins of its maps.
         item: the object; its pose carries the box.
         name: name of the object.
-        low: corner of the box in the object's frame [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the box in the object's frame [m].
         counts: nodes along x, y and z.
         depth: ∫σ ds of a way of one node spacing at the strongest echo.
 

@@ -266,11 +266,7 @@ class MoverMaps:
     point: Tensor
 
     def correlations(self, recording: ChirpCapture) -> dict[str, dict[str, float]]:
-        """Correlations of ``twin`` and ``bare_psf`` with a recording, on the same cells, by scale.
-
-        Args:
-            recording: One frame of chirps.
-        """
+        """Correlations of ``twin`` and ``bare_psf`` with a frame of chirps, by scale."""
         seen = self.model.observe(recording)[0]
         found = {}
         for scale in get_args(Scale):

@@ -75,8 +75,7 @@ def distances(
     """Distances from every place to every point [m].
 
     Args:
-        places: [m].
-        points: [m].
+        places, points: [m].
     """
     # The matrix product that cdist takes by default cancels digits.
     return torch.cdist(places, points, compute_mode="donot_use_mm_for_euclid_dist")

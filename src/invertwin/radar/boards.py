@@ -135,8 +135,7 @@ class Mounting:
 
     Attributes:
         board: where its elements are, or the name of a preset.
-        elevation: as in `Board.arrays`.
-        azimuth: as in `Board.arrays`.
+        elevation, azimuth: as in `Board.arrays`.
         transmitters: numbers from 1 in the order of sending; None = all, or those of a recording.
         receivers: numbers from 1, ascending; None = all, or those of a recording.
         pattern: gain of every element; None = isotropic.

@@ -70,11 +70,7 @@ class PhaseNoise:
             )
 
     def density(self, offset: Float64[Tensor, " offset"]) -> Float64[Tensor, " offset"]:
-        """One-sided S_φ(f) = 2 · 10^(L/10) [rad²/Hz].
-
-        Args:
-            offset: f > 0 [Hz].
-        """
+        """One-sided S_φ(f) = 2 · 10^(L/10) [rad²/Hz] at an offset f > 0 [Hz]."""
         if len(self.offsets) == 1:
             level = self.levels[0] - 20 * torch.log10(offset / self.offsets[0])
         else:

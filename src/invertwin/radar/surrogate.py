@@ -184,8 +184,7 @@ def surrogate_spectrum(
         surrogate: Kernels and their extra widths.
         sampling: How many paths are drawn.
         seed: Same seed, same spectrum.
-        scheme: See ``deposit_power``.
-        reference: See ``deposit_power``.
+        scheme, reference: See ``deposit_power``.
 
     Raises:
         InputError: See ``deposit_power``.

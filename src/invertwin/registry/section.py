@@ -52,7 +52,12 @@ InputPath = Annotated[str, MinLen(1), AfterValidator(_beside_run_file)]
 
 
 class KeyInputError(InputError):
-    """Bad input at a key of the run file."""
+    """Bad input at a key of the run file.
+
+    Args:
+        path: Of the key.
+        text: What is wrong.
+    """
 
     def __init__(self, path: str, text: str) -> None:
         super().__init__(f"{path}: {text}")
@@ -71,7 +76,13 @@ def about(path: str) -> Iterator[None]:
 
 
 def key(description: str, default: Any = ..., **limits: Any) -> Any:
-    """A key of a table: what it means and its default; without one it is required."""
+    """A key of a table.
+
+    Args:
+        description: What it means.
+        default: Its default; without one it is required.
+        limits: Of its value, as pydantic's ``Field`` takes them.
+    """
     return Field(default, description=description, **limits)
 
 
@@ -116,7 +127,13 @@ def tag_by(keys: tuple[str, ...], default: str | None = None) -> Discriminator:
 
 
 def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None:
-    """Keys that one kind needs and the others must not have."""
+    """Refuse keys that are missing, or that should not be there.
+
+    Args:
+        section: The table.
+        wanted: By name, whether the key must be there or must not.
+        when: In which case, for the error.
+    """
     for name, needed in wanted.items():
         if needed != (getattr(section, name) is not None):
             verb, do = ("", "add it") if needed else ("no ", "remove it")
@@ -124,5 +141,10 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
 
 
 def fail(text: str, path: str = "") -> NoReturn:
-    """An error of a whole section, or of the key `path` of the run file."""
+    """Raise an error of the run file.
+
+    Args:
+        text: What is wrong.
+        path: Of the key; without it the error is of the whole section.
+    """
     raise PydanticCustomError("section", "{text}", {"text": text, "path": path})

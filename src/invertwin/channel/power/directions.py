@@ -19,7 +19,12 @@ _TOWARDS = 0.5  # share of the directions that aim at other objects, where there
 
 
 class Directions:
-    """Draws directions on the side of a surface from which it is lit."""
+    """Draws directions on the side of a surface from which it is lit.
+
+    Args:
+        rays: Objects to aim at.
+        surfaces: Their lobes.
+    """
 
     def __init__(self, rays: RayScene, surfaces: Surfaces) -> None:
         centres, radii = rays.spheres

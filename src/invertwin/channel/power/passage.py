@@ -22,10 +22,10 @@ _CHANCE = 0.5
 
 @dataclass(frozen=True)
 class Passage:
-    """Transmittance of what lies on a segment (0 if blocked), and the extra length it adds."""
+    """What lies on a segment."""
 
-    transmittance: Any
-    extra: Any
+    transmittance: Any  # 0 if blocked
+    extra: Any  # length that it adds [m]
 
 
 def passage(rays: RayScene, inputs: Inputs, start: Any, end: Any, active: Any) -> Passage:

@@ -321,8 +321,7 @@ class SkinnedBody(ObjectModule):
         """Angles [rad] by which the sought joints of two meshes of the body differ, by name.
 
         Args:
-            found: the result.
-            truth: what it should be.
+            found, truth: the result, and what it should be.
         """
         a, b = (
             rotation_from_vector(self.template.rotations_of(mesh.vertices.detach()))

@@ -31,8 +31,7 @@ class DensityGrid(ObjectModule):
 
     Args:
         object: name of the object; its mesh is not seen any more.
-        low: corner of the box in the object's frame [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the box in the object's frame [m].
         density: extinction at the nodes [1/m], at least two along each axis. What is below
             0.001 of one over a spacing starts there.
         albedo: see ``Cloud``.
@@ -77,8 +76,7 @@ class DensityGrid(ObjectModule):
 
         Args:
             object: name of the object.
-            low: corner of the box in the object's frame [m].
-            high: the opposite corner [m].
+            low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
             item: the object; a cloud that it is already comes first.
             extinction: 1/m, of a cloud that fills the object's mesh; without it the whole box is
@@ -108,8 +106,7 @@ class DensityGrid(ObjectModule):
 
         Args:
             object: name of the object.
-            low: corner of the box in the object's frame [m].
-            high: the opposite corner [m].
+            low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
             depth: that ∫σ ds. Keep it small: what is opaque hides what lies behind it from the fit.
         """
