@@ -143,8 +143,7 @@ _choice: _Choice | None = None
 
 
 def prepare(
-    folders: Sequence[Path] | None = None,
-    probe: Callable[[str], Verdict] | None = None,
+    folders: Sequence[Path] | None = None, probe: Callable[[str], Verdict] | None = None
 ) -> None:
     """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM that passes, before Dr.Jit is imported.
 
@@ -297,11 +296,7 @@ def report() -> dict[str, Any]:
             **{name: _package_version(name) for name in ("torch", "drjit", "mitsuba")},
         },
         "llvm": {"chosen": chosen and _resolved(chosen), "candidates": examined},
-        "backend": {
-            "requested": requested,
-            "in_force": measured.pop("backend", None),
-            "gpu": gpu,
-        },
+        "backend": {"requested": requested, "in_force": measured.pop("backend", None), "gpu": gpu},
         "threads": measured.pop("threads", os.cpu_count()),
         "self_test": measured,
         "fix": fix,

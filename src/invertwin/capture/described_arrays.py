@@ -120,10 +120,7 @@ def read_chirps(path: str | Path) -> ChirpData:
 
 
 def write_chirps(
-    path: str | Path,
-    data: ChirpData,
-    file: str,
-    arrays: Elements | None = None,
+    path: str | Path, data: ChirpData, file: str, arrays: Elements | None = None
 ) -> None:
     """Write samples, bit for bit, and the description that `read_chirps` reads.
 

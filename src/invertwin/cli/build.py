@@ -112,9 +112,7 @@ def named(tables: Sequence[Any]) -> dict[str, Any]:
 
 
 def parameters(
-    tables: Sequence[Any],
-    scene: Scene,
-    objects: Mapping[str, ObjectTable] | None = None,
+    tables: Sequence[Any], scene: Scene, objects: Mapping[str, ObjectTable] | None = None
 ) -> list[nn.Module]:
     """The modules of the `[[parameters]]` tables; each starts as the object is, or as it says.
 

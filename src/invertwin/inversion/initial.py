@@ -79,12 +79,7 @@ class Rectangle:
 
 
 def detected_points(
-    capture: Capture,
-    grid: Grid,
-    low: ArrayLike,
-    high: ArrayLike,
-    *,
-    false_alarm: float = 1e-6,
+    capture: Capture, grid: Grid, low: ArrayLike, high: ArrayLike, *, false_alarm: float = 1e-6
 ) -> Float64[Tensor, "point 3"]:
     """Find echoes within a box of the world by ordered-statistics CFAR and its local maxima.
 

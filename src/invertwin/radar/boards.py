@@ -149,9 +149,7 @@ class Mounting:
     pattern: Pattern | None = None
 
     def arrays(
-        self,
-        transmitters: Sequence[int] | None = None,
-        receivers: Sequence[int] | None = None,
+        self, transmitters: Sequence[int] | None = None, receivers: Sequence[int] | None = None
     ) -> Elements:
         """TX (in the order of sending) and RX elements in use: its own, or those that recorded.
 

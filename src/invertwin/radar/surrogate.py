@@ -13,12 +13,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Link, Sampling, deposit_power
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
-from invertwin.radar.point_spread import (
-    airy,
-    airy_radii,
-    array_point_spread,
-    range_point_spread,
-)
+from invertwin.radar.point_spread import airy, airy_radii, array_point_spread, range_point_spread
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import Aperture, aperture
 from invertwin.radar.waveform import Waveform
@@ -67,10 +62,7 @@ class Surrogate:
         check_fields(self)
 
     def shape(
-        self,
-        deposit: Float[Tensor, "frame range u v"],
-        radar: Radar,
-        grid: Grid,
+        self, deposit: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
     ) -> Float[Tensor, "frame range u v"]:
         """Deposited power as the radar would show it on average over random phases.
 
@@ -190,13 +182,7 @@ def surrogate_spectrum(
         InputError: See ``deposit_power``.
     """
     deposit = deposit_power(
-        scene,
-        radar.link(),
-        grid,
-        sampling=sampling,
-        seed=seed,
-        scheme=scheme,
-        reference=reference,
+        scene, radar.link(), grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
     )
     return surrogate.shape(deposit, radar, grid)
 

@@ -560,9 +560,6 @@ def _joined(first: type[Table], second: type[Table]) -> type[Table]:
 
 @cache
 def _table_of_class(
-    kind: Any,
-    base: type[Table] = Table,
-    without: tuple[str, ...] = (),
-    checked: bool | None = None,
+    kind: Any, base: type[Table] = Table, without: tuple[str, ...] = (), checked: bool | None = None
 ) -> Any:
     return registry.table_of(kind, _title(kind.__name__), base, without=without, checked=checked)

@@ -10,14 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
 from annotated_types import Ge, Le, Len, Lt, MinLen
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Discriminator,
-    Field,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.errors import InputError

@@ -10,13 +10,7 @@ import torch
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
 from invertwin.cli import build
-from invertwin.cli.fits.problem import (
-    Problem,
-    points_per_m2,
-    settings_of,
-    sharp_models,
-    sought_of,
-)
+from invertwin.cli.fits.problem import Problem, points_per_m2, settings_of, sharp_models, sought_of
 from invertwin.cli.fits.shape_scores import shape_scores
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError

@@ -95,12 +95,7 @@ class DensityGrid(ObjectModule):
 
     @classmethod
     def even(
-        cls,
-        object: str,
-        low: ArrayLike,
-        high: ArrayLike,
-        counts: Sequence[int],
-        depth: float = 0.5,
+        cls, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int], depth: float = 0.5
     ) -> "DensityGrid":
         """Make a grid of one density σ, from ∫σ ds through the box along its longest side.
 
