@@ -145,7 +145,7 @@ class Group:
 class OneOf:
     """Annotates a key whose value is a table of a group."""
 
-    group: str
+    group: str  # its name
     base: type[Table] | None = None  # of these tables; None = the group's
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:

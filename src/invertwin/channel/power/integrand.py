@@ -198,7 +198,7 @@ def edge_ends(inputs: Inputs, first: Any, second: Any) -> tuple[Any, Any]:
 class Place:
     """A material point now; all but its surface is attached."""
 
-    position: Any
+    position: Any  # about the local origin [m]
     normal: Any  # of unit length
     jacobian: Any  # area of its triangle over that area detached: one in value
     surface: Any  # row of its surface
