@@ -37,7 +37,7 @@ def run_file(joints: Any = LEFT, scale: float = 1.0, **tables: Any) -> RunFile:
     return validate(run, Path("run.toml"))
 
 
-def test_every_sought_joint_starts_that_far_off_and_only_these():
+def test_every_free_joint_starts_that_far_off_and_only_these():
     run = run_file(scale=1.2)
     assert run.starts is not None
     scene = build.scene(run)

@@ -120,7 +120,7 @@ class ChirpCapture:
             if self.moving:
                 raise InputError(
                     "expected a parameter of kind mover, since the recording has chirps and "
-                    "movers, which fade in the mean of the chirps; seek a mover, or choose one "
+                    "movers, which fade in the mean of the chirps; fit a mover, or choose one "
                     "`chirp`"
                 )
             beat = self.beat.mean(dim=1)

@@ -115,10 +115,10 @@ class Fit:
         self._observed = [observation.observed().detach() for observation in observations]
         losses = tuple(o.loss or settings.loss for o in observations)
         self.objective = Objective(losses, tuple(o.weight for o in observations))
-        sought = [p for p in self.modules.parameters() if p.requires_grad]
-        if not sought or stage.steps < 1:
+        free = [p for p in self.modules.parameters() if p.requires_grad]
+        if not free or stage.steps < 1:
             raise InputError(
-                f"expected parameters to fit and steps >= 1, got {len(sought)} and "
+                f"expected parameters to fit and steps >= 1, got {len(free)} and "
                 f"{stage.steps}; give modules such as Pose('object')"
             )
         rules = stage.optimizer or settings.optimizer

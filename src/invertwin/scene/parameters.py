@@ -323,7 +323,7 @@ class MaterialValues(nn.Module):
 
         Args:
             object: name of the object.
-            values: which are sought.
+            values: names of those that are fitted.
             item: the object.
             layer: of a multilayer, from 0: the layer whose values they are.
 

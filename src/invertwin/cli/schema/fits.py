@@ -22,7 +22,7 @@ class _StartsTable(Table):
 
     object: str = key("name in the scene")
     joint_deg: NonNegative = key(
-        "turn of each sought joint of a body, about a random axis among its own", 0.0
+        "turn of each free joint of a body, about a random axis among its own", 0.0
     )
     seed: Seed | None = key("without it the run's", None)
 
@@ -50,13 +50,13 @@ class Budget(registry.table_of(Schedule, "Schedule", SAMPLED)):
 class Reconstruct(Budget):
     """The fit: its budget, and what counts as a success."""
 
-    parameters: list[str] = key("names of what is sought; empty = all", [])
+    parameters: list[str] = key("names of the parameters that are fitted; empty = all", [])
     observations: list[str] = key("names of the sensors that are fitted; empty = all", [])
     checkpoint_every: Count = key("steps", 10)
     nuisances: list[Literal["range_bias", "clock_offset"]] = key("fitted along", [])
     position_limit: Positive = key("m, of a success", 0.03)
     rotation_limit_deg: Positive = key("of a success", 3.0)
-    joint_limit_deg: Positive = key("of a success, mean over the sought joints of a body", 5.0)
+    joint_limit_deg: Positive = key("of a success, mean over the free joints of a body", 5.0)
 
 
 def _checked(value: Any, check: Callable[[Any], Any]) -> Any:

@@ -115,7 +115,9 @@ class _RunFile(Section):
     observations: dict[str, ObservationTable] = key(
         "[observations.<name>]: several sensors, each with its own data", {}
     )
-    parameters: list[Annotated[Any, OneOf("parameter")]] = key("[[parameters]]: what is sought", [])
+    parameters: list[Annotated[Any, OneOf("parameter")]] = key(
+        "[[parameters]]: what is unknown", []
+    )
     starts: AnyStarts | None = key("where fits start; without it where the scene says", None)
     initial: AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
@@ -175,8 +177,8 @@ class _RunFile(Section):
             own = set(used.parameters) or own
         for i, stage in enumerate(self.stages):
             _named("parameters", stage.parameters, names, f"stages[{i}].parameters")
-            sought = own & set(stage.parameters or names)
-            if stage.remesh and sought and not sought & free:
+            fitted = own & set(stage.parameters or names)
+            if stage.remesh and fitted and not fitted & free:
                 fail(
                     'expected a parameter with kind = "vertices" among those of the stage, got '
                     "none; add one, or remove `remesh`",
@@ -185,7 +187,7 @@ class _RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _turned_joints_are_sought(self) -> "_RunFile":
+    def _turned_joints_are_fitted(self) -> "_RunFile":
         if self.starts is not None and self.starts.joint_deg > 0:
             name = self.starts.object
             if not any(p.kind == "body" and p.object == name for p in self.parameters):
@@ -238,7 +240,7 @@ class _RunFile(Section):
 
     @property
     def unknowns(self) -> dict[str, Any]:
-        """The tables of what is sought, and of what a gradient check moves, by path."""
+        """The tables of what is unknown, and of what a gradient check moves, by path."""
         found = {f"parameters[{i}]": table for i, table in enumerate(self.parameters)}
         own = {} if self.gradcheck is None else {"gradcheck.parameter": self.gradcheck.parameter}
         return found | own
