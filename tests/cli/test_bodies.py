@@ -172,7 +172,7 @@ def test_bad_tangents(parameter, tangent, message):
         checked(parameter, tangent)
 
 
-def test_joints_that_nobody_seeks_are_not_turned():
+def test_joints_that_are_not_fitted_are_not_turned():
     pose = [{"kind": "pose", "object": "person"}]
     with pytest.raises(InputError, match=r'starts.joint_deg: expected .* kind = "body" of person'):
         run_file(parameters=pose)

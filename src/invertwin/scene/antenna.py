@@ -54,7 +54,7 @@ class Isotropic(Pattern):
 
 @dataclass(frozen=True)
 class Cosine(Pattern):
-    """Gain 2(n+1) cosⁿθ before the antenna and 0 behind it; its integral is 4π.
+    """Gain 2(n+1) cosⁿθ in front of the antenna and 0 behind it; its integral is 4π.
 
     The table departs from it by at most 1.2e-7 n(n−1) of the peak gain for n ≥ 1.
 
