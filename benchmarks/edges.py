@@ -7,8 +7,8 @@ the received power with respect to a shift of the body has a part from the shado
 cast on each other (family 2). The benchmark estimates this part with weighted edge sampling and
 with uniform edge sampling (edges by length alone, directions from the whole sphere), in turns, with
 the same numbers of samples and seeds. It prints a table and writes `metrics.json` into DIR (default
-`out/edges`). For a plate, whose four edges are open, and for a ball, a closed mesh of nearly flat edges,
-`edge_sampling.<body>.variance_ratio` is variance × time of uniform sampling over that of the
+`out/edges`). For a plate, whose four edges are open, and for a ball, a closed mesh of nearly flat
+edges, `edge_sampling.<body>.variance_ratio` is variance × time of uniform sampling over that of the
 weighted one (> 1: the weighted one is better); `edge_sampling.variance_ratio` is the lesser.
 """
 

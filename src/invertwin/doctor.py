@@ -1,4 +1,4 @@
-"""Is this machine fit to trace rays? Chooses a libLLVM that works, reports, names the cure.
+"""Check whether this machine can trace rays: choose a libLLVM that works, report, name the cure.
 
 On the CPU, Dr.Jit compiles its kernels with the system's libLLVM. Some versions are refused, and
 some load and then abort the whole process in the first kernel with a minimum or a maximum, which
@@ -147,7 +147,7 @@ def prepare(
 ) -> None:
     """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM that passes, before Dr.Jit is imported.
 
-    ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require` does as
+    ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require` raises as
     soon as rays are needed. A path set by the user is kept if it passes, and replaced with a
     warning if not. Nothing is done when ``INVERTWIN_BACKEND=cuda``, nor on a second call.
 

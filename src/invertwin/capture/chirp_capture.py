@@ -24,7 +24,7 @@ class ChirpCapture:
         chirps: Timing of the ramps.
         frame_period: Time between the starts of two frames [s]; None = not known.
         real: Whether the samples were real: their analytic signal holds up to half the range.
-        moving: Whether what it shows moves, and fades in the mean of a frame's chirps.
+        moving: Whether its echoes move, and so fade in the mean of a frame's chirps.
 
     Raises:
         InputError: Samples that are not complex, or a shape that radar and timing do not have.

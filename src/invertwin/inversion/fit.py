@@ -39,7 +39,7 @@ class Progress:
         step: Steps done.
         history: One row a step.
         best: Step, loss and parameters of the lowest loss.
-        ended: How the fit has ended, once it has.
+        ended: The status, once the fit has ended.
     """
 
     first: dict[str, Tensor]

@@ -1,7 +1,7 @@
 """First guesses of pose, size and density by conventional processing.
 
-Detected points or backprojected echoes tell where an object is. A rectangle in the ground plane
-tells how it stands. The fit does the rest. Nothing here is differentiable.
+Detected points or backprojected echoes show where an object is. A rectangle in the ground plane
+shows how it stands. The fit does the rest. Nothing here is differentiable.
 """
 
 import math
@@ -260,8 +260,8 @@ def guess_poses(
 
     Its upright attitude and its height are kept. Each side that faces the radar is put where the
     rectangle has it, so that the hidden part of the object lies behind; along an axis on which
-    the radar faces no side, the middles agree. A rectangle tells no front from back, nor for
-    certain length from width: ``best_pose`` chooses.
+    the radar faces no side, the middles agree. A rectangle does not tell front from back, nor
+    always length from width: ``best_pose`` chooses.
 
     Args:
         item: the object; its present pose gives attitude and height.

@@ -142,7 +142,7 @@ def losses_along(
 
 
 class _Field(nn.Module):
-    """The distance of a shape as a module's own call."""
+    """A module whose call is the distance of a shape."""
 
     def __init__(self, shape: nn.Module) -> None:
         super().__init__()

@@ -24,7 +24,7 @@ Maps = Sequence[tuple[Tensor, Tensor]]
 
 
 def relative_error(simulated: Tensor, measured: Tensor) -> Tensor:
-    """``mean|a − b|² / mean|b|²``, of maps of any form: also of complex signals.
+    """``mean|a − b|² / mean|b|²`` of maps of any form, also of complex signals.
 
     Args:
         simulated: a.
@@ -46,7 +46,7 @@ class SpectrumLoss:
         kind: ``mse``: ``mean((g a − b)²) / mean(b²)``. ``likelihood``: the Itakura–Saito
             divergence ``mean(q − log q − 1)``, ``q = (b + n) / (g a + n)``, which is the
             likelihood of fully developed speckle (power with an exponential distribution, or
-            gamma after averaging). It weighs weak and strong echoes by what they tell, so that
+            gamma after averaging). It weighs weak and strong echoes by their information, so that
             the speckle of a bright wall does not drown a dim object.
         levels: Number of resolutions.
         gain: ``fitted``, or ``one`` for calibrated data.

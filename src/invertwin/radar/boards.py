@@ -28,9 +28,9 @@ Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
 class Board:
     """Where the elements of a board are, in half wavelengths.
 
-    Columns (x) and rows (y) are those of the source, but for the columns of ``antGeometry0``, which
-    are taken with the other sign, so that they grow with the numbers of the elements. A table of
-    one's own is one more ``Board``.
+    Columns (x) and rows (y) are those of the source. Only the columns of ``antGeometry0`` have the
+    other sign here, so that they grow with the numbers of the elements. For another board, make a
+    ``Board`` of your own.
 
     Differs from the source: the sources count the columns and rows of TX and of RX each from an
     origin of its own and do not say how far apart these are. Here TX and RX are each centred at

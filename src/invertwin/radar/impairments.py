@@ -175,7 +175,7 @@ class Impairments:
             chirps: Timing of a train, as for ``moving_beat``; None = one ramp a frame.
 
         Raises:
-            InputError: As the single functions.
+            InputError: As ``noisy_oscillator_beat``, ``add_noise`` and ``quantize``.
         """
         if self.phase_noise is not None:
             stream = _streams(seed)[0]

@@ -167,7 +167,7 @@ def surrogate_spectrum(
     scheme: Literal["rays", "area"] = "rays",
     reference: tuple[Scene, Link] | None = None,
 ) -> Float[Tensor, "frame range u v"]:
-    """Power spectrum of a scene, differentiable in it: deposit, then shape.
+    """Power spectrum of a scene, differentiable with respect to it: deposit, then shape.
 
     Args:
         scene: What is seen.

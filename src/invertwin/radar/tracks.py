@@ -26,8 +26,8 @@ def arc(
 
     Args:
         center, radius: m.
-        start: 0 is on the −z side of the centre.
-        stop: 90° is on its +x side.
+        start: first angle; 0 is on the −z side of the centre.
+        stop: last angle; 90° is on the +x side.
         count: positions.
     """
     angle = _linspace(start, stop, count)

@@ -1,4 +1,4 @@
-"""What a run file may name: constructors by group and kind, sections, commands; also of plugins.
+"""What run files may name: constructors by group and kind, sections, commands, those of plugins too.
 
 A constructor is a class or a function. Its signature, its annotations and its docstring become a
 table of the run file: keys, defaults, limits and their meaning are stated there and nowhere else.
@@ -213,7 +213,7 @@ class Registry:
         untagged: bool = False,
         checked: bool | None = None,
     ) -> None:
-        """Adds a kind.
+        """Add a kind.
 
         Args:
             group: Such as "material", "shape", "waveform", "pattern", "array", "board", "track",

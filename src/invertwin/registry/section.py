@@ -59,7 +59,7 @@ class KeyInputError(InputError):
 
 @contextmanager
 def about(path: str) -> Iterator[None]:
-    """Errors of the library with the key of the run file that they are about."""
+    """Add the key of the run file to errors of the library."""
     try:
         yield
     except KeyInputError as error:
@@ -99,7 +99,7 @@ class Section(BaseModel):
 
 
 def tag_by(keys: tuple[str, ...], default: str | None = None) -> Discriminator:
-    """A union's member by the first of `keys` that is present.
+    """Choose a union's member by the first of `keys` that is present.
 
     Args:
         keys: `kind` or `shape` tell the member by their value, others by their presence.

@@ -138,9 +138,9 @@ class Table(Pattern):
         """A measured power pattern in decibels.
 
         Args:
-            theta: from 0 at boresight.
+            theta: angles to boresight, from 0 on [rad].
             gain_db: one row per theta, one column per phi.
-            phi: one: symmetric about boresight.
+            phi: angles about boresight [rad]; a single one means symmetric about boresight.
 
         Raises:
             InputError: as the pattern itself, or rows of other lengths.

@@ -1,7 +1,7 @@
 """Where a path goes on from a surface: towards other objects, or along the lobes of the surface.
 
-Both ways are drawn from, and the density is that of their mixture, so that small bright objects
-and narrow lobes are both found. Detached.
+Directions come from both ways, with the probability density of their mixture, so that small bright
+objects and narrow lobes are both found. Detached.
 """
 
 from typing import Any

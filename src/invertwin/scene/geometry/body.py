@@ -33,10 +33,10 @@ class BodyTemplate:
         weights: share of every joint in every vertex, rows that add up to 1.
         parents: joint that each joint hangs on, always an earlier one; −1 for the first, the root.
         joints: rest positions of the joints [m].
-        shape_directions: how the vertices follow shape coordinates [m]; None has none.
+        shape_directions: how the vertices follow shape coordinates [m]; None: there are none.
         joint_directions: how the joints follow them [m].
         pose_directions: how the rest positions follow the rotations, last axis the elements of
-            R − I of all joints but the root's, row by row; None does not follow.
+            R − I of all joints but the root's, row by row; None: they do not follow.
         names: of the joints; empty where they have none.
 
     Raises:
@@ -387,7 +387,7 @@ def articulated_template(
 def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
     """A body in the layout of SMPL's ``.npz`` files, which users obtain under its own licence.
 
-    Read are ``v_template`` [v, 3], ``f``, ``weights`` [v, j], ``kintree_table`` [2, j],
+    It reads ``v_template`` [v, 3], ``f``, ``weights`` [v, j], ``kintree_table`` [2, j],
     ``J_regressor`` [j, v], ``shapedirs`` [v, 3, n] and, if there, ``posedirs`` [v, 3, 9 (j − 1)].
 
     Args:

@@ -24,7 +24,7 @@ _FAINTEST = 1e-3
 
 
 class DensityGrid(ObjectModule):
-    """An object seen as a cloud of soft scatterers, by densities at the nodes of a grid.
+    """An object as a cloud of soft scatterers, given by densities at the nodes of a grid.
 
     ``σ = softplus(value) / h``, with h the mean spacing of the nodes. At a value of 0 one cell
     holds back half of the power. Learning rates of about 0.1 suit all grids.
@@ -70,20 +70,20 @@ class DensityGrid(ObjectModule):
         item: Object,
         extinction: Positive | None = None,
     ) -> "DensityGrid":
-        """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else as
-        `extinction` says. Rates of about 0.1 suit it; measures and pictures show the surface of its
-        usual level.
+        """A cloud of soft scatterers. It starts as the echoes that [initial] finds, else as
+        `extinction` says. Rates of about 0.1 suit it. Measures and pictures show the surface where
+        the density is half of its maximum.
 
         Args:
             object: name of the object.
             low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
-            item: the object; a cloud that it is already comes first.
+            item: the object; if it is a cloud already, this cloud is the start.
             extinction: 1/m, of a cloud that fills the object's mesh; without it the whole box is
                 faint.
 
         Raises:
-            InputError: as above.
+            InputError: what the class refuses.
         """
         if item.cloud is not None:
             return cls(object, item.cloud.low, item.cloud.high, item.cloud.density.detach())
@@ -103,7 +103,7 @@ class DensityGrid(ObjectModule):
             object: name of the object.
             low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
-            depth: that ∫σ ds. Keep it small: what is opaque hides what lies behind it from the fit.
+            depth: ∫σ ds. Keep it small: an opaque cloud hides from the fit what lies behind.
         """
         lattice = Lattice.between(low, high, counts)
         whole = checked_number(depth, "optical depth", 0.0, open_low=True)
@@ -183,7 +183,7 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
 def without_clouds(scene: Scene) -> Scene:
     """Replace every cloud of a scene by its surface, for exact signals and pictures.
 
-    An even cloud has no such surface: its object keeps the mesh that marked its place.
+    A cloud of one density has no such surface: its object keeps the mesh that marked its place.
     """
     for name, item in scene.objects.items():
         if item.cloud is not None:

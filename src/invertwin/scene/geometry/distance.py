@@ -120,7 +120,7 @@ class DistanceGrid(_Distance):
             low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
             distance: signed distance [m] of points [p, 3], negative inside.
-            smoothing: λ, as above.
+            smoothing: λ of the class.
         """
         lattice = Lattice.between(low, high, counts)
         with torch.no_grad():
@@ -144,10 +144,10 @@ class DistanceGrid(_Distance):
             low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
             mesh: in the object's frame.
-            smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = none.
+            smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = no preconditioning.
 
         Raises:
-            InputError: as above.
+            InputError: what the class refuses.
         """
         return cls.sampled(object, low, high, counts, partial(signed_distance, mesh), smooth)
 
