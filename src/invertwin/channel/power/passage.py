@@ -15,8 +15,8 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, RayScene
 
 _MOST = 32  # surfaces that a segment may pass
-# Probability of passing a sheet on which the ray may end. It is not the transmittance: a probability
-# that follows the material would throw the dice anew under differences.
+# Probability of passing a sheet on which the ray may end. It is not the transmittance: a
+# probability that follows the material would throw the dice anew under differences.
 _CHANCE = 0.5
 
 
