@@ -229,7 +229,8 @@ class _Kernel:
         matrix = lags.flip(0).unfold(0, count, 1).flip(0)
         if dim == power.ndim - 1:
             return power @ matrix.T
-        return (matrix @ power.flatten(dim + 1)).reshape(power.shape)
+        first = power.transpose(1, dim)  # one large product a frame, not one a row
+        return (matrix @ first.flatten(2)).reshape(first.shape).transpose(1, dim)
 
 
 @lru_cache(maxsize=16)
