@@ -61,7 +61,7 @@ class ChirpTable(DataTable, Posed):
     """Raw chirps of a board, made one signal per frame."""
 
     chirp: Annotated[int, Ge(0)] | None = key(
-        "number of one chirp, from 0; without it the mean of a frame's chirps, in which movers fade",
+        "number of one chirp, from 0; without it the mean over a frame, in which movers fade",
         None,
     )
     frame: Annotated[int, Ge(0)] | None = key(

@@ -135,9 +135,9 @@ class MovingBody(nn.Module):
 
     Its axes are across the line of sight to the start, up, and along this line. The body moves in
     the plane of the first and the last axis. Its height is fitted if the antennas resolve it.
-    Motion across the line of sight and a turn look much alike: for a body that does not turn, hold
-    the turn. Maps a scene to the scene with the body where it is in the middle of the frame, and with
-    the velocity of each of its vertices.
+    Motion across the line of sight and a turn look much alike: hold the turn of a body that does
+    not turn. The module puts the body into a scene: where it is in the middle of the frame, and
+    with a velocity of each of its vertices.
 
     Attributes:
         echo: Where it started.

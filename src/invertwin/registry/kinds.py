@@ -1,4 +1,4 @@
-"""What run files may name: constructors by group and kind, sections, commands, those of plugins too.
+"""What run files may name: constructors by group and kind, sections, commands; also of plugins.
 
 A constructor is a class or a function. Its signature, its annotations and its docstring become a
 table of the run file: keys, defaults, limits and their meaning are stated there and nowhere else.
