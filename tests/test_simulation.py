@@ -14,6 +14,7 @@ from scenes import float64, occluder, radar, relative, thing
 FEW = Sampling(points_per_m2=200.0)
 
 
+@pytest.mark.slow
 def test_exact_signals_and_surrogate_have_one_shape_and_one_unit():
     """Averaged over speckle, the exact spectrum is the surrogate's."""
     device = radar([[x, y, 0.0] for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.1, 0.1)])

@@ -88,6 +88,7 @@ def test_simulate_of_nothing_visible_is_silence(run_file, monkeypatch):
     assert read_metrics(run_file.parent / "out" / "small")["peak_power_db"] is None
 
 
+@pytest.mark.slow
 def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     landscape = '[landscape]\nobject = "plate"\naxis = [0.0, 0.0, 1.0]\npoints = 3\n'
     run_file.write_text(RUN + landscape + "exact_points = 21\n")

@@ -211,6 +211,7 @@ def test_a_train_is_written_as_arrays_and_as_raw_files(train):
     assert cfg.waveform == FMCW(77e9, 2e9, 32e-6, 64)
 
 
+@pytest.mark.slow
 def test_trains_are_impaired(train, tmp_path, monkeypatch):
     """Channel errors alone: every channel keeps its signal but for one factor."""
     monkeypatch.chdir(tmp_path)

@@ -134,6 +134,7 @@ def test_splitting_keeps_the_area():
     assert np.isclose(area(small), area(triangles))
 
 
+@pytest.mark.slow
 def test_a_turntable_turns_once():
     """An eye on the axis of symmetry sees a cube of four equal sides four times."""
     gif = plotting.turntable({"truth": box(1.0), "twin": box(1.0)}, up=[0.0, 1.0, 0.0])

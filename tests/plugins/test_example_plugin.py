@@ -145,6 +145,7 @@ def test_a_capture_keeps_the_waveform_of_a_plugin(call, tmp_path):
     assert metrics["steps"] == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -169,6 +170,7 @@ def test_errors_know_what_a_plugin_adds(call, tmp_path, old, new, said):
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_keys_and_schema_list_what_a_plugin_adds(call):
     assert "lean_deg" in call("keys", "scene")
     assert "m², that they stand on" in call("keys", "survey")

@@ -127,6 +127,7 @@ def test_a_pulse_of_ones_own(linear):
     assert (shaped - expected).abs().max() < 0.02
 
 
+@pytest.mark.slow
 def test_mean_over_phase_seeds(linear, point_paths):
     """The mean by brute force: 400 draws of the phases of one cloud, one per frame."""
     seeds = 400

@@ -35,6 +35,7 @@ def test_sections_and_commands_are_there():
     assert {"loss-scan", "train-prior"} <= {command.name for command in app.app.registered_commands}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("section", ["methods", "loss_scan"])
 def test_a_bare_wheel_says_what_to_install(tmp_path, section):
     text = RUN.replace('task = "reconstruct"', 'task = "gradcheck"')
@@ -46,6 +47,7 @@ def test_a_bare_wheel_says_what_to_install(tmp_path, section):
     assert "install the studies: pip install -e ./experiments/studies" in ended.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["openradar", "rail_sar"])
 def test_a_bare_wheel_says_what_reads_a_public_recording(tmp_path, kind):
     head, rest = RUN.split("[data]", 1)

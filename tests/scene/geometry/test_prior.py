@@ -59,6 +59,7 @@ def test_the_packaged_model_is_small():
     assert 16 <= PRIOR.latent_size <= 32
 
 
+@pytest.mark.slow
 def test_loads_without_network_and_decodes_in_slices():
     """512³ numbers would take 1 GB; a plane and its parts take some 10 MB."""
     ended = subprocess.run(
