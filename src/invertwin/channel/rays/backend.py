@@ -99,7 +99,7 @@ def tracing(name: str | None = None) -> Iterator[None]:
 
 
 def _after_fork() -> None:
-    """In a forked child the threads of the ray tracer and of torch are gone; none waits for them."""
+    """In a forked child the threads of the ray tracer and of torch are gone; nobody waits."""
     global _forked
     _forked = _forked or _loaded.cache_info().currsize > 0
     if _forked:
