@@ -32,7 +32,12 @@ from invertwin.scene import RoughDielectric, Translation, linear_array, rigid, s
 REPETITIONS, STEPS, SECONDS = 20, 12, 600.0
 BALL = sphere(0.15, 2)  # one mesh, whose copy in the ray tracer all fits share
 #: Optimiser, bounces and seed of every fit.
-FITS = (("adam", 1, 1), ("adam", 2, 2), ("gauss_newton", 1, 3), ("adam", 1, 4))
+FITS = (
+    (Optimizer("adam"), 1, 1),
+    (Optimizer("adam"), 2, 2),
+    (Optimizer("gauss_newton"), 1, 3),
+    (Optimizer("adam"), 1, 4),
+)
 REQUIRED: Required = {"largest_difference": ("<=", 1e-6), "aborts": ("<=", 0)}
 COUNTED = {
     "largest_difference": "between threads and one after the other [m]",
@@ -42,7 +47,7 @@ COUNTED = {
 }
 
 
-def fitted(kind: str, depth: int, seed: int, steps: int) -> Tensor:
+def fitted(optimizer: Optimizer, depth: int, seed: int, steps: int) -> Tensor:
     """Where a fit finds a ball [m]."""
     ball = iw.Object(BALL, RoughDielectric(4.0), rigid(translation=[0.1, 0.0, 2.1]))
     scene = iw.Scene({"ball": ball})
@@ -59,7 +64,7 @@ def fitted(kind: str, depth: int, seed: int, steps: int) -> Tensor:
         iw.Observation(model, radar, iw.Capture.from_beat(data.beat, radar)),
         Translation("ball", axes="xz"),  # a row of antennas does not tell y
         loss=iw.SpectrumLoss(kind="likelihood"),
-        optimizer=Optimizer(kind),
+        optimizer=optimizer,
         schedule=iw.Schedule(steps),
         seed=seed,
     )
@@ -73,10 +78,11 @@ def apart(first: Sequence[Tensor], second: Sequence[Tensor]) -> float:
 
 def compared(steps: int) -> dict[str, float]:
     """One repetition, in this process."""
-    serial = [fitted(*fit, steps) for fit in FITS]
-    again = [fitted(*fit, steps) for fit in FITS]
+    serial = [fitted(*fit, steps=steps) for fit in FITS]
+    again = [fitted(*fit, steps=steps) for fit in FITS]
     with ThreadPoolExecutor(len(FITS)) as pool:
-        together = list(pool.map(lambda fit: fitted(*fit, steps), FITS))
+        running = [pool.submit(fitted, *fit, steps=steps) for fit in FITS]
+    together = [fit.result() for fit in running]
     return {
         "largest_difference": apart(serial, together),
         "serial_difference": apart(serial, again),

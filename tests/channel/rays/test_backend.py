@@ -24,6 +24,7 @@ def slope(seed):
     scene = scene.replace("occluder", pose=pose)
     found = deposit_power(scene, link(), GRID, sampling=FEW, seed=seed)
     found.sum().backward()
+    assert shift.grad is not None
     return found.detach(), shift.grad
 
 
