@@ -42,7 +42,7 @@ class Manifest(BaseModel):
 
 @contextmanager
 def in_one_line(do: str) -> Iterator[None]:
-    """Tells what the file system refuses as an InputError, with more that one can do."""
+    """Tell what the file system refuses as an InputError, with more that one can do."""
     try:
         yield
     except OSError as error:
@@ -61,7 +61,7 @@ def not_ours(path: Path, name: str) -> InputError:
 
 
 def lock_folder(path: Path, held: ExitStack) -> None:
-    """Locks a folder until the stack is closed, or the process dies."""
+    """Lock a folder until the stack is closed, or the process dies."""
     file = path / LOCK
     if file.is_symlink() or (file.exists() and (not file.is_file() or file.stat().st_size)):
         raise not_ours(path, LOCK)
@@ -99,7 +99,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def save_manifest(path: Path, manifest: Manifest) -> None:
-    """Writes the manifest, the old or the new one whole."""
+    """Write the manifest, the old or the new one whole."""
     with replacing(path / MANIFEST) as part:
         part.write_text(manifest.model_dump_json(indent=1), encoding="utf-8")
 
@@ -118,14 +118,14 @@ def place_in(path: Path, name: str) -> Path:
 
 
 def require_free(path: Path, name: str, own: Iterable[str]) -> None:
-    """Refuses a name at which something lies that is no file of our own."""
+    """Refuse a name at which something lies that is no file of our own."""
     place = place_in(path, name)
     if os.path.lexists(place) and (name not in own or place.is_symlink() or place.is_dir()):
         raise not_ours(path, name)
 
 
 def moved(path: Path, manifest: Manifest) -> Manifest:
-    """Puts the files of a complete run in their places; goes on where a kill has cut it short."""
+    """Put the files of a complete run in their places; go on where a kill has cut it short."""
     work = manifest.unfinished
     assert work is not None
     results = [name for name in work.files if not name.startswith(f"{PARTS}/")]
@@ -141,7 +141,7 @@ def moved(path: Path, manifest: Manifest) -> Manifest:
 
 
 def without_unfinished(path: Path, manifest: Manifest) -> Manifest:
-    """Removes what an unfinished run has left."""
+    """Remove what an unfinished run has left."""
     if manifest.unfinished is None:
         return manifest
     _remove(path, [f"{UNFINISHED}/{name}" for name in manifest.unfinished.files])
@@ -155,7 +155,7 @@ def without_unfinished(path: Path, manifest: Manifest) -> Manifest:
 
 
 def _remove(path: Path, names: Iterable[str]) -> None:
-    """Removes files, the drafts of them that a kill has left, and folders that are then empty."""
+    """Remove files, the drafts of them that a kill has left, and folders that are then empty."""
     for name in names:
         place = place_in(path, name)
         drafts = place.parent.glob(f".{escape(place.stem)}.*.part{escape(place.suffix)}")
@@ -167,6 +167,6 @@ def _remove(path: Path, names: Iterable[str]) -> None:
 
 
 def remove_empty(folder: Path) -> None:
-    """Removes a folder if nothing is in it."""
+    """Remove a folder if nothing is in it."""
     with suppress(OSError):
         folder.rmdir()

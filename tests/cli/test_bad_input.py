@@ -34,7 +34,7 @@ RAIL = MEASURED.replace('"capture"\nfile = "data.nc"', '"rail_sar"\nfolder = "ra
 SOUGHT = 'kind = "translation"\nobject = "plate"'
 
 
-def sought(values: str) -> str:
+def fitted(values: str) -> str:
     return RUN.replace(SOUGHT, f'kind = "material"\nobject = "plate"\nvalues = {values}')
 
 
@@ -120,12 +120,12 @@ def folder(run_file, monkeypatch):
         ),
         pytest.param(BEHIND, ["map with power", "check the grid"], id="behind the radar"),
         pytest.param(
-            sought('["diffuse"]'),
+            fitted('["diffuse"]'),
             ["parameters[0].values, material of plate: ", "got 1", "start away from the end"],
             id="diffuse = 1",
         ),
         pytest.param(
-            sought('["conductivity"]'),
+            fitted('["conductivity"]'),
             ["parameters[0].values, material of plate: ", "got 0", "start away from the end"],
             id="conductivity = 0",
         ),

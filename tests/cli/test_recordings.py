@@ -23,7 +23,7 @@ BOARD = {"name": "xWR1843", "elevation": -1, "transmitters": [1, 3, 2]}
 WAVE = RADAR["waveform"]
 MEASURED = RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]
 SIMULATED = 'kind = "simulated"\ndepth = 1\npoints_per_m2 = 2e3\nsnr_db = 20.0\n'
-# The plate before the wall, seen by a board with two transmitters.
+# The plate in front of the wall, seen by a board with two transmitters.
 TRAIN = (
     (
         RUN[: RUN.index("[radar]")].replace(

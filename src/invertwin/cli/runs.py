@@ -104,12 +104,12 @@ class RunFolder:
         return path
 
     def write_bytes(self, name: str, data: bytes) -> None:
-        """Writes a result file so that a kill leaves the old or the new one, never half of it."""
+        """Write a result file so that a kill leaves the old or the new one, never half of it."""
         with replacing(self.file(name)) as part:
             part.write_bytes(data)
 
     def write_figure(self, name: str, figure: "Figure") -> bytes:
-        """Writes a figure as PNG, and returns its bytes."""
+        """Write a figure as PNG, and return its bytes."""
         from invertwin.plotting import png_bytes
 
         png = png_bytes(figure)
@@ -117,11 +117,11 @@ class RunFolder:
         return png
 
     def write_text(self, name: str, text: str) -> None:
-        """Writes a result file as UTF-8, in the way of `write_bytes`."""
+        """Write a result file as UTF-8, in the way of `write_bytes`."""
         self.write_bytes(name, text.encode("utf-8"))
 
     def write_json(self, name: str, value: Any) -> None:
-        """Writes a JSON file; tensors and arrays become lists, numbers that are not finite null."""
+        """Write a JSON file; tensors and arrays become lists, numbers that are not finite null."""
         text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
         self.write_text(name, text + "\n")
 
@@ -144,7 +144,7 @@ class RunFolder:
 def open_run(
     path: Path, runs: Mapping[str, Any], *, overwrite: bool = False, resume: bool = False
 ) -> RunFolder:
-    """Takes a folder for a run and writes the run files as used into it.
+    """Take a folder for a run and write the run files as used into it.
 
     Args:
         path: The folder; made with its parents when it does not exist.
@@ -209,7 +209,7 @@ def _nothing_to_resume(path: Path) -> InputError:
 
 
 def _require_room(path: Path, manifest: Manifest, stems: Iterable[str], overwrite: bool) -> None:
-    """Refuses a folder with results that are not to be replaced, or not ours to replace."""
+    """Refuse a folder with results that are not to be replaced, or not ours to replace."""
     found = [name for name in manifest.files if (path / name).exists()]
     if not overwrite and (found or _resumable(path, manifest)):
         what = f"{found[0]} in it" if found else "an interrupted run"

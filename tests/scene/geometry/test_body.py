@@ -133,8 +133,8 @@ def test_gradients_both_ways(tmp_path, at):
     assert gradcheck(vertices, inputs, check_forward_ad=True)
 
 
-def test_only_the_sought_joints_have_a_derivative():
-    body = SkinnedBody("arm", arm(), 0.1 * torch.ones(3, 3), sought=[1])
+def test_only_the_free_joints_have_a_derivative():
+    body = SkinnedBody("arm", arm(), 0.1 * torch.ones(3, 3), joints=[1])
     body(SCENE)["arm"].vertices.square().sum().backward()
     assert body.rotation.grad is not None
     assert torch.equal(body.rotation.grad.abs().sum(1) > 0, torch.tensor([False, True, False]))
@@ -158,7 +158,7 @@ def bent(**changes: Any) -> BodyTemplate:
         (lambda: bent(shape_directions=torch.zeros(24, 3, 2).double()), "give both"),
         (lambda: SkinnedBody("arm", arm(), torch.zeros(2, 3)), "give one per joint"),
         (lambda: SkinnedBody("arm", arm(), shape=[1.0]), "give the template's"),
-        (lambda: SkinnedBody("arm", arm(), sought=[3]), r"expected joints in \[0, 2\], got 3"),
+        (lambda: SkinnedBody("arm", arm(), joints=[3]), r"expected joints in \[0, 2\], got 3"),
         (lambda: articulated_template([bar(0, 1)], (-1, 0), [[0, 0, 0]]), "got 1; give one each"),
     ],
 )
