@@ -105,11 +105,7 @@ class Walk:
             self._extend(state, point, directions)
             return (state,)
 
-        # Without a second recording of the body, which would gain the kernel nothing.
-        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-            (state,) = dr.while_loop(
-                (state,), lambda state: state["active"], body, labels=("state",), mode="symbolic"
-            )
+        (state,) = self.rays.loop((state,), lambda state: state["active"], body)
         return state
 
     def step(self, state: State) -> State:

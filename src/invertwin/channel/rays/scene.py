@@ -1,5 +1,6 @@
 """What rays need: the ray scene and the antennas, in float32 about a local origin."""
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -37,6 +38,21 @@ class Occluders:
     def scene(self) -> Any:
         """Mitsuba's scene. Asked for anew: other rays on the same objects may have moved them."""
         return self.topology.ray_scene(self.local_vertices)
+
+    def loop(self, state: Any, going: Callable[..., Any], step: Callable[..., Any]) -> Any:
+        """Record a loop in which rays are cast; all loops of kernels over rays are made here.
+
+        The tree is built before: to build it while a loop is recorded aborts the process. The step
+        is not recorded a second time, which would gain the kernel nothing.
+
+        Args:
+            state: What the loop carries, a tuple.
+            going: Takes the state; which lanes go on.
+            step: Takes the state and returns the next one.
+        """
+        _ = self.scene
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+            return dr.while_loop(state, going, step, mode="symbolic")
 
     def clear(self, start: Any, end: Any, active: Any = True) -> Any:
         """Whether nothing lies between two points (their own surfaces excluded).
