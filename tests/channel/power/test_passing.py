@@ -195,7 +195,7 @@ white = RoughConductor(scattering=1.0)
 wall = thing(plate(0.5, 0.5), (0.0, 0.0, 2.0), material=white)
 board = thing(plate(0.6, 0.6), (0.0, 0.0, 1.0), material=Slab(2.7, 0.05, thickness=0.0125))
 found = deposit_power(
-    Scene({"wall": wall, "board": board}), link(), Grid(0.9, 0.05, 30),
+    Scene({"wall": wall, "board": board}), link(), Grid(1.8, 0.05, 12),  # without the board
     sampling=Sampling(depth=2, samples=100_000, boundary_samples=0), seed=0, scheme=sys.argv[1],
 )
 print(float(found.double().sum()))
