@@ -13,6 +13,7 @@ from invertwin.channel.rays import arrays
 from invertwin.channel.rays.arrays import opaque, to_float, to_points, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.spheres import Spheres
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_tensor
@@ -86,9 +87,9 @@ class RayScene(Occluders):
         self.sound_face = opaque(_sound_face(geometry))
 
     @cached_property
-    def spheres(self) -> tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]]:
-        """Centre and radius of a sphere around each object [m]."""
-        return bounding_spheres(self.geometry)
+    def spheres(self) -> Spheres:
+        """Around the objects."""
+        return Spheres(self.geometry, self.origin, margin=1.001)
 
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Corners of triangles, detached.
@@ -111,21 +112,6 @@ def _sound_face(geometry: Geometry) -> int:
             return topology.sound_face
     topology.sound_face = int(face_areas(geometry).argmax())
     return topology.sound_face
-
-
-def bounding_spheres(
-    geometry: Geometry,
-) -> tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]]:
-    """Centre and radius of a sphere around each object, detached [m]."""
-    centres, radii = [], []
-    positions = geometry.vertices.detach()
-    for used in geometry.topology.object_vertices:
-        corners = positions[used]
-        low, high = torch.aminmax(corners, dim=0)
-        centre = 0.5 * (low + high)
-        centres.append(centre)
-        radii.append((corners - centre).norm(dim=1).max())
-    return torch.stack(centres), torch.stack(radii)
 
 
 def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
