@@ -22,6 +22,7 @@ def script(name: str) -> Any:
 basin = script("basin")
 edges = script("edges")
 house = script("house")
+many_objects = script("many_objects")
 multibounce = script("multibounce")
 report = script("report")
 shapes = script("shapes")

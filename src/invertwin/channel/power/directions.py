@@ -124,7 +124,9 @@ class Directions:
             exponents = self.surfaces.tables["exponents"]
             exponent = dr.gather(mi.Float, exponents, point.surface * 3 + number)
             # Height of the cap that a lobe ((1 + cosψ)/2)^p fills to the share of the number.
-            height = 2 * (1 - dr.exp(dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)))
+            fall = dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)
+            series = -fall * (1 + fall * (1 / 2 + fall / 6))  # a narrow lobe keeps its digits
+            height = 2 * dr.select(fall > -0.01, series, 1 - dr.exp(fall))
             lobe = _in_cap(axis, height, [mi.Float(1.0), numbers[3]])
             share = self._share(point, number + 1)
             chosen = (numbers[1] >= limit) & (numbers[1] < limit + share)
@@ -161,13 +163,11 @@ class Directions:
         return dr.select(first * second < 0, lobe * dr.square(beyond) * dr.abs(second), 0.0)
 
     def _density(self, point: Place, back: Any, facing: Any, omega: Any) -> Any:
-        cosine, between = dr.dot(facing, omega), dr.dot(back, omega)
+        cosine = dr.dot(facing, omega)
         density = self._share(point, 0) * dr.maximum(cosine, 0.0) * dr.inv_pi
-        product = cosine * dr.dot(facing, back)
         for number, present in enumerate(self.surfaces.lobed):
             if present:
-                row = point.surface
-                lobe, exponent = self.surfaces.lobe(number, row, product, between)
+                lobe, exponent = self.surfaces.lobe(number, point.surface, facing, back, omega)
                 lobe = (exponent + 1) / (4 * dr.pi) * lobe
                 density += self._share(point, number + 1) * lobe
         if self.surfaces.bodies:
