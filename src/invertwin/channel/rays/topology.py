@@ -11,6 +11,7 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import to_float, to_index
 from invertwin.channel.rays.backend import VARIANTS, backend, mi
+from invertwin.scene.checks import plain, plainly
 from invertwin.scene.mesh import Mesh
 
 _KEPT_TOPOLOGIES = 8
@@ -95,11 +96,12 @@ def topology_of(meshes: list[Mesh]) -> Topology:
     key = (VARIANTS[backend()], *map(id, owners))
     if key not in _topologies:
         starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
-        faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-        objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
-        # In the objects' own frames, where equal positions are equal to the last bit.
-        vertices = torch.cat([mesh.vertices.detach() for mesh in meshes])
-        made = Topology(torch.cat(faces), torch.cat(objects), vertices)
+        with plainly():
+            faces = [plain(mesh.faces) + start for mesh, start in zip(meshes, starts, strict=False)]
+            objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
+            # In the objects' own frames, where equal positions are equal to the last bit.
+            vertices = torch.cat([plain(mesh.vertices) for mesh in meshes])
+            made = Topology(torch.cat(faces), torch.cat(objects), vertices)
         _topologies[key] = (owners, made)
         while len(_topologies) > _KEPT_TOPOLOGIES:
             _topologies.popitem(last=False)
