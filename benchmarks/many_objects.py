@@ -6,8 +6,8 @@ Boxes stand in a cube of places before the radar, all moved together from call t
 `deposit_power` and the derivative with respect to their place, with 400 000 samples. Prints a table
 and writes `metrics.json` into DIR (default `out/many_objects`), at depths 1 and 3:
 
-- `second_call_ratio.depth<n>`: seconds of the second call and all that repeat it (their median), for
-  200 objects over those for one object of the same triangles, in turns.
+- `second_call_ratio.depth<n>`: seconds of the second call and those after it (median), for 200
+  objects over those for one object of the same triangles, in turns.
 - `compile_seconds_ratio.depth<n>`: seconds in which Dr.Jit generates and compiles code in the first
   call of a fresh process without a cache on disk, for 2000 objects over those for 20.
 - `first_call_seconds.<objects>`: of that process at depth 3, all included.

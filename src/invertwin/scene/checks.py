@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from annotated_types import Ge, Gt, Le, Len, Lt
 from torch import Tensor
-from torch._C import _DisableFuncTorch as plainly
 from torch._C import _functorch as functorch
 
 from invertwin.errors import InputError

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.errors import InputError
 from invertwin.channel import Grid, Link, Sampling, deposit_power
 from invertwin.channel.rays.topology import edges_of
+from invertwin.errors import InputError
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, sphere
 from scenes import GRID, WAVELENGTH, float64, link, occluder, relative, shift_error, thing
 

@@ -327,7 +327,9 @@ def test_a_plate_seen_through_a_cosine_pattern():
 
 def pushed_aside(offset):
     """A map of a box before a wall, two bounces, by the box's offset and permittivity."""
-    moved = Object(box((0.4, 0.4, 0.4)), RoughDielectric(3 + offset[3]), rigid(translation=offset[:3]))
+    moved = Object(
+        box((0.4, 0.4, 0.4)), RoughDielectric(3 + offset[3]), rigid(translation=offset[:3])
+    )
     wall = thing(plate(2.0, 2.0), (0.0, 0.0, 1.5))
     few = Sampling(depth=2, samples=20_000, boundary_samples=20_000)
     around = link(((0.0, 0.0, -1.5),))

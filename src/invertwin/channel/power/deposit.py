@@ -10,18 +10,19 @@ from typing import Any, Literal
 import torch
 from jaxtyping import Float32
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins, replay
 from invertwin.channel.power.clouds import deposit_density
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
-from invertwin.channel.power.trace import Trace, tables_of
+from invertwin.channel.power.trace import Trace, tables_of, without_derivatives
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, use_backend
 from invertwin.channel.rays.geometry import differentiated, flatten, require_edges
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
-from invertwin.scene.checks import plain, plainly
+from invertwin.scene.checks import plain
 from invertwin.scene.scene import Object, Scene
 
 
@@ -81,8 +82,9 @@ def deposit_power(
                 "expected an antenna pattern without derivatives, got one that carries them; "
                 "power paths do not differentiate patterns: detach its values"
             )
-        with plainly():
-            trace = Trace(geometry, link, sampling, seed, scheme=scheme, reference=fixed)
+        with _DisableFuncTorch():
+            bare = without_derivatives(geometry, link)
+            trace = Trace(*bare, sampling, seed, scheme=scheme, reference=fixed)
         tables = tables_of(geometry, link)
         found = _Deposit.apply(trace, grid, any(map(differentiated, tables)), *tables)
     return found + torch.stack(soft).sum(0) if soft else found  # type: ignore[no-any-return]
@@ -127,8 +129,9 @@ class _Deposit(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, _: None, __: None, ___: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         given = {n: t for n, t in zip(DIFFERENTIABLE, tangents, strict=True) if t is not None}
-        return _Linear.apply(lambda *tangents: _pushed(ctx, tuple(given), *tangents), *given.values())
-
+        return _Linear.apply(
+            lambda *tangents: _pushed(ctx, tuple(given), *tangents), *given.values()
+        )
 
     @staticmethod
     def vmap(_: Any, __: Any, *inputs: Any) -> tuple[Tensor, None]:  # type: ignore[override]
@@ -158,7 +161,10 @@ class _Linear(torch.autograd.Function):
         rows = [
             _Linear.apply(
                 act,
-                *(v if dim is None else v.select(dim, k) for v, dim in zip(values, dims[1:])),
+                *(
+                    v if dim is None else v.select(dim, k)
+                    for v, dim in zip(values, dims[1:], strict=True)
+                ),
             )
             for k in range(info.batch_size)
         ]

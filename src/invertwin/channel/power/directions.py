@@ -65,7 +65,9 @@ class Directions:
         spheres = self.spheres
         if spheres.count > 1:
             towards, rest = numbers[0] < _TOWARDS, numbers[4]
-            drawn = dr.minimum(mi.UInt32(numbers[0] / _TOWARDS * spheres.groups), spheres.groups - 1)
+            drawn = dr.minimum(
+                mi.UInt32(numbers[0] / _TOWARDS * spheres.groups), spheres.groups - 1
+            )
             members = dr.minimum(spheres.size, spheres.count - drawn * spheres.size)
             axis, height = mi.Vector3f(0, 0, 1), mi.Float(2.0)
             # One of the group that the point is outside of, if a few tries find one.

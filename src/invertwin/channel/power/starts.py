@@ -14,7 +14,14 @@ from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.passage import land, passage
-from invertwin.channel.rays.arrays import between, point_at, scrambled, to_float, to_points, uniform_pair
+from invertwin.channel.rays.arrays import (
+    between,
+    point_at,
+    scrambled,
+    to_float,
+    to_points,
+    uniform_pair,
+)
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.scene import RayScene, face_areas

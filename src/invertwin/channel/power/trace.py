@@ -37,6 +37,20 @@ def tables_of(geometry: Geometry, link: Link) -> list[Tensor]:
     return [getattr(owners.get(name, link), name) for name in DIFFERENTIABLE]
 
 
+def without_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, Link]:
+    """Plain numbers, also within the transforms of ``torch.func``.
+
+    Args:
+        geometry: The scene.
+        link: Antennas.
+    """
+    tables = dict(zip(DIFFERENTIABLE, map(plain, tables_of(geometry, link)), strict=True))
+    rows = replace(geometry.surfaces, **{name: tables.pop(name) for name in SURFACE})
+    return replace(geometry, vertices=tables.pop("vertices"), surfaces=rows), replace(
+        link, **tables
+    )
+
+
 class Trace:
     """The detached half of a call: which paths there are. Every call gives the same ones."""
 
@@ -50,7 +64,7 @@ class Trace:
         scheme: str = "rays",
         reference: tuple[Geometry, Link] | None = None,
     ) -> None:
-        """Upload a scene, without its derivatives, and prepare the samplers.
+        """Upload a scene and prepare the samplers.
 
         Args:
             geometry: The scene.
@@ -61,10 +75,7 @@ class Trace:
             reference: What fixes how starts are drawn, see ``deposit_power``.
         """
         self.sampling, self.seed = sampling, seed
-        tables = dict(zip(DIFFERENTIABLE, map(plain, tables_of(geometry, link)), strict=True))
-        rows = replace(geometry.surfaces, **{name: tables.pop(name) for name in SURFACE})
-        geometry = replace(geometry, vertices=tables.pop("vertices"), surfaces=rows)
-        link = replace(link, **tables)
+        self.recorded: Records | None = None  # the last paths, where they fit
         self.rays = RayScene(geometry, link)
         sampler = RaySampler if scheme == "rays" else AreaSampler
         self.sampler = sampler(self.rays, sampling.samples, seed, reference)

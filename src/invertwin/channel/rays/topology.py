@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.arrays import to_float, to_index
 from invertwin.channel.rays.backend import VARIANTS, backend, mi
-from invertwin.scene.checks import plain, plainly
+from invertwin.scene.checks import plain
 from invertwin.scene.mesh import Mesh
 
 _KEPT_TOPOLOGIES = 8
@@ -96,7 +97,7 @@ def topology_of(meshes: list[Mesh]) -> Topology:
     key = (VARIANTS[backend()], *map(id, owners))
     if key not in _topologies:
         starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
-        with plainly():
+        with _DisableFuncTorch():
             faces = [plain(mesh.faces) + start for mesh, start in zip(meshes, starts, strict=False)]
             objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
             # In the objects' own frames, where equal positions are equal to the last bit.
