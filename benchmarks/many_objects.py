@@ -41,7 +41,12 @@ REQUIRED = {
 }
 PAINT = RoughDielectric(permittivity=4.0)
 CHIRP = FMCW(start_frequency=76e9, bandwidth=1e9, duration=50e-6, samples=128)
-RADAR = Radar(linear_array(1, 1.0), linear_array(4, CHIRP.wavelength / 2), CHIRP, [[0.0, 0.0, 0.0]])
+RADAR = Radar(
+    linear_array(1, 1.0),
+    linear_array(4, CHIRP.wavelength / 2),
+    CHIRP,
+    torch.zeros(1, 3, dtype=torch.float64),
+)
 
 
 class Boxes:

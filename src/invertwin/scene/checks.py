@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from annotated_types import Ge, Gt, Le, Len, Lt
 from torch import Tensor
-from torch._C import _functorch as functorch
+from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
 
 from invertwin.errors import InputError
 from invertwin.limits import Among, Usual, marks
@@ -61,7 +61,7 @@ def refuse_batch(value: Tensor) -> Tensor:
     Raises:
         InputError: a batch: rays see one scene at a time.
     """
-    if functorch.is_batchedtensor(value):
+    if is_batchedtensor(value):
         raise InputError(
             "expected the tensors of one scene, got a batch of torch.func.vmap; call for one scene "
             "after another and torch.stack the maps (torch.func.jacfwd and jacrev may batch them)"
@@ -75,8 +75,8 @@ def plain(value: Tensor) -> Tensor:
     Args:
         value: a tensor that is no batch.
     """
-    while functorch.is_functorch_wrapped_tensor(value):
-        value = functorch.get_unwrapped(refuse_batch(value))
+    while is_functorch_wrapped_tensor(value):
+        value = get_unwrapped(refuse_batch(value))
     return value.detach()
 
 
