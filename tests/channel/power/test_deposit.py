@@ -325,12 +325,13 @@ def test_a_plate_seen_through_a_cosine_pattern():
     assert float(weighted / plain) == pytest.approx((8 * cosine**3) ** 2, rel=1e-3)
 
 
+BLOCK, SCREEN = box((0.4, 0.4, 0.4)), plate(2.0, 2.0)  # no transform builds meshes
+
+
 def pushed_aside(offset):
     """A map of a box before a wall, two bounces, by the box's offset and permittivity."""
-    moved = Object(
-        box((0.4, 0.4, 0.4)), RoughDielectric(3 + offset[3]), rigid(translation=offset[:3])
-    )
-    wall = thing(plate(2.0, 2.0), (0.0, 0.0, 1.5))
+    moved = Object(BLOCK, RoughDielectric(3 + offset[3]), rigid(translation=offset[:3]))
+    wall = thing(SCREEN, (0.0, 0.0, 1.5))
     few = Sampling(depth=2, samples=20_000, boundary_samples=20_000)
     around = link(((0.0, 0.0, -1.5),))
     return deposit_power(Scene({"w": wall, "b": moved}), around, GRID, sampling=few, seed=1)
