@@ -74,6 +74,11 @@ class RayScene(Occluders):
         """Centre and radius of a sphere around each object [m]."""
         return bounding_spheres(self.geometry)
 
+    @cached_property
+    def exact_vertices(self) -> Any:
+        """Vertices in float64, three numbers each."""
+        return mi.Float64((self.geometry.vertices.detach() - self.origin).ravel().numpy())
+
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Corners of triangles, detached.
 

@@ -2,6 +2,7 @@
 
 import itertools
 from collections import OrderedDict
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,8 +32,10 @@ class Topology:
         self.sound_face: int | None = None  # a triangle that was no sliver when last looked at
         owner = torch.zeros(len(vertices), 1, dtype=torch.float64)
         owner[faces.ravel(), 0] = face_object.repeat_interleave(3).double()
+        self.vertex_object = owner[:, 0].long()
         places = torch.cat([owner, vertices], dim=1).numpy()
-        self.edges, self.opposite, beside = edges_of(faces.numpy(), places)
+        self.edges, self.opposite, self.beside = edges_of(faces.numpy(), places)
+        beside = self.beside
         alone = (self.opposite >= 0).sum(1) == 1
         lone_owner = face_object[beside[alone, 0]]
         self.open_objects = [bool((lone_owner == owner).any()) for owner in owners]
@@ -46,6 +49,25 @@ class Topology:
         self._uploaded: Tensor | None = None
         self._mesh = mesh
         self._scene: Any = None
+
+    @cached_property
+    def welded(self) -> Int64[Tensor, "f 3"]:
+        """Vertices of triangles, where vertices at one place count as one; in any order."""
+        table = self.faces.clone()
+        for face, apex in zip(self.beside.T, self.opposite.T, strict=True):
+            at = face >= 0
+            table[face[at]] = torch.cat([self.edges[at], apex[at, None]], 1)
+        return table
+
+    @cached_property
+    def face_edges(self) -> Int64[Tensor, "f 3"]:
+        """The edge opposite to each of a triangle's ``welded`` vertices (−1: no proper edge)."""
+        table = torch.full_like(self.faces, -1)
+        for face, apex in zip(self.beside.T, self.opposite.T, strict=True):
+            edge = torch.nonzero(face >= 0)[:, 0]
+            slot = (self.welded[face[edge]] == apex[edge, None]).int().argmax(1)
+            table[face[edge], slot] = edge
+        return table
 
     def ray_scene(self, vertices: Tensor) -> Any:
         """The Mitsuba scene with these vertices (float32, never changed in place hereafter)."""

@@ -1,0 +1,196 @@
+"""Where surfaces meet: the segments that pairs of triangles have in common, in float64.
+
+Edges are rays through the tree: each end of such a segment is where an edge of one triangle meets
+the other. The tree, in float32, only proposes pairs; float64 decides (derivations §3).
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.scene import NEAR, RayScene, next_surface
+from invertwin.channel.rays.topology import Topology
+
+IN_PLANE = 1e-9  # closer than this to a plane [m] is in it
+_FLAT = 1e-7  # least sine of the angle between two planes that cross
+_BEYOND = 4e-7  # how far an edge's ray goes beyond its ends, relative to their coordinates
+_MOST = 64  # surfaces that an edge may pass
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Segments that two triangles have in common.
+
+    Attributes:
+        first, second: The triangles.
+        start, end: Of the segments, in the world [m].
+        touching: Where one surface ends in the other: no segment of a crossing.
+        close: Whether two objects are so close that one's edges may lie in the other.
+    """
+
+    first: Int64[Tensor, " n"]
+    second: Int64[Tensor, " n"]
+    start: Float64[Tensor, "n 3"]
+    end: Float64[Tensor, "n 3"]
+    touching: Bool[Tensor, " n"]
+    close: bool = False
+
+    def chosen(self, mask: Bool[Tensor, " n"]) -> "Contacts":
+        """Some of them."""
+        rows = {k: v[mask] for k, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **rows)
+
+
+def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
+    """Which objects' boxes overlap while one moves past the other, and where, per object.
+
+    An object meets itself where its own shape changes.
+
+    Args:
+        geometry: The scene.
+    """
+    count = len(geometry.moving)
+    owner = geometry.topology.vertex_object[:, None].expand(-1, 3)
+    points = geometry.vertices.detach()
+    reduced = (
+        points.new_zeros(count, 3).scatter_reduce(0, owner, points, how, include_self=False)
+        for how in ("amin", "amax")
+    )
+    low, high = reduced
+    margin = 1e-5 * (high - low).amax().clamp_min(1.0)
+    low, high = low - margin, high + margin
+    moving, deforming = (
+        torch.tensor(flags) for flags in (geometry.moving, geometry.deforming)
+    )
+    pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
+    pairs &= ((low[:, None] <= high) & (low <= high[:, None])).all(2)
+    place = torch.where(pairs[..., None], torch.maximum(low[:, None], low), torch.inf).amin(1)
+    until = torch.where(pairs[..., None], torch.minimum(high[:, None], high), -torch.inf).amax(1)
+    return pairs, place, until
+
+
+def contacts_of(rays: RayScene) -> Contacts | None:
+    """All segments in which surfaces meet that move past each other; None if none can.
+
+    Args:
+        rays: The scene.
+    """
+    geometry, topology = rays.geometry, rays.topology
+    if not any(geometry.moving):
+        return None
+    pairs, low, high = may_meet(geometry)
+    if not bool(pairs.any()):
+        return None
+    points = geometry.vertices.detach()
+    owner = topology.vertex_object[topology.edges[:, 0]]
+    ends = points[topology.edges]
+    inside = (ends.amin(1) <= high[owner]) & (ends.amax(1) >= low[owner])
+    edges = torch.nonzero(inside.all(1))[:, 0]
+    others = pairs.clone().fill_diagonal_(False).any(1)
+    edge, face = _passed(rays, edges, others[owner[edges]])
+    keys = []
+    for beside in topology.beside[edge].T:
+        at = beside >= 0
+        couple = torch.stack([beside[at], face[at]]).sort(0).values
+        keys.append(couple[0] * len(geometry.faces) + couple[1])
+    key = torch.cat(keys).unique() if keys else edge
+    first, second = key // len(geometry.faces), key % len(geometry.faces)
+    met = pairs[geometry.face_object[first], geometry.face_object[second]]
+    corners = topology.welded[first], topology.welded[second]
+    apart = ~(corners[0][:, :, None] == corners[1][:, None]).flatten(1).any(1)
+    found = _common(points, topology, first[met & apart], second[met & apart])
+    return replace(found, close=bool(others.any()))
+
+
+def _passed(
+    rays: RayScene, edges: Int64[Tensor, " n"], beyond: Bool[Tensor, " n"]
+) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
+    """Edges and the triangles that they pass, one row each."""
+    start, end = rays.geometry.vertices.detach()[rays.topology.edges[edges]].unbind(1)
+    # Both ways, so that of two surfaces close to each other neither hides the other.
+    edges = torch.cat([edges, edges[beyond]])
+    start, end = torch.cat([start, end[beyond]]), torch.cat([end, start[beyond]])
+    beyond = torch.cat([beyond, beyond[beyond]])
+    offset = end - start
+    scale = (start - rays.origin).abs().amax(1) + (end - rays.origin).abs().amax(1)
+    step = _BEYOND * scale / offset.norm(dim=1).clamp_min(1e-30)
+    step = (step + 2 * NEAR).clamp_max(0.5)[:, None]  # rays start NEAR their ends
+    stretch = torch.where(beyond[:, None], step, 0.0)
+    start, end = start - offset * stretch, end + offset * stretch
+    rows, faces = [edges[:0]], [edges[:0]]
+    for _ in range(_MOST):
+        face, along = next_surface(rays, start, end)
+        on = torch.nonzero(face >= 0)[:, 0]
+        rows.append(edges[on])
+        faces.append(face[on])
+        along = along[on, None]
+        start = start[on] + (end[on] - start[on]) * along + offset[on] * step[on]
+        left = ((end[on] - start) * offset[on]).sum(1) > 0
+        edges, start, end = edges[on][left], start[left], end[on][left]
+        offset, step = offset[on][left], step[on][left]
+        if not len(edges):
+            break
+    return torch.cat(rows), torch.cat(faces)
+
+
+def _common(
+    points: Float64[Tensor, "v 3"],
+    topology: Topology,
+    first: Int64[Tensor, " n"],
+    second: Int64[Tensor, " n"],
+) -> Contacts:
+    """What pairs of triangles have in common, where it is a segment."""
+    faces = first, second
+    triangles = [points[topology.welded[face]] for face in faces]
+    normals = [_unit(torch.linalg.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])) for t in triangles]
+    line = torch.linalg.cross(normals[0], normals[1])
+    kept = line.norm(dim=1) > _FLAT
+    line = _unit(line)
+    sides, spans, touching = [], [], torch.zeros(len(first), dtype=torch.bool)
+    for own, other in ((0, 1), (1, 0)):
+        plane, normal = triangles[other][:, 0], normals[other]
+        height = ((triangles[own] - plane[:, None]) * normal[:, None]).sum(2)
+        height = torch.where(height.abs() < IN_PLANE, 0.0, height)
+        kept &= (height.amin(1) <= 0) & (height.amax(1) >= 0)
+        # An edge in the plane: the surface crosses there if it goes on to the plane's other side.
+        lies = (height == 0).sum(1) == 2
+        apex = height.abs().argmax(1, keepdim=True)
+        edge = topology.face_edges[faces[own]].gather(1, apex)[:, 0]
+        nearby = topology.opposite[edge.clamp_min(0)]
+        there = ((points[nearby.clamp_min(0)] - plane[:, None]) * normal[:, None]).sum(2)
+        mine = height.gather(1, apex)
+        across = ((nearby >= 0) & (there * mine < 0) & (there.abs() >= IN_PLANE)).any(1)
+        touching |= lies & ~across
+        kept &= ~(lies & across & (mine[:, 0] > 0))  # the triangle on the other side has it
+        sides.append(height)
+        spans.append(_span(triangles[own], height, line))
+    (low, high, place), (others_low, others_high, _) = spans
+    low, high = torch.maximum(low, others_low), torch.minimum(high, others_high)
+    kept &= high > low
+    at = (place * line).sum(1)
+    ends = (place + line * (value - at)[:, None] for value in (low, high))
+    start, end = (value[kept] for value in ends)
+    return Contacts(first[kept], second[kept], start, end, touching[kept])
+
+
+def _span(
+    triangle: Float64[Tensor, "n 3 3"], height: Float64[Tensor, "n 3"], line: Float64[Tensor, "n 3"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """From where to where along the line a triangle is in a plane, and a point of it there."""
+    places, there = [*triangle.unbind(1)], [*(height == 0).unbind(1)]
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        share = height[:, i] / (height[:, i] - height[:, j])
+        places.append(triangle[:, i] + (triangle[:, j] - triangle[:, i]) * share[:, None])
+        there.append(height[:, i] * height[:, j] < 0)
+    place, valid = torch.stack(places, 1), torch.stack(there, 1)
+    along = (place * line[:, None]).sum(2)
+    low = torch.where(valid, along, torch.inf).min(1)
+    high = torch.where(valid, along, -torch.inf).amax(1)
+    return low.values, high, place[torch.arange(len(place)), low.indices]
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-300)
