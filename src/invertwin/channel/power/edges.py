@@ -224,8 +224,7 @@ class EdgeSampler:
         valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
         key = index, self.dice
         hit = _ahead(
-            rays, self.inputs, (edge, along), beside, away, valid, key,
-            coherent=True, close=self.close,
+            rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close
         )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
         found = EdgePoints(
@@ -342,7 +341,7 @@ class InteriorEdgeSampler:
         for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
             hit = _ahead(
                 rays, self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
-                (index, dice), coherent=False, close=self.close and sign > 0,
+                (index, dice), close=self.close and sign > 0,
             )  # fmt: skip
             valid &= hit.valid & _not_grazing(rays, hit.face, omega, hit.valid)
             hits.append(hit)
@@ -471,14 +470,14 @@ def _ahead(
     active: Any,
     key: tuple[Any, Any],
     *,
-    coherent: bool,
     close: bool,
 ) -> Hit:
     """What lies behind points on edges.
 
     Where surfaces are close the ray starts before the edge, so that it meets those in which the
     edge lies; whether the edge is before them is decided in float64. In one that it has crossed, it
-    hides nothing: there the curve of the crossing counts.
+    hides nothing: there the curve of the crossing counts. Rays are traced one by one, since Embree
+    loses some of those of a bundle that start close to a surface.
 
     Args:
         rays: Rays.
@@ -488,15 +487,14 @@ def _ahead(
         way: Their directions, as long as the edge is far away.
         active: Lanes.
         key: See ``land``.
-        coherent: See ``land``.
         close: Whether other surfaces may be close to edges.
     """
     towards, distance = dr.normalize(way), dr.norm(way)
     past = mi.Ray3f(mi.Point3f(beside + way * NEAR), mi.Vector3f(towards))
     if not close:
-        return land(rays, inputs, past, active, key, coherent=coherent)
+        return land(rays, inputs, past, active, key, coherent=False)
     early = mi.Ray3f(mi.Point3f(beside - way * _BEFORE), mi.Vector3f(towards))
-    hit = land(rays, inputs, early, active, key, coherent=coherent)
+    hit = land(rays, inputs, early, active, key, coherent=False)
     point = between(rays.corners(hit.face, hit.valid), hit.b1, hit.b2)
     near = hit.valid & (dr.norm(point - beside) < 2 * _BEFORE * distance)
     edge, along = place
@@ -513,7 +511,7 @@ def _ahead(
     normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
     height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(along) - p0)
     crossed = -dr.mulsign(height, dr.dot(normal, mi.Vector3d(way))) < -IN_PLANE
-    again = land(rays, inputs, past, active & own, key, coherent=coherent)
+    again = land(rays, inputs, past, active & own, key, coherent=False)
     pairs = zip(vars(again).values(), vars(hit).values(), strict=True)
     hit = Hit(*(dr.select(own, second, first) for second, first in pairs))
     return replace(hit, valid=hit.valid & ~(near & ~own & crossed))
