@@ -91,18 +91,33 @@ def contacts_of(rays: RayScene) -> Contacts | None:
     edges = torch.nonzero(inside.all(1))[:, 0]
     others = pairs.clone().fill_diagonal_(False).any(1)
     edge, face = _passed(rays, edges, others[owner[edges]])
-    keys = []
-    for beside in topology.beside[edge].T:
-        at = beside >= 0
-        couple = torch.stack([beside[at], face[at]]).sort(0).values
-        keys.append(couple[0] * len(geometry.faces) + couple[1])
-    key = torch.cat(keys).unique() if keys else edge
-    first, second = key // len(geometry.faces), key % len(geometry.faces)
-    met = pairs[geometry.face_object[first], geometry.face_object[second]]
-    corners = topology.welded[first], topology.welded[second]
-    apart = ~(corners[0][:, :, None] == corners[1][:, None]).flatten(1).any(1)
-    found = _common(points, topology, first[met & apart], second[met & apart])
-    return replace(found, close=bool(others.any()))
+    beside, face = topology.beside[edge], face[:, None].expand(-1, topology.beside.shape[1])
+    pairs_met = torch.stack([beside[beside >= 0], face[beside >= 0]])
+    seen, parts = torch.zeros(0, dtype=torch.int64), []
+    while True:
+        # Where rays slip through a seam, the curve leads on: neighbours of a pair that meets.
+        couple = pairs_met.sort(0).values
+        key = (couple[0] * len(geometry.faces) + couple[1]).unique()
+        key = key[~torch.isin(key, seen)]
+        seen = torch.cat([seen, key])
+        first, second = key // len(geometry.faces), key % len(geometry.faces)
+        met = pairs[geometry.face_object[first], geometry.face_object[second]]
+        corners = topology.welded[first], topology.welded[second]
+        met &= ~(corners[0][:, :, None] == corners[1][:, None]).flatten(1).any(1)
+        found = _common(points, topology, first[met], second[met])
+        parts.append(found)
+        if not len(found.first):
+            break
+        around = [topology.around(face) for face in (found.first, found.second)]
+        pairs_met = torch.stack(torch.broadcast_tensors(around[0][:, :, None], around[1][:, None]))
+        pairs_met = pairs_met.flatten(1)
+        pairs_met = pairs_met[:, (pairs_met >= 0).all(0)]
+    rows = {
+        name: torch.cat([getattr(part, name) for part in parts])
+        for name, value in vars(found).items()
+        if isinstance(value, Tensor)
+    }
+    return Contacts(**rows, close=bool(others.any()))
 
 
 def _passed(

@@ -69,6 +69,12 @@ class Topology:
             table[face[edge], slot] = edge
         return table
 
+    def around(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
+        """Triangles and all that share an edge with them (−1: none)."""
+        edges = self.face_edges[faces]
+        nearby = torch.where(edges[..., None] >= 0, self.beside[edges.clamp_min(0)], -1)
+        return torch.cat([faces[:, None], nearby.flatten(1)], 1)
+
     def ray_scene(self, vertices: Tensor) -> Any:
         """The Mitsuba scene with these vertices (float32, never changed in place hereafter)."""
         if self._uploaded is vertices:
