@@ -110,7 +110,8 @@ class ContactSampler:
         for faces in self.faces:
             face = dr.gather(mi.UInt32, faces, entry % self.segments)
             spots.append(Spot(face, *barycentric(x, *rays.corners(face))))
-        normals = [spot.place(inputs).normal for spot in spots]
+        places = [spot.place(inputs) for spot in spots]
+        normals = [place.normal for place in places]
         count, receiver = parts(index, self.depth)
         antenna = inputs.antenna(frame, receiver)
         way = dr.normalize(antenna - x)
@@ -118,7 +119,7 @@ class ContactSampler:
             numbers = mi.Point2f(*uniform_pair(index, self.seeds[1]))
             sphere = mi.Vector3f(mi.warp.square_to_uniform_sphere(numbers))
             way = dr.select(count > 0, sphere, way)
-        origin = x + _off(normals, way, x)
+        origin = _beside(places[0], normals, way).position
         seen = passage(rays, inputs, origin, antenna, valid & (count == 0))
         exists, transmittance, extra = seen.transmittance > 0, seen.transmittance, seen.extra
         odds, source = mi.Float(1.0), Spot(mi.UInt32(0), mi.Float(0.0), mi.Float(0.0))
@@ -145,11 +146,11 @@ def parts(index: Any, depth: int) -> tuple[Any, Any]:
     return (index // 2) % opaque(depth), (index % 2) == 1
 
 
-def _off(normals: Sequence[Any], way: Any, x: Any) -> Any:
-    """A step away from both surfaces, into the wedge between them that a direction leads to."""
+def _beside(place: Place, normals: Sequence[Any], way: Any) -> Place:
+    """The place a little off both surfaces, in the wedge between them that a direction leads to."""
     first, second = (dr.mulsign(normal, dr.dot(normal, way)) for normal in normals)
-    opening = 1 + dr.maximum(dr.dot(first, second), _ACUTE)
-    return (first + second) * (2 * NEAR * dr.norm(x) / opening)
+    step = 2 * NEAR * dr.norm(place.position) / (1 + dr.maximum(dr.dot(first, second), _ACUTE))
+    return replace(place, position=place.position + (first + second) * step)
 
 
 def contact_paths(
@@ -192,25 +193,26 @@ def contact_paths(
             "u": dr.select(deep, done["u"], seen.x),
             "v": dr.select(deep, done["v"], seen.y),
         }
+    normals = [place.normal for place in places]
     throughput *= fixed.scale * depth * drawn.transmittance
     for own, other in ((0, 1), (1, 0)):
         here, hiding = places[own], places[other]
         facing = dr.mulsign(hiding.normal, dr.dot(hiding.normal, back))
         sine = dr.norm(dr.cross(here.normal, hiding.normal))
-        away = _off([place.normal for place in places], back, here.position)
-        shifted = replace(here, position=here.position + away)
         for sign in (1.0, -1.0) if fixed.surfaces.sheets else (1.0,):
             through = partial(_through, fixed, hiding, facing * sign)
 
             def run(
                 state: State,
                 visit: Callable[[State, Contribution, Any], None],
-                point: Place = shifted,
+                here: Place = here,
                 through: Callable[[Any], tuple[Any, Any]] = through,
             ) -> State:
-                path, exists = walk.connect(rays, fixed, state, point, other_end, shared=shared)
                 end = fixed.antenna(frame, at_receiver if shared else other_end)
-                let, longer = through(integrand.segment(point.position, end)[0])
+                onwards, _ = integrand.segment(here.position, end)
+                point = _beside(here, normals, onwards)
+                path, exists = walk.connect(rays, fixed, state, point, other_end, shared=shared)
+                let, longer = through(onwards)
                 path = replace(path, power=path.power * let, range=path.range + 0.5 * longer)
                 visit(state, path, exists & (let > 0))
                 if depth == 1:
@@ -221,7 +223,7 @@ def contact_paths(
                     visit(state, *walk.connect(rays, fixed, state, point, end))
 
                 state["active"] &= count + 1 < opaque(depth)
-                state = walker.step(state, point)
+                state = walker.step(state, _beside(here, normals, back))
                 let, longer = through(-state["back"])
                 state["active"] &= let > 0
                 state["throughput"] = state["throughput"] * let
