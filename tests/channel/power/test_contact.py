@@ -89,19 +89,16 @@ def difference(
         (crossed_plates, link(rx=((0.15, 0.1, 0.0),), shared=False)),
         (folded, link()),
         (lambda theta: crossed_plates(theta, Slab(2.7, 0.05, thickness=0.0125)), link()),
-        (
-            lambda theta: crossed_plates(theta, Slab(2.7, 0.05, thickness=0.0125)),
-            link(rx=((1.4, 0.1, 0.6),), shared=False),
-        ),
         (lambda theta: box_on_floor(theta, 0.1), link()),
         (box_on_floor, link()),
         (lambda theta: box_on_floor(theta, -1e-4), link()),
     ],
-    ids=["plates", "two antennas", "one mesh", "a sheet", "both sides", "sunk", "touching", "gap"],
+    ids=["plates", "two antennas", "one mesh", "a sheet", "sunk", "touching", "gap"],
 )
 def test_what_moves_where_surfaces_meet_is_in_the_derivative(scene, antennas):
-    truth = difference(scene, antennas, SAMPLING)
-    assert relative(slope(scene, antennas, SAMPLING), truth) < 0.04
+    sampling = replace(SAMPLING, samples=200_000, boundary_samples=100_000)
+    truth = difference(scene, antennas, sampling)
+    assert relative(slope(scene, antennas, sampling), truth) < 0.04
 
 
 @pytest.mark.parametrize("scene", [crossed_plates, folded, box_on_floor])
@@ -116,13 +113,9 @@ def test_a_common_shift_of_scene_and_radar_changes_nothing():
         for name, item in crossed_plates(float64(0.0)).objects.items()
     }
     old = crossed_plates(float64(0.0)).objects
-    scene = Scene(
-        {name: Object(Mesh(leaves[name], old[name].mesh.faces), PALE) for name in leaves}
-    )
+    scene = Scene({name: Object(Mesh(leaves[name], old[name].mesh.faces), PALE) for name in leaves})
     tx = float64([[0.0, 0.0, 0.0]]).requires_grad_()
-    out = deposit_power(
-        scene, replace(link(), tx=tx, rx=tx), RANGES, sampling=SAMPLING, seed=1
-    )
+    out = deposit_power(scene, replace(link(), tx=tx, rx=tx), RANGES, sampling=SAMPLING, seed=1)
     assert shift_error(torch.autograd.grad(out.sum() * 1e9, [*leaves.values(), tx])) < 1e-4
 
 

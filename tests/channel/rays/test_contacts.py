@@ -74,7 +74,9 @@ def test_an_edge_that_lies_in_a_plane_crosses_it_once():
 
 
 def test_a_mesh_meets_itself_only_where_its_shape_changes():
-    parts = [thing(plate(0.6, 0.5, 3), (0, 0, 1.5), (0, turn, 0.2)).vertices for turn in (0.9, -0.6)]
+    parts = [
+        thing(plate(0.6, 0.5, 3), (0, 0, 1.5), (0, turn, 0.2)).vertices for turn in (0.9, -0.6)
+    ]
     faces = plate(0.6, 0.5, 3).faces
     crossed = Mesh(torch.cat(parts), torch.cat([faces, faces + len(parts[0])]))
     found = met(FLOOR, thing(crossed), deforming=True)

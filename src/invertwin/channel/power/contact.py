@@ -64,9 +64,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Meeting:
-    """Points of the curve on both surfaces, and the surface points from which paths come.
-
-    """
+    """Points of the curve on both surfaces, and the surface points from which paths come."""
 
     drawn: Crossing
     first: Spot
@@ -83,7 +81,13 @@ class ContactSampler:
     """Points of the curves in which surfaces meet, and where paths come from that pass there."""
 
     def __init__(
-        self, rays: RayScene, inputs: Inputs, contacts: Contacts, samples: int, depth: int, seed: int
+        self,
+        rays: RayScene,
+        inputs: Inputs,
+        contacts: Contacts,
+        samples: int,
+        depth: int,
+        seed: int,
     ) -> None:
         self.rays, self.inputs, self.size, self.depth = rays, inputs, samples, depth
         ends = [(end - rays.origin).float() for end in (contacts.start, contacts.end)]
@@ -166,7 +170,7 @@ def contact_paths(
         depth: Most vertices of a path.
     """
     fixed, drawn, spots = inputs.detached(), found.drawn, (found.first, found.second)
-    surfaces, frame, index = fixed.surfaces, drawn.frame, drawn.index
+    frame, index = drawn.frame, drawn.index
     places = [spot.place(fixed) for spot in spots]
     count, at_receiver = parts(index, depth)
     shared = rays.link.shared_visibility and depth == 1
@@ -290,7 +294,7 @@ def require_unlit(
         owners = [int(rays.topology.face_object[int(face[0])]) for face in faces]
         names = " and ".join(dict.fromkeys(rays.geometry.names[owner] for owner in owners))
         raise InputError(
-            f"expected no paths between surfaces that meet and move past each other, got {names} at "
-            f"depth {depth}: the derivative of such paths does not converge; leave a gap, take "
+            f"expected no paths between surfaces that meet and move past each other, got {names} "
+            f"at depth {depth}: the derivative of such paths does not converge; leave a gap, take "
             f"depth {depth - 1}, or contacts=False in Sampling, which leaves out what moves there"
         )

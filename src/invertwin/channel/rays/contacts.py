@@ -62,9 +62,7 @@ def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor,
     low, high = reduced
     margin = 1e-5 * (high - low).amax().clamp_min(1.0)
     low, high = low - margin, high + margin
-    moving, deforming = (
-        torch.tensor(flags) for flags in (geometry.moving, geometry.deforming)
-    )
+    moving, deforming = (torch.tensor(flags) for flags in (geometry.moving, geometry.deforming))
     pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
     pairs &= ((low[:, None] <= high) & (low <= high[:, None])).all(2)
     place = torch.where(pairs[..., None], torch.maximum(low[:, None], low), torch.inf).amin(1)
