@@ -59,7 +59,7 @@ Trajectory = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Case:
-    """Points of given strengths on their ways before a radar."""
+    """Points of given strengths on their ways in front of a radar."""
 
     radar: Radar
     chirps: Chirps

@@ -111,7 +111,7 @@ def _frames(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: G
     with torch.no_grad():
         smooth = model.predict(scene, radar, run.seed)
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
-    one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.density))
+    one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.points_per_m2))
     metrics = {
         "paths": len(found.paths),
         **_peak(found.spectrum, grid),
@@ -164,7 +164,7 @@ def _sampling(data: SimulatedData, depth: int) -> Sampling:
         samples=data.samples,
         boundary_samples=0,
         boundary=False,
-        points_per_m2=data.density,
+        points_per_m2=data.points_per_m2,
         rough_paths=data.rough_paths,
     )
 

@@ -36,20 +36,12 @@ class Line:
         self._start = {name: value.detach() for name, value in module.named_parameters()}
 
     def at(self, theta: Tensor) -> Any:
-        """The module's result at θ, which may carry a derivative.
-
-        Args:
-            theta: A scalar.
-        """
+        """The module's result at a scalar θ, which may carry a derivative."""
         moved = {n: self._start[n] + theta * change for n, change in self._tangent.items()}
         return torch.func.functional_call(self._module, self._start | moved, (self._target,))
 
     def end(self, theta: float) -> Any:
-        """The module's result at one end of a difference.
-
-        Args:
-            theta: How far from the start.
-        """
+        """The module's result at θ, one end of a difference."""
         return self.at(torch.tensor(theta, dtype=torch.float64))
 
 
@@ -150,7 +142,7 @@ def losses_along(
 
 
 class _Field(nn.Module):
-    """The distance of a shape as a module's own call."""
+    """A module whose call is the distance of a shape."""
 
     def __init__(self, shape: nn.Module) -> None:
         super().__init__()

@@ -57,7 +57,7 @@ def compare(settings: Methods, checked: Checked) -> tuple[dict[str, Any], Figure
         radar,
         grid,
         draw_speckle(
-            scene, radar.link(), Sampling(depth=1, points_per_m2=settings.density), run.seed
+            scene, radar.link(), Sampling(depth=1, points_per_m2=settings.points_per_m2), run.seed
         ),
         settings.sources,
         (settings.smoothing[0], settings.smoothing[1]),

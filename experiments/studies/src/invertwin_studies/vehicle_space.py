@@ -54,7 +54,7 @@ def vehicle_coordinates(
         table: of the object; its coordinates count where they are of the same space.
         folder: path, from the run file's folder, then from INVERTWIN_DATA.
         level: of detail.
-        modes: coordinates that are sought.
+        modes: coordinates that are fitted.
 
     Raises:
         InputError: files are missing, or fewer modes than the object has coefficients.

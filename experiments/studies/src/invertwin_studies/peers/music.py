@@ -89,7 +89,7 @@ class MusicMap:
         return (ends[0] - ends[1]) / (2 * step)
 
     def derivative(self, scene: Scene, direction: Moves) -> Float64[Tensor, "frame range u v"]:
-        """Automatic derivative of the spectrum in θ, by forward mode through the whole chain."""
+        """Automatic derivative of the spectrum in θ, by forward mode."""
         with torch.no_grad(), forward_ad.dual_level():
             theta = forward_ad.make_dual(
                 torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
