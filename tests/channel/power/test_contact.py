@@ -64,7 +64,9 @@ def slope(
     with forward_ad.dual_level():
         theta = forward_ad.make_dual(float64(0.0), float64(1.0))
         out = deposit_power(scene(theta), antennas, grid, sampling=sampling, seed=1)
-        return forward_ad.unpack_dual(out).tangent.double()
+        tangent = forward_ad.unpack_dual(out).tangent
+    assert tangent is not None
+    return tangent.double()
 
 
 def difference(
