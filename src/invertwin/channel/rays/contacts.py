@@ -10,8 +10,10 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from invertwin.channel.rays.arrays import point_at, to_index, to_torch
+from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
-from invertwin.channel.rays.scene import NEAR, RayScene, next_surface
+from invertwin.channel.rays.scene import NEAR, RayScene
 from invertwin.channel.rays.topology import Topology
 
 IN_PLANE = 1e-9  # closer than this to a plane [m] is in it
@@ -121,31 +123,35 @@ def contacts_of(rays: RayScene) -> Contacts | None:
 def _passed(
     rays: RayScene, edges: Int64[Tensor, " n"], beyond: Bool[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
-    """Edges and the triangles that they pass, one row each."""
-    start, end = rays.geometry.vertices.detach()[rays.topology.edges[edges]].unbind(1)
+    """Edges and the triangles that they pass, one row each; some a little beyond their ends."""
     # Both ways, so that of two surfaces close to each other neither hides the other.
-    edges = torch.cat([edges, edges[beyond]])
-    start, end = torch.cat([start, end[beyond]]), torch.cat([end, start[beyond]])
-    beyond = torch.cat([beyond, beyond[beyond]])
-    offset = end - start
-    scale = (start - rays.origin).abs().amax(1) + (end - rays.origin).abs().amax(1)
-    step = _BEYOND * scale / offset.norm(dim=1).clamp_min(1e-30)
-    step = (step + 2 * NEAR).clamp_max(0.5)[:, None]  # rays start NEAR their ends
-    stretch = torch.where(beyond[:, None], step, 0.0)
-    start, end = start - offset * stretch, end + offset * stretch
+    edge = to_index(torch.cat([edges, edges[beyond]]))
+    longer = to_index(torch.cat([beyond, beyond[beyond]])) > 0
+    back = dr.arange(mi.UInt32, dr.width(edge)) >= len(edges)
+    y0, y1 = (
+        point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
+        for ends in rays.topology.device_edges
+    )
+    start, offset = dr.select(back, y1, y0), dr.select(back, y0 - y1, y1 - y0)
+    step = _BEYOND * (dr.norm(y0) + dr.norm(y1)) / dr.maximum(dr.norm(offset), 1e-30)
+    step = dr.minimum(step + NEAR, 0.5)
+    at = dr.select(longer, -step, NEAR)
+    until = dr.select(longer, 1 + step, 1 - NEAR)
     rows, faces = [edges[:0]], [edges[:0]]
     for _ in range(_MOST):
-        face, along = next_surface(rays, start, end)
-        on = torch.nonzero(face >= 0)[:, 0]
-        rows.append(edges[on])
-        faces.append(face[on])
-        along = along[on, None]
-        start = start[on] + (end[on] - start[on]) * along + offset[on] * step[on]
-        left = ((end[on] - start) * offset[on]).sum(1) > 0
-        edges, start, end = edges[on][left], start[left], end[on][left]
-        offset, step = offset[on][left], step[on][left]
-        if not len(edges):
+        ray = mi.Ray3f(mi.Point3f(start + offset * at), mi.Vector3f(offset), until - at, 0.0, [])
+        hit = rays.scene.ray_intersect_preliminary(ray, active=at < until)
+        at = at + hit.t + step
+        lanes = dr.compress(hit.is_valid())
+        if not dr.width(lanes):
             break
+        face = dr.gather(mi.UInt32, hit.prim_index, lanes)
+        edge, start, offset, at, until, step = (
+            dr.gather(type(value), value, lanes)
+            for value in (edge, mi.Point3f(start), mi.Vector3f(offset), at, until, step)
+        )
+        rows.append(to_torch(mi.Int32(edge)).long())
+        faces.append(to_torch(mi.Int32(face)).long())
     return torch.cat(rows), torch.cat(faces)
 
 
