@@ -88,7 +88,7 @@ class Case:
         return beat
 
     def error(self) -> float:
-        """Of all samples, relative."""
+        """Relative error of all samples."""
         expected = self.oracle()
         return float((self.signal() - expected).norm() / expected.norm())
 

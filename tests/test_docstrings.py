@@ -1,7 +1,7 @@
 """Docstrings of the library name what a caller gives: arguments, and fields of values.
 
-Public are functions, methods and classes without an underscore on the way. The commands in `cli/`
-are no library. A method that overrides one leaves its arguments to the method that it overrides.
+Public are functions, methods and classes without an underscore on the way. Commands (`cli/`) are no
+library. A method that overrides one leaves its arguments to the method that it overrides.
 """
 
 import dataclasses
@@ -18,6 +18,7 @@ import pytest
 from pydantic import BaseModel
 
 import invertwin
+import invertwin_studies
 
 
 def described(*texts: str | None) -> set[str]:
@@ -86,8 +87,9 @@ def missing(module: ModuleType) -> list[str]:
 
 MODULES = [
     module.name
-    for module in pkgutil.walk_packages(invertwin.__path__, "invertwin.")
-    if not re.search(r"\._|^invertwin\.cli\b", module.name)
+    for package in (invertwin, invertwin_studies)
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    if not re.search(r"\._|^invertwin\.cli\b|\.commands$", module.name)
 ]
 
 

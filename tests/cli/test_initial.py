@@ -1,4 +1,4 @@
-"""`[initial]`: a start that nobody gave, and what the fit adds to it."""
+"""`[initial]`: a start by conventional processing, and what the fit adds to it."""
 
 import tomllib
 

@@ -1,4 +1,4 @@
-"""The capability table again: the cells of paths of two bounces, what one bounce adds taken off."""
+"""The cells of the capability table for paths of two bounces, without paths of one bounce."""
 
 import math
 from collections.abc import Callable

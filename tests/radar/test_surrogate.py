@@ -128,7 +128,7 @@ def test_a_pulse_of_ones_own(linear):
 
 
 def test_mean_over_phase_seeds(linear, point_paths):
-    """The same by brute force: 400 draws of the phases of one cloud, one per frame."""
+    """The mean by brute force: 400 draws of the phases of one cloud, one per frame."""
     seeds = 400
     points, power = cloud(300, 1)
     copies = replace(linear, positions=linear.positions.expand(seeds, 3))

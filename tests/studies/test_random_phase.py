@@ -147,7 +147,7 @@ def test_extra_width_and_offset(view):
 
 
 def test_of_a_scene():
-    """As a model: a draw a seed, and silhouettes that move it."""
+    """The field as a model: one draw a seed, and silhouettes that move it."""
     radar = small_radar()
     grid = radar.grid(0.5, 2.5, 0.8)
     drawn = Sampling(depth=1, samples=1_500, boundary_samples=300)

@@ -171,7 +171,7 @@ def _demo_file() -> Path:
 
 
 def _shown_once() -> Callable[..., None]:
-    """Prints every warning on one line, the same text once."""
+    """Print every warning on one line, the same text once."""
     said: set[str] = set()
 
     def show(message: Warning | str, *_: Any) -> None:

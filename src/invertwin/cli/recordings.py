@@ -79,7 +79,7 @@ class ChirpTable(DataTable, Posed):
 
 
 def register(kinds: Registry) -> None:
-    """Adds the readers; what one returns says which keys it has beside its own."""
+    """Add the readers; what one returns says which keys it has beside its own."""
     kinds.groups["data"] = Group()
     kinds.bases[Capture] = DataTable
     kinds.bases[ChirpCapture] = ChirpTable

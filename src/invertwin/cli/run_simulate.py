@@ -69,7 +69,7 @@ def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> tor
 
 
 def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
-    """Simulates the true scene of a run file, writes the folder, returns the tables to print."""
+    """Simulate the true scene of a run file, write the folder, return the tables to print."""
     scene = build.true_scene(run)
     radar = build.radar(need(run, "radar", "simulate"))
     grid = build.grid(need(run, "grid", "simulate"), radar)

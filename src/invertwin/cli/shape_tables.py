@@ -106,7 +106,7 @@ class Mover(ParameterTable):
 
 
 def register(registry: Registry) -> None:
-    """Adds shapes, and the modules that fit them."""
+    """Add shapes, and the modules that fit them."""
     registry.groups["shape"] = Group(tag="shape", base=Placement, product=Mesh)
     registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
     registry.groups["parameter"] = Group(base=ParameterTable)

@@ -54,7 +54,7 @@ class FieldLine(Line):
     """
 
     def __init__(self, module: nn.Module, tangent: Mapping[str, Change], target: Any) -> None:
-        """See ``Line``; the module has an ``object`` and its ``distance`` at points."""
+        """Move a module with an ``object`` and its ``distance`` at points; see ``Line``."""
         super().__init__(module, tangent, target)
         self._field, self._object = _Field(module), str(module.object)
         with torch.no_grad():

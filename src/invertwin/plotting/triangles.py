@@ -18,7 +18,7 @@ Shape = tuple[NDArray, NDArray]
 
 
 def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest: float) -> None:
-    """Draws shapes as an eye far away sees them.
+    """Draw shapes as an eye far away sees them.
 
     Args:
         axes: Matplotlib axes to draw in.
@@ -49,7 +49,7 @@ def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest:
 
 
 def small_triangles(triangles: NDArray, longest: float) -> NDArray:
-    """Splits the triangles with a side above `longest`, up to a bound on their number.
+    """Split the triangles with a side above `longest`, up to a bound on their number.
 
     Args:
         triangles: Corners [t, 3, 3] (m).

@@ -45,7 +45,7 @@ _MEANINGS = {
     "counts": "nodes along x, y and z",
     "smooth": "λ of steps preconditioned by (I + λL)⁻²; 0 = none",
 }
-"""Of keys that many tables have, where a constructor says nothing."""
+"""What keys of many tables mean, where a constructor says nothing."""
 _PLAIN = (bool, int, float, str, list, tuple, dict)
 
 

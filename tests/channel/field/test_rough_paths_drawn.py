@@ -1,4 +1,4 @@
-"""How rough paths are drawn: as much power as there is, by way of many paths where it is weak."""
+"""How rough paths are drawn: with all the power, and as many paths where it is weak."""
 
 import math
 

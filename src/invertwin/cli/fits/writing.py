@@ -152,7 +152,7 @@ def _added(metrics: dict[str, Any]) -> Table:
 
 
 def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
-    """Writes the pictures of the best fit; returns those of the report."""
+    """Write the pictures of the best fit; return those of the report."""
     problem, metrics = fitted.problem, fitted.metrics
     run, truth, fitted_names = problem.run, problem.truth, fitted_objects(problem.run)
     known = {k: truth[k] for k in truth.names if k in problem.known and k in fitted_names}
