@@ -36,14 +36,24 @@ _ACUTE = -0.98  # least cosine between the normals of surfaces between which ray
 
 @dataclass(frozen=True)
 class Spot:
-    """A point of a surface: triangle and barycentric coordinates."""
+    """A point of a surface.
+
+    Attributes:
+        face: Triangle.
+        b1, b2: Barycentric coordinates.
+    """
 
     face: Any
     b1: Any
     b2: Any
 
     def place(self, inputs: Inputs, active: Any = True) -> Place:
-        """Where it is."""
+        """Where it is.
+
+        Args:
+            inputs: Tables of the kernel.
+            active: Lanes.
+        """
         return integrand.place(inputs, self.face, self.b1, self.b2, active)
 
 
@@ -51,8 +61,11 @@ class Spot:
 class Crossing:
     """What is drawn of points of the curve.
 
-    ``weight`` is one over (samples × probability per metre); ``transmittance`` and ``extra``
-    length are those of the sheets on the way to where the path comes from.
+    Attributes:
+        index: Number of the sample.
+        frame: Radar pose.
+        weight: One over (samples × probability per metre).
+        transmittance, extra: Of the sheets on the way to where the path comes from.
     """
 
     index: Any
@@ -64,7 +77,13 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Meeting:
-    """Points of the curve on both surfaces, and the surface points from which paths come."""
+    """Points of the curve.
+
+    Attributes:
+        drawn: What is drawn of them.
+        first, second: On either surface.
+        source: The surface points from which paths come, if not from an antenna.
+    """
 
     drawn: Crossing
     first: Spot
@@ -89,6 +108,16 @@ class ContactSampler:
         depth: int,
         seed: int,
     ) -> None:
+        """Prepare the choice of segments.
+
+        Args:
+            rays: The scene and its antennas.
+            inputs: Detached tables.
+            contacts: Segments of the curves.
+            samples: How many points are drawn.
+            depth: Most vertices of a path.
+            seed: Of the points.
+        """
         self.rays, self.inputs, self.size, self.depth = rays, inputs, samples, depth
         ends = [(end - rays.origin).float() for end in (contacts.start, contacts.end)]
         self.ends = list(map(to_points, ends))

@@ -193,7 +193,9 @@ class EdgeSampler:
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
 
     def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
-        """Edge, frame, whether the antenna is the receiver of two, and its place."""
+        """Edge, frame, whether the antenna is the receiver of two, and its place.
+        close: Whether other surfaces may be close to edges.
+        """
         rays, edges = self.rays, len(self.rays.topology.edges)
         frame, edge = entry // edges, entry % edges
         if len(self.centres) == 1:
@@ -292,6 +294,7 @@ class InteriorEdgeSampler:
 
         Azimuths count from the first triangle of the edge. Two triangles at azimuths 0 and α
         leave (α, π); one triangle leaves all; more are left to the test of sides.
+            close: Whether other surfaces may be close to edges.
         """
         topology = self.rays.topology
         along = dr.normalize(y1 - y0)
