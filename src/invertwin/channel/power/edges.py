@@ -161,6 +161,7 @@ class EdgeSampler:
         centres: Antennas whose silhouettes count: ``tx``, ``rx`` or both.
         samples: Points over all frames.
         seed: Of the points.
+        close: Whether other surfaces may be close to edges.
     """
 
     def __init__(
@@ -193,9 +194,7 @@ class EdgeSampler:
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
 
     def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
-        """Edge, frame, whether the antenna is the receiver of two, and its place.
-        close: Whether other surfaces may be close to edges.
-        """
+        """Edge, frame, whether the antenna is the receiver of two, and its place."""
         rays, edges = self.rays, len(self.rays.topology.edges)
         frame, edge = entry // edges, entry % edges
         if len(self.centres) == 1:
@@ -251,6 +250,7 @@ class InteriorEdgeSampler:
         seed: Of the points.
         weighted: False takes edges by length alone and directions from the whole sphere: what the
             benchmark compares with.
+        close: Whether other surfaces may be close to edges.
     """
 
     def __init__(
@@ -294,7 +294,6 @@ class InteriorEdgeSampler:
 
         Azimuths count from the first triangle of the edge. Two triangles at azimuths 0 and α
         leave (α, π); one triangle leaves all; more are left to the test of sides.
-            close: Whether other surfaces may be close to edges.
         """
         topology = self.rays.topology
         along = dr.normalize(y1 - y0)
