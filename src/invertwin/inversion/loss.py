@@ -148,6 +148,19 @@ class SpectrumLoss:
             own = own - mixed @ mixed.T / total[-1, -1]
         return own
 
+    def fitted_gain(self, simulated: Tensor, measured: Tensor) -> float:
+        """What the simulated map is multiplied by to be nearest to the measured one.
+
+        Args:
+            simulated: Power.
+            measured: Power.
+        """
+        unit, scale = self._units(simulated, measured)
+        pairs = self._pyramid(simulated.detach(), measured)
+        if self.kind == "mse":
+            pairs = [(self._cleared(a), self._cleared(b)) for a, b in pairs]
+        return float(self._gain(pairs) * scale / unit)
+
     def _units(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """What the simulated and the measured map are divided by."""
         scale = _mean_size(measured)

@@ -1,7 +1,8 @@
 """Find the parameters of a scene that explain what one or several sensors have observed."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from invertwin.inversion.observation import Observation, Unknown, Unknowns, name
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
+from invertwin.inversion.uncertainty import Uncertainty, uncertainty
 from invertwin.models import ForwardModel
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene
@@ -41,6 +43,16 @@ class Reconstruction:
     status: Status
     steps: int
     loss: float
+    _fit: Fit = field(repr=False)
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """The error bars of the parameters, computed when they are first asked for.
+
+        Raises:
+            InputError: See :func:`invertwin.inversion.uncertainty.uncertainty`.
+        """
+        return uncertainty(self._fit)
 
 
 def reconstruct(
@@ -132,7 +144,7 @@ def reconstruct(
     final = history[-1]["loss"]
     if status == "diverged" and fit.progress.best is not None:
         final = fit.progress.best[1]
-    return Reconstruction(twin, sensors, fit.modules, history, status, len(history), final)
+    return Reconstruction(twin, sensors, fit.modules, history, status, len(history), final, fit)
 
 
 def _models(stage: Stage, observations: Sequence[Observation]) -> Sequence[ForwardModel]:

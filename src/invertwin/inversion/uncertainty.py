@@ -1,0 +1,314 @@
+"""How sure a fit is: error bars from the statistics of the data, and what the radar does not see."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+from jaxtyping import Float64
+from scipy import stats
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.inversion.fit import Fit
+from invertwin.inversion.gauss_newton import along, penalty_curvature
+from invertwin.inversion.loss import Maps, SpectrumLoss
+from invertwin.scene.parameters import Coordinate, Entries
+from invertwin.seeds import derived_seed
+
+_MOST = 64  # coordinates; each costs derivatives of the map
+_LOOKS = 64  # they tell a standard deviation to 9 %
+_DARK = 0.2  # the share of bins, the darkest, in which noise is measured
+_TRUSTED = 0.5  # of the information that the noise of the derivatives feigns
+_BLIND = 20.0  # times the variance of the best known coordinate, in spans: not observed
+_LARGE = 25.0  # spans squared: not observed, however the others are
+_PART = 0.3  # of a direction: smaller components are not named
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """The error bars of a fit.
+
+    They hold what speckle and noise do to the estimate, near the minimum that was found. A wrong
+    minimum, a wrong model or a wrong start are the matter of the verdict.
+
+    Attributes:
+        names: Of the coordinates, such as "letter.x".
+        units: Of the coordinates: "m", "rad", or empty.
+        covariance: Of the estimates. What is not observed has a large variance, not an infinite
+            one: at least as large as it says.
+        unobserved: A sentence for every direction that the data do not tell. It begins with the
+            names of its coordinates.
+        frames: None if the statistics are those of simulated looks at the twin; else the number of
+            frames from whose scatter they are estimated.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    covariance: Float64[Tensor, "p p"]
+    unobserved: tuple[str, ...]
+    frames: int | None = None
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """One standard deviation of every coordinate, in its unit."""
+        return dict(zip(self.names, self.covariance.diagonal().sqrt().tolist(), strict=True))
+
+    @property
+    def correlations(self) -> Float64[Tensor, "p p"]:
+        """Correlations of the errors."""
+        scale = self.covariance.diagonal().rsqrt()
+        return self.covariance * scale * scale[:, None]
+
+    def interval(self, level: float = 0.95) -> dict[str, float]:
+        """How far the truth is from the estimate at most, with this probability.
+
+        Args:
+            level: The probability.
+        """
+        law: Any = stats.norm() if self.frames is None else stats.t(self.frames - 1)
+        factor = float(law.ppf(0.5 + 0.5 * level))
+        return {name: factor * value for name, value in self.deviations.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """What the loss of a fit is on looks at its own twin.
+
+    Attributes:
+        losses: Of every look.
+        slopes: For every look, the derivatives of the loss by the map of every observation.
+    """
+
+    losses: list[float]
+    slopes: list[list[Tensor]]
+
+
+def uncertainty(fit: Fit) -> Uncertainty:
+    """The covariance of what a fit has found.
+
+    ``Cov θ = H⁻¹ Cov(g) H⁻¹``: H the Gauss–Newton matrix of the loss, g its gradient on looks at
+    the twin with other speckle and noise, both with a gain fitted anew. Derivatives of the map are
+    taken in forward mode at the end of the fit, twice with other samples: their noise would feign
+    information. Where a model gives no looks, Cov(g) is the scatter of the frames of the data,
+    as if no two frames shared speckle.
+
+    Source: the sandwich covariance of estimators; derivations §16.
+    Differs from the source: Cov(g) by draws, so that correlated bins and frames count rightly.
+
+    Args:
+        fit: A fit that has ended.
+
+    Raises:
+        InputError: More than 64 coordinates, a loss that is no ``SpectrumLoss``, or a single frame
+            of a model without looks.
+    """
+    found = list(_coordinates(fit.modules))
+    names = {type(loss).__name__ for loss in fit.objective.losses} - {"SpectrumLoss"}
+    if len(found) > _MOST or names:
+        raise InputError(
+            f"expected a SpectrumLoss and at most {_MOST} parameters for error bars, got "
+            f"{', '.join(names) or len(found)}; they are not known for this fit"
+        )
+    (maps, first), (other, second) = (_derivatives(fit, found, number) for number in (0, 1))
+    maps = [((a + c) / 2, b) for (a, b), (c, _) in zip(maps, other, strict=True)]
+    # What nothing depends on is held fixed, unless it has a meaning of its own.
+    moves = [any(bool(rows[k].any()) for rows in first) for k in range(len(found))]
+    kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
+    found = [found[k] for k in kept]
+    first, second = ([rows[kept] for rows in side] for side in (first, second))
+    # J₁J₂ᵀ + J₂J₁ᵀ = 2 (mean mean − half half), with half the difference of J₁ and J₂.
+    rows = [[(a + b) / 2 for a, b in zip(first, second, strict=True)]]
+    rows.append([(a - b) / 2 for a, b in zip(first, second, strict=True)])
+    curvature, feigned = (fit.objective.curvature(maps, some) for some in rows)
+    drawn, frames = draws(fit, maps), None
+    if drawn is not None:
+        scatter, chance = (_covariance(drawn.slopes, some) for some in rows)
+    else:
+        frames = min(len(b) for _, b in maps)
+        if frames < 2:
+            raise InputError(
+                "expected looks at the twin or several frames for error bars, got one frame of a "
+                "model without looks; they are not known for this fit"
+            )
+        scatter, chance = (_frame_scatter(_slopes(fit, maps)[1], some) for some in rows)
+    curvature = curvature - feigned + _penalty(fit, found)
+    spans = torch.tensor([c.span for c in found], dtype=torch.float64)
+    own = curvature.diagonal().clamp_min(1e-30).rsqrt()
+    spans = torch.where(spans.isinf(), own, spans)
+    square = spans * spans[:, None]
+    covariance = _inverted(*(m * square for m in (curvature, feigned, scatter, chance)))
+    return Uncertainty(
+        tuple(c.name for c in found),
+        tuple(c.unit for c in found),
+        covariance * square,
+        tuple(_unobserved(found, covariance)),
+        frames,
+    )
+
+
+def draws(fit: Fit, maps: Maps, count: int = _LOOKS) -> Draws | None:
+    """The loss on looks at the twin, with noise as dark bins of the data have it.
+
+    Args:
+        fit: Its twin is looked at.
+        maps: Predicted and observed, see ``Fit.sharp_maps``.
+        count: Looks.
+
+    Returns:
+        None where a model gives no looks, or the data do not look like the twin at all.
+    """
+    noises = [_noise(loss, *pair) for loss, pair in zip(fit.objective.losses, maps, strict=True)]
+    looks = fit.looks(0)
+    if any(not math.isfinite(noise) for noise in noises) or any(look is None for look in looks):
+        return None
+    found = Draws([], [])
+    for number in range(count):
+        seen = [
+            (predicted, look(derived_seed(number, k), noise))
+            for k, ((predicted, _), look, noise) in enumerate(zip(maps, looks, noises, strict=True))
+            if look is not None
+        ]
+        loss, slopes = _slopes(fit, seen)
+        found.losses.append(loss)
+        found.slopes.append(slopes)
+    return found
+
+
+def _coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
+    """What a module and its parts find, with parameters by their whole name."""
+    if hasattr(module, "coordinates"):
+        for own in module.coordinates():  # type: ignore[operator]
+            if all(module.get_parameter(name).requires_grad for name in own.tangents):
+                tangents = {path + name: tangent for name, tangent in own.tangents.items()}
+                yield Coordinate(own.name, own.unit, tangents, own.span)
+        return
+    known: dict[str, Entries] = getattr(module, "entries", dict)()
+    held = {entry.parameter for entry in known.values()}
+    known |= {n: Entries(n) for n, _ in module.named_parameters(recurse=False) if n not in held}
+    prefix = f"{module.object}." if hasattr(module, "object") else path
+    for name, entry in known.items():
+        parameter = module.get_parameter(entry.parameter)
+        part = parameter.detach()[entry.index]
+        for number in range(part.numel() if parameter.requires_grad else 0):
+            one = torch.zeros_like(part)
+            one.view(-1)[number] = 1.0
+            tangent = torch.zeros_like(parameter.detach())
+            tangent[entry.index] = one / entry.slope
+            shown = prefix + name + (f"[{number}]" if part.numel() > 1 else "")
+            yield Coordinate(shown, "", {path + entry.parameter: tangent})
+    for name, child in module.named_children():
+        if not any(whole.startswith(f"{name}.") for whole in held):
+            yield from _coordinates(child, f"{path}{name}.")
+
+
+def _derivatives(fit: Fit, found: Sequence[Coordinate], number: int) -> tuple[Maps, list[Tensor]]:
+    """Maps at the end, and for every observation the derivatives [coordinate, …] of the predicted."""
+    rows: list[list[Tensor]] = []
+    maps: Maps = []
+    for coordinate in found:
+        with forward_ad.dual_level(), along(fit.modules, coordinate.tangents):
+            pairs = fit.sharp_maps(number)
+            duals = [forward_ad.unpack_dual(predicted) for predicted, _ in pairs]
+            maps = [(dual.primal, b) for dual, (_, b) in zip(duals, pairs, strict=True)]
+            rows.append([torch.zeros_like(p) if t is None else t for p, t in duals])
+    return maps, [torch.stack(column) for column in zip(*rows, strict=True)]
+
+
+def _slopes(fit: Fit, maps: Maps) -> tuple[float, list[Tensor]]:
+    """The loss, and its derivative by every predicted map."""
+    with torch.enable_grad():
+        attached = [(a.detach().requires_grad_(), b) for a, b in maps]
+        loss = fit.objective(attached)
+        return float(loss.detach()), list(torch.autograd.grad(loss, [a for a, _ in attached]))
+
+
+def _noise(loss: Any, predicted: Tensor, observed: Tensor) -> float:
+    """Mean noise in a bin, in units of the predicted map: what its darkest bins hold beyond it."""
+    law = loss if isinstance(loss, SpectrumLoss) else SpectrumLoss("likelihood")
+    gain = law.fitted_gain(predicted, observed)
+    dark = predicted.flatten().argsort()[: max(1, int(_DARK * predicted.numel()))]
+    beyond = (observed.flatten()[dark] / gain if gain > 0 else dark / 0.0) - predicted.flatten()[dark]
+    return float(beyond.mean().clamp_min(0.0))
+
+
+def _covariance(slopes: Sequence[Sequence[Tensor]], rows: Sequence[Tensor]) -> Tensor:
+    """Covariance of the gradient over draws."""
+    flat = [part.flatten(1) for part in rows]
+    scores = torch.stack(
+        [
+            torch.stack([f @ s.flatten() for f, s in zip(flat, own, strict=True)]).sum(0)
+            for own in slopes
+        ]
+    )
+    return torch.cov(scores.T.double()).reshape(len(flat[0]), -1)
+
+
+def _frame_scatter(slopes: Sequence[Tensor], rows: Sequence[Tensor]) -> Tensor:
+    """Covariance of the gradient from the scatter of the terms of single frames."""
+    total = torch.zeros((), dtype=torch.float64)
+    for slope, own in zip(slopes, rows, strict=True):
+        scores = torch.einsum("pfn,fn->pf", own.flatten(2), slope.flatten(1)).double()
+        total = total + len(slope) * torch.cov(scores).reshape(len(own), -1)
+    return total
+
+
+def _penalty(fit: Fit, found: Sequence[Coordinate]) -> Tensor:
+    """Second derivatives of the regularisers along the coordinates."""
+    free = {n: p for n, p in fit.modules.named_parameters() if p.requires_grad}
+    tangents = torch.stack(
+        [
+            torch.cat([c.tangents.get(n, torch.zeros_like(p)).flatten() for n, p in free.items()])
+            for c in found
+        ]
+    ).detach().double()
+    every = torch.ones(tangents.shape[1], dtype=torch.bool)
+    with torch.enable_grad():
+        own = penalty_curvature(fit.penalty, list(free.values()), every)
+    return tangents @ own @ tangents.T
+
+
+def _inverted(curvature: Tensor, feigned: Tensor, scatter: Tensor, chance: Tensor) -> Tensor:
+    """The sandwich, in units of the spans; directions without information get errors of one."""
+    values, axes = torch.linalg.eigh(curvature)
+    least = _TRUSTED * (axes.T @ feigned @ axes).diagonal().clamp_min(1e-30)
+    seen = values > least
+    values = values.clamp_min(least)
+    inner = axes.T @ (scatter - chance) @ axes * (seen * seen[:, None])
+    noise = (axes.T @ chance @ axes).diagonal()
+    inner += torch.diag(torch.where(seen, 0.0, noise.clamp_min(values.square())))
+    powers, turned = torch.linalg.eigh(inner / (values * values[:, None]))
+    axes = axes @ turned
+    return axes @ torch.diag(powers.clamp_min(1e-30)) @ axes.T
+
+
+def _unobserved(found: Sequence[Coordinate], covariance: Tensor) -> Iterator[str]:
+    """Says which directions are more uncertain than their spans, and far more than the best."""
+    known = [k for k, c in enumerate(found) if math.isfinite(c.span)]
+    own = covariance[known][:, known]
+    for error, axis in zip(*_eigen(own), strict=True):
+        if not error > max(1.0, min(_BLIND * float(own.diagonal().min()), _LARGE)):
+            continue
+        parts = [k for k in axis.abs().argsort(descending=True).tolist() if abs(axis[k]) > _PART]
+        names = " and ".join(found[known[k]].name for k in parts)
+        if len(parts) > 1:
+            mixed = " ".join(f"{float(axis[k]):+.2f} {found[known[k]].name}" for k in parts)
+            yield f"{names}: not observed along {mixed}, in units of their spans"
+            continue
+        alone = found[known[parts[0]]]
+        shares = {
+            found[k].name: float(error * alone.span**2 / (covariance[k, k] * found[k].span ** 2))
+            for k in known
+            if found[k].unit == alone.unit and found[k].name != alone.name
+        }
+        best = max(shares, key=lambda name: shares[name], default=None)
+        told = "" if best is None else f"; {1 / shares[best]:.1g} of the information of {best}"
+        yield f"{names}: not observed{told}"
+
+
+def _eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues, and eigenvectors as rows."""
+    values, vectors = torch.linalg.eigh(matrix)
+    return values, vectors.T
