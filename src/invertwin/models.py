@@ -197,7 +197,9 @@ class SurrogateMap(ForwardModel):
         fields = replace(self.sampling, boundary=False)
         looks = Looks(trace_field(scene, sensor.link(), sampling=fields, seed=seed), sensor)
         white = torch.randn(
-            *sensor.shape, sensor.waveform.samples, dtype=torch.complex64,
+            *sensor.shape,
+            sensor.waveform.samples,
+            dtype=torch.complex64,
             generator=torch.Generator().manual_seed(seed),
         )
         share = float(exact_spectrum(white, sensor, self.grid).mean())

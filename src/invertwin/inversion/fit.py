@@ -203,6 +203,18 @@ class Fit:
             pairs.append((predicted, self._observed[k]))
         return pairs
 
+    def loss_at_start(self) -> float:
+        """The loss without extra widths at the parameters that the stage began with."""
+        present = self.parameters()
+        self.modules.load_state_dict(self.progress.first)
+        try:
+            with torch.no_grad():
+                return float(self.objective(self.sharp_maps(0)))
+        except InputError:  # out of bounds
+            return math.inf
+        finally:
+            self.modules.load_state_dict(present)
+
     def looks(self, number: int) -> list[Callable[[int, float], Tensor] | None]:
         """What every sensor might have recorded of the twin, see ``ForwardModel.looks``.
 

@@ -132,7 +132,7 @@ class SpectrumLoss:
         total = rows.new_zeros(len(rows), len(rows), dtype=torch.float64)
         for level, (a, b) in enumerate(pairs):
             if level > 0:
-                rows = _pooled(rows.flatten(0, 1)).unflatten(0, (len(rows), -1))
+                rows = pooled(rows.flatten(0, 1)).unflatten(0, (len(rows), -1))
             if self.kind == "mse":
                 weight = 2 * gain**2 / b.square().mean().clamp_min(1e-30)
                 weighed = torch.stack([self._cleared(row) for row in rows]).flatten(1)
@@ -173,7 +173,7 @@ class SpectrumLoss:
         """A map at all resolutions."""
         found = [power]
         while len(found) < self.levels:
-            found.append(_pooled(found[-1]))
+            found.append(pooled(found[-1]))
         return found
 
     def _pyramid(self, simulated: Tensor, measured: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -410,8 +410,12 @@ def _mean_size(power: Tensor) -> Tensor:
     return torch.linalg.vector_norm(power.detach(), 1) / power.numel()
 
 
-def _pooled(power: Tensor) -> Tensor:
-    """Half the resolution along every axis that has two bins or more."""
+def pooled(power: Tensor) -> Tensor:
+    """Half the resolution along every axis that has two bins or more.
+
+    Args:
+        power: [frame, …].
+    """
     # Axis by axis, since whole rows are added quickly: half the time of ``avg_pool3d``.
     share = 1.0
     for dim in range(1, power.ndim):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.inversion.draws import End
 from invertwin.inversion.fit import Callback, Fit, Settings, Status
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.observation import Observation, Unknown, Unknowns, named_unknowns
@@ -16,6 +17,7 @@ from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
 from invertwin.inversion.uncertainty import Uncertainty, uncertainty
+from invertwin.inversion.verdict import Verdict, verdict
 from invertwin.models import ForwardModel
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene
@@ -32,6 +34,7 @@ class Reconstruction:
         history: One row a step: ``step``, ``stage``, ``loss``, ``values`` (parameters by name).
         status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
             ``diverged`` (not finite, or worse than the start; then the best state is kept).
+            Why the fit stopped: whether it is right is the matter of ``verdict``.
         steps: Steps done.
         loss: Final loss; if the fit diverged, that of the best state, without extra widths.
     """
@@ -43,7 +46,7 @@ class Reconstruction:
     status: Status
     steps: int
     loss: float
-    _fit: Fit = field(repr=False)
+    _end: End = field(repr=False)
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -52,7 +55,12 @@ class Reconstruction:
         Raises:
             InputError: See :func:`invertwin.inversion.uncertainty.uncertainty`.
         """
-        return uncertainty(self._fit)
+        return uncertainty(self._end)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the twin is to be believed, computed when it is first asked for."""
+        return verdict(self._end)
 
 
 def reconstruct(
@@ -144,7 +152,9 @@ def reconstruct(
     final = history[-1]["loss"]
     if status == "diverged" and fit.progress.best is not None:
         final = fit.progress.best[1]
-    return Reconstruction(twin, sensors, fit.modules, history, status, len(history), final, fit)
+    return Reconstruction(
+        twin, sensors, fit.modules, history, status, len(history), final, End(fit)
+    )
 
 
 def _models(stage: Stage, observations: Sequence[Observation]) -> Sequence[ForwardModel]:

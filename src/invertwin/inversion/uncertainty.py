@@ -1,4 +1,4 @@
-"""How sure a fit is: error bars from the statistics of the data, and what the radar does not see."""
+"""How sure a fit is: error bars from the statistics of the data, and what is not observed."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -12,15 +12,13 @@ from scipy import stats
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.inversion.draws import End
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import along, penalty_curvature
-from invertwin.inversion.loss import Maps, SpectrumLoss
+from invertwin.inversion.loss import SpectrumLoss
 from invertwin.scene.parameters import Coordinate, Entries
-from invertwin.seeds import derived_seed
 
 _MOST = 64  # coordinates; each costs derivatives of the map
-_LOOKS = 64  # they tell a standard deviation to 9 %
-_DARK = 0.2  # the share of bins, the darkest, in which noise is measured
 _TRUSTED = 0.5  # of the information that the noise of the derivatives feigns
 _BLIND = 20.0  # times the variance of the best known coordinate, in spans: not observed
 _LARGE = 25.0  # spans squared: not observed, however the others are
@@ -73,20 +71,7 @@ class Uncertainty:
         return {name: factor * value for name, value in self.deviations.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class Draws:
-    """What the loss of a fit is on looks at its own twin.
-
-    Attributes:
-        losses: Of every look.
-        slopes: For every look, the derivatives of the loss by the map of every observation.
-    """
-
-    losses: list[float]
-    slopes: list[list[Tensor]]
-
-
-def uncertainty(fit: Fit) -> Uncertainty:
+def uncertainty(end: End) -> Uncertainty:
     """The covariance of what a fit has found.
 
     ``Cov θ = H⁻¹ Cov(g) H⁻¹``: H the Gauss–Newton matrix of the loss, g its gradient on looks at
@@ -99,21 +84,21 @@ def uncertainty(fit: Fit) -> Uncertainty:
     Differs from the source: Cov(g) by draws, so that correlated bins and frames count rightly.
 
     Args:
-        fit: A fit that has ended.
+        end: Of the fit.
 
     Raises:
         InputError: More than 64 coordinates, a loss that is no ``SpectrumLoss``, or a single frame
             of a model without looks.
     """
+    fit = end.fit
     found = list(_coordinates(fit.modules))
-    names = {type(loss).__name__ for loss in fit.objective.losses} - {"SpectrumLoss"}
-    if len(found) > _MOST or names:
+    others = [x for x in fit.objective.losses if not isinstance(x, SpectrumLoss)]
+    if len(found) > _MOST or others:
         raise InputError(
             f"expected a SpectrumLoss and at most {_MOST} parameters for error bars, got "
-            f"{', '.join(names) or len(found)}; they are not known for this fit"
+            f"{type(others[0]).__name__ if others else len(found)}; they are not known for this fit"
         )
-    (maps, first), (other, second) = (_derivatives(fit, found, number) for number in (0, 1))
-    maps = [((a + c) / 2, b) for (a, b), (c, _) in zip(maps, other, strict=True)]
+    maps, (first, second) = end.maps, (_derivatives(fit, found, number) for number in (0, 1))
     # What nothing depends on is held fixed, unless it has a meaning of its own.
     moves = [any(bool(rows[k].any()) for rows in first) for k in range(len(found))]
     kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
@@ -123,9 +108,9 @@ def uncertainty(fit: Fit) -> Uncertainty:
     rows = [[(a + b) / 2 for a, b in zip(first, second, strict=True)]]
     rows.append([(a - b) / 2 for a, b in zip(first, second, strict=True)])
     curvature, feigned = (fit.objective.curvature(maps, some) for some in rows)
-    drawn, frames = draws(fit, maps), None
-    if drawn is not None:
-        scatter, chance = (_covariance(drawn.slopes, some) for some in rows)
+    frames = None
+    if end.draws is not None:
+        scatter, chance = (_covariance(end.draws.slopes, some) for some in rows)
     else:
         frames = min(len(b) for _, b in maps)
         if frames < 2:
@@ -133,7 +118,7 @@ def uncertainty(fit: Fit) -> Uncertainty:
                 "expected looks at the twin or several frames for error bars, got one frame of a "
                 "model without looks; they are not known for this fit"
             )
-        scatter, chance = (_frame_scatter(_slopes(fit, maps)[1], some) for some in rows)
+        scatter, chance = (_frame_scatter(end.slopes(maps)[1], some) for some in rows)
     curvature = curvature - feigned + _penalty(fit, found)
     spans = torch.tensor([c.span for c in found], dtype=torch.float64)
     own = curvature.diagonal().clamp_min(1e-30).rsqrt()
@@ -147,34 +132,6 @@ def uncertainty(fit: Fit) -> Uncertainty:
         tuple(_unobserved(found, covariance)),
         frames,
     )
-
-
-def draws(fit: Fit, maps: Maps, count: int = _LOOKS) -> Draws | None:
-    """The loss on looks at the twin, with noise as dark bins of the data have it.
-
-    Args:
-        fit: Its twin is looked at.
-        maps: Predicted and observed, see ``Fit.sharp_maps``.
-        count: Looks.
-
-    Returns:
-        None where a model gives no looks, or the data do not look like the twin at all.
-    """
-    noises = [_noise(loss, *pair) for loss, pair in zip(fit.objective.losses, maps, strict=True)]
-    looks = fit.looks(0)
-    if any(not math.isfinite(noise) for noise in noises) or any(look is None for look in looks):
-        return None
-    found = Draws([], [])
-    for number in range(count):
-        seen = [
-            (predicted, look(derived_seed(number, k), noise))
-            for k, ((predicted, _), look, noise) in enumerate(zip(maps, looks, noises, strict=True))
-            if look is not None
-        ]
-        loss, slopes = _slopes(fit, seen)
-        found.losses.append(loss)
-        found.slopes.append(slopes)
-    return found
 
 
 def _coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
@@ -204,34 +161,14 @@ def _coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
             yield from _coordinates(child, f"{path}{name}.")
 
 
-def _derivatives(fit: Fit, found: Sequence[Coordinate], number: int) -> tuple[Maps, list[Tensor]]:
-    """Maps at the end, and for every observation the derivatives [coordinate, …] of the predicted."""
+def _derivatives(fit: Fit, found: Sequence[Coordinate], number: int) -> list[Tensor]:
+    """For every observation the derivatives of its predicted map [coordinate, …]."""
     rows: list[list[Tensor]] = []
-    maps: Maps = []
     for coordinate in found:
         with forward_ad.dual_level(), along(fit.modules, coordinate.tangents):
-            pairs = fit.sharp_maps(number)
-            duals = [forward_ad.unpack_dual(predicted) for predicted, _ in pairs]
-            maps = [(dual.primal, b) for dual, (_, b) in zip(duals, pairs, strict=True)]
+            duals = [forward_ad.unpack_dual(predicted) for predicted, _ in fit.sharp_maps(number)]
             rows.append([torch.zeros_like(p) if t is None else t for p, t in duals])
-    return maps, [torch.stack(column) for column in zip(*rows, strict=True)]
-
-
-def _slopes(fit: Fit, maps: Maps) -> tuple[float, list[Tensor]]:
-    """The loss, and its derivative by every predicted map."""
-    with torch.enable_grad():
-        attached = [(a.detach().requires_grad_(), b) for a, b in maps]
-        loss = fit.objective(attached)
-        return float(loss.detach()), list(torch.autograd.grad(loss, [a for a, _ in attached]))
-
-
-def _noise(loss: Any, predicted: Tensor, observed: Tensor) -> float:
-    """Mean noise in a bin, in units of the predicted map: what its darkest bins hold beyond it."""
-    law = loss if isinstance(loss, SpectrumLoss) else SpectrumLoss("likelihood")
-    gain = law.fitted_gain(predicted, observed)
-    dark = predicted.flatten().argsort()[: max(1, int(_DARK * predicted.numel()))]
-    beyond = (observed.flatten()[dark] / gain if gain > 0 else dark / 0.0) - predicted.flatten()[dark]
-    return float(beyond.mean().clamp_min(0.0))
+    return [torch.stack(column) for column in zip(*rows, strict=True)]
 
 
 def _covariance(slopes: Sequence[Sequence[Tensor]], rows: Sequence[Tensor]) -> Tensor:
@@ -258,12 +195,18 @@ def _frame_scatter(slopes: Sequence[Tensor], rows: Sequence[Tensor]) -> Tensor:
 def _penalty(fit: Fit, found: Sequence[Coordinate]) -> Tensor:
     """Second derivatives of the regularisers along the coordinates."""
     free = {n: p for n, p in fit.modules.named_parameters() if p.requires_grad}
-    tangents = torch.stack(
-        [
-            torch.cat([c.tangents.get(n, torch.zeros_like(p)).flatten() for n, p in free.items()])
-            for c in found
-        ]
-    ).detach().double()
+    tangents = (
+        torch.stack(
+            [
+                torch.cat(
+                    [c.tangents.get(n, torch.zeros_like(p)).flatten() for n, p in free.items()]
+                )
+                for c in found
+            ]
+        )
+        .detach()
+        .double()
+    )
     every = torch.ones(tangents.shape[1], dtype=torch.bool)
     with torch.enable_grad():
         own = penalty_curvature(fit.penalty, list(free.values()), every)

@@ -34,10 +34,11 @@ class Looks:
         points, self._point = torch.unique((mixed / _SAME).round(), return_inverse=True)
         self._count = len(points)
         way = paths.last - link.rx[paths.frame]
-        seen = torch.einsum("ni,nij->nj", way / way.norm(dim=1)[:, None], link.rotations[paths.frame])
+        way = way / way.norm(dim=1)[:, None]
+        u, v, _ = torch.einsum("ni,nij->jn", way, link.rotations[paths.frame])
         ranges = paths.range + torch.as_tensor(radar.range_bias).detach()
         steps = (waveform.range_resolution, *radar.beamwidth)
-        axes = [_axis(x, step / _CELLS) for x, step in zip((ranges, *seen.T[:2]), steps, strict=True)]
+        axes = [_axis(x, step / _CELLS) for x, step in zip((ranges, u, v), steps, strict=True)]
         (ranges, rows), (u, columns), (v, layers) = axes
         self._cells = len(ranges), len(u), len(v)
         self._cell = (rows * len(u) + columns) * len(v) + layers

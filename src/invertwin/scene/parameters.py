@@ -421,6 +421,13 @@ class MaterialValues(nn.Module):
         slopes = {name: _slope(name, raw.detach()) for name, raw in self.raw.items()}
         return {name: Entries(f"raw.{name}", slope=slope) for name, slope in slopes.items()}
 
+    def at_bounds(self) -> list[str]:
+        """Names of values next to an end of their range."""
+        places = {name: _slope(name, raw.detach()) for name, raw in self.raw.items()}
+        spans = {name: RANGES[name].high - RANGES[name].low for name in places}
+        near = {n: 1e-4 if math.isinf(span) else 0.01 * span for n, span in spans.items()}
+        return [f"{self.object}.{n}" for n, p in places.items() if bool((p < near[n]).any())]
+
     def _bounded(self) -> dict[str, Tensor | Texture]:
         values = {name: _bounded(name, raw) for name, raw in self.raw.items()}
         textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
