@@ -1,7 +1,7 @@
 """How the data of a fit would scatter if its twin were right: looks at the twin itself."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -63,24 +63,27 @@ class End:
     @cached_property
     def draws(self) -> Draws | None:
         """Looks at the twin; None where a model gives none, or a gain is zero."""
-        looks = self.fit.looks(0)
-        if not min(self.gains) > 0 or any(look is None for look in looks):
-            return None
-        noises = [_noise(*pair, g) for pair, g in zip(self.maps, self.gains, strict=True)]
         found = Draws([], [], [])
-        for number in range(_LOOKS):
-            seen = [
-                (predicted, look(derived_seed(number, k), noise))
-                for k, ((predicted, _), look, noise) in enumerate(
-                    zip(self.maps, looks, noises, strict=True)
-                )
-                if look is not None
-            ]
-            loss, slopes = self.slopes(seen)
+        for seen in self.looks():
+            loss, slopes = self.slopes(
+                [(a, look) for (a, _), look in zip(self.maps, seen, strict=True)]
+            )
             found.losses.append(loss)
             found.slopes.append(slopes)
-            found.coarse.append([coarse(b) for _, b in seen])
-        return found
+            found.coarse.append([coarse(look) for look in seen])
+        return found if found.losses else None
+
+    def looks(self) -> Iterator[list[Tensor]]:
+        """Maps of every observation as recordings of the twin would show them, with noise."""
+        looks = [look for look in self.fit.looks(0) if look is not None]
+        if not min(self.gains) > 0 or len(looks) < len(self.maps):
+            return
+        noises = [_noise(*pair, g) for pair, g in zip(self.maps, self.gains, strict=True)]
+        for number in range(_LOOKS):
+            yield [
+                look(derived_seed(number, k), noise)
+                for k, (look, noise) in enumerate(zip(looks, noises, strict=True))
+            ]
 
     def slopes(self, maps: Maps) -> tuple[float, list[Tensor]]:
         """The loss, and its derivative by every predicted map.

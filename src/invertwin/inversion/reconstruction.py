@@ -37,6 +37,7 @@ class Reconstruction:
             Why the fit stopped: whether it is right is the matter of ``verdict``.
         steps: Steps done.
         loss: Final loss; if the fit diverged, that of the best state, without extra widths.
+        end: Maps at the end, and looks at the twin.
     """
 
     scene: Scene
@@ -46,7 +47,7 @@ class Reconstruction:
     status: Status
     steps: int
     loss: float
-    _end: End = field(repr=False)
+    end: End = field(repr=False)
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -55,12 +56,12 @@ class Reconstruction:
         Raises:
             InputError: See :func:`invertwin.inversion.uncertainty.uncertainty`.
         """
-        return uncertainty(self._end)
+        return uncertainty(self.end)
 
     @cached_property
     def verdict(self) -> Verdict:
         """Whether the twin is to be believed, computed when it is first asked for."""
-        return verdict(self._end)
+        return verdict(self.end)
 
 
 def reconstruct(

@@ -15,10 +15,10 @@ _COORDINATES = ("x", "y", "z", "pitch", "yaw", "roll")
 
 def judged(problem: Problem, found: Reconstruction) -> dict[str, Any]:
     """Verdict and error bars of a fit, and how far it is from a known truth."""
-    seen, name = found.verdict, problem.target
+    seen, name = found.verdict, problem.target or ""
     rows: dict[str, Any] = {"verdict": seen.word, "loss_excess": seen.excess}
     rows["verdict_reasons"] = list(seen.reasons)
-    known = name is not None and name in problem.known
+    known = name in problem.known
     off = residual(found.scene[name], problem.truth[name]) if known else None
     if off is not None:
         values = [*off.offset.tolist(), *off.turn.tolist()]
