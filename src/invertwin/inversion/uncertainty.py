@@ -214,14 +214,15 @@ def _penalty(fit: Fit, found: Sequence[Coordinate]) -> Tensor:
 
 
 def _inverted(curvature: Tensor, feigned: Tensor, scatter: Tensor, chance: Tensor) -> Tensor:
-    """The sandwich, in units of the spans; directions without information get errors of one."""
+    """The sandwich, in units of the spans; directions without information get large errors."""
     values, axes = torch.linalg.eigh(curvature)
     least = _TRUSTED * (axes.T @ feigned @ axes).diagonal().clamp_min(1e-30)
     seen = values > least
     values = values.clamp_min(least)
     inner = axes.T @ (scatter - chance) @ axes * (seen * seen[:, None])
     noise = (axes.T @ chance @ axes).diagonal()
-    inner += torch.diag(torch.where(seen, 0.0, noise.clamp_min(values.square())))
+    blind = torch.maximum(noise, 2 * _LARGE * values.square())
+    inner += torch.diag(torch.where(seen, 0.0, blind))
     powers, turned = torch.linalg.eigh(inner / (values * values[:, None]))
     axes = axes @ turned
     return axes @ torch.diag(powers.clamp_min(1e-30)) @ axes.T

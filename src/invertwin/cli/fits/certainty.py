@@ -68,6 +68,4 @@ def certainty_table(metrics: dict[str, Any]) -> Table:
         heads, cells = heads[:-1], [row[:-1] for row in cells]
     said = [*metrics["verdict_reasons"], *metrics.get("unobserved", [])]
     said.append(metrics.get("no_error_bars", texts("notes")["error_bars"]))
-    return Table(
-        "Error bars", heads, cells, ". ".join(text[:1].upper() + text[1:] for text in said)
-    )
+    return Table("Error bars", heads, cells, "\n".join(said))
