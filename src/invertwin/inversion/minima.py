@@ -244,6 +244,7 @@ def _way(best: Scene, other: Scene, names: Sequence[str]) -> str:
         off = residual(other[name], best[name])
         if off is not None:
             axis = "xyz"[int(off.turn.abs().argmax())]
-            angle = f"{math.degrees(off.angle):.1f}° about {axis}"
-            told.append(f"{name} turned by {angle} and moved by {off.distance:.3f} m")
+            turned = f"turned by {math.degrees(off.angle):.1f}° about {axis}, "
+            far = f"{name} {turned if off.angle > _SAME_TURN else ''}moved by {off.distance:.3f} m"
+            told.append(far)
     return ", ".join(told) or "another shape"
