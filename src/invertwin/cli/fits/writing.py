@@ -213,7 +213,7 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
     """What came out, in a sentence or two."""
     count = metrics.get("starts_count", 1)
     which = f"Best of {count} starts: " if count > 1 else ""
-    ended = _ended(metrics) + texts("verdicts")[metrics["verdict"]]
+    ended, believed = _ended(metrics), texts("verdicts")[metrics["verdict"]]
     many = "joint_error_after_deg" in metrics or count > 1
     if "joint_error_after_deg" in metrics:
         score = f"{which}joints {metrics['joint_error_after_deg']:.1f}° off, mean; {ended}."
@@ -225,11 +225,11 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
         change = f"from {metrics['start_chamfer_m']:.3f} to {metrics['chamfer_m']:.3f} m"
         return f"{which}Chamfer distance {change}; {ended}."
     else:
-        return f"{which}{ended}."
+        return f"{which}{ended}. {believed}"
     limits = _limits(run, metrics)
     if many:
-        return f"{score} {metrics['successes']} of {count} starts end within {limits}."
-    return f"{score} A success is within {limits}: {shown(metrics['success'])}."
+        return f"{score} {metrics['successes']} of {count} starts end within {limits}. {believed}"
+    return f"{score} A success is within {limits}: {shown(metrics['success'])}. {believed}"
 
 
 def _ended(metrics: dict[str, Any]) -> str:
