@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -39,15 +39,16 @@ class Uncertainty:
             one: at least as large as it says.
         unobserved: A sentence for every direction that the data do not tell. It begins with the
             names of its coordinates.
-        frames: None if the statistics are those of simulated looks at the twin; else the number of
-            frames from whose scatter they are estimated.
+        count: Of the looks, or of the frames, from whose scatter the covariance is estimated.
+        by: Whether these are ``looks`` at the twin or ``frames`` of the data.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     covariance: Float64[Tensor, "p p"]
     unobserved: tuple[str, ...]
-    frames: int | None = None
+    count: int
+    by: Literal["looks", "frames"]
 
     @property
     def deviations(self) -> dict[str, float]:
@@ -66,8 +67,8 @@ class Uncertainty:
         Args:
             level: The probability.
         """
-        law: Any = stats.norm() if self.frames is None else stats.t(self.frames - 1)
-        factor = float(law.ppf(0.5 + 0.5 * level))
+        # Student's law, since the variance is itself an estimate.
+        factor = float(stats.t.ppf(0.5 + 0.5 * level, self.count - 1))
         return {name: factor * value for name, value in self.deviations.items()}
 
 
@@ -108,12 +109,12 @@ def uncertainty(end: End) -> Uncertainty:
     rows = [[(a + b) / 2 for a, b in zip(first, second, strict=True)]]
     rows.append([(a - b) / 2 for a, b in zip(first, second, strict=True)])
     curvature, feigned = (fit.objective.curvature(maps, some) for some in rows)
-    frames = None
     if end.draws is not None:
+        count, by = len(end.draws.losses), "looks"
         scatter, chance = (_covariance(end.draws.slopes, some) for some in rows)
     else:
-        frames = min(len(b) for _, b in maps)
-        if frames < 2:
+        count, by = min(len(b) for _, b in maps), "frames"
+        if count < 2:
             raise InputError(
                 "expected looks at the twin or several frames for error bars, got one frame of a "
                 "model without looks; they are not known for this fit"
@@ -130,7 +131,8 @@ def uncertainty(end: End) -> Uncertainty:
         tuple(c.unit for c in found),
         covariance * square,
         tuple(_unobserved(found, covariance)),
-        frames,
+        count,
+        by,
     )
 
 
