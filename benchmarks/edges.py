@@ -2,13 +2,13 @@
 
     python benchmarks/edges.py [-o DIR]
 
-A body before a wall and above a floor, seen by separate antennas at depth 2. The derivative of the
-received power with respect to a shift of the body has a part from the shadows that surfaces cast on
-each other (family 2). This part is estimated with the weighted edge sampling and with uniform edge
-sampling (edges by length alone, directions from the whole sphere), with the same numbers of samples
-and seeds, in turns. Prints a table and writes `metrics.json` into DIR (default `out/edges`): for a
-plate, whose four edges are open, and for a ball, a closed mesh whose edges are nearly flat,
-`edge_sampling.<body>.variance_ratio` is variance × time of uniform sampling over that of the
+A body in front of a wall and above a floor, seen by separate antennas at depth 2. The derivative of
+the received power with respect to a shift of the body has a part from the shadows that surfaces
+cast on each other (family 2). The benchmark estimates this part with weighted edge sampling and
+with uniform edge sampling (edges by length alone, directions from the whole sphere), in turns, with
+the same numbers of samples and seeds. It prints a table and writes `metrics.json` into DIR (default
+`out/edges`). For a plate, whose four edges are open, and for a ball, a closed mesh of nearly flat
+edges, `edge_sampling.<body>.variance_ratio` is variance × time of uniform sampling over that of the
 weighted one (> 1: the weighted one is better); `edge_sampling.variance_ratio` is the lesser.
 """
 
@@ -66,7 +66,7 @@ class Task:
 
     @staticmethod
     def build(body: Mesh) -> "Task":
-        """A body before a wall and above a floor; it hides parts of both from each other."""
+        """A body in front of a wall and above a floor; it hides parts of both from each other."""
         rough = RoughDielectric(permittivity=4.0)
         objects = {
             "wall": Object(plate(4.0, 3.0, divisions=4), rough, placed(0.0, 0.5, 4.0)),

@@ -17,7 +17,7 @@ time over ours (> 1: we are faster).
   `forward_ratio_sionna_diffuse` and `step_ratio_sionna_diffuse` are with it off: every vertex
   is diffuse, and ends a path. The list is long enough for all paths.
 
-Further, on a scene with shadows (a ball before a wall and above a floor, depth 3):
+Further, on a scene with shadows (a ball in front of a wall and above a floor, depth 3):
 
 - `step.tracing_share`: share of a step of 10⁵ samples in which nothing is executed: its time less
   that of building the tree for the new vertices, less the execution times of all that Dr.Jit

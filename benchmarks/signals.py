@@ -59,7 +59,7 @@ Trajectory = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Case:
-    """Points of given strengths on their ways before a radar."""
+    """Points of given strengths on their ways in front of a radar."""
 
     radar: Radar
     chirps: Chirps
@@ -88,7 +88,7 @@ class Case:
         return beat
 
     def error(self) -> float:
-        """Of all samples, relative."""
+        """Relative error of all samples."""
         expected = self.oracle()
         return float((self.signal() - expected).norm() / expected.norm())
 

@@ -49,7 +49,7 @@ REQUIRED = {
 
 @dataclass(frozen=True)
 class Task:
-    """A bumpy ball before a wall, seen by a 16-element array as a range × angle map."""
+    """A bumpy ball in front of a wall, seen by a 16-element array as a range × angle map."""
 
     scene: Scene
     radar: Radar

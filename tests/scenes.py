@@ -42,7 +42,7 @@ def thing(
 
 
 def occluder(**materials: Material) -> Scene:
-    """A plate 1 m away, turned a little, before a wall 2 m away: visibility changes with both."""
+    """A plate 1 m away, turned a little, and a wall 2 m away: visibility changes with both."""
     return Scene(
         {
             "wall": thing(plate(2.0, 2.0, divisions=2), (0, 0, 2), material=materials.get("wall")),

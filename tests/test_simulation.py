@@ -14,7 +14,7 @@ from scenes import float64, occluder, radar, relative, thing
 FEW = Sampling(points_per_m2=200.0)
 
 
-def test_both_chains_have_one_shape_and_one_unit():
+def test_exact_signals_and_surrogate_have_one_shape_and_one_unit():
     """Averaged over speckle, the exact spectrum is the surrogate's."""
     device = radar([[x, y, 0.0] for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.1, 0.1)])
     scene = Scene({"plate": thing(plate(0.4, 0.4), (0.0, 0.0, 1.2), (0.0, 0.3, 0.0))})

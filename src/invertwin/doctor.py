@@ -1,4 +1,4 @@
-"""Is this machine fit to trace rays? Chooses a libLLVM that works, reports, names the cure.
+"""Check whether this machine can trace rays: choose a libLLVM that works, report, name the cure.
 
 On the CPU, Dr.Jit compiles its kernels with the system's libLLVM. Some versions are refused, and
 some load and then abort the whole process in the first kernel with a minimum or a maximum, which
@@ -143,12 +143,11 @@ _choice: _Choice | None = None
 
 
 def prepare(
-    folders: Sequence[Path] | None = None,
-    probe: Callable[[str], Verdict] | None = None,
+    folders: Sequence[Path] | None = None, probe: Callable[[str], Verdict] | None = None
 ) -> None:
     """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM that passes, before Dr.Jit is imported.
 
-    ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require` does as
+    ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require` raises as
     soon as rays are needed. A path set by the user is kept if it passes, and replaced with a
     warning if not. Nothing is done when ``INVERTWIN_BACKEND=cuda``, nor on a second call.
 
@@ -297,11 +296,7 @@ def report() -> dict[str, Any]:
             **{name: _package_version(name) for name in ("torch", "drjit", "mitsuba")},
         },
         "llvm": {"chosen": chosen and _resolved(chosen), "candidates": examined},
-        "backend": {
-            "requested": requested,
-            "in_force": measured.pop("backend", None),
-            "gpu": gpu,
-        },
+        "backend": {"requested": requested, "in_force": measured.pop("backend", None), "gpu": gpu},
         "threads": measured.pop("threads", os.cpu_count()),
         "self_test": measured,
         "fix": fix,

@@ -245,7 +245,7 @@ class ExactMap(ForwardModel):
     Attributes:
         grid: Bins, see ``Radar.grid``.
         sampling: How paths are sampled.
-        speckle: Rough points and paths with their phases, which a twin does not know; None =
+        speckle: Rough points and paths with their phases, which are unknown for real data; None =
             drawn from the seed.
     """
 
@@ -417,8 +417,8 @@ def surrogate_correlation(
 ) -> float:
     """Correlation of a surrogate's map with the mean exact spectrum over several looks.
 
-    A look has its own phases of the rough surfaces. One look is speckle as strong as the map
-    itself; a scene of conductors has none, and looks the same each time.
+    A look has its own phases of the rough surfaces. One look has speckle as strong as the map
+    itself. A scene of conductors has no speckle: all its looks are equal.
 
     Args:
         scene: What is seen.

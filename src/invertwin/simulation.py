@@ -10,13 +10,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field
 from invertwin.errors import InputError
 from invertwin.radar.impairments import Impairments
-from invertwin.radar.motion import (
-    Chirps,
-    Places,
-    Train,
-    every_ramp,
-    sample_interval,
-)
+from invertwin.radar.motion import Chirps, Places, Train, every_ramp, sample_interval
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.spectrum import exact_spectrum

@@ -205,7 +205,7 @@ def test_a_car_is_fitted(shapes, data_folder, monkeypatch):
     run = shapes.run_of(1, shapes.load_run(shapes.RUN))
     cheap = {"steps": 3, "samples": 20_000, "boundary_samples": 4_000, "frames_per_step": 6}
     short = run.reconstruct.model_copy(update=cheap)
-    few = run.data.model_copy(update={"density": 50.0})
+    few = run.data.model_copy(update={"points_per_m2": 50.0})
     every = run.measures.model_copy(update={"every": 1})
     monkeypatch.setattr(shapes, "MODES", {"prior": shapes.FULL})
     run = run.model_copy(update={"reconstruct": short, "data": few, "measures": every})

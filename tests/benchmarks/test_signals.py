@@ -1,4 +1,4 @@
-"""The signals benchmark in small: the library holds, and the oracle would see if it did not."""
+"""The signals benchmark in small: the library's sums are right, and the oracle finds wrong ones."""
 
 import json
 from dataclasses import replace

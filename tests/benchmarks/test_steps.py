@@ -11,7 +11,7 @@ def test_the_parts_of_a_step_add_up(steps, tmp_path, monkeypatch):
 
     def small(run, console):
         table = run.reconstruct.model_copy(update={"samples": 20_000, "boundary_samples": 4_000})
-        data = run.data.model_copy(update={"density": 200.0})
+        data = run.data.model_copy(update={"points_per_m2": 200.0})
         return problem(run.model_copy(update={"reconstruct": table, "data": data}), console)
 
     monkeypatch.setattr(steps, "problem_of", small)

@@ -49,7 +49,7 @@ v_max = 0.6
 [data]
 kind = "simulated"
 depth = 1
-density = 2e3
+points_per_m2 = 2e3
 snr_db = 20.0
 
 [[parameters]]

@@ -73,7 +73,7 @@ def test_simulate_then_reconstruct_from_the_saved_capture(run_file, monkeypatch,
 
     text = RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]
     text = text.replace('kind = "simulated"', 'kind = "capture"\nfile = "out/small/capture.nc"')
-    text = text.replace("depth = 1\ndensity = 2e3\nsnr_db = 20.0\n", "")
+    text = text.replace("depth = 1\npoints_per_m2 = 2e3\nsnr_db = 20.0\n", "")
     measured = run_file.with_name("measured.toml")
     measured.write_text(text)
     assert call(monkeypatch, "reconstruct", measured, "-o", "fit") == 0

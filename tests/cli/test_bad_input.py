@@ -27,14 +27,14 @@ nan 0 0
 3 0 1 2
 """
 MEASURED = (RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]).replace(
-    'kind = "simulated"\ndepth = 1\ndensity = 2e3\nsnr_db = 20.0',
+    'kind = "simulated"\ndepth = 1\npoints_per_m2 = 2e3\nsnr_db = 20.0',
     'kind = "capture"\nfile = "data.nc"',
 )
 RAIL = MEASURED.replace('"capture"\nfile = "data.nc"', '"rail_sar"\nfolder = "rail_sar"')
 SOUGHT = 'kind = "translation"\nobject = "plate"'
 
 
-def sought(values: str) -> str:
+def fitted(values: str) -> str:
     return RUN.replace(SOUGHT, f'kind = "material"\nobject = "plate"\nvalues = {values}')
 
 
@@ -120,12 +120,12 @@ def folder(run_file, monkeypatch):
         ),
         pytest.param(BEHIND, ["map with power", "check the grid"], id="behind the radar"),
         pytest.param(
-            sought('["diffuse"]'),
+            fitted('["diffuse"]'),
             ["parameters[0].values, material of plate: ", "got 1", "start away from the end"],
             id="diffuse = 1",
         ),
         pytest.param(
-            sought('["conductivity"]'),
+            fitted('["conductivity"]'),
             ["parameters[0].values, material of plate: ", "got 0", "start away from the end"],
             id="conductivity = 0",
         ),

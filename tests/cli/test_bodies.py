@@ -37,7 +37,7 @@ def run_file(joints: Any = LEFT, scale: float = 1.0, **tables: Any) -> RunFile:
     return validate(run, Path("run.toml"))
 
 
-def test_every_sought_joint_starts_that_far_off_and_only_these():
+def test_every_free_joint_starts_that_far_off_and_only_these():
     run = run_file(scale=1.2)
     assert run.starts is not None
     scene = build.scene(run)
@@ -172,7 +172,7 @@ def test_bad_tangents(parameter, tangent, message):
         checked(parameter, tangent)
 
 
-def test_joints_that_nobody_seeks_are_not_turned():
+def test_joints_that_are_not_fitted_are_not_turned():
     pose = [{"kind": "pose", "object": "person"}]
     with pytest.raises(InputError, match=r'starts.joint_deg: expected .* kind = "body" of person'):
         run_file(parameters=pose)

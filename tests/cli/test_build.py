@@ -166,7 +166,7 @@ def test_starts_in_a_plane_about_one_axis():
         torch.testing.assert_close(start["box"].transform[1, :3], scene["box"].transform[1, :3])
 
 
-def test_axes_that_are_not_sought_stay():
+def test_axes_that_are_not_fitted_stay():
     table = {"kind": "pose", "object": "box", "axes": ["x"], "rotation_axes": ["y"]}
     run = read(parameters=[table])
     scene = build.scene(run)

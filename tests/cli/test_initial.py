@@ -1,4 +1,4 @@
-"""`[initial]`: a start that nobody gave, and what the fit adds to it."""
+"""`[initial]`: a start by conventional processing, and what the fit adds to it."""
 
 import tomllib
 
@@ -15,7 +15,7 @@ def smaller(repository, **changes: str) -> str:
     text = (repository / "experiments" / "initial_guess.toml").read_text(encoding="utf-8")
     small = {
         "count = 24 }": "count = 12 }",
-        "density = 800.0": "density = 500.0",
+        "points_per_m2 = 800.0": "points_per_m2 = 500.0",
         "steps = 100": "steps = 50",
         "frames_per_step = 12": "frames_per_step = 6",
     }

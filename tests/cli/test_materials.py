@@ -172,7 +172,7 @@ def parameters(table, *values, **more):
     return module(scene)["wall"].material
 
 
-def test_every_value_can_be_sought():
+def test_every_value_can_be_fitted():
     board = {"permittivity": 2.7, "conductivity": 0.1, "loss_tangent": 0.01, "thickness": 0.0125}
     slab = {"kind": "slab", **board, **ROUGHNESS}
     names = [name for name in slab if name != "kind"]
@@ -184,7 +184,7 @@ def test_every_value_can_be_sought():
         assert float(value.detach()) == pytest.approx(slab[name], rel=1e-9)
 
 
-def test_rows_and_layers_can_be_sought():
+def test_rows_and_layers_can_be_fitted():
     rows = parameters({"kind": "dielectric", "permittivity": [3.0, 4.0]}, "permittivity")
     assert rows.permittivity.tolist() == pytest.approx([3.0, 4.0])
     layers = [{"itu": "wood", "thickness": 0.01}, {"permittivity": 2.0, "thickness": 0.02}]
@@ -221,7 +221,7 @@ def test_truth_may_be_of_another_material_and_the_error_is_told():
         ),
     ],
 )
-def test_values_that_cannot_be_sought(table, name, more, message):
+def test_values_that_cannot_be_fitted(table, name, more, message):
     with pytest.raises(InputError, match=message) as caught:
         parameters(table, name, **more)
     assert str(caught.value).startswith("parameters[0].values, material of wall: ")

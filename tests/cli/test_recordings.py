@@ -22,8 +22,8 @@ from invertwin.radar.boards import board
 BOARD = {"name": "xWR1843", "elevation": -1, "transmitters": [1, 3, 2]}
 WAVE = RADAR["waveform"]
 MEASURED = RUN[: RUN.index("[radar]")] + RUN[RUN.index("[grid]") :]
-SIMULATED = 'kind = "simulated"\ndepth = 1\ndensity = 2e3\nsnr_db = 20.0\n'
-# The plate before the wall, seen by a board with two transmitters.
+SIMULATED = 'kind = "simulated"\ndepth = 1\npoints_per_m2 = 2e3\nsnr_db = 20.0\n'
+# The plate in front of the wall, seen by a board with two transmitters.
 TRAIN = (
     (
         RUN[: RUN.index("[radar]")].replace(
@@ -55,7 +55,7 @@ adc_start_time = 4e-6
 
 [data]
 kind = "simulated"
-density = 300.0
+points_per_m2 = 300.0
 snr_db = 20.0
 """
     )
@@ -148,7 +148,7 @@ def test_what_a_run_file_says_is_written_back():
 def test_impairments_reach_the_front_end():
     run = read(
         impairments={"phase_noise": {"offsets": [1e6], "levels": [-90]}, "phase_std_deg": 90},
-        data={"kind": "simulated", "density": 1.0, "noise_figure_db": 12.0},
+        data={"kind": "simulated", "points_per_m2": 1.0, "noise_figure_db": 12.0},
     )
     assert run.impairments is not None
     assert isinstance(run.data, schema.SimulatedData)

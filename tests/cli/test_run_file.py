@@ -100,7 +100,9 @@ def radar(**changes):
         ),
         (run(truth={"wall": {"scale": 2.0}}), ["truth.wall: ", "letter", "add it to the scene"]),
         (
-            run(data={"kind": "simulated", "density": 1e3, "snr_db": 3, "noise_figure_db": 4}),
+            run(
+                data={"kind": "simulated", "points_per_m2": 1e3, "snr_db": 3, "noise_figure_db": 4}
+            ),
             ["data: ", "got both"],
         ),
         (
@@ -120,7 +122,7 @@ def radar(**changes):
             ["reconstruct.depth: ", "greater than or equal to 1", "got 0"],
         ),
         (
-            run(data={"kind": "simulated", "density": 1e3, "depth": 17}),
+            run(data={"kind": "simulated", "points_per_m2": 1e3, "depth": 17}),
             ["data.depth: ", "less than or equal to 16", "got 17"],
         ),
         (

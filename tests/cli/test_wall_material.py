@@ -11,7 +11,7 @@ def test_permittivity_of_a_wall_beside_a_panel(repository, tmp_path, monkeypatch
     for whole, part in (
         ("count = [8, 4]", "count = [4, 2]"),
         ("count = [16, 8]", "count = [8, 4]"),
-        ("density = 4e3", "density = 2e3"),
+        ("points_per_m2 = 4e3", "points_per_m2 = 2e3"),
         ("steps = 50", "steps = 30"),
     ):
         assert whole in text

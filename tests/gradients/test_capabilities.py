@@ -49,8 +49,8 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "limitations.md"
 MECHANISMS = {
     "power paths, interior": "interior",
     "power paths, boundary": "boundary",
-    "2+ bounces, interior": "chain interior",
-    "2+ bounces, boundary": "chain boundary",
+    "2+ bounces, interior": "bounces interior",
+    "2+ bounces, boundary": "bounces boundary",
     "coherent field": "coherent",
     "rough field": "rough",
 }
@@ -311,16 +311,18 @@ def test_the_table_is_whole():
     assert set(CELLS.values()) == {"supported", "zero", "refused", "–"}
 
 
-def selected(word: str, *, chains: bool = False) -> list[Any]:
+def selected(word: str, *, bounces: bool = False) -> list[Any]:
     slow = {"pose", "scale", "vertices", "radar position"}
     return [
         pytest.param(
             *cell,
             id=re.sub(r"\W+", "_", " ".join(cell)),
-            marks=pytest.mark.slow if chains or (cell[1] == "coherent" and cell[0] in slow) else (),
+            marks=pytest.mark.slow
+            if bounces or (cell[1] == "coherent" and cell[0] in slow)
+            else (),
         )
         for cell, said in CELLS.items()
-        if said == word and cell[1].startswith("chain") == chains
+        if said == word and cell[1].startswith("bounces") == bounces
     ]
 
 
@@ -350,7 +352,7 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     if mechanism.endswith(("interior", "boundary")):
         grid = radar.grid(0.4, 2.8, 0.6)
         drawn = Sampling(
-            depth=2 if mechanism.startswith("chain") else 1,
+            depth=2 if mechanism.startswith("bounces") else 1,
             samples=1_000,
             boundary_samples=100,
             boundary=mechanism.endswith("boundary"),

@@ -15,7 +15,7 @@ LOW, HIGH = [-0.35, -0.3, -0.3], [0.35, 0.3, 0.3]
 
 @pytest.mark.slow
 def test_gradient_by_densities_is_that_of_converged_differences():
-    """A soft ball before a wall; its densities change at random."""
+    """A soft ball in front of a wall; its densities change at random."""
     start = thing(plate(0.1, 0.1), (0.05, 0.02, 1.1), (0.1, 0.2, 0.05))
     scene = Scene({"wall": thing(plate(2.4, 2.4, divisions=2), (0, 0, 2)), "object": start})
     module = DensityGrid.even("object", LOW, HIGH, (10, 9, 8))

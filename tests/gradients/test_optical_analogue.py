@@ -74,7 +74,7 @@ def quads(mi: Any, item: Object) -> Any:
 
 
 def mitsuba(seeds: int, size: int = 128) -> tuple[Tensor, Tensor, float]:
-    """The same and its derivative by ``direct_projective``, and the noise of the latter."""
+    """The image, its derivative by ``direct_projective``, and the noise of the derivative."""
     raytracer.variant()  # loads it as we do
     import drjit as dr
     import mitsuba as mi

@@ -40,7 +40,7 @@ LOW, HIGH = [-0.45, -0.4, -0.35], [0.45, 0.4, 0.35]
 
 
 def before_a_wall(mesh: Mesh) -> Scene:
-    """An object 1 m away, turned a little, before a wall 2 m away."""
+    """An object 1 m away, turned a little, in front of a wall 2 m away."""
     return Scene(
         {
             "wall": thing(plate(2.4, 2.4, divisions=2), (0, 0, 2)),

@@ -1,4 +1,4 @@
-"""A plate off its place before a wall, and what a radar recorded of it, by the exact simulation."""
+"""A plate off its place in front of a wall, and the exact signals of it."""
 
 from dataclasses import dataclass
 from typing import Any

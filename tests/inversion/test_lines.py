@@ -112,7 +112,7 @@ def test_a_bump_covers_control_points_beyond_the_box():
 
 
 def test_losses_along_a_line_are_least_at_the_truth():
-    """Of the smooth map, and of exact signals, which have the points of the data."""
+    """Losses of the smooth map, and of exact signals, which have the points of the data."""
     device = radar(receivers=4)
     grid = device.grid(0.5, 1.5, 0.6, oversample=1)
     line, offsets = line_of(Translation("ball"), AHEAD, SCENE), [-0.2, -0.1, 0.0, 0.1, 0.2]

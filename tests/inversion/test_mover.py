@@ -159,7 +159,7 @@ def test_materials_without_a_diffuse_share_are_refused(frame):
 
 
 @pytest.mark.slow
-def test_a_twin_finds_place_and_motion_in_the_exact_chain():
+def test_a_twin_finds_place_and_motion_in_exact_signals():
     """A ball that fills several range cells, at mean power: 12 looks of other phases."""
     place, velocity, radius = (-0.4, 0.0, 2.6), (0.0, 0.0, 1.6), 0.3
     frames = [recorded(place, velocity, radius, seed) for seed in range(12)]

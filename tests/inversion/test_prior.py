@@ -42,8 +42,8 @@ def nearest(mesh: Mesh) -> tuple[Mesh, Mesh]:
     def search(free: bool) -> Mesh:
         latent = torch.zeros(prior.latent_size, dtype=torch.float64, requires_grad=free)
         place = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-        sought = [latent, place] if free else [place]
-        optimizer = torch.optim.LBFGS(sought, max_iter=40, line_search_fn="strong_wolfe")
+        fitted = [latent, place] if free else [place]
+        optimizer = torch.optim.LBFGS(fitted, max_iter=40, line_search_fn="strong_wolfe")
 
         def loss() -> torch.Tensor:
             optimizer.zero_grad()

@@ -416,7 +416,7 @@ def test_widths_fall_to_the_exact_response(case, annealing, monkeypatch):
     assert kernels[FAST["steps"] - 1] == Surrogate()
 
 
-def test_the_exact_chain_as_the_model(case):
+def test_exact_signals_as_the_model(case):
     """By the same switch; it fits a realisation, and holds visibility fixed."""
     settings = case.settings(**FAST, depth=1, surrogate="exact", points_per_m2=300.0, seed=3)
     with pytest.raises(InputError, match="boundary=False for fixed visibility"):

@@ -17,7 +17,7 @@ def lengths(mesh: Mesh) -> torch.Tensor:
 
 
 def euler(mesh: Mesh) -> int:
-    """Of a closed mesh: 2 for a ball, 0 with one hole through it."""
+    """Euler number of a closed mesh: 2 for a ball, 0 with one hole through it."""
     return len(mesh.vertices) - len(mesh.faces) // 2
 
 

@@ -181,8 +181,8 @@ def test_terms_are_of_the_scene_that_a_module_was_built_for(case):
 
 
 @pytest.mark.parametrize("kind", ["adam", "gauss_newton"])
-@pytest.mark.parametrize("sought", [("shape",), ("shape", "other")])
-def test_a_shape_that_another_replaces_is_no_parameter(case, kind, sought):
+@pytest.mark.parametrize("fitted", [("shape",), ("shape", "other")])
+def test_a_shape_that_another_replaces_is_no_parameter(case, kind, fitted):
     class Replaced(torch.nn.Module):
         def __init__(self):
             super().__init__()
@@ -195,7 +195,7 @@ def test_a_shape_that_another_replaces_is_no_parameter(case, kind, sought):
     with pytest.raises(
         InputError, match="got log_scale of Scale, which has no gradient; probably a later"
     ):
-        fit(case, [Stage(1, unknowns=sought)], builders, optimizer=Optimizer(kind))
+        fit(case, [Stage(1, unknowns=fitted)], builders, optimizer=Optimizer(kind))
 
 
 def test_the_mesh_of_a_stage_is_plain(case):

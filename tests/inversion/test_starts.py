@@ -51,7 +51,7 @@ def test_a_displaced_object_turns_about_its_centre():
     ("pose", "box", "said"),
     [("rectangle", None, "expected `low` with"), ("known", [0.0] * 3, "expected no `low` with")],
 )
-def test_a_first_pose_is_sought_in_a_box_unless_it_is_known(pose, box, said):
+def test_a_first_pose_is_looked_for_in_a_box_unless_it_is_known(pose, box, said):
     corner = None if box is None else torch.tensor(box, dtype=torch.float64)
     with pytest.raises(InputError, match=said):
         FirstPose(corner, corner, pose=pose)

@@ -1,4 +1,4 @@
-"""Slow twin of the beat signal: the plain sum over paths, element by element."""
+"""Slow reference of the beat signal: the plain sum over paths, element by element."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Slow twin of the deposit: explicit quadratic B-spline weights, one path at a time in torch."""
+"""Slow reference of the deposit: explicit quadratic B-spline weights, one path at a time."""
 
 import torch
 from torch import Tensor

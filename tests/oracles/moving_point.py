@@ -56,7 +56,7 @@ def moving_point(
     v: float = 0.0,
     amplitude: float = 1.0,
 ) -> Tensor:
-    """The same for one point that moves along its line of sight.
+    """Beat signals of one point that moves along its line of sight.
 
     Distance [m] and direction are those in the frame of each pose, from the middle of the phase
     centres, at the middle of the burst; the range rate [m/s] is positive away.

@@ -123,9 +123,9 @@ def power_map(
     """Received over transmitted power by range L/2 and the x component of arrival at ``rx``."""
     out = np.zeros((ranges.count, cosines.count))
     scale = (wavelength / (4 * np.pi)) ** 2
-    chains = [(p,) for p in plates] if bounces == 1 else list(permutations(plates, 2))
-    for chain in chains:
-        grids = [plate.patches(count) for plate in chain]
+    orders = [(p,) for p in plates] if bounces == 1 else list(permutations(plates, 2))
+    for order in orders:
+        grids = [plate.patches(count) for plate in order]
         rows = [grids[0][0]] if bounces == 1 else np.array_split(grids[0][0], count)
         for row in rows:
             points = [row] if bounces == 1 else [row[:, None, :], grids[1][0][None, :, :]]
@@ -141,7 +141,7 @@ def power_map(
                 directions.append(offset / distance[..., None])
                 for plate in plates:
                     power = np.where(plate.blocks(start + 0 * end, end + 0 * start), 0.0, power)
-            for number, plate in enumerate(chain):
+            for number, plate in enumerate(order):
                 back, on = -directions[number], directions[number + 1]
                 power = power * plate.scattered(back, on) * grids[number][1]
             arrival = np.broadcast_to(-directions[-1][..., 0], power.shape)

@@ -16,7 +16,7 @@ def _line(epsilon, cosine, frequency, polarisation):
     return 2j * np.pi * frequency / SPEED_OF_LIGHT * root, impedance
 
 
-def _chain(epsilon, length, cosine, frequency, polarisation):
+def _transfer(epsilon, length, cosine, frequency, polarisation):
     gamma, impedance = _line(epsilon, cosine, frequency, polarisation)
     across, along = np.sinh(gamma * length), np.cosh(gamma * length)
     return np.array([[along, impedance * across], [across / impedance, along]])
@@ -30,7 +30,7 @@ def coefficients(layers, cosine, frequency, polarisation):
     """
     total = np.eye(2, dtype=complex)
     for epsilon, thickness in layers:
-        total = total @ _chain(epsilon, thickness, cosine, frequency, polarisation)
+        total = total @ _transfer(epsilon, thickness, cosine, frequency, polarisation)
     (a, b), (c, d) = total
     air = _line(1.0, cosine, frequency, polarisation)[1]
     load = a + b / air + c * air + d
@@ -49,15 +49,15 @@ def absorbed(layers, cosine, frequency, polarisation, points=400):
     for epsilon, thickness in reversed(layers):
         density = []
         for depth in thickness * (nodes + 1) / 2:  # before the layer's far face
-            chain = _chain(epsilon, depth, cosine, frequency, polarisation)
-            voltage, current = chain @ state
+            matrix = _transfer(epsilon, depth, cosine, frequency, polarisation)
+            voltage, current = matrix @ state
             across = 0.0
             if polarisation == "p":
                 across = abs(np.sqrt(1 - cosine**2) * current / epsilon) ** 2
             density.append(abs(voltage) ** 2 + across)
         integral = thickness / 2 * (weights @ np.array(density))
         total += wave_number * -complex(epsilon).imag * integral / cosine
-        state = _chain(epsilon, thickness, cosine, frequency, polarisation) @ state
+        state = _transfer(epsilon, thickness, cosine, frequency, polarisation) @ state
     return total
 
 

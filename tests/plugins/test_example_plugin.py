@@ -39,7 +39,7 @@ range_max = 1.8
 
 [data]
 kind = "simulated"
-density = 1e3
+points_per_m2 = 1e3
 
 [[parameters]]
 kind = "thickness"

@@ -152,7 +152,7 @@ def radar() -> Radar:
 
 
 def test_points_of_movers(radar):
-    """Chain and points: range, rate, direction, power, place in the world, in both poses."""
+    """From echoes to points: range, rate, direction, power, place in the world, in both poses."""
     grid = radar.grid(2, 7, u_max=0.6, v_max=0.6)
     span = velocity_span(radar, CHIRPS)
     truth = [(4.03, -0.21 * span, 0.21, -0.13, 1.0), (5.52, 0.33 * span, -0.34, 0.2, 0.7)]

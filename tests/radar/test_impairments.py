@@ -305,7 +305,7 @@ def test_a_train_with_everything(point_paths):
 
 
 def test_impairments_of_a_finished_signal(point_paths):
-    """As of paths, where nothing needs them; phase noise does and is refused."""
+    """Finished signals get what paths get; phase noise needs the paths and is refused."""
     radar = recorder(2, 2, 3)
     paths = scatterers(radar, point_paths, 10)
     some = Impairments(leakage=Leakage(2e-9, -3.0), phase_std=0.1, snr_db=20, adc=ADC(10, 40.0))

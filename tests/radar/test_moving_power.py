@@ -58,7 +58,7 @@ def exact(radar, grid, chirps, bins):
 
 
 @pytest.mark.parametrize(("name", "elevation"), [("xWR1642", None), ("xWR1843", 1)])
-def test_power_in_motion_is_the_mean_of_the_exact_chain(name, elevation):
+def test_power_in_motion_is_the_mean_of_exact_signals(name, elevation):
     radar = make_radar(name, elevation, window="hann")
     grid = radar.grid(2.0, 3.8)
     chirps = Chirps(32, 60e-6)

@@ -36,7 +36,7 @@ def cloud(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def two_bounces(radar: Radar, count: int) -> Paths:
-    """Chains over two points, spread over the radar's frames."""
+    """Paths over two points, spread over the radar's frames."""
     first, coefficient = cloud(count, 1)
     last, _ = cloud(count, 2)
     frame = torch.arange(count) % radar.frame_count

@@ -65,10 +65,10 @@ def test_mean_exact_spectrum_is_the_surrogate(array, planar, mimo, linear, point
     points, power = cloud(60)
     grid = radar.grid(3.5, 5.5, 0.7, 0.7)
     exact = expected_exact(radar, points, power, grid, point_paths)
-    twin = Surrogate().shape(deposited(points, power, grid), radar, grid)
-    assert (exact - twin).norm() < 0.02 * exact.norm()
-    assert (exact - twin).abs().max() < 0.02 * exact.max()
-    assert twin.sum() == pytest.approx(float(exact.sum()), rel=0.005)
+    smooth = Surrogate().shape(deposited(points, power, grid), radar, grid)
+    assert (exact - smooth).norm() < 0.02 * exact.norm()
+    assert (exact - smooth).abs().max() < 0.02 * exact.max()
+    assert smooth.sum() == pytest.approx(float(exact.sum()), rel=0.005)
 
 
 # A rectangular window fills the whole band of the power profile: it asks for finer bins.
@@ -82,9 +82,9 @@ def test_the_surrogate_follows_every_waveform(chosen, window, oversample, linear
     points, power = cloud(40)
     grid = radar.grid(3, 6, 0.7, oversample=oversample)
     exact = expected_exact(radar, points, power, grid, point_paths)
-    twin = Surrogate().shape(deposited(points, power, grid), radar, grid)
-    assert (exact - twin).norm() < 0.02 * exact.norm()
-    assert (exact - twin).abs().max() < 0.02 * exact.max()
+    smooth = Surrogate().shape(deposited(points, power, grid), radar, grid)
+    assert (exact - smooth).norm() < 0.02 * exact.norm()
+    assert (exact - smooth).abs().max() < 0.02 * exact.max()
 
 
 def test_the_surrogate_follows_a_waveform_of_ones_own(linear, point_paths):
@@ -104,8 +104,8 @@ def test_the_surrogate_follows_a_waveform_of_ones_own(linear, point_paths):
     points, power = cloud(40)
     grid = radar.grid(3, 5.9, 0.7)
     exact = expected_exact(radar, points, power, grid, point_paths)
-    twin = Surrogate().shape(deposited(points, power, grid), radar, grid)
-    assert (exact - twin).norm() < 0.02 * exact.norm()
+    smooth = Surrogate().shape(deposited(points, power, grid), radar, grid)
+    assert (exact - smooth).norm() < 0.02 * exact.norm()
 
 
 def test_a_pulse_of_ones_own(linear):
@@ -128,7 +128,7 @@ def test_a_pulse_of_ones_own(linear):
 
 
 def test_mean_over_phase_seeds(linear, point_paths):
-    """The same by brute force: 400 draws of the phases of one cloud, one per frame."""
+    """The mean by brute force: 400 draws of the phases of one cloud, one per frame."""
     seeds = 400
     points, power = cloud(300, 1)
     copies = replace(linear, positions=linear.positions.expand(seeds, 3))
@@ -139,11 +139,11 @@ def test_mean_over_phase_seeds(linear, point_paths):
     paths = point_paths(copies, points.repeat(seeds, 1), coefficient, frame)
     grid = linear.grid(3.5, 5.5, 0.7)
     mean = exact_spectrum(beat_signal(paths, copies), copies, grid).mean(0)
-    twin = Surrogate().shape(deposited(points, power, grid), linear, grid)[0]
-    assert mean.sum() == pytest.approx(float(twin.sum()), rel=0.02)
-    assert (mean - twin).mean().abs() < 0.02 * twin.max()
+    smooth = Surrogate().shape(deposited(points, power, grid), linear, grid)[0]
+    assert mean.sum() == pytest.approx(float(smooth.sum()), rel=0.02)
+    assert (mean - smooth).mean().abs() < 0.02 * smooth.max()
     # What is left is speckle: 1/√seeds per bin.
-    assert (mean - twin).norm() < 1.3 / math.sqrt(seeds) * twin.norm()
+    assert (mean - smooth).norm() < 1.3 / math.sqrt(seeds) * smooth.norm()
 
 
 def test_the_windows_are_part_of_the_kernel(planar, point_paths):
@@ -152,8 +152,8 @@ def test_the_windows_are_part_of_the_kernel(planar, point_paths):
     grid = radar.grid(3.5, 5.5, 0.7, 0.7)
     exact = expected_exact(radar, points, power, grid, point_paths)
     for used, limit in ((radar, 0.02), (planar, None)):
-        twin = Surrogate().shape(deposited(points, power, grid), used, grid)
-        error = (exact - twin).norm() / exact.norm()
+        smooth = Surrogate().shape(deposited(points, power, grid), used, grid)
+        error = (exact - smooth).norm() / exact.norm()
         assert error < limit if limit else error > 0.1
 
 
@@ -164,8 +164,8 @@ def test_dirichlet_is_the_response_without_a_window(linear, point_paths):
     grid = linear.grid(3, 6, 0.7, oversample=3)
     exact = expected_exact(bare, points, power, grid, point_paths)
     spread = deposited(points, power, grid)
-    twin = Surrogate(range_kernel="dirichlet").shape(spread, linear, grid)
-    assert (exact - twin).norm() < 0.02 * exact.norm()
+    smooth = Surrogate(range_kernel="dirichlet").shape(spread, linear, grid)
+    assert (exact - smooth).norm() < 0.02 * exact.norm()
     assert (exact - Surrogate().shape(spread, linear, grid)).norm() > 0.1 * exact.norm()
 
 
@@ -347,7 +347,7 @@ def test_impulse_is_a_gaussian_pulse():
 
 
 @pytest.mark.slow
-def test_both_chains_of_a_scene_agree(mimo):
+def test_exact_signals_of_a_scene_agree_with_the_surrogate(mimo):
     """Ray-traced: the rough points' exact spectra, summed in power, are the surrogate's map."""
     pose = rigid(
         rotation_from_vector(torch.tensor([0.2, 0.3, 0.1], dtype=torch.float64)),
@@ -355,7 +355,7 @@ def test_both_chains_of_a_scene_agree(mimo):
     )
     scene = Scene({"plate": Object(plate(0.5, 0.3), RoughDielectric(5.0), pose)})
     grid = mimo.grid(2.6, 3.6, 0.5, 0.5)
-    twin = surrogate_spectrum(
+    smooth = surrogate_spectrum(
         scene,
         mimo,
         grid,
@@ -373,9 +373,9 @@ def test_both_chains_of_a_scene_agree(mimo):
     copies = replace(mimo, positions=mimo.positions.expand(count, 3))
     alone = replace(paths, frame=torch.arange(count))
     exact = exact_spectrum(beat_signal(alone, copies), copies, grid).sum(0, keepdim=True)
-    assert exact.argmax() == twin.argmax()
-    assert exact.sum() == pytest.approx(float(twin.sum()), rel=0.02)
-    assert (exact - twin).norm() < 0.02 * exact.norm()
+    assert exact.argmax() == smooth.argmax()
+    assert exact.sum() == pytest.approx(float(smooth.sum()), rel=0.02)
+    assert (exact - smooth).norm() < 0.02 * exact.norm()
 
 
 def test_annealing_ends_at_the_exact_response(linear, point_paths):

@@ -131,7 +131,7 @@ def test_measured_pattern_given_from_zero_to_two_pi():
 
 @pytest.mark.parametrize("exponent", [0.5, 3.0])
 def test_gradients_on_the_axis_and_at_the_horizon(exponent):
-    """Of 2 (n + 1) zⁿ: 2 (n + 1) n on the axis, along it; none behind or at the horizon."""
+    """Gradient of 2 (n + 1) zⁿ: 2 (n + 1) n along the axis; none behind or at the horizon."""
     found = gradients(Cosine(exponent))
     expected = torch.zeros(3, 3, dtype=torch.float64)
     expected[0, 2] = 2 * (exponent + 1) * exponent

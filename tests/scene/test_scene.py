@@ -132,9 +132,9 @@ def test_scene_does_not_follow_the_dict_it_came_from():
 
 
 def test_scene_can_be_copied_and_pickled():
-    for twin in (copy.deepcopy(scene()), pickle.loads(pickle.dumps(scene()))):
-        assert twin.names == scene().names
-        assert torch.equal(twin["wall"].vertices, PLATE.vertices)
+    for copied in (copy.deepcopy(scene()), pickle.loads(pickle.dumps(scene()))):
+        assert copied.names == scene().names
+        assert torch.equal(copied["wall"].vertices, PLATE.vertices)
 
 
 @pytest.mark.usefixtures("unchecked")

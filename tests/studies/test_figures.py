@@ -12,7 +12,7 @@ from invertwin_studies.methods import best_factor, scores
 
 METHODS = """
 [methods]
-density = 5e2
+points_per_m2 = 5e2
 sources = 3
 smoothing = [4, 3]
 samples = 20_000

@@ -1,4 +1,4 @@
-"""The peers do what they claim to, so that a comparison with them means something."""
+"""The peers compute what they claim, so that a comparison with them is fair."""
 
 import pytest
 import torch

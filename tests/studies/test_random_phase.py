@@ -64,11 +64,11 @@ def test_the_mean_over_phases_is_the_power_surrogate(view):
     power = (~boundary).double()
     paths = paths_of(points, 2 * r / SPEED_OF_LIGHT, power, boundary)
     draws = random_phase_spectrum(paths, radar, grid, seed=1)
-    mean, twin = draws.mean(0), shaped(points, r, power, radar, grid)
-    assert float(mean.sum() / twin.sum()) == pytest.approx(1, abs=0.05)
-    assert (mean - twin).norm() < 1.5 / DRAWS**0.5 * twin.norm()
+    mean, smooth = draws.mean(0), shaped(points, r, power, radar, grid)
+    assert float(mean.sum() / smooth.sum()) == pytest.approx(1, abs=0.05)
+    assert (mean - smooth).norm() < 1.5 / DRAWS**0.5 * smooth.norm()
     # One draw is speckle: its standard deviation is its mean.
-    bright = twin > 0.3 * twin.max()
+    bright = smooth > 0.3 * smooth.max()
     assert float((draws.std(0) / mean)[bright].mean()) == pytest.approx(1, abs=0.1)
 
 
@@ -101,8 +101,8 @@ def test_the_interior_derivative_is_right_on_average(view):
     draws = random_phase_spectrum(paths, radar, grid, seed=3)
     (slopes,) = torch.autograd.grad((weight * draws).sum(), shift)
     one = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    twin = (weight * shaped(points, r + one, power, radar, grid)).sum()
-    (true,) = torch.autograd.grad(twin, one)
+    smooth = (weight * shaped(points, r + one, power, radar, grid)).sum()
+    (true,) = torch.autograd.grad(smooth, one)
     error = float(slopes.std()) / DRAWS**0.5
     assert error < 0.2 * float(true.abs())
     assert float(slopes.mean()) == pytest.approx(float(true), abs=3 * error)
@@ -140,14 +140,14 @@ def test_extra_width_and_offset(view):
     paths = paths_of(points, 2 * r / SPEED_OF_LIGHT, one, boundary, draws=1)
     wide = random_phase_spectrum(paths, radar, grid, seed=0, range_width=1.5)
     spread = deposit(one, r, points[:, 0] / r, points[:, 1] / r, grid)[None]
-    twin = Surrogate("gaussian", "airy", range_width=1.5).shape(spread, radar, grid)
-    assert (wide - twin).abs().max() < 0.02 * twin.max()
+    smooth = Surrogate("gaussian", "airy", range_width=1.5).shape(spread, radar, grid)
+    assert (wide - smooth).abs().max() < 0.02 * smooth.max()
     far = paths_of(points, 2 * (r + 9) / SPEED_OF_LIGHT, one, boundary, draws=1)
     assert not random_phase_spectrum(far, radar, grid, seed=0).any()
 
 
 def test_of_a_scene():
-    """As a model: a draw a seed, and silhouettes that move it."""
+    """The field as a model: one draw a seed, and silhouettes that move it."""
     radar = small_radar()
     grid = radar.grid(0.5, 2.5, 0.8)
     drawn = Sampling(depth=1, samples=1_500, boundary_samples=300)

@@ -30,9 +30,9 @@ class Capture:
 
     It holds either ``beat`` (frame, tx, rx, sample), the raw samples of an FMCW radar, or
     ``range_profile`` (frame, range), analytic signals at radio frequency; beside it the radar's
-    pose in every frame, its arrays and waveform, and where known the time of each frame on the
-    radar's clock, the track its positions were read from, and surveyed positions of targets.
-    Every variable carries its unit.
+    pose in every frame, its arrays and waveform. Where known, it also holds the time of each frame
+    on the radar's clock, the track of the radar, and surveyed positions of targets. Every variable
+    carries its unit.
 
     Attributes:
         dataset: the labelled arrays. Not to be changed in place.
@@ -95,7 +95,7 @@ class Capture:
             ranges: R = L/2 of its samples, uniform, the bias already subtracted [m].
             radar: what measured them.
             times: time of each frame on the radar's clock [s].
-            track: what the radar's positions were read from, at ``times + clock_offset``.
+            track: from which the radar's positions are read, at ``times + clock_offset``.
             clock_offset: how far the track's clock is ahead of the radar's [s].
             range_bias: what was subtracted from the radar's own ranges [m].
             survey: known positions of targets [m].
@@ -126,7 +126,7 @@ class Capture:
 
     @classmethod
     def load(cls, path: str | Path) -> "Capture":
-        """Reads what `save` wrote.
+        """Read what `save` wrote.
 
         Raises:
             InputError: no such file, a truncated file, or one that holds no capture.
@@ -134,7 +134,7 @@ class Capture:
         return cls(read_dataset(Path(path)))
 
     def save(self, path: str | Path) -> None:
-        """Writes NetCDF (HDF5), bit for bit; an interrupted write leaves what was there before.
+        """Write NetCDF (HDF5), bit for bit; an interrupted write leaves an old file as it was.
 
         Raises:
             InputError: the folder does not exist.

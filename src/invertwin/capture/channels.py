@@ -62,7 +62,7 @@ class ChannelCalibration:
 
     @classmethod
     def load(cls, path: str | Path) -> "ChannelCalibration":
-        """Reads what `save` wrote.
+        """Read what `save` wrote.
 
         Raises:
             InputError: no such file, or one that holds no calibration.
@@ -83,7 +83,7 @@ class ChannelCalibration:
         return calibration
 
     def save(self, path: str | Path) -> None:
-        """Writes JSON, every bit kept; an interrupted write leaves what was there before.
+        """Write JSON, every bit kept; an interrupted write leaves an old file as it was.
 
         Raises:
             InputError: the folder does not exist.
@@ -118,8 +118,8 @@ def estimate_channels(
     ``c = Σ w_n s[n] conj(ideal[n])``. The delays of the ideal point are exact to every element, so
     the reflector may be close. The sum suppresses echoes from other ranges. Over several frames
     ``c ≈ amplitude(frame) · gain(channel)``. The gains are the leading singular vector, whatever
-    phase the reflector has in each frame. Errors of the elements' positions end up in the phases,
-    which then are right in the direction of this reflector only.
+    phase the reflector has in each frame. Errors of the elements' positions end up in the phases;
+    the phases are then right in the direction of this reflector only.
 
     Args:
         capture: samples with the reflector as the strongest echo at its range.

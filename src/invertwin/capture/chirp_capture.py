@@ -24,7 +24,7 @@ class ChirpCapture:
         chirps: Timing of the ramps.
         frame_period: Time between the starts of two frames [s]; None = not known.
         real: Whether the samples were real: their analytic signal holds up to half the range.
-        moving: Whether what it shows moves, and fades in the mean of a frame's chirps.
+        moving: Whether its echoes move, and so fade in the mean of a frame's chirps.
 
     Raises:
         InputError: Samples that are not complex, or a shape that radar and timing do not have.
@@ -120,7 +120,7 @@ class ChirpCapture:
             if self.moving:
                 raise InputError(
                     "expected a parameter of kind mover, since the recording has chirps and "
-                    "movers, which fade in the mean of the chirps; seek a mover, or choose one "
+                    "movers, which fade in the mean of the chirps; fit a mover, or choose one "
                     "`chirp`"
                 )
             beat = self.beat.mean(dim=1)

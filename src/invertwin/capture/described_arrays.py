@@ -34,7 +34,7 @@ def described_board(
     elevation: int | None = None,
     azimuth: int | None = None,
 ) -> Mounting | Elements:
-    """Whose elements recorded described samples: a board as it is mounted, or TX and RX elements.
+    """The elements that recorded described samples: a board as it is mounted, or TX and RX.
 
     The description's ``[radar]`` says it: ``board``, ``elevation`` and ``azimuth`` of a preset, or
     ``tx_positions`` and ``rx_positions`` [m].
@@ -120,10 +120,7 @@ def read_chirps(path: str | Path) -> ChirpData:
 
 
 def write_chirps(
-    path: str | Path,
-    data: ChirpData,
-    file: str,
-    arrays: Elements | None = None,
+    path: str | Path, data: ChirpData, file: str, arrays: Elements | None = None
 ) -> None:
     """Write samples, bit for bit, and the description that `read_chirps` reads.
 

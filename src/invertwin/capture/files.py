@@ -27,7 +27,7 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
 
 
 def read_dataset(path: Path) -> xr.Dataset:
-    """Reads what `write_dataset` wrote.
+    """Read what `write_dataset` wrote.
 
     Raises:
         InputError: no such file, or one that is damaged or no NetCDF.

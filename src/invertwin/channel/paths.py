@@ -31,8 +31,11 @@ class Pattern(Protocol):
 class Grid:
     """Bins of a map: range R = L/2 [m] × direction cosines u, v of the radar frame.
 
-    A count of 1 for ``u`` or ``v`` means that the axis is not resolved: every direction falls
-    into that one bin.
+    Attributes:
+        range_start, u_start, v_start: Centre of the first bin.
+        range_step, u_step, v_step: Distance of neighbouring centres.
+        range_count, u_count, v_count: Number of bins. Of ``u`` or ``v``, 1 means that the axis is
+            not resolved: every direction falls into that one bin.
     """
 
     range_start: float

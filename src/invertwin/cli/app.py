@@ -22,20 +22,12 @@ from invertwin.cli.options import (
     with_options,
 )
 from invertwin.cli.run_file import about_file
-from invertwin.cli.running import (
-    load_runs,
-    now_and_then,
-    print_tables,
-    run_folder,
-)
+from invertwin.cli.running import load_runs, now_and_then, print_tables, run_folder
 from invertwin.errors import InputError
 from invertwin.registry.kinds import load_plugins
 
 app = typer.Typer(
-    name="invertwin",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+    name="invertwin", no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False
 )
 
 
@@ -179,7 +171,7 @@ def _demo_file() -> Path:
 
 
 def _shown_once() -> Callable[..., None]:
-    """Prints every warning on one line, the same text once."""
+    """Print every warning on one line, the same text once."""
     said: set[str] = set()
 
     def show(message: Warning | str, *_: Any) -> None:

@@ -112,9 +112,7 @@ def named(tables: Sequence[Any]) -> dict[str, Any]:
 
 
 def parameters(
-    tables: Sequence[Any],
-    scene: Scene,
-    objects: Mapping[str, ObjectTable] | None = None,
+    tables: Sequence[Any], scene: Scene, objects: Mapping[str, ObjectTable] | None = None
 ) -> list[nn.Module]:
     """The modules of the `[[parameters]]` tables; each starts as the object is, or as it says.
 
@@ -126,15 +124,15 @@ def parameters(
 
 
 def body_of(run: RunFile, scene: Scene, name: str) -> SkinnedBody | None:
-    """The body of an object whose joints are sought; None for other objects.
+    """The body of an object whose joints are fitted; None for other objects.
 
     Args:
-        run: Tells what is sought.
+        run: Tells what is fitted.
         scene: Where the body is as it was built.
         name: Of the object.
     """
-    sought = [table for table in run.parameters if table.kind == "body" and table.object == name]
-    found = parameters(sought[:1], scene, run.scene)
+    fitted = [table for table in run.parameters if table.kind == "body" and table.object == name]
+    found = parameters(fitted[:1], scene, run.scene)
     return found[0] if found else None  # type: ignore[return-value]
 
 

@@ -35,7 +35,7 @@ class SurrogateTable(Table):
 
 
 def register(registry: Registry) -> None:
-    """Adds losses and optimizers; forward models of one's own come from plugins."""
+    """Add losses and optimizers; forward models of one's own come from plugins."""
     registry.groups["loss"] = Group(default="mse")
     registry.groups["optimizer"] = Group(default="adam")
     registry.groups["model"] = Group()

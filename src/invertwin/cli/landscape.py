@@ -57,7 +57,7 @@ def exact_losses(run: RunFile, line: Line, offsets: np.ndarray, seen: Observatio
     """Losses of exact signals along a line, with the rough points of the simulated data."""
     data = need(run, "data", "the loss landscape")
     assert isinstance(data, SimulatedData)
-    drawn = {"samples": data.samples, "points_per_m2": data.density, "boundary": False}
+    drawn = {"samples": data.samples, "points_per_m2": data.points_per_m2, "boundary": False}
     seen = replace(seen, model=seen.model.sampled_by(depth=1, **drawn))
     seed = run.seed if data.seed is None else data.seed
     return losses_along(line, offsets, seen, seed=seed).numpy()

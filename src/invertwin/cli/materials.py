@@ -81,7 +81,7 @@ class MediumTable(Table):
 
 
 def register(registry: Registry) -> None:
-    """Adds the materials."""
+    """Add the materials."""
     registry.groups["material"] = Group()
     registry.forms[Texture] = Form(_value_type, _value)
     registry.bases[Medium] = MediumTable

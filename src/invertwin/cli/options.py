@@ -117,7 +117,7 @@ class Look(Where):
 
 
 def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command the fields of a dataclass as options; it gets them as one value.
+    """Give a command the fields of a dataclass as options; it gets them as one value.
 
     Args:
         kind: The dataclass, whose annotations say what typer needs to know.

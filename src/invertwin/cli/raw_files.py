@@ -63,7 +63,7 @@ def write_raw(
     beat: Complex[Tensor, "frame chirp tx rx sample"] | Complex[Tensor, "frame tx rx sample"],
     folder: RunFolder,
 ) -> dict[str, float]:
-    """Writes raw/capture.bin and its settings files; returns numbers for metrics.json.
+    """Write raw/capture.bin and its settings files; return numbers for metrics.json.
 
     Raises:
         InputError: What no such file can hold.

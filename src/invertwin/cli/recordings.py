@@ -26,11 +26,11 @@ class SimulatedData(Section):
     """Exact signals of the true scene, with noise."""
 
     kind: Literal["simulated"]
-    density: Positive = key("rough points per m²")
+    points_per_m2: Positive = key("rough points per m²")
     samples: Count = key("coherent paths", 200_000)
     depth: Depth = key("most bounces of a path; with [chirps] it is one", 3)
-    rough_paths: Count = key("paths of two bounces to draw, and of each number above", 200_000)
-    snr_db: float | None = key("signal to noise per sample; without it no noise", None)
+    rough_paths: Count = key("paths to draw of two bounces, and of each larger number", 200_000)
+    snr_db: float | None = key("signal-to-noise ratio per sample; without it no noise", None)
     noise_figure_db: float | None = key("thermal noise of a receiver instead of snr_db", None)
     seed: Seed | None = key("without it the run's", None)
     every_start: bool = key("a recording of its own for every start: coverage of error bars", False)
@@ -62,10 +62,11 @@ class ChirpTable(DataTable, Posed):
     """Raw chirps of a board, made one signal per frame."""
 
     chirp: Annotated[int, Ge(0)] | None = key(
-        "number from 0 of one; without it the mean of a frame's, in which movers fade", None
+        "number of one chirp, from 0; without it the mean over a frame, in which movers fade",
+        None,
     )
     frame: Annotated[int, Ge(0)] | None = key(
-        "number from 0 of the only one that is used; without it all", None
+        "number of the only frame that is used, from 0; without it all", None
     )
 
     def build(self, given: Any = None, /, **more: Any) -> ChirpCapture:
@@ -79,7 +80,7 @@ class ChirpTable(DataTable, Posed):
 
 
 def register(kinds: Registry) -> None:
-    """Adds the readers; what one returns says which keys it has beside its own."""
+    """Add the readers; what one returns says which keys it has beside its own."""
     kinds.groups["data"] = Group()
     kinds.bases[Capture] = DataTable
     kinds.bases[ChirpCapture] = ChirpTable

@@ -81,7 +81,7 @@ def finish(
     again: str,
     note: str = "",
 ) -> list[Table]:
-    """Writes metrics.json and report.html; returns the tables, to be printed.
+    """Write metrics.json and report.html; return the tables, to be printed.
 
     Args:
         folder: Of the run.
@@ -104,7 +104,7 @@ def finish(
 def picture(
     folder: "RunFolder", name: str, figure: "Figure", title: str = "", note: str = ""
 ) -> Picture:
-    """Writes a figure as a PNG file, and returns it for the report.
+    """Write a figure as a PNG file, and return it for the report.
 
     Args:
         folder: Of the run.

@@ -43,7 +43,7 @@ _WORDS = {
 
 
 def load_run(path: Path) -> Any:
-    """Reads and validates a run file: a `RunFile` of the schema.
+    """Read and validate a run file: a `RunFile` of the schema.
 
     Raises:
         InputError: The file is missing, is not TOML, or does not fit the schema; the message
@@ -86,7 +86,7 @@ def need(run: Any, section: str, command: str, otherwise: str = "add it") -> Any
 
 @contextmanager
 def about_file(path: Path) -> Iterator[None]:
-    """Errors with the name of the run file that they are about."""
+    """Add the name of the run file to errors."""
     try:
         yield
     except InputError as error:

@@ -91,7 +91,7 @@ def run_gradcheck(
     folder: RunFolder,
     say: Callable[[str], None],
 ) -> list[Table]:
-    """Checks every run file, writes the folder, and returns the tables to print.
+    """Check every run file, write the folder, and return the tables to print.
 
     Scenes that an interrupted run has finished are not computed again.
     """

@@ -41,7 +41,7 @@ _NEAREST_CELLS = 3
 
 
 def run_look(look: Look, folder: RunFolder) -> list[Table]:
-    """Reads a recording, writes capture, pictures and numbers, returns the tables to print.
+    """Read a recording, write capture, pictures and numbers, return the tables to print.
 
     Raises:
         InputError: A recording or options that do not fit each other; nothing has been written.

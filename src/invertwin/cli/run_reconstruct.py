@@ -42,7 +42,7 @@ from invertwin.scene.geometry.density import without_clouds
 
 
 def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
-    """Fits from every start, writes the folder; returns the tables to print and the outcome.
+    """Fit from every start, write the folder; return the tables to print and the outcome.
 
     Starts that an interrupted run has finished are not fitted again.
     """

@@ -69,7 +69,7 @@ def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> tor
 
 
 def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
-    """Simulates the true scene of a run file, writes the folder, returns the tables to print."""
+    """Simulate the true scene of a run file, write the folder, return the tables to print."""
     scene = build.true_scene(run)
     radar = build.radar(need(run, "radar", "simulate"))
     grid = build.grid(need(run, "grid", "simulate"), radar)
@@ -111,7 +111,7 @@ def _frames(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: G
     with torch.no_grad():
         smooth = model.predict(scene, radar, run.seed)
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
-    one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.density))
+    one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.points_per_m2))
     metrics = {
         "paths": len(found.paths),
         **_peak(found.spectrum, grid),
@@ -164,7 +164,7 @@ def _sampling(data: SimulatedData, depth: int) -> Sampling:
         samples=data.samples,
         boundary_samples=0,
         boundary=False,
-        points_per_m2=data.density,
+        points_per_m2=data.points_per_m2,
         rough_paths=data.rough_paths,
     )
 

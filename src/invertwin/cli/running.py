@@ -85,7 +85,7 @@ def now_and_then() -> Callable[[str], None]:
 
 
 def print_tables(tables: Sequence[Table]) -> None:
-    """Prints tables with their notes."""
+    """Print tables with their notes."""
     for table in tables:
         grid = RichTable(title=Text(table.title), title_justify="left")
         for i, column in enumerate(table.columns):

@@ -89,11 +89,11 @@ class RunFolder:
         return path
 
     def write_bytes(self, name: str, data: bytes) -> None:
-        """Writes a result file so that a kill leaves the old or the new one, never half of it."""
+        """Write a result file so that a kill leaves the old or the new one, never half of it."""
         _replace(self.file(name), data)
 
     def write_figure(self, name: str, figure: "Figure") -> bytes:
-        """Writes a figure as PNG, and returns its bytes."""
+        """Write a figure as PNG, and return its bytes."""
         from invertwin.plotting import png_bytes
 
         png = png_bytes(figure)
@@ -101,11 +101,11 @@ class RunFolder:
         return png
 
     def write_text(self, name: str, text: str) -> None:
-        """Writes a result file as UTF-8, in the way of `write_bytes`."""
+        """Write a result file as UTF-8, in the way of `write_bytes`."""
         self.write_bytes(name, text.encode("utf-8"))
 
     def write_json(self, name: str, value: Any) -> None:
-        """Writes a JSON file; tensors and arrays become lists, numbers that are not finite null."""
+        """Write a JSON file; tensors and arrays become lists, numbers that are not finite null."""
         text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
         self.write_text(name, text + "\n")
 
@@ -117,7 +117,7 @@ class RunFolder:
         return json.loads(path.read_text(encoding="utf-8"))
 
     def remove(self, names: Iterable[str]) -> None:
-        """Removes intermediate files of this run."""
+        """Remove intermediate files of this run."""
         names = list(names)
         self._manifest["files"] = [f for f in self._manifest["files"] if f not in names]
         self._save_manifest()
@@ -141,7 +141,7 @@ class RunFolder:
 def open_run(
     path: Path, runs: Mapping[str, Any], *, overwrite: bool = False, resume: bool = False
 ) -> RunFolder:
-    """Takes a folder for a run and writes the run files as used into it.
+    """Take a folder for a run and write the run files as used into it.
 
     Args:
         path: The folder; made with its parents when it does not exist.

@@ -162,7 +162,7 @@ AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_f
 
 
 def register(registry: Registry) -> None:
-    """Adds waveforms, antennas, boards and tracks."""
+    """Add waveforms, antennas, boards and tracks."""
     registry.groups["pattern"] = Group(product=Pattern)
     registry.groups["waveform"] = Group(product=Waveform)
     registry.groups["array"] = Group(base=ArrayTable, product=AntennaArray)

@@ -1,4 +1,4 @@
-"""Shapes of run files: objects and their parts, and what is sought of them."""
+"""Shapes of run files: objects and their parts, and what is fitted of them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
@@ -106,7 +106,7 @@ class Mover(ParameterTable):
 
 
 def register(registry: Registry) -> None:
-    """Adds shapes, and the modules of what is sought of them."""
+    """Add shapes, and the modules that fit them."""
     registry.groups["shape"] = Group(tag="shape", base=Placement, product=Mesh)
     registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
     registry.groups["parameter"] = Group(base=ParameterTable)
@@ -188,7 +188,7 @@ def joints(
     """Joint angles of an object with shape = "body", from those it has.
 
     Args:
-        joints: by name: the components of the rotation vector that are sought, such as ["y"].
+        joints: by name: the components of the rotation vector that are fitted, such as ["y"].
 
     Raises:
         InputError: The object is no body, or has no such joint.
@@ -208,7 +208,7 @@ def _shape(table: Any) -> str | None:
 
 
 def shape_terms(table: Any, module: nn.Module, scene: Scene) -> list[Regularizer]:
-    """What keeps a shape that is sought plausible: of its table, module and first scene."""
+    """Terms of the loss that keep a fitted shape plausible."""
     if table.kind == "vertices" and table.laplacian > 0:
         return [Laplacian(scene, table.object, table.laplacian)]
     if isinstance(table, LearnedTable) and table.weight > 0:

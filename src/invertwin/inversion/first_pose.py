@@ -40,8 +40,8 @@ class Guess:
     Attributes:
         scene: The scene.
         points: Number of echoes that the object was found by.
-        losses: Of the poses that were tried, where there were several.
-        size: Of the rectangle around the echoes, where one was fitted [m].
+        losses: Losses of the poses that were tried, where there were several.
+        size: Size of the rectangle around the echoes, where one was fitted [m].
     """
 
     scene: Scene

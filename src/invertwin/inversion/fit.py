@@ -40,7 +40,7 @@ class Progress:
         step: Steps done.
         history: One row a step.
         best: Step, loss and parameters of the lowest loss.
-        ended: How the fit has ended, once it has.
+        ended: The status, once the fit has ended.
     """
 
     first: dict[str, Tensor]
@@ -61,7 +61,12 @@ class Callback:
         return {}
 
     def step(self, fit: "Fit", row: dict[str, Any]) -> None:
-        """Called after every step, with its complete row."""
+        """Called after every step.
+
+        Args:
+            fit: The stage.
+            row: Its complete row of the step.
+        """
 
     def end(self, fit: "Fit") -> None:
         """Called when a stage has ended."""
@@ -93,7 +98,14 @@ class Fit:
         rates: Mapping[nn.Parameter, float],
         position: tuple[int, int, bool],
     ) -> None:
-        """Prepare a stage. See :func:`invertwin.reconstruct` for what the arguments mean."""
+        """Prepare a stage.
+
+        Args:
+            scene, observations, unknowns, sensor_unknowns, stage: As the attributes.
+            settings: What all stages have in common.
+            rates: Learning rates of single parameters.
+            position: Number of the stage, steps before it, whether it is the last one.
+        """
         self.scene, self.stage = scene, stage
         self.number, self._before, self.last = position
         self.unknowns, self.sensor_unknowns = list(unknowns), [list(m) for m in sensor_unknowns]
@@ -104,10 +116,10 @@ class Fit:
         self._observed = [observation.observed().detach() for observation in observations]
         losses = tuple(o.loss or settings.loss for o in observations)
         self.objective = Objective(losses, tuple(o.weight for o in observations))
-        sought = [p for p in self.modules.parameters() if p.requires_grad]
-        if not sought or stage.steps < 1:
+        free = [p for p in self.modules.parameters() if p.requires_grad]
+        if not free or stage.steps < 1:
             raise InputError(
-                f"expected parameters to fit and steps >= 1, got {len(sought)} and "
+                f"expected parameters to fit and steps >= 1, got {len(free)} and "
                 f"{stage.steps}; give modules such as Pose('object')"
             )
         rules = stage.optimizer or settings.optimizer
@@ -133,14 +145,7 @@ class Fit:
         self.progress = Progress(self.parameters())
 
     def run(self, callbacks: Sequence[Callback]) -> Status:
-        """Take all steps.
-
-        Args:
-            callbacks: What watches the fit.
-
-        Returns:
-            How the fit has ended.
-        """
+        """Take all steps, watched by the callbacks, and return how the fit has ended."""
         for callback in callbacks:
             callback.begin(self)
         if self.progress.ended is None:
@@ -171,10 +176,9 @@ class Fit:
             return self.applied()[0]
 
     def maps(self, step: int) -> Maps:
-        """The predicted and the observed map of every observation in a step, blurred alike.
+        """The predicted and the observed map of every observation, blurred alike.
 
-        Args:
-            step: Number of the step; the same step has the same random numbers.
+        The same number of a step gives the same random numbers.
         """
         scene, sensors = self.applied()
         share = max(0.0, 1 - step / self.stage.widths_end)
@@ -236,11 +240,7 @@ class Fit:
         return total
 
     def evaluate(self, step: int) -> Tensor:
-        """The loss of a step.
-
-        Args:
-            step: Number of the step.
-        """
+        """The loss with the random numbers of a step."""
         value = self.objective(self.maps(step))
         return value + self.penalty() if self._settings.regularizers else value
 
@@ -258,14 +258,7 @@ class Fit:
         }
 
     def restore(self, state: dict[str, Any]) -> bool:
-        """Go on from a state.
-
-        Args:
-            state: From ``state`` of the same fit.
-
-        Returns:
-            Whether it is a state of this fit; if not, nothing has changed.
-        """
+        """Go on from a ``state`` of this fit; of another fit, change nothing and return False."""
         if not self.fingerprint.matches(state.get("fingerprint")):
             return False
         self.modules.load_state_dict(state["modules"])
@@ -274,11 +267,7 @@ class Fit:
         return True
 
     def annealed(self, step: int) -> bool:
-        """Whether the extra widths are zero from this step on.
-
-        Args:
-            step: Number of the step.
-        """
+        """Whether the extra widths are zero from the step of this number on."""
         return step >= self.stage.widths_end or not any(m.widened for m in self._models)
 
     def _note(self, **changes: Any) -> None:
@@ -389,10 +378,10 @@ class Fit:
 class Settings:
     """What all stages of a fit have in common. See :func:`invertwin.reconstruct`."""
 
-    loss: Callable[[Tensor, Tensor], Tensor]
-    optimizer: Optimizer
-    regularizers: tuple[Regularizer, ...]
-    seed: int
+    loss: Callable[[Tensor, Tensor], Tensor]  # of a predicted and an observed map
+    optimizer: Optimizer  # of stages without one of their own
+    regularizers: tuple[Regularizer, ...]  # of the scene, beside those of its unknowns
+    seed: int  # of all random numbers
 
 
 def _require_all_used(modules: nn.ModuleList) -> None:

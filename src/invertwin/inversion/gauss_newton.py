@@ -32,8 +32,8 @@ class GaussNewton:
     again with more damping μ.
 
     Source: the Levenberg–Marquardt method.
-    Differs from the source: g and H are estimates from samples, and D keeps what the data hardly
-    tell from drifting with their noise; H may serve several steps.
+    Differs from the source: g and H are estimates from samples. D keeps parameters that the data
+    hardly determine from drifting with the noise. H may serve several steps.
 
     Args:
         modules: what is fitted.
@@ -163,7 +163,7 @@ class GaussNewton:
         self._known = (state["curvature"], state["free"]) if "curvature" in state else None
 
     def zero_grad(self) -> None:
-        """Nothing: gradients are not kept in the parameters."""
+        """Do nothing: gradients are not kept in the parameters."""
 
     def _solved(self, curvature: Tensor, slope: Tensor, reach: Tensor) -> Float64[Tensor, " p"]:
         """The minimum of the damped quadratic model within the reach of every parameter."""
@@ -255,7 +255,12 @@ def _value(
 
 
 def without_effect(module: nn.Module, name: str) -> InputError:
-    """Make the error for a parameter that the loss does not depend on."""
+    """Make the error for a parameter that the loss does not depend on.
+
+    Args:
+        module: It has the parameter.
+        name: Of the parameter.
+    """
     return InputError(
         f"expected parameters that change the map, got {name} of {type(module).__name__}, which "
         "has no gradient; probably a later module overwrites this mesh: give one shape of each "

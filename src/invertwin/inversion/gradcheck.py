@@ -28,7 +28,7 @@ class Check:
     Attributes:
         repeats: Derivatives averaged, with different seeds.
         step: ε of the differences; ε/2 is evaluated too, and 4ε and 8ε for the order.
-        difference_samples: Samples of one end of a pair.
+        difference_samples: Samples for one end of a pair.
         noise: ‖standard error‖₁/‖g_FD‖₁ below which no more pairs are added.
         max_pairs: Most pairs; the report says what was reached.
         scheme: How the differences sample surfaces: "rays" from the antenna, or by "area".

@@ -1,7 +1,7 @@
 """First guesses of pose, size and density by conventional processing.
 
-Detected points or backprojected echoes tell where an object is. A rectangle in the ground plane
-tells how it stands. The fit does the rest. Nothing here is differentiable.
+Detected points or backprojected echoes show where an object is. A rectangle in the ground plane
+shows how it stands. The fit does the rest. Nothing here is differentiable.
 """
 
 import math
@@ -79,12 +79,7 @@ class Rectangle:
 
 
 def detected_points(
-    capture: Capture,
-    grid: Grid,
-    low: ArrayLike,
-    high: ArrayLike,
-    *,
-    false_alarm: float = 1e-6,
+    capture: Capture, grid: Grid, low: ArrayLike, high: ArrayLike, *, false_alarm: float = 1e-6
 ) -> Float64[Tensor, "point 3"]:
     """Find echoes within a box of the world by ordered-statistics CFAR and its local maxima.
 
@@ -93,8 +88,7 @@ def detected_points(
     Args:
         capture: the data.
         grid: bins of its maps.
-        low: corner of the box [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the box [m].
         false_alarm: probability that a cell of noise is detected.
 
     Raises:
@@ -158,8 +152,7 @@ def image_points(
     Args:
         capture: the data.
         grid: bins of its maps.
-        low: corner of the image in the world [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the image in the world [m].
         step: distance of neighbouring nodes, about [m].
         share: least brightness of a node, relative to the strongest.
 
@@ -267,8 +260,8 @@ def guess_poses(
 
     Its upright attitude and its height are kept. Each side that faces the radar is put where the
     rectangle has it, so that the hidden part of the object lies behind; along an axis on which
-    the radar faces no side, the middles agree. A rectangle tells no front from back, nor for
-    certain length from width: ``best_pose`` chooses.
+    the radar faces no side, the middles agree. A rectangle does not tell front from back, nor
+    always length from width: ``best_pose`` chooses.
 
     Args:
         item: the object; its present pose gives attitude and height.
@@ -378,8 +371,7 @@ def guess_density(
         grid: bins of its maps.
         item: the object; its pose carries the box.
         name: name of the object.
-        low: corner of the box in the object's frame [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the box in the object's frame [m].
         counts: nodes along x, y and z.
         depth: ∫σ ds of a way of one node spacing at the strongest echo.
 

@@ -36,20 +36,12 @@ class Line:
         self._start = {name: value.detach() for name, value in module.named_parameters()}
 
     def at(self, theta: Tensor) -> Any:
-        """The module's result at θ, which may carry a derivative.
-
-        Args:
-            theta: A scalar.
-        """
+        """The module's result at a scalar θ, which may carry a derivative."""
         moved = {n: self._start[n] + theta * change for n, change in self._tangent.items()}
         return torch.func.functional_call(self._module, self._start | moved, (self._target,))
 
     def end(self, theta: float) -> Any:
-        """The module's result at one end of a difference.
-
-        Args:
-            theta: How far from the start.
-        """
+        """The module's result at θ, one end of a difference."""
         return self.at(torch.tensor(theta, dtype=torch.float64))
 
 
@@ -62,7 +54,7 @@ class FieldLine(Line):
     """
 
     def __init__(self, module: nn.Module, tangent: Mapping[str, Change], target: Any) -> None:
-        """See ``Line``; the module has an ``object`` and its ``distance`` at points."""
+        """Move a module with an ``object`` and its ``distance`` at points; see ``Line``."""
         super().__init__(module, tangent, target)
         self._field, self._object = _Field(module), str(module.object)
         with torch.no_grad():
@@ -150,7 +142,7 @@ def losses_along(
 
 
 class _Field(nn.Module):
-    """The distance of a shape as a module's own call."""
+    """A module whose call is the distance of a shape."""
 
     def __init__(self, shape: nn.Module) -> None:
         super().__init__()

@@ -24,7 +24,7 @@ Maps = Sequence[tuple[Tensor, Tensor]]
 
 
 def relative_error(simulated: Tensor, measured: Tensor) -> Tensor:
-    """``mean|a − b|² / mean|b|²``, of maps of any form: also of complex signals.
+    """``mean|a − b|² / mean|b|²`` of maps of any form, also of complex signals.
 
     Args:
         simulated: a.
@@ -46,7 +46,7 @@ class SpectrumLoss:
         kind: ``mse``: ``mean((g a − b)²) / mean(b²)``. ``likelihood``: the Itakura–Saito
             divergence ``mean(q − log q − 1)``, ``q = (b + n) / (g a + n)``, which is the
             likelihood of fully developed speckle (power with an exponential distribution, or
-            gamma after averaging). It weighs weak and strong echoes by what they tell, so that
+            gamma after averaging). It weighs weak and strong echoes by their information, so that
             the speckle of a bright wall does not drown a dim object.
         levels: Number of resolutions.
         gain: ``fitted``, or ``one`` for calibrated data.
@@ -117,10 +117,13 @@ class SpectrumLoss:
     ) -> Float[Tensor, "p p"]:
         """The Gauss–Newton matrix of the loss: its second derivatives but for those of the map.
 
-        Along ``tangents``, the derivatives of the simulated map by p parameters. Under ``mse`` it
-        is twice the matrix of squared residuals, under ``likelihood`` the Fisher information of
-        the speckle. A fitted gain is eliminated: what it can explain tells nothing about the
-        parameters.
+        Under ``mse`` it is twice the matrix of squared residuals, under ``likelihood`` the Fisher
+        information of the speckle. A fitted gain is eliminated: what it can explain tells nothing
+        about the parameters.
+
+        Args:
+            simulated, measured: The maps.
+            tangents: Derivatives of the simulated map with respect to p parameters.
         """
         pairs = self._pyramid(simulated.detach(), measured)
         # The derivative of a map with respect to the logarithm of its gain is the map.
@@ -339,8 +342,7 @@ class CorrelationLoss:
         """The loss: 0 for maps of one pattern, 1 for unrelated ones.
 
         Args:
-            simulated: Power.
-            measured: Power.
+            simulated, measured: Power.
 
         Raises:
             InputError: Maps of different shapes.
@@ -373,8 +375,7 @@ class Objective:
     """The weighted mean of the losses of all observations.
 
     Attributes:
-        losses: One per observation.
-        weights: One per observation.
+        losses, weights: One per observation.
     """
 
     losses: tuple[Callable[[Tensor, Tensor], Tensor], ...]

@@ -95,8 +95,7 @@ def residual(found: Object, truth: Object) -> Residual | None:
     parameterised. None for other triangles: no vertex is another one's copy.
 
     Args:
-        found: the result.
-        truth: where it really is.
+        found, truth: the result, and where it really is.
     """
     same = found.vertices.shape == truth.vertices.shape
     if not same or not torch.equal(found.mesh.faces, truth.mesh.faces):
@@ -130,8 +129,7 @@ def compare_shapes(
     surface. In the volume these are the voxels whose closest surface point is seen.
 
     Args:
-        found: the result.
-        truth: what it should be.
+        found, truth: the result, and what it should be.
         seen_from: radar positions [n, 3] in the frame of the meshes (m); None counts everything.
         thresholds: of the F-score [m].
         count: points drawn on each surface.
@@ -184,8 +182,7 @@ def volume_iou(found: Mesh, truth: Mesh, voxel: float = VOXEL) -> float:
     and cavities are empty.
 
     Args:
-        found: the result.
-        truth: what it should be.
+        found, truth: the result, and what it should be.
         voxel: edge [m].
 
     Raises:
@@ -225,8 +222,7 @@ def value_errors(
 
     Args:
         values: their names; what one of the materials does not have is left out.
-        found: the result.
-        truth: what it should be.
+        found, truth: the result, and what it should be.
         frequency: at which values of the ITU table are compared [Hz].
         layer: of multilayers, from 0; None = values of the materials themselves.
 

@@ -133,11 +133,11 @@ def _coherence(recording: ChirpCapture, grid: Grid, rate: float, range_: float) 
 class MovingBody(nn.Module):
     """A rigid body in motion: place, size, velocity, turn, and how much of its echo is diffuse.
 
-    Its axes are across the line of sight to the start, up, and along that line. It moves in the
-    plane of the first and the last, at a height that is fitted where the antennas resolve it.
-    Motion across the line of sight and a turn look much alike: hold the turn of what does not
-    turn. Maps a scene to the scene with the body where it is in the middle of the frame, and with
-    the velocity of each of its vertices.
+    Its axes are across the line of sight to the start, up, and along this line. The body moves in
+    the plane of the first and the last axis. Its height is fitted if the antennas resolve it.
+    Motion across the line of sight and a turn look much alike: hold the turn of a body that does
+    not turn. The module puts the body into a scene: where it is in the middle of the frame, and
+    with a velocity of each of its vertices.
 
     Attributes:
         echo: Where it started.
@@ -266,11 +266,7 @@ class MoverMaps:
     point: Tensor
 
     def correlations(self, recording: ChirpCapture) -> dict[str, dict[str, float]]:
-        """Correlations of ``twin`` and ``bare_psf`` with a recording, on the same cells, by scale.
-
-        Args:
-            recording: One frame of chirps.
-        """
+        """Correlations of ``twin`` and ``bare_psf`` with a frame of chirps, by scale."""
         seen = self.model.observe(recording)[0]
         found = {}
         for scale in get_args(Scale):

@@ -77,7 +77,12 @@ class Optimizer:
         return torch.optim.SGD(listed, lr=self.rate, momentum=self.momentum)
 
     def apply(self, optimizer: torch.optim.Optimizer | GaussNewton, progress: float) -> None:
-        """Set the learning rates after this share of the steps."""
+        """Set the learning rates.
+
+        Args:
+            optimizer: From ``build``.
+            progress: Share of the steps that are done.
+        """
         if isinstance(optimizer, GaussNewton):
             return
         last = self.rate / 20 if self.final_rate is None else self.final_rate

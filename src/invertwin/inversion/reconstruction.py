@@ -113,9 +113,9 @@ def reconstruct(
         {name: item.made(o.sensor) for name, item in found.items()}
         for o, found in zip(watched, own, strict=True)
     ]
-    begun, sought, fit, status = scene, unknowns, None, "budget"
+    begun, current, fit, status = scene, unknowns, None, "budget"
     history: list[dict[str, Any]] = []
-    modules, terms = _made(begun, sought)
+    modules, terms = _made(begun, current)
     free = _Free([modules, *sensor_modules])
     for number, stage in enumerate(stages):
         if fit is not None and stage.renews:
@@ -123,16 +123,16 @@ def reconstruct(
             begun = without_clouds(fit.twin())
             for name, change in stage.remesh.items():
                 begun = begun.replace(name, mesh=change(begun[name].mesh))
-            sought = {
+            current = {
                 n: u for n, u in unknowns.items() if not stage.unknowns or n in stage.unknowns
             }
-            fixed = [n for n, u in sought.items() if isinstance(u.module, nn.Module)]
+            fixed = [n for n, u in current.items() if isinstance(u.module, nn.Module)]
             if fixed:
                 raise InputError(
                     f"expected functions that make the modules of a stage that rebuilds, got a "
                     f"module for {fixed[0]!r}; give Unknown(lambda scene: ...)"
                 )
-            modules, terms = _made(begun, sought)
+            modules, terms = _made(begun, current)
             free = _Free([modules, *sensor_modules])
         free.apply(stage)
         fit = Fit(

@@ -22,6 +22,11 @@ class Laplacian:
     Source: §4.2 of the paper (λ L θ; its gradient is weight · L d).
     Differs from the source: the energy is that of the displacement, so that the first shape is
     not itself smoothed away.
+
+    Args:
+        scene: With the first shape.
+        object: Name of the object.
+        weight: Of the energy.
     """
 
     def __init__(self, scene: Scene, object: str, weight: float) -> None:

@@ -110,7 +110,7 @@ class _Surface:
                 return
 
     def collapse(self, shortest: float, longest: float) -> None:
-        """Draw the ends of short edges together, where the surface stays one."""
+        """Merge the ends of short edges, where the surface stays a surface."""
         for a, b in self._sorted(lambda length: length < shortest, 1):
             both = self.around[a] & self.around[b]
             if len(both) != 2 or a in self.fixed or b in self.fixed:

@@ -47,7 +47,7 @@ class Stage(Schedule):
             for another kind of shape, or a finer mesh.
         remesh: For every object named here, a function of its mesh that is applied before modules
             are made anew.
-        optimizer: Optimizer of this stage; None = that of the whole fit.
+        optimizer: Optimizer of this stage; None = the one of the whole fit.
         models: Of the observations in this stage, in their order; empty = their own.
     """
 

@@ -23,7 +23,7 @@ def convergence(
     """Loss over the steps and, beside it, an error: one colour for each way to fit.
 
     Args:
-        losses: Losses of one fit; or those of every fit, by the name of the way.
+        losses: Losses of one fit; or those of several fits, by name.
         errors: Pairs of step and error of every fit, by name.
         annealed: Step from which the surrogate has no extra width.
         before: Loss of the start without extra width.

@@ -87,7 +87,7 @@ def panels(shown: Mapping[str, Panel], *, dynamic_range: float = 40.0) -> Figure
 
 
 def range_doppler(maps: DopplerMaps) -> Figure:
-    """Range × range rate of one frame of chirps, and range × direction of all and of what moves."""
+    """One frame of chirps: range × range rate, and range × direction of all and of movers."""
     return panels(doppler_panels(maps))
 
 

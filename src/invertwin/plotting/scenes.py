@@ -101,7 +101,7 @@ def _views(radar: Radar | None) -> list[_View]:
     sign = [-1 if frame[k, c] < 0 else 1 for c, k in enumerate(nearest)]
     views = []
     for title, (across, up, depth) in _VIEWS.items():
-        # The eye is before the radar's boresight, above, or on the right.
+        # The eye is in front of the radar, above, or on the right.
         towards = sign[depth] * (-1 if depth == 2 else 1)
         axes = nearest[across], nearest[up], nearest[depth]
         views.append(_View(title, axes, (sign[across], sign[up], towards)))

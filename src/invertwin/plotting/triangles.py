@@ -18,7 +18,7 @@ Shape = tuple[NDArray, NDArray]
 
 
 def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest: float) -> None:
-    """Draws shapes as an eye far away sees them.
+    """Draw shapes as an eye far away sees them.
 
     Args:
         axes: Matplotlib axes to draw in.
@@ -49,7 +49,7 @@ def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest:
 
 
 def small_triangles(triangles: NDArray, longest: float) -> NDArray:
-    """Splits the triangles with a side above `longest`, up to a bound on their number.
+    """Split the triangles with a side above `longest`, up to a bound on their number.
 
     Args:
         triangles: Corners [t, 3, 3] (m).
@@ -69,7 +69,12 @@ def small_triangles(triangles: NDArray, longest: float) -> NDArray:
 
 
 def sharp_edges(vertices: NDArray, faces: NDArray) -> NDArray:
-    """Vertex pairs [e, 2] of open edges and of edges that bend by more than 30°."""
+    """Vertex pairs [e, 2] of open edges and of edges that bend by more than 30°.
+
+    Args:
+        vertices: Positions [v, 3].
+        faces: Vertex indices of triangles [f, 3].
+    """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     bent = mesh.face_adjacency_edges[mesh.face_adjacency_angles > math.radians(30)]
     alone = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)

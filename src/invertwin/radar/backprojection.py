@@ -36,8 +36,8 @@ def backproject_beat(
         points: Positions in the world [m].
 
     Raises:
-        InputError: The signal does not fit the radar, which may have none, or a point lies
-            beyond the unambiguous range.
+        InputError: The signal does not fit the radar, the radar has no beat signal, or a point
+            lies beyond the unambiguous range.
     """
     waveform = sampled(radar)
     tx, rx = (places.to(beat.device) for places in radar.elements())
@@ -75,8 +75,7 @@ def distances(
     """Distances from every place to every point [m].
 
     Args:
-        places: [m].
-        points: [m].
+        places, points: [m].
     """
     # The matrix product that cdist takes by default cancels digits.
     return torch.cdist(places, points, compute_mode="donot_use_mm_for_euclid_dist")

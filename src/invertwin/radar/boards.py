@@ -28,9 +28,9 @@ Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
 class Board:
     """Where the elements of a board are, in half wavelengths.
 
-    Columns (x) and rows (y) are those of the source, but for the columns of ``antGeometry0``, which
-    are taken with the other sign, so that they grow with the numbers of the elements. A table of
-    one's own is one more ``Board``.
+    Columns (x) and rows (y) are those of the source. Only the columns of ``antGeometry0`` have the
+    other sign here, so that they grow with the numbers of the elements. For another board, make a
+    ``Board`` of your own.
 
     Differs from the source: the sources count the columns and rows of TX and of RX each from an
     origin of its own and do not say how far apart these are. Here TX and RX are each centred at
@@ -135,8 +135,7 @@ class Mounting:
 
     Attributes:
         board: where its elements are, or the name of a preset.
-        elevation: as in `Board.arrays`.
-        azimuth: as in `Board.arrays`.
+        elevation, azimuth: as in `Board.arrays`.
         transmitters: numbers from 1 in the order of sending; None = all, or those of a recording.
         receivers: numbers from 1, ascending; None = all, or those of a recording.
         pattern: gain of every element; None = isotropic.
@@ -150,9 +149,7 @@ class Mounting:
     pattern: Pattern | None = None
 
     def arrays(
-        self,
-        transmitters: Sequence[int] | None = None,
-        receivers: Sequence[int] | None = None,
+        self, transmitters: Sequence[int] | None = None, receivers: Sequence[int] | None = None
     ) -> Elements:
         """TX (in the order of sending) and RX elements in use: its own, or those that recorded.
 

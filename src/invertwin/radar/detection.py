@@ -291,10 +291,7 @@ def _ordered_factor(cells: int, place: int, false_alarm: float, looks: int) -> f
 
 
 def _refinement(
-    power: Float64[Tensor, "frame velocity range u v"],
-    cell: list[Tensor],
-    axis: int,
-    wrap: bool,
+    power: Float64[Tensor, "frame velocity range u v"], cell: list[Tensor], axis: int, wrap: bool
 ) -> Float64[Tensor, " point"]:
     """Peak between the bins of one axis, in bins: within half a bin, 0 at an edge."""
     size = power.shape[axis]

@@ -181,7 +181,7 @@ def range_doppler_angle(
 ) -> Float[Tensor, "frame velocity range u v"]:
     """Power over range rate, range and direction (Bartlett), with ``compensate_tdm``.
 
-    ``range_doppler``, ``compensate_tdm``, then ``beamform``; see there.
+    It is ``range_doppler``, ``compensate_tdm``, then ``beamform``.
 
     Args:
         beat: Signals of trains of chirps.
@@ -193,7 +193,7 @@ def range_doppler_angle(
         fold: How often each range rate has wrapped around, see ``compensate_tdm``.
 
     Raises:
-        InputError: As those.
+        InputError: As these three.
     """
     spectrum = range_doppler(beat, radar, grid, chirps, window=window, bins=bins)
     return _steered(compensate_tdm(spectrum, radar, chirps, fold), radar, grid)

@@ -70,11 +70,7 @@ class PhaseNoise:
             )
 
     def density(self, offset: Float64[Tensor, " offset"]) -> Float64[Tensor, " offset"]:
-        """One-sided S_φ(f) = 2 · 10^(L/10) [rad²/Hz].
-
-        Args:
-            offset: f > 0 [Hz].
-        """
+        """One-sided S_φ(f) = 2 · 10^(L/10) [rad²/Hz] at an offset f > 0 [Hz]."""
         if len(self.offsets) == 1:
             level = self.levels[0] - 20 * torch.log10(offset / self.offsets[0])
         else:
@@ -179,7 +175,7 @@ class Impairments:
             chirps: Timing of a train, as for ``moving_beat``; None = one ramp a frame.
 
         Raises:
-            InputError: As the single functions.
+            InputError: As ``noisy_oscillator_beat``, ``add_noise`` and ``quantize``.
         """
         if self.phase_noise is not None:
             stream = _streams(seed)[0]

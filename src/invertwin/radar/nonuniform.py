@@ -76,8 +76,8 @@ def beat_of_delays(
 
     With one instant delays are constant, and the phase is a straight line over the samples. With
     more, a path has its exact phase at every instant. What this phase has beyond a straight line
-    becomes a factor of each path, known at the instants, a polynomial between them; so the sum
-    is as many non-uniform FFTs as there are instants, over the same rates.
+    becomes a factor of each path: known at the instants, a polynomial between them. The sum is
+    then one non-uniform FFT for every instant, over the same rates.
 
     Args:
         coefficient: a of the paths; the signal has its conjugate.

@@ -15,12 +15,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Link, differentiated
 from invertwin.errors import InputError
 from invertwin.limits import Among, NonNegative, Positive
-from invertwin.radar.waveform import (
-    WINDOWS,
-    PhysicsWarning,
-    SampledWaveform,
-    Waveform,
-)
+from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import check_fields, check_shape, checked_tensor
 

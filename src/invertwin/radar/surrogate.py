@@ -13,12 +13,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Link, Sampling, deposit_power
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
-from invertwin.radar.point_spread import (
-    airy,
-    airy_radii,
-    array_point_spread,
-    range_point_spread,
-)
+from invertwin.radar.point_spread import airy, airy_radii, array_point_spread, range_point_spread
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import Aperture, aperture
 from invertwin.radar.waveform import Waveform
@@ -67,10 +62,7 @@ class Surrogate:
         check_fields(self)
 
     def shape(
-        self,
-        deposit: Float[Tensor, "frame range u v"],
-        radar: Radar,
-        grid: Grid,
+        self, deposit: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
     ) -> Float[Tensor, "frame range u v"]:
         """Deposited power as the radar would show it on average over random phases.
 
@@ -175,7 +167,7 @@ def surrogate_spectrum(
     scheme: Literal["rays", "area"] = "rays",
     reference: tuple[Scene, Link] | None = None,
 ) -> Float[Tensor, "frame range u v"]:
-    """Power spectrum of a scene, differentiable in it: deposit, then shape.
+    """Power spectrum of a scene, differentiable with respect to it: deposit, then shape.
 
     Args:
         scene: What is seen.
@@ -184,20 +176,13 @@ def surrogate_spectrum(
         surrogate: Kernels and their extra widths.
         sampling: How many paths are drawn.
         seed: Same seed, same spectrum.
-        scheme: See ``deposit_power``.
-        reference: See ``deposit_power``.
+        scheme, reference: See ``deposit_power``.
 
     Raises:
         InputError: See ``deposit_power``.
     """
     deposit = deposit_power(
-        scene,
-        radar.link(),
-        grid,
-        sampling=sampling,
-        seed=seed,
-        scheme=scheme,
-        reference=reference,
+        scene, radar.link(), grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
     )
     return surrogate.shape(deposit, radar, grid)
 
@@ -244,7 +229,8 @@ class _Kernel:
         matrix = lags.flip(0).unfold(0, count, 1).flip(0)
         if dim == power.ndim - 1:
             return power @ matrix.T
-        return (matrix @ power.flatten(dim + 1)).reshape(power.shape)
+        first = power.transpose(1, dim)  # one large product a frame, not one a row
+        return (matrix @ first.flatten(2)).reshape(first.shape).transpose(1, dim)
 
 
 @lru_cache(maxsize=16)

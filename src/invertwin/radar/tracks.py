@@ -12,8 +12,7 @@ def line(start: Point, stop: Point, count: Count) -> Float64[Tensor, "frame 3"]:
     """Positions at even distances on a line.
 
     Args:
-        start: m.
-        stop: m.
+        start, stop: m.
         count: positions.
     """
     first, last = _point(start), _point(stop)
@@ -26,10 +25,9 @@ def arc(
     """A level arc about `center`; 0° is on its −z side, 90° on its +x side.
 
     Args:
-        center: m.
-        radius: m.
-        start: 0 is on the −z side of the centre.
-        stop: 90° is on its +x side.
+        center, radius: m.
+        start: first angle; 0 is on the −z side of the centre.
+        stop: last angle; 90° is on the +x side.
         count: positions.
     """
     angle = _linspace(start, stop, count)

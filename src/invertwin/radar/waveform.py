@@ -29,8 +29,7 @@ class Waveform(ABC):
     """What any waveform must offer. Waveforms are hashable, so that kernels are cached.
 
     Attributes:
-        center_frequency: [Hz].
-        bandwidth: [Hz].
+        center_frequency, bandwidth: [Hz].
 
     Raises:
         InputError: A value is not positive or its unit is evidently wrong.
@@ -292,8 +291,7 @@ class Impulse(Waveform):
     cell c/2B. It has no beat signal, so only the surrogate can model it.
 
     Attributes:
-        center_frequency: [Hz].
-        bandwidth: [Hz].
+        center_frequency, bandwidth: [Hz].
     """
 
     center_frequency: Frequency

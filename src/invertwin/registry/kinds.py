@@ -1,4 +1,4 @@
-"""What a run file may name: constructors by group and kind, sections, commands; also of plugins.
+"""What run files may name: constructors by group and kind, sections, commands; also of plugins.
 
 A constructor is a class or a function. Its signature, its annotations and its docstring become a
 table of the run file: keys, defaults, limits and their meaning are stated there and nowhere else.
@@ -45,7 +45,7 @@ _MEANINGS = {
     "counts": "nodes along x, y and z",
     "smooth": "λ of steps preconditioned by (I + λL)⁻²; 0 = none",
 }
-"""Of keys that many tables have, where a constructor says nothing."""
+"""What keys of many tables mean, where a constructor says nothing."""
 _PLAIN = (bool, int, float, str, list, tuple, dict)
 
 
@@ -129,6 +129,7 @@ class Group:
         default: The kind of a table without `tag`.
         points: The type of a list that may stand in place of a table.
         includes: Another group, whose kinds it has, too.
+        kinds: By name.
     """
 
     tag: str = "kind"
@@ -142,10 +143,10 @@ class Group:
 
 @dataclass(frozen=True)
 class OneOf:
-    """Annotates a key whose value is a table of a group, with a base of its own if it has one."""
+    """Annotates a key whose value is a table of a group."""
 
-    group: str
-    base: type[Table] | None = None
+    group: str  # its name
+    base: type[Table] | None = None  # of these tables; None = the group's
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
         return handler.generate_schema(registry.union(self.group, self.base))
@@ -155,10 +156,10 @@ class OneOf:
 class TableOf:
     """Annotates a key whose value is the table of one constructor."""
 
-    make: Any
-    base: type[Table] = Table
-    without: tuple[str, ...] = ()
-    checked: bool | None = None
+    make: Any  # the constructor
+    base: type[Table] = Table  # with keys beside its arguments
+    without: tuple[str, ...] = ()  # arguments that are no keys
+    checked: bool | None = None  # as in ``Registry.add``
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
         found = _table_of_class(self.make, self.base, self.without, self.checked)
@@ -212,7 +213,7 @@ class Registry:
         untagged: bool = False,
         checked: bool | None = None,
     ) -> None:
-        """Adds a kind.
+        """Add a kind.
 
         Args:
             group: Such as "material", "shape", "waveform", "pattern", "array", "board", "track",
@@ -241,7 +242,12 @@ class Registry:
 
     @cache  # noqa: B019 - the only registry lives as long as the program
     def union(self, group: str, base: type[Table] | None = None) -> Any:
-        """The type of a value that is a table of a group."""
+        """The type of a value that is a table of a group.
+
+        Args:
+            group: Its name.
+            base: Of its tables; None = the group's.
+        """
         found, kinds = self._complete()[group], self._kinds(group)
         if not kinds:
             return _NoKind
@@ -255,7 +261,12 @@ class Registry:
 
     @cache  # noqa: B019 - as above
     def table(self, group: str, name: str, base: type[Table] | None = None) -> Any:
-        """The table of a kind."""
+        """The table of a kind.
+
+        Args:
+            group, name: Of the kind.
+            base: Of the table; None = the group's.
+        """
         found = self._complete()[group]
         kind, base = self._kinds(group)[name], base or found.base
         fields: dict[str, Any] = {}
@@ -277,8 +288,12 @@ class Registry:
     ) -> Any:
         """The table of a constructor, made from its signature and docstring.
 
-        A model is taken as it is. `fields` and the keys of `base` stand beside those of the
-        arguments; `checked` is as in `add`.
+        Args:
+            make: The constructor, or "module:name" of it. A pydantic model is taken as it is.
+            title: Of the table.
+            base: Its keys stand beside those of the arguments.
+            fields: Further keys.
+            without, checked: As in `add`.
         """
         self._complete()
         make = pkgutil.resolve_name(make) if isinstance(make, str) else make
@@ -328,7 +343,12 @@ class Registry:
         return kind, key(words, default, validate_default=isinstance(default, str))
 
     def read_type(self, hint: Any, name: str) -> Any:
-        """What a run file may say for an argument with this annotation."""
+        """What a run file may say for an argument.
+
+        Args:
+            hint: Annotation of the argument.
+            name: Of the argument.
+        """
         origin, arguments, members = get_origin(hint), get_args(hint), _members(hint)
         form = next((self.forms[member] for member in members if member in self.forms), None)
         products = {found.product: name for name, found in self.groups.items() if found.product}
@@ -368,7 +388,14 @@ class Registry:
         return hint
 
     def value(self, value: Any, hint: Any, name: str, given: Mapping[type, object]) -> Any:
-        """What the constructor gets for a value of the run file."""
+        """What the constructor gets for a value of the run file.
+
+        Args:
+            value: What was read.
+            hint: Annotation of the argument.
+            name: Of the argument.
+            given: Values that no run file can hold, by their type.
+        """
         if isinstance(value, Table):
             return value.build(given)
         form = next((self.forms[m] for m in _members(hint) if m in self.forms), None)
@@ -533,9 +560,6 @@ def _joined(first: type[Table], second: type[Table]) -> type[Table]:
 
 @cache
 def _table_of_class(
-    kind: Any,
-    base: type[Table] = Table,
-    without: tuple[str, ...] = (),
-    checked: bool | None = None,
+    kind: Any, base: type[Table] = Table, without: tuple[str, ...] = (), checked: bool | None = None
 ) -> Any:
     return registry.table_of(kind, _title(kind.__name__), base, without=without, checked=checked)

@@ -10,14 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
 from annotated_types import Ge, Le, Len, Lt, MinLen
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Discriminator,
-    Field,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.errors import InputError
@@ -52,7 +45,12 @@ InputPath = Annotated[str, MinLen(1), AfterValidator(_beside_run_file)]
 
 
 class KeyInputError(InputError):
-    """Bad input at a key of the run file."""
+    """Bad input at a key of the run file.
+
+    Args:
+        path: Of the key.
+        text: What is wrong.
+    """
 
     def __init__(self, path: str, text: str) -> None:
         super().__init__(f"{path}: {text}")
@@ -61,7 +59,7 @@ class KeyInputError(InputError):
 
 @contextmanager
 def about(path: str) -> Iterator[None]:
-    """Errors of the library with the key of the run file that they are about."""
+    """Add the key of the run file to errors of the library."""
     try:
         yield
     except KeyInputError as error:
@@ -71,7 +69,13 @@ def about(path: str) -> Iterator[None]:
 
 
 def key(description: str, default: Any = ..., **limits: Any) -> Any:
-    """A key of a table: what it means and its default; without one it is required."""
+    """A key of a table.
+
+    Args:
+        description: What it means.
+        default: Its default; without one it is required.
+        limits: Of its value, as pydantic's ``Field`` takes them.
+    """
     return Field(default, description=description, **limits)
 
 
@@ -95,7 +99,7 @@ class Section(BaseModel):
 
 
 def tag_by(keys: tuple[str, ...], default: str | None = None) -> Discriminator:
-    """A union's member by the first of `keys` that is present.
+    """Choose a union's member by the first of `keys` that is present.
 
     Args:
         keys: `kind` or `shape` tell the member by their value, others by their presence.
@@ -116,7 +120,13 @@ def tag_by(keys: tuple[str, ...], default: str | None = None) -> Discriminator:
 
 
 def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None:
-    """Keys that one kind needs and the others must not have."""
+    """Refuse keys that are missing, or that should not be there.
+
+    Args:
+        section: The table.
+        wanted: By name, whether the key must be there or must not.
+        when: In which case, for the error.
+    """
     for name, needed in wanted.items():
         if needed != (getattr(section, name) is not None):
             verb, do = ("", "add it") if needed else ("no ", "remove it")
@@ -124,5 +134,10 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
 
 
 def fail(text: str, path: str = "") -> NoReturn:
-    """An error of a whole section, or of the key `path` of the run file."""
+    """Raise an error of the run file.
+
+    Args:
+        text: What is wrong.
+        path: Of the key; without it the error is of the whole section.
+    """
     raise PydanticCustomError("section", "{text}", {"text": text, "path": path})

@@ -54,7 +54,7 @@ class Isotropic(Pattern):
 
 @dataclass(frozen=True)
 class Cosine(Pattern):
-    """Gain 2(n+1) cosⁿθ before the antenna and 0 behind it; its integral is 4π.
+    """Gain 2(n+1) cosⁿθ in front of the antenna and 0 behind it; its integral is 4π.
 
     The table departs from it by at most 1.2e-7 n(n−1) of the peak gain for n ≥ 1.
 
@@ -138,9 +138,9 @@ class Table(Pattern):
         """A measured power pattern in decibels.
 
         Args:
-            theta: from 0 at boresight.
+            theta: angles to boresight, from 0 on [rad].
             gain_db: one row per theta, one column per phi.
-            phi: one: symmetric about boresight.
+            phi: angles about boresight [rad]; a single one means symmetric about boresight.
 
         Raises:
             InputError: as the pattern itself, or rows of other lengths.

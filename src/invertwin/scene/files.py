@@ -153,9 +153,7 @@ def read_arrays(
 
 
 def load_scene_xml(
-    path: str | Path,
-    materials: Mapping[str, Material] | None = None,
-    default: Material = CONCRETE,
+    path: str | Path, materials: Mapping[str, Material] | None = None, default: Material = CONCRETE
 ) -> Scene:
     """Read the geometry of a Mitsuba or Sionna scene file.
 

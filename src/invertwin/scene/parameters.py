@@ -373,7 +373,7 @@ class MaterialValues(nn.Module):
 
         Args:
             object: name of the object.
-            values: which are sought.
+            values: names of those that are fitted.
             item: the object.
             layer: of a multilayer, from 0: the layer whose values they are.
 
@@ -524,7 +524,12 @@ def axes_mask(axes: str) -> Tensor:
 
 
 def free_part(parameter: Tensor, mask: Tensor) -> Tensor:
-    """The parameter, with no derivative where a mask is 0."""
+    """The parameter, with no derivative where it is held.
+
+    Args:
+        parameter: Values.
+        mask: 1 where the fit may change them, 0 where it may not.
+    """
     return parameter * mask + parameter.detach() * (1 - mask)
 
 

@@ -69,8 +69,7 @@ def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
 
 
 def rigid(
-    rotation: Float[Tensor, "3 3"] | None = None,
-    translation: ArrayLike = (0.0, 0.0, 0.0),
+    rotation: Float[Tensor, "3 3"] | None = None, translation: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Float[Tensor, "4 4"]:
     """Make the matrix of the transform x → rotation x + translation [m].
 

@@ -174,7 +174,7 @@ class Scene:
         if shaped and changed.cloud is not None:
             raise InputError(
                 f"expected changes of pose or density of the cloud {name!r}, got its {shaped[0]}, "
-                "which rays do not see; seek its density alone, or take the cloud away"
+                "which rays do not see; fit its density alone, or take the cloud away"
             )
         return Scene({**self.objects, name: changed})
 

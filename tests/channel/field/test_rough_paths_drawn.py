@@ -1,4 +1,4 @@
-"""How rough paths are drawn: as much power as there is, by way of many paths where it is weak."""
+"""How rough paths are drawn: with all the power, and as many paths where it is weak."""
 
 import math
 
@@ -38,7 +38,7 @@ def antennas(*x: float) -> Link:
 
 
 def by_area(geometry: Geometry, count: int, seed: int) -> SurfacePaths:
-    """Chains from wall to item to wall, every point uniform on its object: the plain integral."""
+    """Paths from wall to item to wall, every point uniform on its object: the plain integral."""
     generator = torch.Generator().manual_seed(seed)
     areas = face_areas(geometry)
     columns: list[list[Tensor]] = [[], [], []]

@@ -1,4 +1,4 @@
-"""Fields of what stands behind a sheet: as much power, as late, as power paths say."""
+"""Fields from behind a sheet have the power and the delay that power paths have."""
 
 import pytest
 import torch

@@ -35,7 +35,7 @@ def paths() -> tuple[Contribution, tuple, object]:
 
 
 def spline(found, dots, exists, grid: Grid, derivative: bool) -> np.ndarray:
-    """The same in NumPy, in float64: quadratic B-splines along the resolved axes."""
+    """The map in NumPy, in float64: quadratic B-splines along the resolved axes."""
     values = {k: getattr(found, k).numpy().astype(np.float64) for k in ("power", "range", "u", "v")}
     rates = [dot.numpy().astype(np.float64) for dot in dots]
     starts = (grid.range_start, grid.u_start, grid.v_start)

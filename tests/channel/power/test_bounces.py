@@ -1,4 +1,4 @@
-"""Chains of several points: the fused walk against its torch twin, its own adjoint, and itself."""
+"""Paths of several bounces: the fused walk against its torch reference, its adjoint, and itself."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from invertwin.scene import (
     plate,
     rotation_from_vector,
 )
-from oracles.twin import deposit_by_paths
+from oracles.deposit_by_paths import deposit_by_paths
 from scenes import float64, link, occluder, relative, thing
 
 GRID = Grid(0.4, 0.075, 60, u_start=-0.6, u_step=0.1, u_count=13)
@@ -94,11 +94,11 @@ def more_than_one(
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("bistatic", [False, True], ids=["monostatic", "bistatic"])
-def test_value_and_gradients_are_those_of_the_torch_twin(bistatic, kind):
+def test_value_and_gradients_are_those_of_the_torch_reference(bistatic, kind):
     """At fixed visibility: explicit boundary paths stop at one bounce.
 
     Towards the critical angle the derivative of Snell's law grows without bound, and single
-    precision with it: the seed is one whose few chains stay away from there.
+    precision with it: the seed is one whose few paths stay away from there.
     """
     values = leaves(bistatic, kind)
     where = *built(values, kind), GRID

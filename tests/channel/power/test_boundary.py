@@ -18,7 +18,7 @@ COUNTS = Sampling(depth=1, samples=4_000, boundary_samples=40_000)
 
 
 def shadow_rate(screens: dict[str, Mesh], antennas: Link, boundary: bool = True) -> Tensor:
-    """∂map/∂x of screens that slide together before the wall."""
+    """∂map/∂x of screens that slide together in front of the wall."""
     shift = torch.zeros((), dtype=torch.float64, requires_grad=True)
     offset = torch.stack([0.1 + shift, 0.05 + 0 * shift, 1 + 0 * shift])
     scene = Scene(

@@ -1,4 +1,4 @@
-"""The fused deposit against its slow twins, its own adjoint, and itself."""
+"""The fused deposit against its slow references, its own adjoint, and itself."""
 
 from dataclasses import replace
 from typing import Any
@@ -24,7 +24,7 @@ from invertwin.scene import (
     sphere,
 )
 from oracles import autodiff_deposit
-from oracles.twin import deposit_by_paths
+from oracles.deposit_by_paths import deposit_by_paths
 from scenes import GRID, float64, link, occluder, relative, thing
 
 COUNTS = Sampling(depth=1, samples=20_000, boundary_samples=4_000)
@@ -77,7 +77,7 @@ def random_map(shape: tuple[int, ...]) -> Tensor:
 
 @pytest.mark.parametrize("grid", [GRID, BOX], ids=["range-u", "range-u-v"])
 @pytest.mark.parametrize("bistatic", [False, True], ids=["monostatic", "bistatic"])
-def test_value_and_gradients_are_those_of_the_torch_twin(bistatic, grid):
+def test_value_and_gradients_are_those_of_the_torch_reference(bistatic, grid):
     values = leaves(bistatic)
     scene, antennas = built(values)
     fused = deposit_power(scene, antennas, grid, sampling=COUNTS, seed=3)

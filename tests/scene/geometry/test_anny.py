@@ -67,7 +67,7 @@ def test_a_model_becomes_a_template_in_our_axes():
 @pytest.mark.usefixtures("stick")
 def test_unknown_phenotypes_are_named():
     with pytest.raises(InputError, match="among age, height, got wings; use Anny's names"):
-        load_anny(sought=["wings"])
+        load_anny(coordinates=["wings"])
     with pytest.raises(InputError, match="got size"):
         load_anny({"size": 0.5})
 

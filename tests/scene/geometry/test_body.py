@@ -59,16 +59,16 @@ def reference(model: dict[str, Any], rotations: np.ndarray, betas: np.ndarray) -
     joints = model["J_regressor"] @ shaped
     posed = shaped + model["posedirs"] @ (rotations[1:] - np.eye(3)).ravel()
     parents = [-1, *model["kintree_table"][0, 1:].astype(int)]
-    chain: list[np.ndarray] = []
+    frames: list[np.ndarray] = []
     for k, parent in enumerate(parents):
         local = np.eye(4)
         local[:3, :3] = rotations[k]
         local[:3, 3] = joints[k] - (joints[parent] if k else 0)
-        chain.append(chain[parent] @ local if k else local)
+        frames.append(frames[parent] @ local if k else local)
     out = []
     for row, vertex in enumerate(posed):
         total = np.zeros(3)
-        for k, matrix in enumerate(chain):
+        for k, matrix in enumerate(frames):
             back = np.eye(4)
             back[:3, 3] = -joints[k]
             total += model["weights"][row, k] * (matrix @ back @ [*vertex, 1.0])[:3]
@@ -91,7 +91,7 @@ def test_rest_pose_is_the_template_and_parts_turn_rigidly():
     assert found.pose is SCENE["arm"].pose
 
 
-def test_rotations_of_a_chain_add_up():
+def test_rotations_of_joints_in_a_row_add_up():
     turns = float64([[0.1, 0.2, -0.3], [0.4, 0.0, 0.5], [0.0, -0.6, 0.2]])
     body = SkinnedBody("arm", arm(), turns)
     tip = float64([2.4, 0.05, 0.05])
@@ -133,8 +133,8 @@ def test_gradients_both_ways(tmp_path, at):
     assert gradcheck(vertices, inputs, check_forward_ad=True)
 
 
-def test_only_the_sought_joints_have_a_derivative():
-    body = SkinnedBody("arm", arm(), 0.1 * torch.ones(3, 3), sought=[1])
+def test_only_the_free_joints_have_a_derivative():
+    body = SkinnedBody("arm", arm(), 0.1 * torch.ones(3, 3), joints=[1])
     body(SCENE)["arm"].vertices.square().sum().backward()
     assert body.rotation.grad is not None
     assert torch.equal(body.rotation.grad.abs().sum(1) > 0, torch.tensor([False, True, False]))
@@ -158,7 +158,7 @@ def bent(**changes: Any) -> BodyTemplate:
         (lambda: bent(shape_directions=torch.zeros(24, 3, 2).double()), "give both"),
         (lambda: SkinnedBody("arm", arm(), torch.zeros(2, 3)), "give one per joint"),
         (lambda: SkinnedBody("arm", arm(), shape=[1.0]), "give the template's"),
-        (lambda: SkinnedBody("arm", arm(), sought=[3]), r"expected joints in \[0, 2\], got 3"),
+        (lambda: SkinnedBody("arm", arm(), joints=[3]), r"expected joints in \[0, 2\], got 3"),
         (lambda: articulated_template([bar(0, 1)], (-1, 0), [[0, 0, 0]]), "got 1; give one each"),
     ],
 )

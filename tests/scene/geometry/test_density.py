@@ -87,7 +87,7 @@ def test_a_level_beyond_the_densities_is_refused() -> None:
 
 
 @pytest.mark.parametrize("order", [("size", "cloud"), ("cloud", "size")])
-def test_what_a_cloud_does_not_show_cannot_be_sought(order):
+def test_what_a_cloud_does_not_show_cannot_be_fitted(order):
     scene = Scene({"ball": Object(sphere(0.1, 1), RoughDielectric(4.0))})
     made = {
         "size": Scale("ball"),

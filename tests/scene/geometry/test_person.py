@@ -58,8 +58,8 @@ def test_an_elbow_carries_the_hand_and_nothing_else():
     assert volume(moved) == pytest.approx(volume(TEMPLATE.vertices), rel=0.02)
 
 
-def test_only_the_sought_axes_have_a_derivative():
-    body = SkinnedBody("person", TEMPLATE, sought={"left_elbow": "y", "left_hip": "xz"})
+def test_only_the_free_axes_have_a_derivative():
+    body = SkinnedBody("person", TEMPLATE, joints={"left_elbow": "y", "left_hip": "xz"})
     body(SCENE)["person"].vertices.square().sum().backward()
     assert body.rotation.grad is not None
     free = {(TEMPLATE.names[int(j)], "xyz"[int(k)]) for j, k in body.rotation.grad.nonzero()}
@@ -74,12 +74,12 @@ def test_only_the_sought_axes_have_a_derivative():
         (lambda: person(spacing=0.2), "expected spacing"),
         (lambda: TEMPLATE.joint("elbow"), "expected a joint among pelvis, .* got 'elbow'"),
         (lambda: TEMPLATE.rotations({"neck": [1.0]}), "expected rotation of neck"),
-        (lambda: SkinnedBody("person", TEMPLATE, sought=["tail"]), "got 'tail'; choose one"),
+        (lambda: SkinnedBody("person", TEMPLATE, joints=["tail"]), "got 'tail'; choose one"),
         (
-            lambda: SkinnedBody("person", TEMPLATE, sought={"left_elbow": "w"}),
+            lambda: SkinnedBody("person", TEMPLATE, joints={"left_elbow": "w"}),
             "expected axes among x, y and z, got 'w'",
         ),
-        (lambda: SkinnedBody("person", TEMPLATE, sought={"neck": ""}), "expected axes among"),
+        (lambda: SkinnedBody("person", TEMPLATE, joints={"neck": ""}), "expected axes among"),
     ],
 )
 def test_bad_input(make, message):

@@ -76,7 +76,7 @@ def test_a_step_is_the_gradient_solved_twice():
 
 
 def test_rough_gradients_do_not_crumple_the_surface():
-    """The same noisy pulls, to the same mean displacement: edges keep their lengths."""
+    """Noisy pulls to the same mean displacement: edges keep their lengths."""
     edges = BALL.faces[:, :2]
 
     def stretch(module) -> float:

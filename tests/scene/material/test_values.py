@@ -73,7 +73,7 @@ def test_texture_laid_over_a_plate():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (4, 1)])
 def test_thin_images(shape):
-    """As an image whose single row or column is there twice."""
+    """An image of one row or column acts as one that has it twice."""
     pixels = image(*shape)
     repeats = [2 if count == 1 else 1 for count in shape]
     wide = pixels.repeat(*repeats)

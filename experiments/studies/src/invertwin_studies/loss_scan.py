@@ -47,7 +47,12 @@ _NOTE = (
 
 
 def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
-    """Scans the line of a run file, writes the folder, and returns the table to print."""
+    """Scan the line of a run file, write the folder, and return the table to print.
+
+    Args:
+        run: With `[loss_scan]`.
+        folder: Of the run.
+    """
     begin = time.perf_counter()
     settings: LossScan = need(run, "loss_scan", "loss-scan")
     truth = build.true_scene(run)

@@ -57,7 +57,7 @@ def compare(settings: Methods, checked: Checked) -> tuple[dict[str, Any], Figure
         radar,
         grid,
         draw_speckle(
-            scene, radar.link(), Sampling(depth=1, points_per_m2=settings.density), run.seed
+            scene, radar.link(), Sampling(depth=1, points_per_m2=settings.points_per_m2), run.seed
         ),
         settings.sources,
         (settings.smoothing[0], settings.smoothing[1]),
@@ -122,7 +122,12 @@ def scores(values: Tensor | None, truth: Tensor, *, fitted: bool) -> dict[str, A
 
 
 def best_factor(values: Tensor, truth: Tensor) -> float:
-    """The s with the least Σ|s·values − truth|: a weighted median of truth / values."""
+    """The s with the least Σ|s·values − truth|: a weighted median of truth / values.
+
+    Args:
+        values: A map.
+        truth: What it should be in proportion to.
+    """
     used = values != 0
     if not bool(used.any()):
         return 1.0
@@ -132,7 +137,12 @@ def best_factor(values: Tensor, truth: Tensor) -> float:
 
 
 def methods_table(name: str, found: Mapping[str, Any]) -> Table:
-    """One row a method; what is not installed says so."""
+    """One row a method; what is not installed says so.
+
+    Args:
+        name: Of the gradient check.
+        found: What `compare` found, by method.
+    """
     rows = [
         [title, found[key]["relative_l1"], found[key]["mae_unit_max"], found[key].get("note", "")]
         for key, title in NAMES.items()

@@ -130,7 +130,14 @@ def train_prior(settings: Training | None = None, say: Callable[[str], None] = p
 def car_distances(
     lattice: Lattice, count: int, seed: int, wheels: bool = False
 ) -> Float[Tensor, "car node"]:
-    """Distances of cars, drawn one after another, at the nodes with y ≥ 0 [m], float32."""
+    """Distances of cars, drawn one after another, at the nodes with y ≥ 0 [m], float32.
+
+    Args:
+        lattice: The nodes.
+        count: Cars to draw.
+        seed: Of the cars.
+        wheels: Whether they have some.
+    """
     half = lattice.nodes[:, lattice.counts[1] // 2 :].float()
     nodes = half.shape[0] * half.shape[1] * half.shape[2]
     distances = torch.empty(count, nodes)

@@ -20,7 +20,7 @@ Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 class Methods(Section):
     """Other ways to the derivative of a gradient check, in one table with ours."""
 
-    density: float = Field(
+    points_per_m2: float = Field(
         6e3, gt=0, description="rough points per m² of the exact signals that MUSIC is given"
     )
     sources: int = Field(6, ge=1, description="of MUSIC, in every range bin")

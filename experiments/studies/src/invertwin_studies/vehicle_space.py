@@ -51,10 +51,11 @@ def vehicle_coordinates(
     """Coordinates of the public space of vehicles, from those of its object, else the mean.
 
     Args:
+        object: name of the object.
         table: of the object; its coordinates count where they are of the same space.
         folder: path, from the run file's folder, then from INVERTWIN_DATA.
         level: of detail.
-        modes: coordinates that are sought.
+        modes: coordinates that are fitted.
 
     Raises:
         InputError: files are missing, or fewer modes than the object has coefficients.

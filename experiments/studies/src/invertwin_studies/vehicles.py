@@ -309,7 +309,12 @@ def car_distance(
 
 
 def car_mesh(car: Car, spacing: float = 0.05, wheels: bool = True) -> Mesh:
-    """The watertight surface of a car, in triangles of about this size [m].
+    """The watertight surface of a car.
+
+    Args:
+        car: The car.
+        spacing: Size of the triangles, about [m].
+        wheels: Whether it has some.
 
     Raises:
         InputError: a spacing that is not positive, or too coarse to meet the car.

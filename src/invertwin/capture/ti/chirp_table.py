@@ -83,7 +83,7 @@ def lanes_of(device: str) -> int | None:
 
 
 def profile_texts(chirp_settings: ChirpSettings) -> list[str]:
-    """The numbers of a profile as files have them; `settings` reads them in this order."""
+    """The numbers of a profile as texts, in the order in which `settings` reads them."""
     numbers = vars(chirp_settings) | {"ramp_end_time": chirp_settings.ramp_time}
     return [text(numbers[name], -exponent) for name, exponent in _PROFILE.items()]
 

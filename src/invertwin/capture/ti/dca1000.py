@@ -26,9 +26,7 @@ _LANE_COUNT = 4
 
 
 def read_recording(
-    path: str | Path,
-    settings: str | Path | ChirpSettings | None = None,
-    lanes: int | None = None,
+    path: str | Path, settings: str | Path | ChirpSettings | None = None, lanes: int | None = None
 ) -> ChirpData:
     """Read every chirp of a recording, with its settings.
 

@@ -28,12 +28,7 @@ _ROWS_AT_ONCE = 1 << 18  # frames × paths
 
 
 def trace_field(
-    scene: Scene,
-    link: Link,
-    *,
-    sampling: Sampling,
-    seed: int,
-    speckle: Speckle | None = None,
+    scene: Scene, link: Link, *, sampling: Sampling, seed: int, speckle: Speckle | None = None
 ) -> Paths:
     """Field paths: physical optics for conductors, fixed random-phase points for rough surfaces.
 

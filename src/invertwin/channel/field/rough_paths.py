@@ -1,8 +1,8 @@
 """Rough paths: the fixed paths of several bounces that rough surfaces scatter along.
 
 The power of a path is its radar equation; as a field it is the square root of that, with a phase
-of its own (derivations §4). Nothing draws anew what is drawn here: a realisation stays while radar
-and scene move.
+of its own (derivations §4). These paths are drawn once: a realisation stays while radar and scene
+move.
 """
 
 from dataclasses import replace
@@ -43,11 +43,11 @@ def draw_rough_paths(
     The first point is spread over the surfaces, every object alike; the next ones follow the
     lobes and aim at other objects. After every point, paths that bring much to their last
     point go on several times and others by chance; of whole paths, the strong ones are kept.
-    Every sequence of objects gets its share, so that a weak echo that takes a narrow way, by a
-    wall to a hidden object and back, is made of many paths, too. One over the chance goes into
-    the weight: the expected power is that of all paths. The antennas only suggest what is worth
-    while: nothing is lost that another pose could see. Returns paths of two points, of three
-    points, and so on.
+    Every sequence of objects gets its share, so that a weak echo along a narrow way, by a wall
+    to a hidden object and back, consists of many paths, too. One over the chance goes into
+    the weight: the expected power is that of all paths. The antennas only suggest which paths are
+    worth drawing: nothing is lost that another pose could see. The result is paths of two points,
+    of three points, and so on.
 
     Args:
         scene: Surfaces.

@@ -9,7 +9,7 @@ from invertwin.channel.reference.radar_equation import SurfacePaths
 from invertwin.scene.scene import Scene
 
 
-def draw_rough_points(scene: Scene, density: float, seed: int) -> SurfacePaths:
+def draw_rough_points(scene: Scene, points_per_m2: float, seed: int) -> SurfacePaths:
     """Draw the material points of all rough objects, as paths of one point.
 
     They belong to the surfaces: never drawn again between chirps, poses, looks or iterations. The
@@ -17,7 +17,7 @@ def draw_rough_points(scene: Scene, density: float, seed: int) -> SurfacePaths:
 
     Args:
         scene: Surfaces to cover.
-        density: Points per m².
+        points_per_m2: Their number per m².
         seed: Hash key.
     """
     found: list[np.ndarray] = [np.zeros((4, 0))]
@@ -29,7 +29,7 @@ def draw_rough_points(scene: Scene, density: float, seed: int) -> SurfacePaths:
         if not item.material.coherent:
             key = np.uint64(zlib.crc32(name.encode()) ^ (seed * 0x9E3779B97F4A7C15 & (2**64 - 1)))
             face = np.arange(len(area), dtype=np.uint64)
-            expected = area * density
+            expected = area * points_per_m2
             count = np.floor(expected + _hash(key, face, face * 0, 0)).astype(np.int64)
             face = np.repeat(face, count)
             number = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
@@ -39,7 +39,7 @@ def draw_rough_points(scene: Scene, density: float, seed: int) -> SurfacePaths:
             found.append(np.stack([face.astype(np.int64) + offset, b1, b2, 2 * np.pi * turn]))
         offset += len(area)
     face, b1, b2, phase = torch.from_numpy(np.concatenate(found, axis=1))
-    weight = torch.full_like(phase, 1 / density)
+    weight = torch.full_like(phase, 1 / points_per_m2)
     return SurfacePaths(face.long()[:, None], b1[:, None], b2[:, None], weight, phase)
 
 

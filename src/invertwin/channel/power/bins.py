@@ -22,10 +22,10 @@ from invertwin.channel.rays.backend import dr, mi
 class Contribution:
     """Received over transmitted power per sample, and where it falls."""
 
-    frame: Any
+    frame: Any  # radar pose
     power: Any
-    range: Any
-    u: Any
+    range: Any  # half of the optical length [m]
+    u: Any  # direction cosines of arrival in the radar frame
     v: Any
 
     @property
@@ -71,6 +71,10 @@ class Bins:
     Taps are added one by one: for small maps Dr.Jit then keeps a copy for every thread and lane,
     so that the many sums of one bin are rounded little. Additions of whole vectors are faster and
     have no copies: differences of maps were ten times as noisy with them.
+
+    Args:
+        grid: Bins.
+        frames: Number of radar poses.
     """
 
     def __init__(self, grid: Grid, frames: int) -> None:

@@ -36,10 +36,10 @@ def deposit_density(
 
         ∫ (λ/4π)² G_t G_r / (R_t R_r)² · (albedo/4π) σ exp(−∫_t σ ds − ∫_r σ ds) dV
 
-    with the ways from both antennas to the point through the cloud; one way serves both where
-    the link shares its visibility. Rays start at the transmitter through points spread evenly over
-    the box; along a ray every segment holds back 1 − exp(−σΔ) of what reaches it, so that
-    nothing is lost in cells that are opaque.
+    where t and r are the ways through the cloud from both antennas to the point; one way serves
+    both where the link shares its visibility. Rays start at the transmitter, through points spread
+    evenly over the box. Along a ray every segment holds back 1 − exp(−σΔ) of what reaches it, so
+    that nothing is lost in opaque cells.
     Differentiable in both modes with respect to densities, albedo, the object's pose and the
     radar's poses and patterns. Meshes neither hide the cloud nor are hidden by it.
 
@@ -142,7 +142,7 @@ class _Rays:
         offset = self.through - tx
         way = offset / offset.norm(dim=1, keepdim=True)
         near, far = self._chord(tx, way)
-        # Density of rays per steradian that even points in the box make: chord's share of it.
+        # Rays per steradian, of points spread evenly over the box: the chord's share of it.
         volume = (self.cloud.high - self.cloud.low).prod()
         weight = 3 * volume / ((far**3 - near**3) * per_frame)
         length = (far - near)[:, None] / self.steps

@@ -1,7 +1,7 @@
 """Where a path goes on from a surface: towards other objects, or along the lobes of the surface.
 
-Both ways are drawn from, and the density is that of their mixture, so that small bright objects
-and narrow lobes are both found. Detached.
+Directions come from both ways, with the probability density of their mixture, so that small bright
+objects and narrow lobes are both found. Detached.
 """
 
 from typing import Any
@@ -19,7 +19,12 @@ _TOWARDS = 0.5  # share of the directions that aim at other objects, where there
 
 
 class Directions:
-    """Draws directions on the side of a surface from which it is lit."""
+    """Draws directions on the side of a surface from which it is lit.
+
+    Args:
+        rays: Objects to aim at.
+        surfaces: Their lobes.
+    """
 
     def __init__(self, rays: RayScene, surfaces: Surfaces) -> None:
         centres, radii = rays.spheres

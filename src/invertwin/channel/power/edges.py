@@ -29,27 +29,24 @@ _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 class EdgePoints:
     """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
 
-    ``receiver`` says of silhouettes of two antennas whether it is the receiver's (else False).
-    ``weight`` is one over (samples × probability along the edge parameter). ``transmittance`` and
-    ``extra`` length are those of the sheets on the way, the edge's own triangles left out; what
-    these let through on the side of ``opposite`` is ``covered``, on the other side ``open`` (1
-    where there is nothing, 0 where it is opaque), both with an extra length.
+    ``open`` and ``covered`` are the transmittances of the edge's own triangles: 1 where there is
+    none, 0 where it is opaque.
     """
 
-    index: Any
-    receiver: Any
-    frame: Any
-    first: Any
+    index: Any  # of the sample
+    receiver: Any  # whether it is the receiver's silhouette; False where one serves both antennas
+    frame: Any  # radar pose
+    first: Any  # vertices at the ends of the edge
     second: Any
-    opposite: Any
-    along: Any
-    face: Any
-    weight: Any
-    transmittance: Any
+    opposite: Any  # third vertex of its triangle on the covered side
+    along: Any  # place from the first end to the second, 0 to 1
+    face: Any  # triangle on which the shadow falls
+    weight: Any  # one over (samples × probability per ``along``)
+    transmittance: Any  # of all other sheets on the way, and the length [m] that these add
     extra: Any
-    open: Any
+    open: Any  # beside the edge, on the side away from ``opposite``
     open_extra: Any
-    covered: Any
+    covered: Any  # on the side of ``opposite``
     covered_extra: Any
 
     def sides(self, inputs: Inputs) -> list[tuple[float, Any, Any]]:
@@ -62,44 +59,37 @@ class EdgePoints:
 
 @dataclass(frozen=True)
 class Behind:
-    """A point from which a shadow is cast: triangle and barycentric coordinates."""
+    """A point from which a shadow is cast."""
 
-    face: Any
-    b1: Any
+    face: Any  # triangle
+    b1: Any  # barycentric coordinates
     b2: Any
 
 
 @dataclass(frozen=True)
 class TwoSided:
-    """Points on edges with what lies on both sides of a tangential direction.
+    """Points on edges with what lies on both sides of a tangential direction."""
 
-    ``edge.face`` is where the shadow's edge runs, ``behind`` where it is cast from. The weight
-    holds the change of measure from directions to area there.
-    """
-
-    edge: EdgePoints
-    behind: Behind
+    edge: EdgePoints  # its weight holds the change of measure from directions to area
+    behind: Behind  # where the shadow is cast from
 
 
 @dataclass(frozen=True)
 class Shadow:
-    """A point on a shadow's edge: place, detached; area newly lit per unit of θ, attached."""
+    """A point on a shadow's edge."""
 
-    b1: Any
+    b1: Any  # barycentric coordinates, detached
     b2: Any
-    speed: Any
+    speed: Any  # area newly lit per unit of θ, attached
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Edge points of which some are void: recorded, and executed when asked for.
+    """Edge points of which some are void: recorded, and executed when asked for."""
 
-    ``groups`` are dataclasses of arrays, of which ``kind`` makes the points.
-    """
-
-    valid: Any
-    groups: tuple[Any, ...]
-    kind: Callable[..., Any]
+    valid: Any  # which are not void
+    groups: tuple[Any, ...]  # dataclasses of arrays
+    kind: Callable[..., Any]  # makes the points of them
 
     def launch(self) -> None:
         """Start the execution, without waiting for it."""
@@ -151,6 +141,13 @@ class EdgeSampler:
     it: one triangle for an open edge, two for a fold, any number for a non-manifold edge. The
     rule needs no consistent winding. Of sheets, every edge counts at which they let through
     more on one side than on the other.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Detached tables.
+        centres: Antennas whose silhouettes count: ``tx``, ``rx`` or both.
+        samples: Points over all frames.
+        seed: Of the points.
     """
 
     def __init__(
@@ -220,8 +217,15 @@ class InteriorEdgeSampler:
 
     Edges are weighted by their length, by the angle under which they hide (the opening between
     their triangles' planes) and by how near they are to both antennas; directions are uniform
-    over those that are tangential. ``weighted=False`` takes edges by length alone and directions
-    from the whole sphere: what the benchmark compares with.
+    over those that are tangential.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Detached tables.
+        samples: Points over all frames.
+        seed: Of the points.
+        weighted: False takes edges by length alone and directions from the whole sphere: what the
+            benchmark compares with.
     """
 
     def __init__(

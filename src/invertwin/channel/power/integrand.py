@@ -56,17 +56,17 @@ def from_table(name: str, values: Any, like: Tensor) -> Tensor:
 class Inputs:
     """Flat Dr.Jit arrays; those named in ``DIFFERENTIABLE`` may carry derivatives."""
 
-    vertices: Any
-    tx: Any
+    vertices: Any  # as ``to_points`` has them, about the local origin [m]
+    tx: Any  # place of the transmitter in every frame, likewise
     rx: Any
-    rotations: Any
+    rotations: Any  # of the radar in every frame
     surfaces: Surfaces
-    faces: Any
-    face_surface: Any
-    monostatic: bool
+    faces: Any  # vertices of every triangle
+    face_surface: Any  # row of every triangle's surface
+    monostatic: bool  # both antennas are one
     tx_pattern: "PatternTable"
     rx_pattern: "PatternTable"
-    scale: float
+    scale: float  # (λ/4π)²
 
     @staticmethod
     def of(rays: RayScene, *, monostatic: bool = False) -> "Inputs":
@@ -139,9 +139,9 @@ class Inputs:
 class PatternTable:
     """An antenna pattern as the kernel reads it: bilinear in cosθ and φ."""
 
-    values: Any
-    shape: tuple[int, int]
-    constant: float | None
+    values: Any  # gains, row after row
+    shape: tuple[int, int]  # nodes in cosθ and φ
+    constant: float | None  # the gain, where it is the same everywhere
 
     @staticmethod
     def of(pattern: Pattern) -> "PatternTable":
@@ -196,15 +196,12 @@ def edge_ends(inputs: Inputs, first: Any, second: Any) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Place:
-    """A material point: position and unit normal, attached, and the row of its surface.
+    """A material point now; all but its surface is attached."""
 
-    ``jacobian`` is the area of its triangle over that area detached: one in value.
-    """
-
-    position: Any
-    normal: Any
-    jacobian: Any
-    surface: Any
+    position: Any  # about the local origin [m]
+    normal: Any  # of unit length
+    jacobian: Any  # area of its triangle over that area detached: one in value
+    surface: Any  # row of its surface
 
 
 def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Place:
@@ -253,10 +250,10 @@ def to_radar(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> 
 
 @dataclass(frozen=True)
 class Medium:
-    """What a segment runs through: refractive index, and power attenuation [1/m]."""
+    """What a segment runs through."""
 
-    index: Any
-    attenuation: Any
+    index: Any  # refractive
+    attenuation: Any  # of power [1/m]
 
 
 def medium(inputs: Inputs, start: Place, end: Place | None, towards: Any, active: Any) -> Medium:
@@ -287,7 +284,7 @@ class Connection:
     """The last segment of a path, from a surface point to an antenna."""
 
     factor: Any  # f |cosθ| |cosθ'| G / R²
-    distance: Any
+    distance: Any  # R [m]
     seen: Any  # direction of the point in the radar frame
 
 

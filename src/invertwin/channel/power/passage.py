@@ -15,17 +15,17 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, RayScene
 
 _MOST = 32  # surfaces that a segment may pass
-# Probability of passing a sheet on which the ray may end. Not that of the power: a probability that
-# follows the material would throw the dice anew under differences.
+# Probability of passing a sheet on which the ray may end. It is not the transmittance: a
+# probability that follows the material would throw the dice anew under differences.
 _CHANCE = 0.5
 
 
 @dataclass(frozen=True)
 class Passage:
-    """Transmittance of what lies on a segment (0 if blocked), and the extra length it adds."""
+    """What lies on a segment."""
 
-    transmittance: Any
-    extra: Any
+    transmittance: Any  # 0 if blocked
+    extra: Any  # length that it adds [m]
 
 
 def passage(rays: RayScene, inputs: Inputs, start: Any, end: Any, active: Any) -> Passage:

@@ -131,7 +131,7 @@ def pull(
     records: Records,
     gather: Callable[[Contribution, Any], tuple[Any, Any, Any, Any]],
 ) -> None:
-    """Reverse mode: adds to the gradients of the attached inputs.
+    """Reverse mode: add to the gradients of the attached inputs.
 
     Args:
         rays: The scene and its antennas.
@@ -191,7 +191,7 @@ def push(
     records: Records,
     scatter: Callable[[Contribution, tuple[Any, Any, Any, Any], Any], None],
 ) -> None:
-    """Forward mode: hands every path and the derivatives of its power, range, u, v on.
+    """Forward mode: hand on every path with the derivatives of its power, range, u and v.
 
     Args:
         rays: The scene and its antennas.

@@ -26,18 +26,15 @@ from invertwin.errors import InputError
 
 @dataclass(frozen=True)
 class Samples:
-    """Points on surfaces (Dr.Jit arrays). ``weight`` is one over (samples × probability per area).
+    """Points on surfaces (Dr.Jit arrays)."""
 
-    ``transmittance`` and ``extra`` length are those of the sheets between transmitter and point.
-    """
-
-    frame: Any
-    face: Any
-    b1: Any
+    frame: Any  # radar pose
+    face: Any  # triangle
+    b1: Any  # barycentric coordinates
     b2: Any
-    weight: Any
-    transmittance: Any
-    extra: Any
+    weight: Any  # one over (samples × probability per area)
+    transmittance: Any  # of the sheets between transmitter and point
+    extra: Any  # length that these add [m]
 
 
 def _caps(
@@ -55,7 +52,14 @@ def _caps(
 
 
 class RaySampler:
-    """Rays from TX, the same number into the cap around each object, jittered on a grid."""
+    """Rays from TX, the same number into the cap around each object, jittered on a grid.
+
+    Args:
+        rays: The scene and its antennas.
+        samples: Rays over all frames, about.
+        seed: Of the rays.
+        reference: What the caps are around, instead of the scene; they are a tenth larger.
+    """
 
     def __init__(
         self,
@@ -122,6 +126,12 @@ class AreaSampler:
 
     A reference that does not follow the parameters keeps the point set under differences
     (common random numbers) also when areas change.
+
+    Args:
+        rays: The scene and its antennas.
+        samples: Points over all frames, about.
+        seed: Of the points.
+        reference: Whose areas count; None = those of the scene.
     """
 
     def __init__(

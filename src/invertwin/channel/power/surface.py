@@ -21,11 +21,11 @@ SURFACE = tuple(field.name for field in fields(Surface))
 class Surfaces:
     """Rows of ``scene.material.Surface`` as flat Dr.Jit arrays, and what is known of all rows."""
 
-    tables: Mapping[str, Any]
-    cosines: int
-    lobed: tuple[bool, ...]
-    sheets: bool
-    bodies: bool
+    tables: Mapping[str, Any]  # by the names of ``SURFACE``
+    cosines: int  # entries of a table over cosθ
+    lobed: tuple[bool, ...]  # which lobes have weight anywhere
+    sheets: bool  # whether something passes straight through any surface
+    bodies: bool  # whether any surface is the skin of a refracting body
 
     @staticmethod
     def of(geometry: Geometry) -> "Surfaces":

@@ -70,7 +70,13 @@ def start(
 
 
 class Walk:
-    """Continues paths, and shows every vertex to a visitor."""
+    """Continues paths, and shows every vertex to a visitor.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Detached tables.
+        seed: Of the directions.
+    """
 
     def __init__(self, rays: RayScene, inputs: Inputs, seed: int) -> None:
         self.rays = rays
@@ -218,21 +224,17 @@ def connect(
 
 @dataclass(frozen=True)
 class Records:
-    """Vertices of paths as flat arrays, vertex after vertex: ``[vertex × lane]``.
+    """Vertices of paths as flat arrays, vertex after vertex: ``[vertex × lane]``."""
 
-    ``throughput`` is zero where a path has ended; ``seen`` says that the vertex is connected to
-    the receiver.
-    """
-
-    lanes: int
-    depth: int
-    frame: Any
-    face: Any
-    b1: Any
+    lanes: int  # paths
+    depth: int  # vertices of a path
+    frame: Any  # radar pose of a lane
+    face: Any  # triangle
+    b1: Any  # barycentric coordinates
     b2: Any
-    throughput: Any
-    length: Any
-    seen: Any
+    throughput: Any  # all factors so far; zero where the path has ended
+    length: Any  # from the transmitter to the vertex [m]
+    seen: Any  # whether the vertex is connected to the receiver
 
     @staticmethod
     def single(state: State, seen: Any) -> "Records":

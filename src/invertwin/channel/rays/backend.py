@@ -65,8 +65,8 @@ def use_backend(name: str | None) -> Iterator[None]:
 def torch_threads(count: int) -> Iterator[None]:
     """Keep torch to so many threads inside a ``with`` block.
 
-    Between its operations they spin for a while, on the cores that trace rays. So torch has one
-    where what it does is small, and leaves half of the cores alone where both work by turns.
+    Between torch's operations its threads spin for a while, on the cores that trace rays. So torch
+    gets one thread for small work, and half of the cores where torch and rays work in turns.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count)

@@ -24,7 +24,13 @@ _SLIVER = 1e-3  # a triangle's area over its squared sides, below which it is on
 
 
 class Occluders:
-    """Triangles that block rays, in float32 about a local origin."""
+    """Triangles that block rays, in float32 about a local origin.
+
+    Args:
+        vertices: World positions [m].
+        topology: Their triangles.
+        origin: The local origin [m].
+    """
 
     def __init__(
         self, vertices: Float64[Tensor, "v 3"], topology: Topology, origin: Float64[Tensor, "3"]
@@ -56,7 +62,12 @@ class Occluders:
 
 
 class RayScene(Occluders):
-    """The triangles of a scene and the antennas that look at them."""
+    """The triangles of a scene and the antennas that look at them.
+
+    Args:
+        geometry: The scene.
+        link: The antennas; the local origin is the mean place of the transmitters.
+    """
 
     def __init__(self, geometry: Geometry, link: Link) -> None:
         origin = link.tx.detach().mean(dim=0)

@@ -21,6 +21,11 @@ class Topology:
     """Connectivity of a flattened scene and the ray tracer's copy of it.
 
     The acceleration structure is rebuilt only when the vertices differ from the last upload.
+
+    Args:
+        faces: Vertex indices of all triangles.
+        face_object: Object of every triangle.
+        vertices: In the objects' own frames; those of one object at one place count as one.
     """
 
     def __init__(self, faces: Tensor, face_object: Tensor, vertices: Tensor) -> None:

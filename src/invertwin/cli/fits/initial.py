@@ -51,11 +51,11 @@ def guessed(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]
 
 
 def _clouded(problem: Problem, scene: Scene, name: str) -> Scene:
-    """The scene with a density from the backprojected echoes, where one is sought."""
+    """The scene with a density from the backprojected echoes, where one is fitted."""
     sight = problem.first
-    for sought in problem.run.parameters:
-        if sought.kind == "density" and sought.object == name:
-            box = sought.low, sought.high, sought.counts
+    for table in problem.run.parameters:
+        if table.kind == "density" and table.object == name:
+            box = table.low, table.high, table.counts
             grid = guess_density(sight.capture, sight.grid, scene[name], name, *box)
             return scene.replace(name, cloud=grid.cloud)
     return scene

@@ -56,7 +56,7 @@ def _scores(maps: MoverMaps, recording: ChirpCapture, prefix: str = "") -> dict[
 
 
 def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
-    """Finds the strongest mover, fits a twin to it, writes the folder.
+    """Find the strongest mover, fit a twin to it, write the folder.
 
     Raises:
         InputError: A run file that asks for something else, or data without chirps.

@@ -96,7 +96,7 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     sights = _sights(run, truth, console)
     simulated = all(isinstance(own.data, SimulatedData) for own in observed_runs(run).values())
     known = frozenset(truth.names if simulated else run.truth)
-    target = run.starts.object if run.starts else next(iter(sought_objects(run)), None)
+    target = run.starts.object if run.starts else next(iter(fitted_objects(run)), None)
     return Problem(run, scene, truth, known, sights, target)
 
 
@@ -159,7 +159,7 @@ def _recorded(run: RunFile, truth: Scene, console: Console) -> tuple[Capture, Ra
     return capture, capture.radar(), build.grid(table, capture.radar())
 
 
-def sought_objects(run: RunFile) -> list[str]:
+def fitted_objects(run: RunFile) -> list[str]:
     """Objects that have parameters."""
     return [p.object for p in run.parameters if getattr(p, "object", None)]
 
@@ -202,8 +202,8 @@ def varied(problem: Problem, mode: str) -> Problem:
     return replace(problem, run=run, sights=sights)
 
 
-def sought_of(run: RunFile) -> dict[str, Any]:
-    """The tables of what a fit seeks, by name."""
+def fitted_of(run: RunFile) -> dict[str, Any]:
+    """The tables of what is fitted, by name."""
     tables = build.named(run.parameters)
     names = set(settings_of(run).parameters or tables)
     if run.stages and all(stage.parameters for stage in run.stages):
@@ -212,22 +212,22 @@ def sought_of(run: RunFile) -> dict[str, Any]:
 
 
 def stages_of(run: RunFile) -> list[tuple[StageTable, RunFile]]:
-    """The stages of a fit, each with its run file; one that has nothing to seek falls out."""
-    sought = sought_of(run)
+    """The stages of a fit, each with its run file; one that fits nothing falls out."""
+    fitted = fitted_of(run)
     found = [
         (stage, run.varied(stage))
         for stage in run.stages
-        if not stage.parameters or sought.keys() & set(stage.parameters)
+        if not stage.parameters or fitted.keys() & set(stage.parameters)
     ]
     return found or [(StageTable(), run)]
 
 
 def schedule_of(problem: Problem) -> list[Stage]:
     """The stages of a fit, as the library takes them."""
-    sought, found = sought_of(problem.run), []
+    fitted, found = fitted_of(problem.run), []
     for table, run in stages_of(problem.run):
-        names = [name for name in table.parameters if name in sought]
-        free = [sought[name] for name in names or sought]
+        names = [name for name in table.parameters if name in fitted]
+        free = [fitted[name] for name in names or fitted]
         finer = partial(remeshed, edge=table.remesh or 0.0)
         counts = {k: v for k, v in (table.reconstruct or {}).items() if k in SAMPLED.made_from}
         models = models_of(replace(problem, run=run))
@@ -261,7 +261,7 @@ def sampling_of(run: RunFile) -> Sampling:
 
 def points_per_m2(run: RunFile) -> float:
     """Points per m² of rough surfaces in exact signals: those of simulated data, or enough."""
-    return run.data.density if isinstance(run.data, SimulatedData) else _POINTS_PER_M2
+    return run.data.points_per_m2 if isinstance(run.data, SimulatedData) else _POINTS_PER_M2
 
 
 def models_of(problem: Problem) -> list[ForwardModel]:
@@ -295,7 +295,7 @@ def observations_of(problem: Problem) -> list[Observation]:
     """What is fitted of every sensor: data, model and what is unknown of the sensor."""
     poses = {
         name: Unknown(lambda _: RadarPose(), getattr(table, "rate", None))
-        for name, table in sought_of(problem.run).items()
+        for name, table in fitted_of(problem.run).items()
         if table.kind == "radar_pose"
     }
     found = []
@@ -314,6 +314,6 @@ def unknowns_of(run: RunFile) -> dict[str, Unknown]:
     makers = build.builders(run.parameters, run.scene)
     return {
         name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
-        for name, table in sought_of(run).items()
+        for name, table in fitted_of(run).items()
         if table.kind != "radar_pose"
     }

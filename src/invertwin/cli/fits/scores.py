@@ -10,13 +10,7 @@ import torch
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
 from invertwin.cli import build
-from invertwin.cli.fits.problem import (
-    Problem,
-    points_per_m2,
-    settings_of,
-    sharp_models,
-    sought_of,
-)
+from invertwin.cli.fits.problem import Problem, fitted_of, points_per_m2, settings_of, sharp_models
 from invertwin.cli.fits.shape_scores import shape_scores
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
@@ -54,15 +48,15 @@ def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
         "success": after.distance <= settings.position_limit,
         "position": place,
     }
-    sought = sought_of(problem.run).values()
-    kinds = {table.kind for table in sought}
+    fitted = fitted_of(problem.run).values()
+    kinds = {table.kind for table in fitted}
     if "pose" in kinds:
         angle = math.degrees(after.angle)
         rows |= {"start_angle_deg": math.degrees(before.angle), "rotation_error_deg": angle}
         rows["success"] &= angle <= settings.rotation_limit_deg
     if "scale" in kinds:
         rows |= {"scale_error": abs(after.scale - 1)}
-    told = [table for table in sought if _made_known(problem, table)]
+    told = [table for table in fitted if _made_known(problem, table)]
     frequency = problem.first.radar.waveform.center_frequency
     for table in told:
         ends = twin[table.object].material, problem.truth[table.object].material
@@ -71,7 +65,7 @@ def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
 
 
 def joint_scores(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> dict[str, float]:
-    """Angles [°] by which the sought joints are off, means over them and each at the end."""
+    """Angles [°] by which the free joints are off, means over them and each at the end."""
     before, after = (body.joint_errors(mesh, truth) for mesh in (start, found))
     return {
         "joint_error_before_deg": math.degrees(sum(before.values()) / len(before)),
@@ -81,7 +75,7 @@ def joint_scores(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> di
 
 
 def _made_known(problem: Problem, parameter: Any) -> bool:
-    """Whether the run file tells what the sought object is really made of."""
+    """Whether the run file tells what a fitted object is really made of."""
     if parameter.kind != "material":
         return False
     table = problem.run.truth.get(parameter.object)

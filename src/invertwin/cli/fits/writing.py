@@ -14,8 +14,8 @@ from invertwin.cli.fits.problem import (
     INTERIOR,
     Problem,
     annealed_until,
+    fitted_objects,
     settings_of,
-    sought_objects,
 )
 from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
@@ -123,9 +123,9 @@ def _variants(fitted: Fitted) -> Table:
 
 
 def _places(fitted: Fitted) -> Table:
-    """Where the sought objects stand, and how they are turned."""
+    """Where the fitted objects stand, and how they are turned."""
     problem, cells = fitted.problem, []
-    for name in dict.fromkeys(sought_objects(problem.run)):
+    for name in dict.fromkeys(fitted_objects(problem.run)):
         known = name in problem.known
         scenes = [fitted.start, fitted.twin, *([problem.truth] if known else [])]
         centers = [scene[name].center.detach().tolist() for scene in scenes]
@@ -153,15 +153,15 @@ def _added(metrics: dict[str, Any]) -> Table:
 
 
 def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
-    """Writes the pictures of the best fit; returns those of the report."""
+    """Write the pictures of the best fit; return those of the report."""
     problem, metrics = fitted.problem, fitted.metrics
-    run, truth, sought = problem.run, problem.truth, sought_objects(problem.run)
-    known = {k: truth[k] for k in truth.names if k in problem.known and k in sought}
+    run, truth, fitted_names = problem.run, problem.truth, fitted_objects(problem.run)
+    known = {k: truth[k] for k in truth.names if k in problem.known and k in fitted_names}
     scenes = {"truth": truth} if known else {}
     scenes |= {"start": fitted.start, "twin": fitted.twin}
     outline = Scene(known) if known else None
     radars = [sight.radar for sight in problem.sights.values()]
-    figure = plotting.scene(scenes, radars, highlight=sought, outline=outline)
+    figure = plotting.scene(scenes, radars, highlight=fitted_names, outline=outline)
     found = [picture(folder, "scene", figure, note="scene" if "success" in metrics else "")]
     data = "exact simulation" if isinstance(run.data, SimulatedData) else "measured"
     titles = {"measured": f"data ({data})", "start": "surrogate, start", "twin": "surrogate, twin"}

@@ -22,7 +22,7 @@ class _StartsTable(Table):
 
     object: str = key("name in the scene")
     joint_deg: NonNegative = key(
-        "turn of each sought joint of a body, about a random axis among its own", 0.0
+        "turn of each free joint of a body, about a random axis among its own", 0.0
     )
     seed: Seed | None = key("without it the run's", None)
 
@@ -50,13 +50,13 @@ class Budget(registry.table_of(Schedule, "Schedule", SAMPLED)):
 class Reconstruct(Budget):
     """The fit: its budget, and what counts as a success."""
 
-    parameters: list[str] = key("names of what is sought; empty = all", [])
+    parameters: list[str] = key("names of the parameters that are fitted; empty = all", [])
     observations: list[str] = key("names of the sensors that are fitted; empty = all", [])
-    checkpoint_every: Count = key("steps", 10)
-    nuisances: list[Literal["range_bias", "clock_offset"]] = key("fitted along", [])
-    position_limit: Positive = key("m, of a success", 0.03)
-    rotation_limit_deg: Positive = key("of a success", 3.0)
-    joint_limit_deg: Positive = key("of a success, mean over the sought joints of a body", 5.0)
+    checkpoint_every: Count = key("steps from one checkpoint to the next", 10)
+    nuisances: list[Literal["range_bias", "clock_offset"]] = key("of the radar, fitted too", [])
+    position_limit: Positive = key("m, largest error of a success", 0.03)
+    rotation_limit_deg: Positive = key("largest error of a success", 3.0)
+    joint_limit_deg: Positive = key("largest mean error over the free joints of a body", 5.0)
 
 
 def _checked(value: Any, check: Callable[[Any], Any]) -> Any:
@@ -71,14 +71,14 @@ AnyTable = dict[str, Any]
 
 
 class Part(Section):
-    """A part of a run: its sections say only what is other than in those of the whole."""
+    """A part of a run: its sections hold only what differs from the run."""
 
-    reconstruct: Annotated[Budget, *_CHECKED] = key("what is other than in [reconstruct]", None)
+    reconstruct: Annotated[Budget, *_CHECKED] = key("what differs from [reconstruct]", None)
     optimizer: Annotated[Any, OneOf("optimizer"), *_GIVEN] = key(
-        "what is other than in [optimizer]; another `kind` replaces it", None
+        "what differs from [optimizer]; another `kind` replaces it", None
     )
     surrogate: Annotated[Any, TableOf(Surrogate, SurrogateTable), *_GIVEN] = key(
-        "what is other than in [surrogate], or a name that replaces it", None
+        "what differs from [surrogate], or a name that replaces it", None
     )
 
     def changes(self) -> dict[str, Any]:
@@ -90,10 +90,10 @@ class Stage(Part):
     """A part of a fit, from where the one before has ended."""
 
     parameters: list[str] = key(
-        "names of what is free; the others keep their values; empty = all", []
+        "names of those that are free; the others keep their values; empty = all", []
     )
     rebuild: bool = key(
-        "these parameters begin anew on the twin so far, the others are dropped", False
+        "new modules of these parameters start from the twin so far; the others are dropped", False
     )
     remesh: Positive | None = key(
         "m, edge length of the new triangles of objects with free vertices; rebuilds them", None
@@ -101,13 +101,13 @@ class Stage(Part):
 
 
 class Variant(Part):
-    """The same data and starts, fitted otherwise, to compare."""
+    """The same data and starts, fitted in another way, to compare."""
 
     reconstruct: Annotated[Reconstruct, *_CHECKED] = key(  # type: ignore[override]
-        "what is other than in [reconstruct]", None
+        "what differs from [reconstruct]", None
     )
-    loss: AnyTable | None = key("what is other than in [loss]", None)
-    model: AnyTable | None = key("what is other than in [model]", None)
+    loss: AnyTable | None = key("what differs from [loss]", None)
+    model: AnyTable | None = key("what differs from [model]", None)
     parameters: list[Annotated[Any, OneOf("parameter")]] | None = key(
         "in place of [[parameters]]", None
     )
@@ -131,7 +131,7 @@ class Calibration(Part):
 
     object: str = key("name of the known object")
     method: Literal["fit", "backprojection"] = key(
-        "a fit of the two numbers, or what focuses the object best", "fit"
+        "fit the two numbers, or focus the object best", "fit"
     )
 
 
@@ -139,9 +139,9 @@ class Measures(Section):
     """How near the found shape is to the true one, in numbers and pictures."""
 
     object: str = key("name in the scene")
-    thresholds: Annotated[list[Positive], MinLen(1)] = key("m, of the F-score", [0.02])
-    voxel: Positive = key("m, for the shared volume", 0.02)
-    seen: bool = key("score what some radar position sees; both are written", False)
+    thresholds: Annotated[list[Positive], MinLen(1)] = key("m, thresholds of the F-score", [0.02])
+    voxel: Positive = key("m, edge of voxels for the shared volume", 0.02)
+    seen: bool = key("score only what some radar position sees; both are written", False)
     every: Count = key("steps between two points of the curve", 10)
 
 
@@ -151,6 +151,6 @@ class Landscape(Section):
     object: str = key("name in the scene")
     axis: Vector = key("direction of the line")
     span: Positive = key("m on either side, surrogate", 0.4)
-    points: Annotated[int, Ge(3)] = key("on the line, surrogate", 41)
+    points: Annotated[int, Ge(3)] = key("points on the line, surrogate", 41)
     exact_span: Positive = key("m on either side, exact signal", 0.01)
-    exact_points: Annotated[int, Ge(3)] = key("on the line", 201)
+    exact_points: Annotated[int, Ge(3)] = key("points on the line, exact signal", 201)

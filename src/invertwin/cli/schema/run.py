@@ -47,8 +47,8 @@ class SceneFile(Section):
     """Objects from the geometry of a Mitsuba or Sionna scene file (XML), named as in the file."""
 
     file: InputPath = key("path, from the run file's folder")
-    materials: dict[str, AnyMaterial] = key("by the file's material ids", {})
-    material: AnyMaterial | None = key("of all other objects; without it concrete", None)
+    materials: dict[str, AnyMaterial] = key("materials by the file's material ids", {})
+    material: AnyMaterial | None = key("material of all other objects; without it concrete", None)
 
 
 class Truth(Section):
@@ -59,9 +59,7 @@ class Truth(Section):
     scale: Positive | None = key("factor", None)
     material: AnyMaterial | None = key("what it is really made of", None)
     velocity: Vector | None = key("m/s", None)
-    angles_deg: dict[str, Vector] | None = key(
-        "of a body, all of its joints that are not at rest", None
-    )
+    angles_deg: dict[str, Vector] | None = key("of a body: all joints that are not at rest", None)
     parts: Annotated[list[Annotated[Any, OneOf("shape")]], MinLen(1)] | None = key(
         "its real shape, in place of the scene's and in the same frame", None
     )
@@ -93,7 +91,7 @@ class ObservationTable(Section):
     surrogate: AnySurrogate | None = key("kernels of the smooth model", None)
     chirps: AnyChirps | None = key("several ramps a frame", None)
     model: AnyModel | None = key("a plugin's forward model, in place of the surrogate's", None)
-    weight: Positive = key("of its loss beside the others'", 1.0)
+    weight: Positive = key("weight of its loss in the mean", 1.0)
 
 
 class _RunFile(Section):
@@ -102,7 +100,7 @@ class _RunFile(Section):
     task: Annotated[str, NameOf("task")] = key("what the file is for")
     title: str = key("heading of the report", "")
     note: str = key("shown in the report", "")
-    seed: Seed = key("of everything random", 0)
+    seed: Seed = key("seed of all random numbers", 0)
     scene: dict[str, Annotated[Any, OneOf("object")]] = key("[scene.<name>]: an object each", {})
     scene_file: SceneFile | None = key("objects from a file", None)
     truth: dict[str, Truth] = key("[truth.<name>]: where an object really is", {})
@@ -115,7 +113,9 @@ class _RunFile(Section):
     observations: dict[str, ObservationTable] = key(
         "[observations.<name>]: several sensors, each with its own data", {}
     )
-    parameters: list[Annotated[Any, OneOf("parameter")]] = key("[[parameters]]: what is sought", [])
+    parameters: list[Annotated[Any, OneOf("parameter")]] = key(
+        "[[parameters]]: what is unknown", []
+    )
     starts: AnyStarts | None = key("where fits start; without it where the scene says", None)
     initial: AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
@@ -131,8 +131,8 @@ class _RunFile(Section):
         "[[stages]]: parts of the fit, one after another; without them one", []
     )
     variants: dict[str, Variant] = key("[variants.<name>]: other ways to fit, to compare", {})
-    measures: Measures | None = key("of the found shape", None)
-    calibration: Calibration | None = key("before the fit", None)
+    measures: Measures | None = key("scores of the found shape", None)
+    calibration: Calibration | None = key("calibration before the fit", None)
     landscape: Landscape | None = key("losses along a line", None)
     gradcheck: AnyGradcheck | None = key("the gradient check", None)
 
@@ -175,8 +175,8 @@ class _RunFile(Section):
             own = set(used.parameters) or own
         for i, stage in enumerate(self.stages):
             _named("parameters", stage.parameters, names, f"stages[{i}].parameters")
-            sought = own & set(stage.parameters or names)
-            if stage.remesh and sought and not sought & free:
+            fitted = own & set(stage.parameters or names)
+            if stage.remesh and fitted and not fitted & free:
                 fail(
                     'expected a parameter with kind = "vertices" among those of the stage, got '
                     "none; add one, or remove `remesh`",
@@ -185,7 +185,7 @@ class _RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _turned_joints_are_sought(self) -> "_RunFile":
+    def _turned_joints_are_fitted(self) -> "_RunFile":
         if self.starts is not None and self.starts.joint_deg > 0:
             name = self.starts.object
             if not any(p.kind == "body" and p.object == name for p in self.parameters):
@@ -238,7 +238,7 @@ class _RunFile(Section):
 
     @property
     def unknowns(self) -> dict[str, Any]:
-        """The tables of what is sought, and of what a gradient check moves, by path."""
+        """The tables of what is unknown, and of what a gradient check moves, by path."""
         found = {f"parameters[{i}]": table for i, table in enumerate(self.parameters)}
         own = {} if self.gradcheck is None else {"gradcheck.parameter": self.gradcheck.parameter}
         return found | own

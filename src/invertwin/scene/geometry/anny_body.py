@@ -16,7 +16,7 @@ _TURN = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype
 
 
 def load_anny(
-    phenotypes: Mapping[str, float] | None = None, sought: Sequence[str] = ()
+    phenotypes: Mapping[str, float] | None = None, coordinates: Sequence[str] = ()
 ) -> BodyTemplate:
     """Load a person of the model Anny (Apache-2.0), which the optional extra ``anny`` installs.
 
@@ -27,8 +27,8 @@ def load_anny(
     Args:
         phenotypes: by their names in Anny ("gender", "age", "muscle", "weight", "height",
             "proportions"), from 0 to 1; those not given are 0.5.
-        sought: phenotypes that become shape coordinates, as changes from the given values. They
-            follow Anny's own blending to first order.
+        coordinates: phenotypes that become shape coordinates, as changes from the given values.
+            They follow Anny's own blending to first order.
 
     Raises:
         InputError: Anny is not installed, or has no such phenotype.
@@ -41,7 +41,7 @@ def load_anny(
         ) from None
     model = anny.Anny(skinning_method="lbs").to(dtype=torch.float64)
     values = dict.fromkeys(model.phenotype_labels, 0.5)
-    unknown = [name for name in (*(phenotypes or {}), *sought) if name not in values]
+    unknown = [name for name in (*(phenotypes or {}), *coordinates) if name not in values]
     if unknown:
         raise InputError(
             f"expected phenotypes among {', '.join(values)}, got {', '.join(unknown)}; "
@@ -50,7 +50,7 @@ def load_anny(
     values |= {name: float(value) for name, value in (phenotypes or {}).items()}
     rest, places = _rest(model, values)
     skin, bones = [], []
-    for name in sought:
+    for name in coordinates:
         ends = [_rest(model, values | {name: values[name] + s * _STEP}) for s in (1.0, -1.0)]
         (up, heads_up), (down, heads_down) = ends
         skin.append((up - down) / (2 * _STEP))

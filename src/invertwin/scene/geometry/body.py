@@ -33,10 +33,10 @@ class BodyTemplate:
         weights: share of every joint in every vertex, rows that add up to 1.
         parents: joint that each joint hangs on, always an earlier one; −1 for the first, the root.
         joints: rest positions of the joints [m].
-        shape_directions: how the vertices follow shape coordinates [m]; None has none.
+        shape_directions: how the vertices follow shape coordinates [m]; None: there are none.
         joint_directions: how the joints follow them [m].
         pose_directions: how the rest positions follow the rotations, last axis the elements of
-            R − I of all joints but the root's, row by row; None does not follow.
+            R − I of all joints but the root's, row by row; None: they do not follow.
         names: of the joints; empty where they have none.
 
     Raises:
@@ -230,7 +230,7 @@ class SkinnedBody(ObjectModule):
         template: the body.
         rotation: rotation vectors [j, 3] (rad); None is the rest pose.
         shape: shape coordinates [n]; None is zero.
-        sought: joints that the fit may turn, by name or number, or a mapping from their names
+        joints: those that the fit may turn, by name or number, or a mapping from their names
             to the components of the rotation vector that it may change, such as "y" for an
             elbow; None is all.
 
@@ -250,7 +250,7 @@ class SkinnedBody(ObjectModule):
         template: BodyTemplate,
         rotation: ArrayLike | None = None,
         shape: ArrayLike | None = None,
-        sought: Sequence[str | int] | Mapping[str, str] | None = None,
+        joints: Sequence[str | int] | Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(object)
         self.template = template
@@ -259,14 +259,14 @@ class SkinnedBody(ObjectModule):
         turns = checked_tensor(turns, (count, 3), "joint rotations [rad]", "give one per joint")
         given = torch.zeros(shapes) if shape is None else shape
         given = checked_tensor(given, (shapes,), "shape coordinates", "give the template's")
-        chosen = range(count) if sought is None else sought
+        chosen = range(count) if joints is None else joints
         free = chosen if isinstance(chosen, Mapping) else dict.fromkeys(chosen, "xyz")
-        self._sought = torch.zeros(count, 3, dtype=torch.float64)
+        self._free = torch.zeros(count, 3, dtype=torch.float64)
         self._joints = {str(name): template.joint(name) for name in free}
         for name, axes in free.items():
             if not axes:
                 raise InputError(f"expected axes among x, y and z for {name}, got none; give some")
-            self._sought[template.joint(name)] = axes_mask(axes)
+            self._free[template.joint(name)] = axes_mask(axes)
         self.rotation = nn.Parameter(turns.detach().clone())
         self.shape = nn.Parameter(given.detach().clone(), requires_grad=shapes > 0)
 
@@ -284,19 +284,19 @@ class SkinnedBody(ObjectModule):
             object: name of the object.
             template: the body.
             mesh: with its triangles.
-            joints: as `sought`.
+            joints: as in the class.
 
         Raises:
             InputError: other vertices, or a joint that the template does not have.
         """
         for name in joints:
             template.joint(name)
-        found = cls(object, template, template.rotations_of(mesh.vertices), sought=joints)
+        found = cls(object, template, template.rotations_of(mesh.vertices), joints=joints)
         found.shape.requires_grad_(False)
         return found
 
     def turned(self, mesh: Mesh, angle: float, generator: torch.Generator) -> Mesh:
-        """A mesh of the body with every sought joint turned by `angle` [rad], about random axes.
+        """A mesh of the body with every free joint turned by `angle` [rad], about random axes.
 
         Args:
             mesh: of the body, as it is posed.
@@ -306,7 +306,7 @@ class SkinnedBody(ObjectModule):
         turns = self.template.rotations_of(mesh.vertices)
         rotations = rotation_from_vector(turns)
         for joint in self._joints.values():
-            free = self._sought[joint]
+            free = self._free[joint]
             axis = torch.randn(3, generator=generator, dtype=torch.float64) * free
             change = angle * axis / axis.norm()
             # A hinge stays one: its angle changes, not its axis.
@@ -318,11 +318,10 @@ class SkinnedBody(ObjectModule):
         return Mesh(self.template.posed(rotations)[0], mesh.faces)
 
     def joint_errors(self, found: Mesh, truth: Mesh) -> dict[str, float]:
-        """Angles [rad] by which the sought joints of two meshes of the body differ, by name.
+        """Angles [rad] by which the free joints of two meshes of the body differ, by name.
 
         Args:
-            found: the result.
-            truth: what it should be.
+            found, truth: the result, and what it should be.
         """
         a, b = (
             rotation_from_vector(self.template.rotations_of(mesh.vertices.detach()))
@@ -336,23 +335,23 @@ class SkinnedBody(ObjectModule):
         return self._posed()[1]
 
     def values(self) -> dict[str, Tensor]:
-        """Rotations of the joints that are sought [rad] and shape coordinates, by name."""
+        """Rotations [rad] of the free joints and shape coordinates, by name."""
         turns = self.rotation.detach().clone()
         named = {f"{self.object}.joint_rotation": turns}
         if self.template.names:
-            free = [int(joint) for joint in self._sought.any(1).nonzero()[:, 0]]
+            free = [int(joint) for joint in self._free.any(1).nonzero()[:, 0]]
             named = {f"{self.object}.{self.template.names[joint]}": turns[joint] for joint in free}
         if self.template.shape_count:
             named[f"{self.object}.shape"] = self.shape.detach().clone()
         return named
 
     def entries(self) -> dict[str, Entries]:
-        """The rotation vectors [rad] of the joints that are sought and have a name."""
+        """The rotation vectors [rad] of the free joints that have a name."""
         joints = enumerate(self.template.names)
-        return {name: Entries("rotation", k) for k, name in joints if self._sought[k].any()}
+        return {name: Entries("rotation", k) for k, name in joints if self._free[k].any()}
 
     def _posed(self) -> tuple[Tensor, Tensor]:
-        rotations = rotation_from_vector(free_part(self.rotation, self._sought))
+        rotations = rotation_from_vector(free_part(self.rotation, self._free))
         return self.template.posed(rotations, self.shape)
 
 
@@ -388,7 +387,7 @@ def articulated_template(
 def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
     """A body in the layout of SMPL's ``.npz`` files, which users obtain under its own licence.
 
-    Read are ``v_template`` [v, 3], ``f``, ``weights`` [v, j], ``kintree_table`` [2, j],
+    It reads ``v_template`` [v, 3], ``f``, ``weights`` [v, j], ``kintree_table`` [2, j],
     ``J_regressor`` [j, v], ``shapedirs`` [v, 3, n] and, if there, ``posedirs`` [v, 3, 9 (j − 1)].
 
     Args:

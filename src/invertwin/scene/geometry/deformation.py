@@ -19,8 +19,7 @@ class LatticeDeformation(ObjectModule):
 
     Args:
         object: name of the object.
-        low: corner of a box that holds the object's mesh, in its frame [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of a box that holds the object's mesh, in its frame [m].
         counts: nodes of the lattice along x, y and z.
 
     Attributes:

@@ -24,15 +24,14 @@ _FAINTEST = 1e-3
 
 
 class DensityGrid(ObjectModule):
-    """An object seen as a cloud of soft scatterers, by densities at the nodes of a grid.
+    """An object as a cloud of soft scatterers, given by densities at the nodes of a grid.
 
     ``σ = softplus(value) / h``, with h the mean spacing of the nodes. At a value of 0 one cell
     holds back half of the power. Learning rates of about 0.1 suit all grids.
 
     Args:
         object: name of the object; its mesh is not seen any more.
-        low: corner of the box in the object's frame [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the box in the object's frame [m].
         density: extinction at the nodes [1/m], at least two along each axis. What is below
             0.001 of one over a spacing starts there.
         albedo: see ``Cloud``.
@@ -71,21 +70,20 @@ class DensityGrid(ObjectModule):
         item: Object,
         extinction: Positive | None = None,
     ) -> "DensityGrid":
-        """A cloud of soft scatterers; starts as the echoes of [initial] for its object, else as
-        `extinction` says. Rates of about 0.1 suit it; measures and pictures show the surface of its
-        usual level.
+        """A cloud of soft scatterers. It starts as the echoes that [initial] finds, else as
+        `extinction` says. Rates of about 0.1 suit it. Measures and pictures show the surface where
+        the density is half of its maximum.
 
         Args:
             object: name of the object.
-            low: corner of the box in the object's frame [m].
-            high: the opposite corner [m].
+            low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
-            item: the object; a cloud that it is already comes first.
+            item: the object; if it is a cloud already, this cloud is the start.
             extinction: 1/m, of a cloud that fills the object's mesh; without it the whole box is
                 faint.
 
         Raises:
-            InputError: as above.
+            InputError: what the class refuses.
         """
         if item.cloud is not None:
             return cls(object, item.cloud.low, item.cloud.high, item.cloud.density.detach())
@@ -97,21 +95,15 @@ class DensityGrid(ObjectModule):
 
     @classmethod
     def even(
-        cls,
-        object: str,
-        low: ArrayLike,
-        high: ArrayLike,
-        counts: Sequence[int],
-        depth: float = 0.5,
+        cls, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int], depth: float = 0.5
     ) -> "DensityGrid":
         """Make a grid of one density σ, from ∫σ ds through the box along its longest side.
 
         Args:
             object: name of the object.
-            low: corner of the box in the object's frame [m].
-            high: the opposite corner [m].
+            low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
-            depth: that ∫σ ds. Keep it small: what is opaque hides what lies behind it from the fit.
+            depth: ∫σ ds. Keep it small: an opaque cloud hides from the fit what lies behind.
         """
         lattice = Lattice.between(low, high, counts)
         whole = checked_number(depth, "optical depth", 0.0, open_low=True)
@@ -191,7 +183,7 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
 def without_clouds(scene: Scene) -> Scene:
     """Replace every cloud of a scene by its surface, for exact signals and pictures.
 
-    An even cloud has no such surface: its object keeps the mesh that marked its place.
+    A cloud of one density has no such surface: its object keeps the mesh that marked its place.
     """
     for name, item in scene.objects.items():
         if item.cloud is not None:

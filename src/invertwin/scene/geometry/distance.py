@@ -77,8 +77,7 @@ class DistanceGrid(_Distance):
 
     Args:
         object: name of the object.
-        low: corner of the grid in the object's frame [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the grid in the object's frame [m].
         value: signed distances at the nodes [m], at least two along each axis.
         smoothing: λ; detail of steps below about √λ spacings is held back.
 
@@ -118,11 +117,10 @@ class DistanceGrid(_Distance):
 
         Args:
             object: name of the object.
-            low: corner of the box in the object's frame [m].
-            high: the opposite corner [m].
+            low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
             distance: signed distance [m] of points [p, 3], negative inside.
-            smoothing: λ, as above.
+            smoothing: λ of the class.
         """
         lattice = Lattice.between(low, high, counts)
         with torch.no_grad():
@@ -143,14 +141,13 @@ class DistanceGrid(_Distance):
 
         Args:
             object: name of the object.
-            low: corner of the box in the object's frame [m].
-            high: the opposite corner [m].
+            low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
             mesh: in the object's frame.
-            smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = none.
+            smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = no preconditioning.
 
         Raises:
-            InputError: as above.
+            InputError: what the class refuses.
         """
         return cls.sampled(object, low, high, counts, partial(signed_distance, mesh), smooth)
 
@@ -203,8 +200,7 @@ class NeuralDistance(_Distance):
 
     Args:
         object: name of the object.
-        low: corner of the box in the object's frame [m].
-        high: the opposite corner [m].
+        low, high: opposite corners of the box in the object's frame [m].
         counts: nodes along x, y and z at which the field is meshed.
         radius: radius of the ball [m].
         width: sines of a layer.

@@ -23,8 +23,8 @@ def iso_surface(field: Field, lattice: Lattice) -> Mesh:
 
     Values and topology are those of marching cubes, moved onto the field's zero; the derivative of
     a vertex V with unit normal n = ∇f/|∇f| is ``dV = −n df/|∇f|``, in reverse and in forward mode.
-    Vertices slide along the surface when the field changes: only the normal part is theirs, and it
-    is the part that moves the surface. A surface that leaves the box is open there.
+    Only the normal part of a vertex's motion is determined, and only this part moves the surface. A
+    surface that leaves the box is open there.
 
     Source: f(V(θ), θ) = 0, differentiated along the normal; derivations §8.
 
@@ -50,7 +50,7 @@ def surface_of(
     Args:
         field: the signed distance at points in the box.
         lattice: nodes on which the field is known.
-        values: there.
+        values: the field at the nodes.
     """
     if not bool(torch.isfinite(values).all()):
         raise InputError("expected a finite field, got NaN or infinity; lower the learning rate")

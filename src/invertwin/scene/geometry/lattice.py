@@ -31,8 +31,7 @@ class Lattice:
         """The lattice between two corners, given as any numbers.
 
         Args:
-            low: corner of the box [m].
-            high: the opposite corner [m].
+            low, high: opposite corners of the box [m].
             counts: nodes along x, y and z.
 
         Raises:

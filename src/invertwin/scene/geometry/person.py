@@ -95,14 +95,14 @@ def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:
 def _cone(
     points: Tensor, start: Tensor, end: Tensor, first: float, last: float
 ) -> Float64[Tensor, " p"]:
-    """About the distance to a cone with round ends, negative inside."""
+    """Approximate distance to a cone with round ends, negative inside."""
     axis = end - start
     share = ((points - start) @ axis / axis.square().sum()).clamp(0.0, 1.0)
     return (points - start - share[:, None] * axis).norm(dim=1) - (first + share * (last - first))
 
 
 def _distance(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
-    """About the distance to the skin, negative inside: a soft least distance to the parts."""
+    """Approximate distance to the skin, negative inside: a soft minimum over the parts."""
     found = torch.stack([_cone(points, *part[1:]) for part in _parts()])
     return -_FILLET * torch.logsumexp(-found / _FILLET, dim=0)
 

@@ -88,7 +88,7 @@ class ShapePrior:
         self._last: tuple[tuple[int, ...], Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
     def nodes(self, counts: Sequence[int] | None = None) -> Lattice:
-        """Nodes in the box, as many along x, y and z as told; None is about 0.1 m apart.
+        """Nodes in the box, so many along x, y and z; None makes them about 0.1 m apart.
 
         Raises:
             InputError: fewer than two nodes along an axis.
@@ -130,7 +130,7 @@ class ShapePrior:
             counts: nodes along x, y and z.
 
         Raises:
-            InputError: as above, or fewer than two nodes along an axis.
+            InputError: what `values` refuses, or fewer than two nodes along an axis.
         """
         return cubic_slices(self.values(latent), self.lattice, self.nodes(counts))
 

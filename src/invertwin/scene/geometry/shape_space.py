@@ -14,7 +14,7 @@ from invertwin.scene.parameters import ObjectModule
 
 @dataclass(frozen=True, eq=False)
 class ShapeSpace:
-    """Meshes ``mean + Σ z_k σ_k component_k`` of equal triangles.
+    """Meshes ``mean + Σ z_k σ_k component_k`` of the same triangles.
 
     Attributes:
         mean: vertices of the mean shape [m].
@@ -63,7 +63,7 @@ class ShapeSpace:
         return Mesh(self.mean + offsets, self.faces)
 
     def latent(self, vertices: Float64[Tensor, "v 3"]) -> Float64[Tensor, " k"]:
-        """The coordinates z of the space's shape that is closest to vertices of its order."""
+        """The coordinates z of the shape that is closest to vertices in the space's order."""
         basis = (self.components * self.deviations).flatten(0, 1)
         return torch.linalg.lstsq(basis, (vertices - self.mean).reshape(-1, 1)).solution[:, 0]
 

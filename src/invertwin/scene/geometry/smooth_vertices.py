@@ -23,7 +23,7 @@ class SmoothVertices(ObjectModule):
 
     Source: Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geometry".
     Differs from the source: u belongs to the displacement, not to the positions, so that zero is
-    the first shape; the optimiser is whichever fits u.
+    the first shape; any optimiser may step u.
 
     Args:
         object: name of the object.

@@ -125,7 +125,7 @@ def fresnel_transmittance(
 
 
 def refractive_index(permittivity: Shaped[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
-    """Real part n of √ε, by which rays bend: sinθ = n sinθ'."""
+    """Real part n of √ε. Rays bend by it: sinθ = n sinθ'."""
     return torch.sqrt(permittivity).real
 
 

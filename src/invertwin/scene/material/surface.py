@@ -73,7 +73,7 @@ class Surface:
     attenuation: Float64[Tensor, "*#row"] = _ZERO
 
     def __post_init__(self) -> None:
-        """Gives all fields the same rows."""
+        """Give all fields the same rows."""
         given = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         widths = {n: v.shape[v.ndim - (n not in _SCALARS) :] for n, v in given.items()}
         row = torch.broadcast_shapes(

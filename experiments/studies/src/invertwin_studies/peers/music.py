@@ -47,7 +47,12 @@ class MusicMap:
     def beat(
         self, scene: Scene, radar: Radar | None = None
     ) -> Complex128[Tensor, "frame tx rx sample"]:
-        """Exact beat signal of the scene, seen by the radar or by one that has moved."""
+        """Exact beat signal of the scene.
+
+        Args:
+            scene: What is seen.
+            radar: What sees it, perhaps moved; None = the attribute.
+        """
         seen = radar or self.radar
         paths = trace_field(
             scene,
@@ -74,7 +79,13 @@ class MusicMap:
     def difference(
         self, scene: Scene, direction: Moves, step: float
     ) -> Float64[Tensor, "frame range u v"]:
-        """Central difference of the spectrum in θ."""
+        """Central difference of the spectrum in θ.
+
+        Args:
+            scene: At θ = 0.
+            direction: Gives the scene and the radar at a θ.
+            step: Of θ.
+        """
         with torch.no_grad():
             ends = [
                 self.spectrum(
@@ -89,7 +100,12 @@ class MusicMap:
         return (ends[0] - ends[1]) / (2 * step)
 
     def derivative(self, scene: Scene, direction: Moves) -> Float64[Tensor, "frame range u v"]:
-        """Automatic derivative of the spectrum in θ, by forward mode through the whole chain."""
+        """Automatic derivative of the spectrum in θ, by forward mode.
+
+        Args:
+            scene: At θ = 0.
+            direction: Gives the scene and the radar at a θ.
+        """
         with torch.no_grad(), forward_ad.dual_level():
             theta = forward_ad.make_dual(
                 torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)

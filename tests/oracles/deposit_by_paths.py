@@ -1,4 +1,4 @@
-"""Slow twin of the fused deposit: explicit torch paths on explicit B-spline weights."""
+"""Slow reference of the fused deposit: explicit torch paths on explicit B-spline weights."""
 
 import torch
 from torch import Tensor

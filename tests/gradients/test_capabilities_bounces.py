@@ -1,4 +1,4 @@
-"""The capability table again: the cells of paths of two bounces, what one bounce adds taken off."""
+"""The cells of the capability table for paths of two bounces, without paths of one bounce."""
 
 import math
 from collections.abc import Callable
@@ -69,7 +69,7 @@ def converged(draw: Callable[[int], Tensor], noise: float) -> tuple[Tensor, floa
 
 
 @cache
-def chain_case(parameter: str) -> tuple[Found, Tensor]:
+def bounces_case(parameter: str) -> tuple[Found, Tensor]:
     """Derivatives, and the one without the shadows that surfaces cast on each other."""
     radar, moves = clock() if parameter == "clock offset" else (power_radar(), MOVES[parameter])
     first = replace(radar.receivers, positions=radar.receivers.positions[:1] * 0)
@@ -128,13 +128,13 @@ def chain_case(parameter: str) -> tuple[Found, Tensor]:
     return Found(full, interior, truth, noise), outer
 
 
-@pytest.mark.parametrize(("parameter", "mechanism"), selected("supported", chains=True))
+@pytest.mark.parametrize(("parameter", "mechanism"), selected("supported", bounces=True))
 def test_supported(parameter, mechanism):
     if parameter == "range bias":
         found = bias_case(depth=2)
         assert relative(found.full, found.truth) < 0.03
         return
-    found, outer = chain_case(parameter)
+    found, outer = bounces_case(parameter)
     assert found.noise < 0.03
     assert relative(found.full, found.truth) < 0.05
     if mechanism.endswith("boundary"):
@@ -143,9 +143,9 @@ def test_supported(parameter, mechanism):
         assert relative(outer, found.truth) > relative(found.full, found.truth)
 
 
-@pytest.mark.parametrize(("parameter", "mechanism"), selected("zero", chains=True))
+@pytest.mark.parametrize(("parameter", "mechanism"), selected("zero", bounces=True))
 def test_zero(parameter, mechanism):
-    assert mechanism == "chain boundary"
+    assert mechanism == "bounces boundary"
     if parameter == "range bias":
         found = bias_case(depth=2)
         assert relative(found.full, found.interior) < 1e-5
