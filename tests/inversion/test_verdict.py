@@ -76,7 +76,7 @@ def test_without_looks_it_is_not_known():
 def test_an_end_worse_than_its_start_says_so():
     found = fitted(look(0), start=0.1)
     with torch.no_grad():
-        found.parameters[0].translation[0] += 0.5
+        next(found.parameters.parameters())[0] += 0.5
     assert found.verdict.word == "worse"
 
 
