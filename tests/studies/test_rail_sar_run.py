@@ -29,7 +29,7 @@ def test_run_file_finds_the_second_reflector(repository, data_folder, tmp_path, 
     assert metrics["backprojection_distance_m"] == pytest.approx(5.07, abs=5e-3)
     assert metrics["surveyed_distance_m"] == pytest.approx(4.91, abs=5e-3)
     report = (tmp_path / "out" / "report.html").read_text()
-    assert "Noise is not what limits the result." in report
+    assert "Noise does not limit the result." in report
     assert "no evidence that either is better" in report
 
 
