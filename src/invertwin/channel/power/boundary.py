@@ -72,7 +72,8 @@ class BoundaryPoints:
     """The edge points of all boundary paths: antenna segments first, then interior ones.
 
     The first of each family are drawn at once, without waiting for them: this is prepared while
-    another kernel runs. The rest are drawn each time they are asked for.
+    another kernel runs. They are given away once, so that they take no memory later; the rest, and
+    all of them when they are asked for again, are drawn anew, to the same points.
     """
 
     def __init__(
@@ -112,11 +113,12 @@ class BoundaryPoints:
 
     def families(self) -> list[Iterator[Any]]:
         """``EdgePoints``, and ``TwoSided`` if there are interior segments."""
-        first = [[drawn.kept() for drawn in family] for family in self._first]
+        ahead, self._first = self._first, [[] for _ in self._samplers]
+        first = [[drawn.kept() for drawn in family] for family in ahead]
         # Each sampler is bound here: a generator expression would draw all of them from the last.
         later = [
-            map(Drawn.kept, map(s.draw, itertools.islice(self._chunks(s.size), 1, None)))
-            for s in self._samplers
+            map(Drawn.kept, map(s.draw, itertools.islice(self._chunks(s.size), len(now), None)))
+            for s, now in zip(self._samplers, first, strict=True)
         ]
         return [itertools.chain(*family) for family in zip(first, later, strict=True)]
 
