@@ -31,9 +31,10 @@ ALLOWED = {
     "capture": CAPTURE,
     "models": MODELS,
     "inversion": INVERSION,
+    "folders": SCENE,
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION | {"doctor", "plotting", "registry", "cli", "__init__"},
+    "cli": INVERSION | {"doctor", "folders", "plotting", "registry", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

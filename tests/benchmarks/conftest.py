@@ -20,6 +20,7 @@ def script(name: str) -> Any:
 
 
 basin = script("basin")
+crash_safety = script("crash_safety")
 edges = script("edges")
 house = script("house")
 multibounce = script("multibounce")
@@ -27,4 +28,5 @@ report = script("report")
 shapes = script("shapes")
 signals = script("signals")
 steps = script("steps")
+threads = script("threads")
 throughput = script("throughput")

@@ -174,7 +174,7 @@ def test_ended_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypa
     heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     command = [sys.executable, "-c", heed + "from invertwin.cli.app import main; main()"]
     command += ["reconstruct", str(run_file), "-o", "cut"]
-    checkpoint = run_file.parent / "cut" / "parts" / "full_01.pt"
+    checkpoint = run_file.parent / "cut" / "unfinished" / "parts" / "full_01.pt"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen(
         command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
@@ -211,7 +211,7 @@ def test_interruption_says_how_to_go_on(run_file, monkeypatch, capsys):
     error = capsys.readouterr().err
     assert "--resume" in error
     assert error.count("\n") == 1
-    assert (run_file.parent / "out" / "small" / "checkpoint.pt").exists()
+    assert (run_file.parent / "out" / "small" / "unfinished" / "checkpoint.pt").exists()
 
 
 def test_demo_reconstructs_the_run_file_that_comes_along(tmp_path, monkeypatch):

@@ -14,10 +14,11 @@ from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
 from invertwin.cli.report import Picture, Table, finish, texts
 from invertwin.cli.run_file import about_file, need
-from invertwin.cli.runs import PARTS, RunFolder
+from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.errors import InputError
+from invertwin.folders import PARTS
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
 from invertwin.models import SurrogateMap
@@ -114,7 +115,7 @@ def run_gradcheck(
             studies.append(study.table(name, found[key]))
             shown[f"{name}_{key}"] = studies[-1].title, study.picture_note
         for file, (title, note) in shown.items():
-            pictures.append(Picture(title, (folder.path / f"{file}.png").read_bytes(), note))
+            pictures.append(Picture(title, folder.file(f"{file}.png").read_bytes(), note))
     metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
         metrics |= compared
@@ -123,9 +124,7 @@ def run_gradcheck(
     table = Table("Agreement with central differences", _COLUMNS, rows, legend)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
     parts = [table, *studies, *pictures]
-    found = finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
-    folder.remove([f"{PARTS}/{name}.json" for name in runs])
-    return found
+    return finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
 
 
 def _check(

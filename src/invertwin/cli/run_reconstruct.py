@@ -24,7 +24,7 @@ from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table, finish
-from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
+from invertwin.cli.runs import CHECKPOINT, RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.inversion import Reconstruction
@@ -98,10 +98,9 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     if run.measures is not None:
         save_mesh(folder.file("twin.glb"), twin)
     if not single:
-        shutil.copyfile(folder.path / best["checkpoint"], folder.file(CHECKPOINT))
+        shutil.copyfile(folder.file(best["checkpoint"]), folder.file(CHECKPOINT))
     title, outcome = run.title or "Reconstruction", status(run, metrics)
     tables = finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note)
-    folder.remove([name for name in folder.names if name.startswith(PARTS)])
     return tables, outcome
 
 

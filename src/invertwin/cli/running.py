@@ -41,7 +41,7 @@ def run_folder(
             line += f"; the same command with --resume goes on (results so far in {path})"
         print(line, file=sys.stderr)
         sys.exit(130)
-    done = "was complete already" if folder.complete and folder.resumed else "complete"
+    done = "was complete already" if folder.complete else "complete"
     console.print(f"{done}: {path / 'report.html'}", markup=False, soft_wrap=True)
 
 

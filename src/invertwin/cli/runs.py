@@ -1,96 +1,112 @@
-"""Run folders: what a run leaves on disk, and the rule that no result is ever lost.
-
-A folder is owned through a manifest of the files that the run has written, so a folder that also
-holds the user's own files is safe: only listed files are moved or removed.
-"""
+"""Run folders: what a run leaves on disk, and the rule that no result is ever lost."""
 
 import hashlib
 import json
 import math
 import os
-import shutil
+import platform
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from fnmatch import fnmatchcase
+from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from invertwin.cli.run_file import to_toml
 from invertwin.errors import InputError
+from invertwin.folders import (
+    PARTS,
+    UNFINISHED,
+    Manifest,
+    Work,
+    in_one_line,
+    lock_folder,
+    moved,
+    not_ours,
+    place_in,
+    read_manifest,
+    remove_empty,
+    require_free,
+    save_manifest,
+    without_unfinished,
+)
+from invertwin.scene.files import replacing
 
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
     from matplotlib.figure import Figure
 
-MANIFEST = ".invertwin.json"
-PREVIOUS = ".previous"
 CHECKPOINT = "checkpoint.pt"
-PARTS = "parts"  # finished and unfinished parts of a run, until it ends
-RESULTS = ("metrics.json", "run.toml", "report.html", "twin.ply", CHECKPOINT)
+# What commands write, beside run files and the pictures that are named after them.
+RESULTS = (
+    *("metrics.json", "report.html", "checkpoint*.pt", "twin.*", "raw", "capture.nc", "chirps.*"),
+    *("channels.json", "points.csv", "prior.npz", "train.log", "turntable.gif", UNFINISHED),
+    *("scene.png", "spectra*.png", "doppler.png", "loss*.png", "convergence.png", "landscape.png"),
+    *("look.png", "recording.png", "twin_*.png"),
+)
 
 
 class RunFolder:
     """The folder of one run, from `open_run`; use it as a context manager.
 
-    Leaving the block normally completes the run and drops the results it replaces. An
-    interruption keeps what can be resumed. Any other exception puts back what was there before.
+    Leaving the block normally completes the run, in place of what was there before. Any other end
+    keeps what can be resumed, or leaves no trace. An OSError becomes an InputError.
+
+    Attributes:
+        path: Where the results are in the end.
+        complete: Whether the run had ended before it was opened again.
     """
 
-    def __init__(self, path: Path, manifest: dict[str, Any], *, resumed: bool):
-        self.path = path
-        self.resumed = resumed
-        self._manifest = manifest
+    def __init__(self, path: Path, manifest: Manifest, held: ExitStack):
+        self.path, self.complete = path, manifest.unfinished is None
+        self._manifest, self._held = manifest, held
 
     def __enter__(self) -> "RunFolder":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        if kind is None:
-            self._manifest["complete"] = True
-            self._save_manifest()
-            shutil.rmtree(self.path / PREVIOUS, ignore_errors=True)
-        elif self.resumable and (
-            issubclass(kind, KeyboardInterrupt)
-            or self.resumed
-            or not (self.path / PREVIOUS).exists()
-        ):
-            return
-        else:
-            self._undo()
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        with in_one_line("; then --resume goes on" if self.resumable else ""), self._held:
+            try:
+                if error is None and not self.complete:
+                    self._finish()
+            finally:
+                work = self._manifest.unfinished
+                if work is not None and not work.complete and not self.resumable:
+                    without_unfinished(self.path, self._manifest)
+            if isinstance(error, OSError):
+                raise error
 
     @property
     def resumable(self) -> bool:
         """Whether this run left something to go on from."""
-        return any(
-            (name == CHECKPOINT or name.startswith(PARTS)) and (self.path / name).exists()
-            for name in self._manifest["files"]
-        )
-
-    @property
-    def complete(self) -> bool:
-        """Whether the run had ended before it was opened again."""
-        return self._manifest["complete"]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The result files of this run."""
-        return tuple(self._manifest["files"])
+        return _resumable(self.path, self._manifest)
 
     @property
     def run_files(self) -> dict[str, str]:
         """The run files as used, by their path in the folder."""
-        found = [name for name in self.names if name == "run.toml" or name.startswith("runs/")]
-        return {name: (self.path / name).read_text(encoding="utf-8") for name in found}
+        names = self._manifest.unfinished.files if self._manifest.unfinished else []
+        found = [name for name in names if name == "run.toml" or name.startswith("runs/")]
+        return {name: self.file(name).read_text(encoding="utf-8") for name in found}
 
     def file(self, name: str) -> Path:
-        """The path of a result file, owned by this run from now on."""
-        if name not in self._manifest["files"]:
-            self._manifest["files"].append(name)
-            self._save_manifest()
-        path = self.path / name
+        """Where a result file is while the run goes on; it is owned by this run from now on.
+
+        Raises:
+            InputError: The folder holds a file of that name that no run has written.
+        """
+        work = self._manifest.unfinished
+        assert work is not None
+        if name not in work.files:
+            require_free(self.path, name, self._manifest.files)
+            work.files.append(name)
+            save_manifest(self.path, self._manifest)
+        path = place_in(self.path, f"{UNFINISHED}/{name}")
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def write_bytes(self, name: str, data: bytes) -> None:
         """Write a result file so that a kill leaves the old or the new one, never half of it."""
-        _replace(self.file(name), data)
+        with replacing(self.file(name)) as part:
+            part.write_bytes(data)
 
     def write_figure(self, name: str, figure: "Figure") -> bytes:
         """Write a figure as PNG, and return its bytes."""
@@ -111,31 +127,18 @@ class RunFolder:
 
     def read_json(self, name: str) -> Any | None:
         """A JSON file that this run wrote before it was interrupted, or None."""
-        path = self.path / name
-        if name not in self._manifest["files"] or not path.exists():
-            return None
-        return json.loads(path.read_text(encoding="utf-8"))
+        path = self.file(name)
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
-    def remove(self, names: Iterable[str]) -> None:
-        """Remove intermediate files of this run."""
-        names = list(names)
-        self._manifest["files"] = [f for f in self._manifest["files"] if f not in names]
-        self._save_manifest()
-        _remove(self.path, names)
-
-    def _save_manifest(self) -> None:
-        _replace(self.path / MANIFEST, json.dumps(self._manifest, indent=1).encode())
-
-    def _undo(self) -> None:
-        _remove(self.path, [*self._manifest["files"], MANIFEST])
-        previous = self.path / PREVIOUS
-        if previous.exists():
-            _move(previous, self.path, _files_under(previous))
-            shutil.rmtree(previous)
-        for made in [self.path, *self.path.parents][: self._manifest["created"]]:
-            if any(made.iterdir()):
-                return
-            made.rmdir()
+    def _finish(self) -> None:
+        work = self._manifest.unfinished
+        assert work is not None
+        there = [name for name in work.files if (self.path / UNFINISHED / name).exists()]
+        done = work.model_copy(update={"files": there, "complete": True})
+        manifest = self._manifest.model_copy(update={"unfinished": done})
+        save_manifest(self.path, manifest)
+        self._manifest = manifest
+        self._manifest = moved(self.path, manifest)
 
 
 def open_run(
@@ -147,109 +150,88 @@ def open_run(
         path: The folder; made with its parents when it does not exist.
         runs: Run files as used, by file stem; one is written as run.toml, several as
             runs/<stem>.toml.
-        overwrite: Replace the results that are there; they are set aside until this run ends.
+        overwrite: Replace the results that are there when this run ends.
         resume: Go on with the interrupted run that is there.
 
     Raises:
         InputError: The folder holds results and neither flag is given, there is nothing to
-            resume, or it belongs to another run file.
+            resume, it belongs to another run file, another run uses it, it holds files of others
+            where results go, or it cannot be written.
     """
     if overwrite and resume:
         raise InputError("expected --overwrite or --resume, got both; choose one")
-    if path.exists() and not path.is_dir():
-        raise InputError(
-            f"expected a folder for the results, got the file {path}; choose another -o"
-        )
+    if "\0" in str(path):
+        raise InputError(f"expected a folder's name, got {str(path)!r}; take the NUL out")
     texts = {name: to_toml(run) for name, run in runs.items()}
     digest = hashlib.sha256(json.dumps(texts, sort_keys=True).encode()).hexdigest()
-    manifest = _read_manifest(path)
-    if resume:
-        return RunFolder(path, _to_resume(path, manifest, digest), resumed=True)
-    found = manifest["files"] if manifest else RESULTS
-    found = [name for name in found if (path / name).exists()]
-    if found and not overwrite:
-        raise InputError(
-            f"expected a folder without results, got {path} with {found[0]} in it; "
-            "add --overwrite or choose another -o (interrupted fits go on with --resume)"
-        )
-    created = sum(not folder.exists() for folder in (path, *path.parents))
-    try:
+    with in_one_line(" or choose another -o"), ExitStack() as held:
+        missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+        if resume and missing:
+            raise _nothing_to_resume(path)
+        for folder in reversed(missing):
+            held.callback(remove_empty, folder)
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"expected a folder that can be made, got {path}: {error.strerror}; choose another -o"
-        ) from None
-    _set_aside(path, found, manifest)
-    new = {"files": [], "digest": digest, "complete": False, "created": created}
-    folder = RunFolder(path, new, resumed=False)
-    for name, text in texts.items():
-        folder.write_text("run.toml" if len(texts) == 1 else f"runs/{name}.toml", text)
+        lock_folder(path, held)
+        manifest = read_manifest(path)
+        if manifest.unfinished is not None and manifest.unfinished.complete:
+            manifest = moved(path, manifest)
+        if not resume:
+            _require_room(path, manifest, texts, overwrite)
+            manifest = without_unfinished(path, manifest)
+            manifest.unfinished = Work(digest=digest, owner="")
+        work = manifest.unfinished
+        if work is None and not manifest.files:
+            raise _nothing_to_resume(path)
+        if digest != (manifest.digest if work is None else work.digest):
+            raise InputError(
+                f"expected the run file and options that {path} was made with (its run.toml), got "
+                "others; use those, or --overwrite"
+            )
+        if work is not None:
+            work.owner = f"process {os.getpid()} on {platform.node()}"
+            save_manifest(path, manifest)  # before there is anything that it could claim
+            (path / UNFINISHED).mkdir(exist_ok=resume)
+        folder = RunFolder(path, manifest, held.pop_all())
+    try:
+        for name, text in texts.items() if work is not None else ():
+            folder.write_text("run.toml" if len(texts) == 1 else f"runs/{name}.toml", text)
+    except BaseException as error:
+        folder.__exit__(type(error), error, None)
+        raise
     return folder
 
 
-def _to_resume(path: Path, manifest: dict[str, Any] | None, digest: str) -> dict[str, Any]:
-    if manifest is None:
+def _nothing_to_resume(path: Path) -> InputError:
+    return InputError(
+        f"expected a folder with an interrupted run, got {path} without one; "
+        "leave --resume out or correct -o"
+    )
+
+
+def _require_room(path: Path, manifest: Manifest, stems: Iterable[str], overwrite: bool) -> None:
+    """Refuse a folder with results that are not to be replaced, or not ours to replace."""
+    found = [name for name in manifest.files if (path / name).exists()]
+    if not overwrite and (found or _resumable(path, manifest)):
+        what = f"{found[0]} in it" if found else "an interrupted run"
         raise InputError(
-            f"expected a folder with an interrupted run, got {path} without one; "
-            "leave --resume out or correct -o"
+            f"expected a folder without results, got {path} with {what}; "
+            "add --overwrite or choose another -o (interrupted fits go on with --resume)"
         )
-    if manifest["digest"] != digest:
-        raise InputError(
-            f"expected the run file and options that {path} was made with (its run.toml), got "
-            "others; use those, or --overwrite"
-        )
-    return manifest
+    own = {name.split("/")[0]: "/" in name for name in manifest.files}  # whether it is a folder
+    if manifest.unfinished is not None:
+        own[UNFINISHED] = True
+    pictures = [f"{escape(stem)}{end}" for stem in stems for end in (".png", "_*.png")]
+    wanted = (*RESULTS, *pictures, "run.toml" if len(pictures) == 2 else "runs")
+    for name in sorted(os.listdir(path)):
+        ours = not (path / name).is_symlink() and own.get(name) is (path / name).is_dir()
+        if not ours and any(fnmatchcase(name, pattern) for pattern in wanted):
+            raise not_ours(path, name)
 
 
-def _read_manifest(path: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise InputError(
-            f"expected a readable {MANIFEST}, got a damaged one in {path}; choose another -o"
-        ) from None
-
-
-def _set_aside(path: Path, names: list[str], manifest: dict[str, Any] | None) -> None:
-    previous = path / PREVIOUS
-    if previous.exists():
-        # An earlier --overwrite was interrupted: what it had set aside is the result to keep.
-        _remove(path, names)
-    elif names:
-        _move(path, previous, [*names, MANIFEST] if manifest else names)
-
-
-def _files_under(folder: Path) -> list[str]:
-    return [str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()]
-
-
-def _move(source: Path, target: Path, names: Iterable[str]) -> None:
-    for name in names:
-        if (source / name).exists():
-            (target / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(source / name, target / name)
-            _remove_empty_parents(source, name)
-
-
-def _remove(folder: Path, names: Iterable[str]) -> None:
-    for name in names:
-        (folder / name).unlink(missing_ok=True)
-        _remove_empty_parents(folder, name)
-
-
-def _remove_empty_parents(folder: Path, name: str) -> None:
-    for parent in list((folder / name).parents):
-        if parent == folder or not parent.exists() or any(parent.iterdir()):
-            return
-        parent.rmdir()
-
-
-def _replace(path: Path, data: bytes) -> None:
-    draft = path.with_name(path.name + ".part")
-    draft.write_bytes(data)
-    os.replace(draft, path)
+def _resumable(path: Path, manifest: Manifest) -> bool:
+    begins, work = (f"{PARTS}/", Path(CHECKPOINT).stem), manifest.unfinished
+    names = [name for name in work.files if name.startswith(begins)] if work else []
+    return any((path / UNFINISHED / name).exists() for name in names)
 
 
 def plain(value: Any) -> Any:

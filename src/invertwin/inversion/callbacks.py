@@ -1,6 +1,6 @@
 """Callbacks of a fit: progress reports, metrics of a known truth, checkpoints."""
 
-import os
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +10,7 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.inversion.fit import Callback, Fit
+from invertwin.scene.files import replacing
 from invertwin.scene.scene import Scene
 
 
@@ -101,10 +102,10 @@ class Checkpoint(Callback):
 
     def end(self, fit: Fit) -> None:
         """Write the file. If the process is killed, the last whole file is left."""
-        path = self._path(fit)
-        part = path.with_suffix(path.suffix + ".part")
-        torch.save(fit.state(), part)
-        os.replace(part, path)
+        data = io.BytesIO()  # torch would tell of a full disk in its own words
+        torch.save(fit.state(), data)
+        with replacing(self._path(fit)) as part:
+            part.write_bytes(data.getbuffer())
 
     def _path(self, fit: Fit) -> Path:
         path = Path(self.file)

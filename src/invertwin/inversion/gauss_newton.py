@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from invertwin.channel import alone
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Maps, Objective, SpectrumLoss
 from invertwin.scene.checks import checked_count
@@ -199,7 +200,7 @@ class GaussNewton:
         fixed = [(predicted.detach(), observed) for predicted, observed in pairs]
         tangents: list[list[Tensor]] = [[] for _ in fixed]
         for index in free.nonzero()[:, 0].tolist():
-            with forward_ad.dual_level(), self._along(index):
+            with alone, forward_ad.dual_level(), self._along(index):
                 found = [forward_ad.unpack_dual(predicted).tangent for predicted, _ in maps()]
             for rows, tangent, (predicted, _) in zip(tangents, found, fixed, strict=True):
                 rows.append(torch.zeros_like(predicted) if tangent is None else tangent)

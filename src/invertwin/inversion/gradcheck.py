@@ -10,6 +10,7 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.channel import alone
 from invertwin.errors import InputError
 from invertwin.inversion.lines import line_of
 from invertwin.inversion.tangents import Change
@@ -141,7 +142,7 @@ def gradcheck(
     def derivative(chosen: ForwardModel) -> tuple[Tensor, Tensor]:
         primals, tangents = [], []
         for number in range(check.repeats):
-            with forward_ad.dual_level():
+            with alone, forward_ad.dual_level():
                 zero = torch.zeros((), dtype=torch.float64)
                 theta = forward_ad.make_dual(zero, torch.ones_like(zero))
                 out = chosen.predict(*seen(line.at(theta)), derived_seed(seed, 0, number)).double()

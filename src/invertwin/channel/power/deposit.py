@@ -17,7 +17,7 @@ from invertwin.channel.power.clouds import deposit_density
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
 from invertwin.channel.power.trace import Trace
 from invertwin.channel.rays.arrays import to_float
-from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, use_backend
+from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, tracing
 from invertwin.channel.rays.geometry import differentiated, flatten, require_edges
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
@@ -68,7 +68,7 @@ def deposit_power(
     soft = [deposit_density(item, link, grid, sampling=sampling, seed=seed) for item in clouds]
     if surfaces is None:
         return torch.stack(soft).sum(0)
-    with use_backend(sampling.backend), torch_threads(1):
+    with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(surfaces, link.wavelength)
         fixed = None
         if reference is not None and (hard := _sorted(reference[0])[0]) is not None:
@@ -113,7 +113,7 @@ class _Deposit(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         trace: Trace = ctx.trace
-        with use_backend(ctx.backend), torch_threads(1):
+        with tracing(ctx.backend), torch_threads(1):
             wanted = [n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[2:], strict=True) if w]
             tables = _attached(trace, wanted)
             inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
@@ -142,7 +142,7 @@ class _Deposit(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, _: None, __: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         trace: Trace = ctx.trace
-        with use_backend(ctx.backend), torch_threads(1):
+        with tracing(ctx.backend), torch_threads(1):
             given = {
                 name: tangent
                 for name, tangent in zip(DIFFERENTIABLE, tangents, strict=True)

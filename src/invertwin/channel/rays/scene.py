@@ -10,7 +10,7 @@ from torch import Tensor
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import arrays
 from invertwin.channel.rays.arrays import opaque, to_float, to_points, to_torch
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.errors import InputError
@@ -176,10 +176,11 @@ def visible_points(
         InputError: Positions of another shape, or that are not finite.
     """
     places = checked_tensor(positions, (None, 3), "radar positions [m]", "give x, y, z of each")
-    rays = Occluders(mesh.vertices, topology_of([mesh]), places.detach().mean(dim=0))
     seen = torch.zeros(len(points), dtype=torch.bool)
-    for place in places:
-        hidden = torch.nonzero(~seen)[:, 0]
-        clear = visible(rays, points[hidden], place.expand(len(hidden), 3))
-        seen[hidden[clear]] = True
+    with tracing():
+        rays = Occluders(mesh.vertices, topology_of([mesh]), places.detach().mean(dim=0))
+        for place in places:
+            hidden = torch.nonzero(~seen)[:, 0]
+            clear = visible(rays, points[hidden], place.expand(len(hidden), 3))
+            seen[hidden[clear]] = True
     return seen

@@ -8,7 +8,7 @@ from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.power.trace import Trace
 from invertwin.channel.power.walk import Records
 from invertwin.channel.rays.arrays import to_torch
-from invertwin.channel.rays.backend import use_backend
+from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import Geometry, flatten, require_edges, silhouettes_move
 from invertwin.channel.reference.radar_equation import Echo, SurfacePaths, path_view
 from invertwin.channel.reference.shadows import ShadowEdge, boundary_rows
@@ -35,7 +35,7 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
             several bounces of objects in motion.
     """
     boundary, edges, depth = sampling.boundary, sampling.boundary_samples, sampling.depth
-    with use_backend(sampling.backend):
+    with tracing(sampling.backend):
         geometry = flatten(scene, link.wavelength, motion="free")
         if depth > 1:
             geometry.require_rest(depth)

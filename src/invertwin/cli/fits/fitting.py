@@ -31,8 +31,9 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
-from invertwin.cli.runs import PARTS, RunFolder
+from invertwin.cli.runs import RunFolder
 from invertwin.errors import InputError
+from invertwin.folders import PARTS
 from invertwin.inversion import (
     Checkpoint,
     Observation,

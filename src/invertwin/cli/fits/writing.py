@@ -186,7 +186,7 @@ def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
         minima = metrics["landscape"]["local_minima"]["exact"]
         span = {"span_mm": run.landscape.exact_span * 1e3}
         note = notes["landscape"].format(object=run.landscape.object, exact=minima, **span)
-        found.append(Picture("Landscape", (folder.path / "landscape.png").read_bytes(), note))
+        found.append(Picture("Landscape", folder.file("landscape.png").read_bytes(), note))
     return found
 
 
