@@ -1,6 +1,9 @@
 """What passes: boards, which let through straight on, and bodies, which refract."""
 
 import math
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -180,3 +183,41 @@ def test_refraction_shifts_a_ray_as_snell_says():
     ]
     assert abs(gaps[0]) < 0.005
     assert gaps[1] < -0.05
+
+
+FIRST_OF_A_PROCESS = """
+import sys
+from invertwin.channel import Grid, Sampling, deposit_power
+from invertwin.scene import RoughConductor, Scene, Slab, plate
+from scenes import link, thing
+
+white = RoughConductor(scattering=1.0)
+wall = thing(plate(0.5, 0.5), (0.0, 0.0, 2.0), material=white)
+board = thing(plate(0.6, 0.6), (0.0, 0.0, 1.0), material=Slab(2.7, 0.05, thickness=0.0125))
+found = deposit_power(
+    Scene({"wall": wall, "board": board}), link(), Grid(1.8, 0.05, 12),  # without the board
+    sampling=Sampling(depth=2, samples=100_000, boundary_samples=0), seed=0, scheme=sys.argv[1],
+)
+print(float(found.double().sum()))
+"""
+
+
+@pytest.mark.slow
+def test_the_tree_is_there_before_a_loop_is_recorded(repository):
+    """To build it inside aborts the process; only the first call of a process would build it."""
+    folders = ":".join(str(repository / name) for name in ("src", "tests"))
+    environment = {**os.environ, "PYTHONPATH": folders}
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", FIRST_OF_A_PROCESS, scheme],
+            env=environment, check=True, capture_output=True, text=True,
+        ).stdout
+        for scheme in ("area", "rays")
+    ]  # fmt: skip
+    assert float(found[0]) == pytest.approx(float(found[1]), rel=0.02)
+    assert float(found[1]) > 0
+
+
+def test_all_loops_over_rays_are_made_where_the_tree_is_built(repository):
+    users = [p.name for p in (repository / "src").rglob("*.py") if "while_loop(" in p.read_text()]
+    assert users == ["scene.py"]

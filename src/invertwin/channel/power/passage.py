@@ -95,12 +95,10 @@ def crossed(
         state["count"] = state["count"] + 1
         return (state,)
 
-    (state,) = dr.while_loop(
+    (state,) = rays.loop(
         ({**state, "active": mi.Bool(active), **carry},),
         lambda state: state["active"] & (state["count"] < most),
         body,
-        labels=("state",),
-        mode="symbolic",
     )
     return state
 
@@ -196,8 +194,6 @@ def land(
         state["going"] = passes & (state["count"] < _MOST)
         return (state,)
 
-    (state,) = dr.while_loop(
-        (state,), lambda state: state["going"], body, labels=("state",), mode="symbolic"
-    )
+    (state,) = rays.loop((state,), lambda state: state["going"], body)
     names = ("valid", "face", "b1", "b2", "transmittance", "extra", "chance")
     return Hit(*(state[name] for name in names))

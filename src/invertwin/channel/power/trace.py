@@ -21,8 +21,34 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.scene import RayScene
 from invertwin.channel.sampling import Sampling
+from invertwin.scene.checks import plain
 
 _BYTES_PER_VERTEX = 21  # one record: triangle, two barycentrics, throughput, length, seen
+
+
+def tables_of(geometry: Geometry, link: Link) -> list[Tensor]:
+    """What a map can be differentiated with respect to, in the kernel's order.
+
+    Args:
+        geometry: The scene.
+        link: Antennas.
+    """
+    owners = {"vertices": geometry, **dict.fromkeys(SURFACE, geometry.surfaces)}
+    return [getattr(owners.get(name, link), name) for name in DIFFERENTIABLE]
+
+
+def without_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, Link]:
+    """Plain numbers, also within the transforms of ``torch.func``.
+
+    Args:
+        geometry: The scene.
+        link: Antennas.
+    """
+    tables = dict(zip(DIFFERENTIABLE, map(plain, tables_of(geometry, link)), strict=True))
+    rows = replace(geometry.surfaces, **{name: tables.pop(name) for name in SURFACE})
+    return replace(geometry, vertices=tables.pop("vertices"), surfaces=rows), replace(
+        link, **tables
+    )
 
 
 class Trace:
@@ -49,6 +75,7 @@ class Trace:
             reference: What fixes how starts are drawn, see ``deposit_power``.
         """
         self.sampling, self.seed = sampling, seed
+        self.recorded: Records | None = None  # the last paths, where they fit
         self.rays = RayScene(geometry, link)
         sampler = RaySampler if scheme == "rays" else AreaSampler
         self.sampler = sampler(self.rays, sampling.samples, seed, reference)
@@ -56,13 +83,6 @@ class Trace:
         self._walk = Walk(self.rays, self.fixed, seed)
         per_lane = _BYTES_PER_VERTEX * sampling.depth
         self.chunk = max(1, int(sampling.memory_budget) // per_lane)
-
-    @property
-    def tables(self) -> list[Tensor]:
-        """What the map can be differentiated with respect to, in the kernel's order."""
-        geometry, link = self.rays.geometry, self.rays.link
-        owners = {"vertices": geometry, **dict.fromkeys(SURFACE, geometry.surfaces)}
-        return [getattr(owners.get(name, link), name) for name in DIFFERENTIABLE]
 
     def inputs(self, tables: dict[str, Any] | None = None, *, together: bool = True) -> Inputs:
         """The kernel's inputs, with some arrays replaced by ones that carry derivatives.

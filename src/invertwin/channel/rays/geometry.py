@@ -164,7 +164,7 @@ def flatten(
         own = topology.face_object == number
         if bool(skins[face_surface[own]].any()):
             _require_solid(
-                name, vertices.detach()[topology.faces[own]], topology.open_objects[number]
+                name, vertices.detach()[topology.faces[own]], number in topology.open_objects
             )
     weights, free = surfaces.lobes, differentiated(surfaces.lobes)
     return Geometry(

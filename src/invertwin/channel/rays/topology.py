@@ -8,9 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.arrays import to_float, to_index
 from invertwin.channel.rays.backend import VARIANTS, backend, mi
+from invertwin.scene.checks import plain
 from invertwin.scene.mesh import Mesh
 
 _KEPT_TOPOLOGIES = 8
@@ -31,17 +33,19 @@ class Topology:
     def __init__(self, faces: Tensor, face_object: Tensor, vertices: Tensor) -> None:
         self.faces = faces
         self.face_object = face_object
-        owners = range(int(face_object.max()) + 1)
-        self.object_vertices = [faces[face_object == owner].unique() for owner in owners]
         self.sound_face: int | None = None  # a triangle that was no sliver when last looked at
-        owner = torch.zeros(len(vertices), 1, dtype=torch.float64)
-        owner[faces.ravel(), 0] = face_object.repeat_interleave(3).double()
-        places = torch.cat([owner, vertices], dim=1).numpy()
+        owner = torch.zeros(len(vertices), dtype=torch.int64)
+        owner[faces.ravel()] = face_object.repeat_interleave(3)
+        used = faces.unique()
+        # Vertices of triangles, the first of each object among them, and the object of each.
+        first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
+        self.used = used.numpy(), first.numpy(), owner[used].numpy()
+        places = torch.cat([owner[:, None].double(), vertices], dim=1).numpy()
         self.edges, self.opposite, beside = edges_of(faces.numpy(), places)
         alone = (self.opposite >= 0).sum(1) == 1
-        lone_owner = face_object[beside[alone, 0]]
-        self.open_objects = [bool((lone_owner == owner).any()) for owner in owners]
+        self.open_objects = set(face_object[beside[alone, 0]].tolist())
         self.device_faces = to_index(faces)
+        self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
         self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
         self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]
@@ -98,11 +102,12 @@ def topology_of(meshes: list[Mesh]) -> Topology:
     key = (VARIANTS[backend()], *map(id, owners))
     if key not in _topologies:
         starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
-        faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-        objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
-        # In the objects' own frames, where equal positions are equal to the last bit.
-        vertices = torch.cat([mesh.vertices.detach() for mesh in meshes])
-        made = Topology(torch.cat(faces), torch.cat(objects), vertices)
+        with _DisableFuncTorch():
+            faces = [plain(mesh.faces) + start for mesh, start in zip(meshes, starts, strict=False)]
+            objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
+            # In the objects' own frames, where equal positions are equal to the last bit.
+            vertices = torch.cat([plain(mesh.vertices) for mesh in meshes])
+            made = Topology(torch.cat(faces), torch.cat(objects), vertices)
         _topologies[key] = (owners, made)
         while len(_topologies) > _KEPT_TOPOLOGIES:
             _topologies.popitem(last=False)
