@@ -26,11 +26,11 @@ from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 
 _COLUMNS = (
-    *("scene", "L1 full", "L1 interior", "L1 no interior edges", "ratio", "L2 full"),
-    *("correlation", "noise", "steps differ", "order", "pairs"),
+    *("scene", "L1 full", "L1 interior", "L1 no interior edges", "L1 no contact", "ratio"),
+    *("L2 full", "correlation", "noise", "steps differ", "order", "pairs"),
 )
 _KEPT = (
-    *("full", "interior", "no_interior_edges"),
+    *("full", "interior", "no_interior_edges", "no_contact"),
     *("difference_noise", "step_agreement", "pairs"),
 )
 # Units of a derivative with respect to θ, by the value that θ changes; angles are told apart.
@@ -191,9 +191,9 @@ def _maps(report: GradientReport, grid: Grid, settings: Gradcheck) -> Figure:
 
 def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
     full, interior = found["full"], found["interior"]["relative_l1"]
-    outer = found.get("no_interior_edges", {}).get("relative_l1")
+    less = [found.get(key, {}).get("relative_l1") for key in ("no_interior_edges", "no_contact")]
     ratio = interior / full["relative_l1"] if full["relative_l1"] else None
-    errors = [full["relative_l1"], interior, outer, ratio, full["relative_l2"]]
+    errors = [full["relative_l1"], interior, *less, ratio, full["relative_l2"]]
     differences = [found["difference_noise"], found["step_agreement"], full["order"]]
     return [name, *errors, full["correlation"], *differences, found["pairs"]]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from invertwin.channel import use_backend
-from invertwin.channel.power.edges import _Proportional
+from invertwin.channel.power.edges import Proportional
 from invertwin.channel.rays.backend import mi
 
 
@@ -12,7 +12,7 @@ def drawn(weights, count):
     """Entries, rests and probabilities of numbers spread evenly over [0, 1)."""
     spread = (np.arange(count, dtype=np.float32) + 0.5) / count
     with use_backend("cpu"):
-        return tuple(np.array(c) for c in _Proportional(mi.Float(weights)).draw(mi.Float(spread)))
+        return tuple(np.array(c) for c in Proportional(mi.Float(weights)).draw(mi.Float(spread)))
 
 
 def test_entries_are_drawn_in_proportion():

@@ -6,14 +6,16 @@ ways along a direction that is tangential there, so that no silhouette is ever s
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.passage import land, passage
+from invertwin.channel.power.passage import Hit, land, passage
 from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.contacts import IN_PLANE
 from invertwin.channel.rays.scene import NEAR, RayScene
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
@@ -21,6 +23,7 @@ _RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's pla
 # Boundary rays pass beside the edge, by this much of its distance from the origin (fifteen
 # roundings): a fine mesh's own triangles, nearly edge-on, would else lie in their way.
 _BESIDE = 1e-6
+_BEFORE = 3e-5  # how much before an edge, of its distance, such rays start among close surfaces
 _LAST_BELOW_ONE = 1 - 2.0**-24
 _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 
@@ -49,6 +52,11 @@ class EdgePoints:
     covered: Any  # on the side of ``opposite``
     covered_extra: Any
 
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return dr.width(self.face)
+
     def sides(self, inputs: Inputs) -> list[tuple[float, Any, Any]]:
         """Sign, transmittance and extra length of either side of the shadow's edge."""
         lit = (1.0, self.transmittance * self.open, self.extra + self.open_extra)
@@ -72,6 +80,11 @@ class TwoSided:
 
     edge: EdgePoints  # its weight holds the change of measure from directions to area
     behind: Behind  # where the shadow is cast from
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return self.edge.size
 
 
 @dataclass(frozen=True)
@@ -112,7 +125,7 @@ class Drawn:
         )
 
 
-class _Proportional:
+class Proportional:
     """Draws entries in proportion to weights, without reading any back."""
 
     def __init__(self, weights: Any) -> None:
@@ -148,13 +161,21 @@ class EdgeSampler:
         centres: Antennas whose silhouettes count: ``tx``, ``rx`` or both.
         samples: Points over all frames.
         seed: Of the points.
+        close: Whether other surfaces may be close to edges.
     """
 
     def __init__(
-        self, rays: RayScene, inputs: Inputs, centres: Sequence[str], samples: int, seed: int
+        self,
+        rays: RayScene,
+        inputs: Inputs,
+        centres: Sequence[str],
+        samples: int,
+        seed: int,
+        *,
+        close: bool = False,
     ) -> None:
         topology = rays.topology
-        self.rays, self.inputs, self.centres = rays, inputs, centres
+        self.rays, self.inputs, self.centres, self.close = rays, inputs, centres, close
         entries = len(centres) * rays.link.frame_count * len(topology.edges)
         edge, _, receiver, origin = self._seen(dr.arange(mi.UInt32, entries))
         y0, y1 = (
@@ -169,7 +190,7 @@ class EdgeSampler:
             of, totals = dr.select(receiver, mi.UInt32(1), 0), dr.zeros(mi.Float, 2)
             dr.scatter_add(totals, length, of, sides.unlike)
             share = length / dr.gather(mi.Float, totals, of)
-            self.choice = _Proportional(dr.select(sides.unlike, share, 0.0))
+            self.choice = Proportional(dr.select(sides.unlike, share, 0.0))
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
 
     def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
@@ -187,7 +208,7 @@ class EdgeSampler:
     def draw(self, index: Any) -> Drawn:
         """The samples of the given indices below ``size``; those without a shadow are void."""
         rays, topology = self.rays, self.rays.topology
-        place, along, pmf = _along(self.choice, index, self.size, self.seed)
+        place, along, pmf = place_along(self.choice, index, self.size, self.seed)
         edge, frame, receiver, origin = self._seen(place)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0 = point_at(rays.vertices, first)
@@ -196,10 +217,13 @@ class EdgeSampler:
         away = y - origin
         sides = _sides(rays, self.inputs, edge, y0, y1, away)
         beside = y + sides.outwards * (_BESIDE * dr.norm(y))
-        before = passage(rays, self.inputs, origin, beside, pmf > 0)
+        reach = beside - away * _BEFORE if self.close else beside
+        before = passage(rays, self.inputs, origin, reach, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
-        ray = mi.Ray3f(beside + away * NEAR, dr.normalize(away))
-        hit = land(rays, self.inputs, ray, valid, (index, self.dice), coherent=True)
+        key = index, self.dice
+        hit = _ahead(
+            rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close
+        )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
         found = EdgePoints(
             index, receiver, frame, first, second, sides.opposite, along, hit.face,
@@ -226,13 +250,21 @@ class InteriorEdgeSampler:
         seed: Of the points.
         weighted: False takes edges by length alone and directions from the whole sphere: what the
             benchmark compares with.
+        close: Whether other surfaces may be close to edges.
     """
 
     def __init__(
-        self, rays: RayScene, inputs: Inputs, samples: int, seed: int, *, weighted: bool = True
+        self,
+        rays: RayScene,
+        inputs: Inputs,
+        samples: int,
+        seed: int,
+        *,
+        weighted: bool = True,
+        close: bool = False,
     ) -> None:
         topology = rays.topology
-        self.rays, self.inputs, self.weighted = rays, inputs, weighted
+        self.rays, self.inputs, self.weighted, self.close = rays, inputs, weighted, close
         self.frames = rays.link.frame_count
         edge = dr.arange(mi.UInt32, len(topology.edges))
         y0, y1 = (
@@ -253,7 +285,7 @@ class InteriorEdgeSampler:
         self.per_frame = max(1, samples // self.frames)
         self.size = self.per_frame * self.frames if len(topology.edges) else 0
         if self.size:
-            self.choice = _Proportional(weight)
+            self.choice = Proportional(weight)
         self.seeds = scrambled(seed, 4), scrambled(seed, 5)
         self.dice = scrambled(seed, 10), scrambled(seed, 11)
 
@@ -303,7 +335,7 @@ class InteriorEdgeSampler:
         """The samples of the given indices below ``size``; those that hide nothing are void."""
         rays, topology = self.rays, self.rays.topology
         frame, within = index // self.per_frame, index % self.per_frame
-        edge, along, pmf = _along(self.choice, within, self.per_frame, self.seeds[0], index)
+        edge, along, pmf = place_along(self.choice, within, self.per_frame, self.seeds[0], index)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = (point_at(rays.vertices, end) for end in (first, second))
         y = y0 + (y1 - y0) * along
@@ -313,8 +345,10 @@ class InteriorEdgeSampler:
         beside = mi.Point3f(y + sides.outwards * (_BESIDE * dr.norm(y)))
         hits = []
         for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
-            ray = mi.Ray3f(beside + omega * (sign * NEAR * dr.norm(y)), omega * sign)
-            hit = land(rays, self.inputs, ray, valid, (index, dice), coherent=False)
+            hit = _ahead(
+                rays, self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
+                (index, dice), close=self.close and sign > 0,
+            )  # fmt: skip
             valid &= hit.valid & _not_grazing(rays, hit.face, omega, hit.valid)
             hits.append(hit)
         behind, ahead = hits
@@ -352,10 +386,18 @@ class InteriorEdgeSampler:
         return mi.Vector3f(dr.normalize(omega)), 1 / (4 * span)
 
 
-def _along(
-    choice: _Proportional, index: Any, count: int, seed: Any, key: Any = None
+def place_along(
+    choice: Proportional, index: Any, count: int, seed: Any, key: Any = None
 ) -> tuple[Any, Any, Any]:
-    """Entry of the choice, place along its edge and probability, stratified over count."""
+    """Entry of the choice, place along its edge and probability, stratified over count.
+
+    Args:
+        choice: Of edges.
+        index: Number of the sample.
+        count: Of samples.
+        seed: Of the numbers.
+        key: What the numbers belong to, if not the index.
+    """
     jitter, along = uniform_pair(index if key is None else key, seed)
     place, rest, chance = choice.draw((mi.Float(index) + jitter) / count)
     return place, dr.select(chance > _RESOLVED, rest, along), chance
@@ -425,6 +467,62 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, directio
     )
 
 
+def _ahead(
+    rays: RayScene,
+    inputs: Inputs,
+    place: tuple[Any, Any],
+    beside: Any,
+    way: Any,
+    active: Any,
+    key: tuple[Any, Any],
+    *,
+    close: bool,
+) -> Hit:
+    """What lies behind points on edges.
+
+    Where surfaces are close the ray starts before the edge, so that it meets those in which the
+    edge lies; whether the edge is before them is decided in float64. In one that it has crossed, it
+    hides nothing: there the curve of the crossing counts. Rays are traced one by one, since Embree
+    loses some of those of a bundle that start close to a surface.
+
+    Args:
+        rays: Rays.
+        inputs: Detached.
+        place: Edges, and where along them.
+        beside: From where rays start, off the edge.
+        way: Their directions, as long as the edge is far away.
+        active: Lanes.
+        key: See ``land``.
+        close: Whether other surfaces may be close to edges.
+    """
+    towards, distance = dr.normalize(way), dr.norm(way)
+    past = mi.Ray3f(mi.Point3f(beside + way * NEAR), mi.Vector3f(towards))
+    if not close:
+        return land(rays, inputs, past, active, key, coherent=False)
+    early = mi.Ray3f(mi.Point3f(beside - way * _BEFORE), mi.Vector3f(towards))
+    hit = land(rays, inputs, early, active, key, coherent=False)
+    point = between(rays.corners(hit.face, hit.valid), hit.b1, hit.b2)
+    near = hit.valid & (dr.norm(point - beside) < 2 * _BEFORE * distance)
+    edge, along = place
+    own = mi.Bool(False)
+    for beside_edge, apex in zip(
+        rays.topology.device_beside, rays.topology.device_opposite, strict=True
+    ):
+        is_there = dr.gather(mi.Int32, apex, edge) >= 0
+        own |= is_there & (dr.gather(mi.UInt32, beside_edge, edge) == hit.face)
+    own &= near
+    corner = partial(dr.gather, mi.Vector3d, rays.exact_vertices)
+    y0, y1 = (corner(dr.gather(mi.UInt32, e, edge)) for e in rays.topology.device_edges)
+    p0, p1, p2 = map(corner, dr.gather(mi.Vector3u, rays.topology.device_faces, hit.face))
+    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(along) - p0)
+    crossed = -dr.mulsign(height, dr.dot(normal, mi.Vector3d(way))) < -IN_PLANE
+    again = land(rays, inputs, past, active & own, key, coherent=False)
+    pairs = zip(vars(again).values(), vars(hit).values(), strict=True)
+    hit = Hit(*(dr.select(own, second, first) for second, first in pairs))
+    return replace(hit, valid=hit.valid & ~(near & ~own & crossed))
+
+
 def _not_grazing(rays: RayScene, face: Any, direction: Any, active: Any) -> Any:
     """A ray in the plane of the triangle it meets has no shadow point there."""
     p0, p1, p2 = rays.corners(face, active)
@@ -453,7 +551,7 @@ def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
 
     f0, f1, f2 = integrand.corners(fixed, points.face)
     shadow, normal = dr.detach(moving), dr.normalize(dr.cross(f1 - f0, f2 - f0))
-    b1, b2 = _barycentric(shadow, f0, f1, f2)
+    b1, b2 = barycentric(shadow, f0, f1, f2)
     material = between(triangle, b1, b2)
 
     ray, edge = dr.detach(y - c), dr.detach(y1 - y0)
@@ -469,7 +567,13 @@ def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
     return Shadow(b1, b2, dr.dot(tangent, moving - material) * points.weight)
 
 
-def _barycentric(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
+def barycentric(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
+    """Coordinates b1 and b2 of a point in the plane of a triangle.
+
+    Args:
+        point: The point.
+        p0, p1, p2: Corners.
+    """
     a, b, r = p1 - p0, p2 - p0, point - p0
     aa, ab, bb, ra, rb = dr.dot(a, a), dr.dot(a, b), dr.dot(b, b), dr.dot(r, a), dr.dot(r, b)
     determinant = dr.fma(aa, bb, -ab * ab)

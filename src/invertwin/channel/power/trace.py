@@ -11,6 +11,7 @@ from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand, walk
 from invertwin.channel.power.bins import Bins
 from invertwin.channel.power.boundary import BoundaryPaths, BoundaryPoints, boundary_paths
+from invertwin.channel.power.contact import require_unlit
 from invertwin.channel.power.integrand import DIFFERENTIABLE, Inputs, Place
 from invertwin.channel.power.passage import Passage
 from invertwin.channel.power.starts import AreaSampler, RaySampler
@@ -18,6 +19,7 @@ from invertwin.channel.power.surface import SURFACE
 from invertwin.channel.power.walk import Records, State, Walk
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.contacts import contacts_of
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.scene import RayScene
 from invertwin.channel.sampling import Sampling
@@ -81,6 +83,10 @@ class Trace:
         self.sampler = sampler(self.rays, sampling.samples, seed, reference)
         self.fixed = Inputs.of(self.rays, monostatic=bool((link.tx == link.rx).all()))
         self._walk = Walk(self.rays, self.fixed, seed)
+        edges = sampling.boundary and sampling.contacts and sampling.boundary_samples
+        self.contacts = contacts_of(self.rays) if edges else None
+        if self.contacts is not None and len(self.contacts.first) and sampling.depth > 1:
+            require_unlit(self.rays, self.fixed, self._walk, self.contacts, sampling.depth, seed)
         per_lane = _BYTES_PER_VERTEX * sampling.depth
         self.chunk = max(1, int(sampling.memory_budget) // per_lane)
 
@@ -165,8 +171,9 @@ class Trace:
         if not (sampling.boundary and sampling.boundary_samples):
             return None
         return BoundaryPoints(
-            self.rays, self.fixed, sampling, self.seed, chunks=lambda size: chunks(size, self.chunk)
-        )
+            self.rays, self.fixed, sampling, self.seed, self.contacts,
+            chunks=lambda size: chunks(size, self.chunk),
+        )  # fmt: skip
 
     def boundary(self, inputs: Inputs) -> Iterator[BoundaryPaths]:
         """Boundary paths of all segments, a chunk at a time."""

@@ -114,11 +114,38 @@ class Walk:
         (state,) = self.rays.loop((state,), lambda state: state["active"], body)
         return state
 
-    def step(self, state: State) -> State:
-        """One more vertex, outside any loop."""
+    def step(self, state: State, point: Place | None = None) -> State:
+        """One more vertex, outside any loop.
+
+        Args:
+            state: The path so far.
+            point: Its latest vertex, if not quite where the state has it.
+        """
         state = {**state, "last": state["number"] + 1}
-        self._extend(state, self._place(state), self.directions)
+        self._extend(state, point or self._place(state), self.directions)
         return state
+
+    def ended(self, first: State, count: Any, receiver: Any) -> State:
+        """The one path with ``count`` vertices that ends at an antenna: its amount and ``so_far``.
+
+        Args:
+            first: Paths at their first vertex.
+            count: Vertices, one number per lane.
+            receiver: Whether the path ends at the receiver; then ``u`` and ``v`` are set too.
+        """
+        zero = dr.zeros(mi.Float, dr.width(first["index"]))
+        first = first | {"u": zero, "v": zero, "amount": zero, "so_far": zero, "here": receiver}
+
+        def ending(state: State, point: Place) -> None:
+            path, exists = connect(self.rays, self.inputs, state, point, state["here"])
+            last = exists & (state["number"] == state["last"])
+            state["amount"] = dr.select(last, path.power, state["amount"])
+            state["so_far"] = dr.select(last, 2 * path.range, state["so_far"])
+            state["u"] = dr.select(last, path.u, state["u"])
+            state["v"] = dr.select(last, path.v, state["v"])
+
+        with dr.suspend_grad():
+            return self.run(first, count, ending)
 
     def _place(self, state: State) -> Place:
         return integrand.place(

@@ -42,7 +42,10 @@ class Geometry:
         lobed: Which lobes have weight, or a derivative that could give them some.
         sheets: Whether something passes straight through any surface.
         bodies: Whether any surface is the skin of a refracting body.
+        names: Of the objects.
         coherent: Per object, whether its field paths have a deterministic phase.
+        moving: Per object, whether derivatives flow through its place or its shape.
+        deforming: Per object, whether they flow through its shape.
         topology: What depends on the connectivity only.
         velocities: World velocities of the vertices [m/s]; None = all at rest.
     """
@@ -55,7 +58,10 @@ class Geometry:
     lobed: tuple[bool, ...]
     sheets: bool
     bodies: bool
+    names: tuple[str, ...]
     coherent: tuple[bool, ...]
+    moving: tuple[bool, ...]
+    deforming: tuple[bool, ...]
     topology: Topology
     velocities: Float64[Tensor, "v 3"] | None = None
 
@@ -156,7 +162,8 @@ def flatten(
             f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time) "
             "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
         )
-    vertices = torch.cat([item.vertices for item in objects])
+    placed = [item.vertices for item in objects]
+    vertices = torch.cat(placed)
     topology = topology_of([item.mesh for item in objects])
     surfaces, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength)
     skins = surfaces.refraction.any(1)
@@ -176,7 +183,10 @@ def flatten(
         lobed=tuple(free or bool(weight.any()) for weight in weights.T),
         sheets=bool(surfaces.transmittance.any()),
         bodies=bool(skins.any()),
+        names=tuple(scene.objects),
         coherent=tuple(item.material.coherent for item in objects),
+        moving=tuple(map(differentiated, placed)),
+        deforming=tuple(differentiated(item.mesh.vertices) for item in objects),
         topology=topology,
         velocities=torch.cat([_velocities(item) for item in objects]) if moving else None,
     )

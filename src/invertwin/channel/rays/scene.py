@@ -102,6 +102,11 @@ class RayScene(Occluders):
         """Around the objects."""
         return Spheres(self.geometry, self.origin, margin=1.001)
 
+    @cached_property
+    def exact_vertices(self) -> Any:
+        """Vertices in float64, three numbers each."""
+        return mi.Float64((self.geometry.vertices.detach() - self.origin).ravel().numpy())
+
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Corners of triangles, detached.
 

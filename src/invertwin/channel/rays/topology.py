@@ -2,6 +2,7 @@
 
 import itertools
 from collections import OrderedDict
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -36,12 +37,14 @@ class Topology:
         self.sound_face: int | None = None  # a triangle that was no sliver when last looked at
         owner = torch.zeros(len(vertices), dtype=torch.int64)
         owner[faces.ravel()] = face_object.repeat_interleave(3)
+        self.vertex_object = owner
         used = faces.unique()
         # Vertices of triangles, the first of each object among them, and the object of each.
         first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
         self.used = used.numpy(), first.numpy(), owner[used].numpy()
         places = torch.cat([owner[:, None].double(), vertices], dim=1).numpy()
-        self.edges, self.opposite, beside = edges_of(faces.numpy(), places)
+        self.edges, self.opposite, self.beside = edges_of(faces.numpy(), places)
+        beside = self.beside
         alone = (self.opposite >= 0).sum(1) == 1
         self.open_objects = set(face_object[beside[alone, 0]].tolist())
         self.device_faces = to_index(faces)
@@ -55,6 +58,31 @@ class Topology:
         self._uploaded: Tensor | None = None
         self._mesh = mesh
         self._scene: Any = None
+
+    @cached_property
+    def welded(self) -> Int64[Tensor, "f 3"]:
+        """Vertices of triangles, where vertices at one place count as one; in any order."""
+        table = self.faces.clone()
+        for face, apex in zip(self.beside.T, self.opposite.T, strict=True):
+            at = face >= 0
+            table[face[at]] = torch.cat([self.edges[at], apex[at, None]], 1)
+        return table
+
+    @cached_property
+    def face_edges(self) -> Int64[Tensor, "f 3"]:
+        """The edge opposite to each of a triangle's ``welded`` vertices (−1: no proper edge)."""
+        table = torch.full_like(self.faces, -1)
+        for face, apex in zip(self.beside.T, self.opposite.T, strict=True):
+            edge = torch.nonzero(face >= 0)[:, 0]
+            slot = (self.welded[face[edge]] == apex[edge, None]).int().argmax(1)
+            table[face[edge], slot] = edge
+        return table
+
+    def around(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
+        """Triangles and all that share an edge with them (−1: none)."""
+        edges = self.face_edges[faces]
+        nearby = torch.where(edges[..., None] >= 0, self.beside[edges.clamp_min(0)], -1)
+        return torch.cat([faces[:, None], nearby.flatten(1)], 1)
 
     def ray_scene(self, vertices: Tensor) -> Any:
         """The Mitsuba scene with these vertices (float32, never changed in place hereafter)."""

@@ -48,6 +48,11 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
         if boundary and simple:
             require_edges(geometry, link, edges)
         trace = Trace(geometry, link, sampling, seed)
+        if trace.contacts is not None and len(trace.contacts.first):
+            raise InputError(
+                "expected surfaces that do not meet for derivatives of explicit paths, got some "
+                "that cross or touch; use deposit_power, or contacts=False to leave out what moves"
+            )
         parts = [paths for records in trace.records() for paths in _walked(trace, records)]
         if boundary and simple and edges:
             parts += boundary_rows(trace.rays, edges, seed, lambda *found: _row(geometry, *found))
