@@ -33,6 +33,7 @@ class SimulatedData(Section):
     snr_db: float | None = key("signal-to-noise ratio per sample; without it no noise", None)
     noise_figure_db: float | None = key("thermal noise of a receiver instead of snr_db", None)
     seed: Seed | None = key("without it the run's", None)
+    every_start: bool = key("a recording of its own for every start: coverage of error bars", False)
 
     @model_validator(mode="after")
     def _one_noise_level(self) -> "SimulatedData":

@@ -8,10 +8,19 @@ from typing import Any
 
 from rich.console import Console
 
+from invertwin.cli.fits.certainty import coverage, judged
 from invertwin.cli.fits.fitting import calibrated, fit
 from invertwin.cli.fits.initial import guessed
 from invertwin.cli.fits.mover import run_mover
-from invertwin.cli.fits.problem import FULL, problem_of, settings_of, starts_of, varied
+from invertwin.cli.fits.problem import (
+    FULL,
+    problem_of,
+    recorded_anew,
+    recorded_for,
+    settings_of,
+    starts_of,
+    varied,
+)
 from invertwin.cli.fits.scores import (
     agreement,
     heldout,
@@ -53,12 +62,14 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         rows[mode] = []
         for i, start in enumerate(starts):
             checkpoint = CHECKPOINT if single else None
-            row, outcome = fit(whole, start, i, mode, folder, console, checkpoint)
+            own = recorded_for(whole, i, console)
+            row, outcome = fit(own, start, i, mode, folder, console, checkpoint)
             rows[mode].append(row)
             if mode == modes[0]:
                 outcomes[i] = outcome
     best = min(rows[modes[0]], key=lambda row: (row["status"] == "diverged", _finite(row["loss"])))
     start, found = starts[best["start"]], outcomes[best["start"]]()
+    problem = varied(recorded_for(whole, best["start"], console), FULL)
     twin, radars = found.scene, found.sensors
     maps = {
         "measured": [s.capture.spectrum(s.grid).float() for s in problem.sights.values()],
@@ -69,6 +80,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     metrics = {
         "task": run.task,
         **summary(problem, rows, modes),
+        **(coverage(rows[FULL]) if recorded_anew(run) else {}),
+        **judged(problem, found),
         **{k: best[k] for k in best if (k in COLUMNS or is_shape_key(k)) and k != "seconds"},
         "start_loss_sharp": misfit(problem, maps["start"], maps["measured"]),
         "loss_sharp": misfit(problem, maps["twin"], maps["measured"]),

@@ -21,6 +21,9 @@ from invertwin.inversion.metrics import compare_shapes as compare_shapes
 from invertwin.inversion.metrics import residual as residual
 from invertwin.inversion.metrics import topology as topology
 from invertwin.inversion.metrics import volume_iou as volume_iou
+from invertwin.inversion.minima import Search as Search
+from invertwin.inversion.minima import pose_grid as pose_grid
+from invertwin.inversion.minima import search as search
 from invertwin.inversion.mover import Echo as Echo
 from invertwin.inversion.mover import MoverMaps as MoverMaps
 from invertwin.inversion.mover import MoverTwin as MoverTwin
@@ -41,3 +44,5 @@ from invertwin.inversion.schedule import Stage as Stage
 from invertwin.inversion.starts import displaced as displaced
 from invertwin.inversion.starts import nearby as nearby
 from invertwin.inversion.tangents import Bump as Bump
+from invertwin.inversion.uncertainty import Uncertainty as Uncertainty
+from invertwin.inversion.verdict import Verdict as Verdict

@@ -28,6 +28,7 @@ _DIVERGED = 1e3  # times the first loss
 _WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
 _WINDOW = 20  # steps over which convergence is judged
 _SUBSETS = 2**16  # keys of the seeds that choose frames, beyond those of observations
+_SHARP, _LOOKS = 2**17, 2**17 + 1  # keys of seeds, beyond those of stages
 
 
 @dataclass(frozen=True)
@@ -191,6 +192,45 @@ class Fit:
             predicted = model.predict(scene, sensor, derived_seed(self._settings.seed, *key))
             pairs.append((predicted, model.blurred(observed, sensor)))
         return pairs
+
+    def sharp_maps(self, number: int) -> Maps:
+        """The predicted and the observed map of every observation, with all frames, not blurred.
+
+        Args:
+            number: Other numbers have other random numbers.
+        """
+        scene, sensors = self.applied()
+        pairs = []
+        for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True)):
+            key = derived_seed(self._settings.seed, _SHARP, number, k)
+            predicted = model.narrowed(0.0).predict(scene, sensor, key)
+            pairs.append((predicted, self._observed[k]))
+        return pairs
+
+    def loss_at_start(self) -> float:
+        """The loss without extra widths at the parameters that the stage began with."""
+        present = self.parameters()
+        self.modules.load_state_dict(self.progress.first)
+        try:
+            with torch.no_grad():
+                return float(self.objective(self.sharp_maps(0)))
+        except InputError:  # out of bounds
+            return math.inf
+        finally:
+            self.modules.load_state_dict(present)
+
+    def looks(self, number: int) -> list[Callable[[int, float], Tensor] | None]:
+        """What every sensor might have recorded of the twin, see ``ForwardModel.looks``.
+
+        Args:
+            number: Other numbers have other points on surfaces.
+        """
+        with torch.no_grad():
+            scene, sensors = self.applied()
+            return [
+                model.looks(scene, sensor, derived_seed(self._settings.seed, _LOOKS, number, k))
+                for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True))
+            ]
 
     def penalty(self) -> Tensor:
         """What the regularisers add to the loss."""

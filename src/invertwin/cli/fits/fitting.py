@@ -19,11 +19,13 @@ from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
+from invertwin.cli.fits.certainty import judged
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
     models_of,
     observations_of,
+    recorded_anew,
     schedule_of,
     settings_of,
     unknowns_of,
@@ -133,11 +135,13 @@ def fit(
         "seconds": time.perf_counter() - begin,
         "values": _values(found.parameters),
         "checkpoint": checkpoint,
+        **(judged(own, found) if recorded_anew(own.run) else {}),
         "losses": [step["loss"] for step in found.history],
         "curve": [[step["step"] + 1, step[CURVE]] for step in found.history if CURVE in step],
     }
     folder.write_json(f"{part}.json", row)
-    return row, lambda: found
+    # The twins of many recordings are read again, not kept.
+    return row, again if recorded_anew(own.run) else lambda: found
 
 
 def _staged(

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from invertwin import plotting
+from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.problem import (
     FULL,
     INTERIOR,
@@ -73,7 +74,7 @@ def tables_of(fitted: Fitted) -> list[Table]:
             tables.append(Table(f"Starts, {way}", heads, cells))
     if len(fitted.ways) > 1 and any(is_shape_key(key) for key in metrics):
         tables.append(_variants(fitted))
-    tables.append(_places(fitted))
+    tables += [_places(fitted), certainty_table(metrics)]
     moves = [[k + _UNITS.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
     if moves:
         tables.append(Table("Moves from the start", ["parameter", "value"], moves))
@@ -83,7 +84,7 @@ def tables_of(fitted: Fitted) -> list[Table]:
 
 
 def _result(run: RunFile, metrics: dict[str, Any]) -> Table:
-    rows: list[list[Any]] = [["how it ended", _ended(metrics)]]
+    rows: list[list[Any]] = [["verdict", metrics["verdict"]], ["why it stopped", _ended(metrics)]]
     if "success" in metrics:
         count, limits = metrics["starts_count"], _limits(run, metrics)
         if count == 1:
@@ -212,7 +213,7 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
     """What came out, in a sentence or two."""
     count = metrics.get("starts_count", 1)
     which = f"Best of {count} starts: " if count > 1 else ""
-    ended = _ended(metrics)
+    ended, believed = _ended(metrics), texts("verdicts")[metrics["verdict"]]
     many = "joint_error_after_deg" in metrics or count > 1
     if "joint_error_after_deg" in metrics:
         score = f"{which}joints {metrics['joint_error_after_deg']:.1f}° off, mean; {ended}."
@@ -224,11 +225,11 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
         change = f"from {metrics['start_chamfer_m']:.3f} to {metrics['chamfer_m']:.3f} m"
         return f"{which}Chamfer distance {change}; {ended}."
     else:
-        return f"{which}{ended}."
+        return f"{which}{ended}. {believed}"
     limits = _limits(run, metrics)
     if many:
-        return f"{score} {metrics['successes']} of {count} starts end within {limits}."
-    return f"{score} A success is within {limits}: {shown(metrics['success'])}."
+        return f"{score} {metrics['successes']} of {count} starts end within {limits}. {believed}"
+    return f"{score} A success is within {limits}: {shown(metrics['success'])}. {believed}"
 
 
 def _ended(metrics: dict[str, Any]) -> str:
