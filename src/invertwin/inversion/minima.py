@@ -9,8 +9,10 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective, SpectrumLoss
+from invertwin.inversion.metrics import residual
 from invertwin.inversion.observation import Observation, Unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
@@ -18,10 +20,12 @@ from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.rivals import REJECTED, same, score, turns, way
 from invertwin.inversion.schedule import Schedule
 from invertwin.inversion.starts import displaced
+from invertwin.models import ForwardModel
 from invertwin.scene.scene import Object, Scene
 from invertwin.seeds import derived_seed
 
 _FITS = 4  # full fits of the best starts
+_FEWER = 8  # samples of a screened start: a share of those of a fit
 _NEAR_PLACE, _NEAR_TURN = 0.1, 0.35  # m and rad: of starts as near one is enough
 
 
@@ -124,7 +128,7 @@ def search(
             seed=derived_seed(seed, number),
         )
 
-    found = [fit(start, number) for number, start in enumerate(_apart(screened, names)[:_FITS])]
+    found = [fit(start, number) for number, start in enumerate(_apart(screened, names))]
     best = min(found, key=_sharp)
     for start in _turned(best):
         found.append(fit(start, len(found)))
@@ -149,15 +153,25 @@ def _screening(
         tuple(o.loss or loss for o in observations), tuple(o.weight for o in observations)
     )
     blurred = [o.model.blurred(o.observed(), o.sensor) for o in observations]
+    models = [_coarse(o.model) for o in observations]
 
     def score(scene: Scene) -> float:
         with torch.no_grad():
-            maps = [o.model.predict(scene, o.sensor, seed) for o in observations]
+            drawn = zip(models, observations, strict=True)
+            maps = [model.predict(scene, o.sensor, seed) for model, o in drawn]
             lit = all(bool(power.any()) for power in maps)
             pairs = list(zip(maps, blurred, strict=True))
             return float(objective(pairs)) if lit else math.inf
 
     return score
+
+
+def _coarse(model: ForwardModel) -> ForwardModel:
+    """The model with few samples: enough for a blurred map."""
+    sampling = getattr(model, "sampling", None)
+    if not isinstance(sampling, Sampling):
+        return model
+    return model.sampled_by(samples=max(1, sampling.samples // _FEWER), boundary=False)
 
 
 def _sharp(found: Reconstruction) -> float:
@@ -174,9 +188,17 @@ def _turned(found: Reconstruction) -> Iterator[Scene]:
 
 
 def _apart(scenes: Sequence[Scene], names: Sequence[str]) -> list[Scene]:
-    """The scenes in order, without those that a better one stands for."""
+    """The first scenes, without those that a better one stands for."""
     kept: list[Scene] = []
     for scene in scenes:
-        if not any(same(scene, other, names, _NEAR_PLACE, _NEAR_TURN) for other in kept):
+        if len(kept) == _FITS:
+            break
+        if not any(_near(scene, other, names) for other in kept):
             kept.append(scene)
     return kept
+
+
+def _near(first: Scene, second: Scene, names: Sequence[str]) -> bool:
+    """Whether one start stands for another."""
+    offs = [residual(first[name], second[name]) for name in names]
+    return all(o and o.distance < _NEAR_PLACE and o.angle < _NEAR_TURN for o in offs)

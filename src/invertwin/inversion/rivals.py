@@ -24,6 +24,7 @@ SAME_PLACE, SAME_TURN = 0.03, 0.1  # m and rad: ends as near are one
 _PARTS = (3, 4, 5, 6)  # of a whole turn, tried where the object nearly keeps its shape
 _NEARLY = 0.06  # of the diagonal: distance of surfaces that look much the same
 _EQUAL = 1.3  # times the distance of two draws from one surface
+_CLEAR = 5.0  # standard deviations of a loss: so large a difference needs no looks
 _POINTS = 5_000  # of each surface
 _STEPS, _REACH, _BLUR = 6, 0.1, 0.4  # of a rival's fit: Gauss–Newton, its first share of widths
 
@@ -109,7 +110,8 @@ def score(best: End, other: End) -> float | None:
         other: Another end of the same data.
 
     Returns:
-        Standard deviations over looks at the twin of the other end; None where there are none.
+        Standard deviations over looks at the twin of the other end, or a lower bound of them
+        where they are many; None where there are no looks.
     """
 
     def difference(observed: Sequence[Tensor]) -> float:
@@ -119,31 +121,28 @@ def score(best: End, other: End) -> float | None:
         first, second = (float(best.fit.objective(maps)) for maps in pairs)
         return first - second
 
+    found = difference([b for _, b in best.maps])
+    if best.draws is not None:
+        # Of looks the difference is below zero, and it scatters less than a loss does.
+        least = found / float(torch.tensor(best.draws.losses).std())
+        if least > _CLEAR:
+            return least
     drawn = [difference(look) for look in other.looks()]
-    return zscore(difference([b for _, b in best.maps]), drawn) if drawn else None
+    return zscore(found, drawn) if drawn else None
 
 
-def same(
-    first: Scene,
-    second: Scene,
-    names: Sequence[str],
-    place: float = SAME_PLACE,
-    turn: float = SAME_TURN,
-) -> bool:
+def same(first: Scene, second: Scene, names: Sequence[str]) -> bool:
     """Whether objects stand alike: in one pose, or in poses that look alike.
 
     Args:
         first, second: The scenes.
         names: Of the objects.
-        place: Distance of their centres that is none [m].
-        turn: Angle that is none [rad].
     """
     for name in names:
         a, b = first[name], second[name]
         off = residual(a, b)
-        if off is not None and off.distance < place and off.angle < turn:
-            continue
-        if off is None or off.distance >= place or not _equal_after(a, b):
+        near = off is not None and off.distance < SAME_PLACE
+        if not near or not (off.angle < SAME_TURN or _equal_after(a, b)):
             return False
     return True
 
