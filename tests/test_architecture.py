@@ -32,9 +32,10 @@ ALLOWED = {
     "models": MODELS,
     "inversion": INVERSION,
     "folders": SCENE,
+    "runs": SCENE | {"folders"},
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION | {"doctor", "folders", "plotting", "registry", "cli", "__init__"},
+    "cli": INVERSION | {"doctor", "folders", "runs", "plotting", "registry", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

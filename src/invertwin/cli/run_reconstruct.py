@@ -32,11 +32,11 @@ from invertwin.cli.fits.scores import (
 from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
-from invertwin.cli.report import Table, finish
-from invertwin.cli.runs import CHECKPOINT, RunFolder
+from invertwin.cli.report import Table, finish, picture
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.inversion import Reconstruction
+from invertwin.runs import CHECKPOINT, RunFolder
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry.density import without_clouds
 
@@ -100,7 +100,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         console.print("computing the loss landscape")
         figure, found = landscape(problem)
-        folder.write_figure("landscape.png", figure)
+        picture(folder, "landscape", figure)
         metrics["landscape"] = found
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin

@@ -33,7 +33,6 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
-from invertwin.cli.runs import RunFolder
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import (
@@ -47,6 +46,7 @@ from invertwin.inversion import (
 )
 from invertwin.inversion.callbacks import stage_file
 from invertwin.radar.parameters import ClockOffset, RangeBias
+from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.seeds import derived_seed
 

@@ -19,9 +19,9 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
-from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion.metrics import residual
+from invertwin.runs import RunFolder
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
 
