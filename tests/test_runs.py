@@ -286,7 +286,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, monkeypatch
 
 
 def test_several_run_files_are_kept_by_stem(tmp_path):
-    with open_run(tmp_path, {"a": make_run(), "b": to_toml(make_run(seed=1))}):
+    with open_run(tmp_path, {"a": to_toml(make_run()), "b": to_toml(make_run(seed=1))}):
         pass
     assert sorted(p.name for p in (tmp_path / "runs").iterdir()) == ["a.toml", "b.toml"]
 
