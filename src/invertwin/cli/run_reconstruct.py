@@ -8,12 +8,12 @@ from typing import Any
 
 from rich.console import Console
 
-from invertwin.cli.fits.certainty import coverage, judged
 from invertwin.cli.fits.fitting import calibrated, fit
 from invertwin.cli.fits.initial import guessed
 from invertwin.cli.fits.mover import run_mover
 from invertwin.cli.fits.problem import (
     FULL,
+    known_of,
     problem_of,
     recorded_anew,
     recorded_for,
@@ -36,6 +36,7 @@ from invertwin.cli.report import Table, finish, picture
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.inversion import Reconstruction
+from invertwin.inversion.certainty import certainty, coverage
 from invertwin.runs import CHECKPOINT, RunFolder
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry.density import without_clouds
@@ -81,7 +82,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         "task": run.task,
         **summary(problem, rows, modes),
         **(coverage(rows[FULL]) if recorded_anew(run) else {}),
-        **judged(problem, found),
+        **certainty(found, known_of(problem)),
+        **{key: best[key] for key in ("other_ends", "ambiguities") if key in best},
         **{k: best[k] for k in best if (k in COLUMNS or is_shape_key(k)) and k != "seconds"},
         "start_loss_sharp": misfit(problem, maps["start"], maps["measured"]),
         "loss_sharp": misfit(problem, maps["twin"], maps["measured"]),
@@ -110,7 +112,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:
         save_mesh(folder.file("twin.glb"), twin)
-    if not single:
+    if best["checkpoint"] != CHECKPOINT:
         shutil.copyfile(folder.file(best["checkpoint"]), folder.file(CHECKPOINT))
     title, outcome = run.title or "Reconstruction", status(run, metrics)
     tables = finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note)

@@ -5,12 +5,14 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
+from invertwin.inversion.fit import Callback
 from invertwin.inversion.loss import Objective, SpectrumLoss
 from invertwin.inversion.metrics import residual
 from invertwin.inversion.observation import Observation, Unknowns
@@ -39,12 +41,25 @@ class Search:
         rivals: For every end how unlikely the difference of its loss and the best one's is, were it
             right, in standard deviations over looks at its twin. None where there are no looks.
         ambiguities: A sentence for every end that the data do not reject.
+        number: Of the best fit, as ``callbacks`` got it.
+        objects: Names of those with several starts.
     """
 
     best: Reconstruction
     ends: list[Reconstruction]
     rivals: list[float | None]
     ambiguities: tuple[str, ...]
+    number: int
+    objects: tuple[str, ...]
+
+    def rows(self) -> dict[str, Any]:
+        """The ends as numbers."""
+        best = self.best.scene
+        ends = [
+            {"pose": way(best, end.scene, self.objects), "loss": end.loss, "score": score}
+            for end, score in zip(self.ends[1:], self.rivals[1:], strict=True)
+        ]
+        return {"other_ends": ends, "ambiguities": list(self.ambiguities)}
 
 
 def pose_grid(
@@ -84,6 +99,7 @@ def search(
     optimizer: Optimizer | None = None,
     schedule: Schedule | Sequence[Schedule] | None = None,
     regularizers: Sequence[Regularizer] = (),
+    callbacks: Callable[[int], Sequence[Callback]] = lambda _: (),
     seed: int = 0,
 ) -> Search:
     """Fit from many starts, and say which ends the data tell apart.
@@ -103,6 +119,7 @@ def search(
         optimizer: Kind and rates.
         schedule: Of every fit.
         regularizers: Added to the loss.
+        callbacks: For the number of a fit, from 0, what watches it.
         seed: Of all random numbers.
 
     Raises:
@@ -125,6 +142,7 @@ def search(
             optimizer=optimizer,
             schedule=schedule,
             regularizers=regularizers,
+            callbacks=callbacks(number),
             seed=derived_seed(seed, number),
         )
 
@@ -142,7 +160,7 @@ def search(
         for end, z in zip(ends, rivals, strict=True)
         if z is not None and z < REJECTED
     )
-    return Search(ends[0], ends, rivals, told)
+    return Search(ends[0], ends, rivals, told, found.index(ends[0]), tuple(names))
 
 
 def _screening(

@@ -108,7 +108,7 @@ def _mover(run: RunFile) -> Mover:
     if others:
         kinds = ", ".join(parameter.kind for parameter in run.parameters)
         raise InputError(f"parameters: expected a mover alone, got {kinds}; leave only the mover")
-    for name in ("starts", "calibration", "landscape", "initial"):
+    for name in ("starts", "search", "calibration", "landscape", "initial"):
         if getattr(run, name):
             raise InputError(
                 f"{name}: expected no such section with a mover, got one; remove it: the fit "
