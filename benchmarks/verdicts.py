@@ -113,7 +113,7 @@ class Trial:
         place = torch.tensor([uniform(-0.3, 0.3), 0.0, uniform(1.9, 2.4)], dtype=torch.float64)
         item = iw.Object(mesh, PAINT, rigid(turn, place - turn @ mesh.center))
         wall = iw.Object(plate(3.6, 1.6), PAINT, rigid(translation=[0.0, 0.0, 3.9]))
-        limits = {"distance": (0.0, FAR), "angle": (0.0, math.pi), "axes": "xz"}
+        limits: dict[str, Any] = {"distance": (0.0, FAR), "angle": (0.0, math.pi), "axes": "xz"}
         (start,) = nearby(item, rotation_axis=UP, generator=chance, **limits)
         parts = 1 if kind in ("L", "car") else 2
         return Trial(number, kind, iw.Scene({"object": item, "wall": wall}), start, parts)
@@ -140,7 +140,7 @@ class Trial:
         known = self.truth.replace("object", pose=self.start.transform)
         pose = Pose("object", axes="xz", rotation_axes="y")
         fit = iw.reconstruct(known, seen, pose, seed=self.number, **FIT)
-        row = {"number": self.number, "kind": self.kind, "start": self.error(known)}
+        row: dict[str, Any] = {"number": self.number, "kind": self.kind, "start": self.error(known)}
         row |= {"fit": self._judged(fit), "fit_seconds": perf_counter() - begin}
         low, high = ([float(c) + s * FAR for c in self.start.center] for s in (-1, 1))
         low[1] = high[1] = float(self.start.center[1])

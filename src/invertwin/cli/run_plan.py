@@ -62,10 +62,8 @@ def run_plan(
     metrics["wall_seconds"] = time.perf_counter() - begin
     parts = [replace(certainty_table(metrics), title="Expected error bars")]
     if added:
-        rows = [
-            [str(i + 1), row["position"], row["share"]]
-            for i, row in enumerate(metrics["candidates"])
-        ]
+        ranked = enumerate(metrics["candidates"], 1)
+        rows = [[str(rank), row["position"], row["share"]] for rank, row in ranked]
         heads = ["rank", "position [m]", "standard deviations, times"]
         parts.append(Table("Positions to add", heads, rows, texts("notes")["candidates"]))
     title = run.title or "Plan"

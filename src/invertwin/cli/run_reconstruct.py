@@ -101,12 +101,12 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         metrics |= {f"{key}_{mode}": same[key] for key in own}
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         console.print("computing the loss landscape")
-        figure, found = landscape(problem)
+        figure, minima = landscape(problem)
         picture(folder, "landscape", figure)
-        metrics["landscape"] = found
+        metrics["landscape"] = minima
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
-    fitted = Fitted(problem, metrics, rows, start, twin, maps)
+    fitted = Fitted(problem, metrics, rows, start, twin, maps, found.verdict.residuals)
     result, *tables = tables_of(fitted)
     parts = [result, *pictures_of(fitted, folder), *tables]
     save_mesh(folder.file("twin.ply"), twin)

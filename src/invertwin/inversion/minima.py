@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -22,7 +22,9 @@ from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.rivals import REJECTED, same, score, turns, way
 from invertwin.inversion.schedule import Schedule
 from invertwin.inversion.starts import displaced
+from invertwin.limits import Count, Positive
 from invertwin.models import ForwardModel
+from invertwin.scene.checks import Point
 from invertwin.scene.scene import Object, Scene
 from invertwin.seeds import derived_seed
 
@@ -53,7 +55,7 @@ class Search:
     objects: tuple[str, ...]
 
     def rows(self) -> dict[str, Any]:
-        """The ends as numbers."""
+        """The other ends as numbers: how they differ from the best, loss, score."""
         best = self.best.scene
         ends = [
             {"pose": way(best, end.scene, self.objects), "loss": end.loss, "score": score}
@@ -64,21 +66,21 @@ class Search:
 
 def pose_grid(
     item: Object,
-    low: Sequence[float],
-    high: Sequence[float],
-    step: float,
-    turns: int = 4,
-    axis: Sequence[float] = (0.0, 1.0, 0.0),
+    low: Point,
+    high: Point,
+    step: Positive,
+    turns: Count = 4,
+    axis: Point = (0.0, 1.0, 0.0),
 ) -> Iterator[Object]:
     """An object on a coarse grid over a box of poses, as copies of it.
 
     Args:
         item: The object.
-        low: Corner of the box of its centre [m].
-        high: The opposite corner.
-        step: From one place to the next at most [m].
-        turns: Turns about the axis at every place, evenly spread over a whole one.
-        axis: Of the turns, in the world.
+        low: m, corner of the box of its centre
+        high: m, the opposite corner
+        step: m, from one place to the next at most
+        turns: about the axis at every place, evenly spread over a whole one
+        axis: of the turns, in the world
     """
     axes = [
         torch.linspace(a, b, 1 + math.ceil((b - a) / step - 1e-9), dtype=torch.float64)
@@ -93,7 +95,7 @@ def search(
     scene: Scene,
     observations: Observation | Sequence[Observation],
     parameters: Unknowns,
-    starts: dict[str, Sequence[Object]],
+    starts: Mapping[str, Sequence[Object]],
     *,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
     optimizer: Optimizer | None = None,

@@ -141,8 +141,9 @@ def same(first: Scene, second: Scene, names: Sequence[str]) -> bool:
     for name in names:
         a, b = first[name], second[name]
         off = residual(a, b)
-        near = off is not None and off.distance < SAME_PLACE
-        if not near or not (off.angle < SAME_TURN or _equal_after(a, b)):
+        if off is None or off.distance >= SAME_PLACE:
+            return False
+        if off.angle >= SAME_TURN and not _equal_after(a, b):
             return False
     return True
 

@@ -78,9 +78,8 @@ def posed(
             "give one each, or none"
         )
     turns = [rotation_from_vector(torch.as_tensor(r, dtype=torch.float64)) for r in rotations]
-    for turn, place in zip(
-        turns or [item.transform[:3, :3]] * len(positions), positions, strict=True
-    ):
+    turns = turns or [item.transform[:3, :3]] * len(positions)
+    for turn, place in zip(turns, positions, strict=True):
         yield replace(item, pose=rigid(turn, torch.as_tensor(place, dtype=torch.float64)))
 
 
