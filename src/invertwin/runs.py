@@ -36,16 +36,8 @@ CHECKPOINT = "checkpoint.pt"
 RESULTS = (
     *("metrics.json", "report.html", "checkpoint*.pt", "twin.*", "raw", "capture.nc", "chirps.*"),
     *("channels.json", "points.csv", "prior.npz", "train.log", "turntable.gif", UNFINISHED),
-    *(
-        "scene.png",
-        "spectra*.png",
-        "residuals*.png",
-        "doppler.png",
-        "loss*.png",
-        "convergence.png",
-        "landscape.png",
-    ),
-    *("look.png", "recording.png", "twin_*.png"),
+    *("scene.png", "spectra*.png", "doppler.png", "loss*.png", "convergence.png", "landscape.png"),
+    *("look.png", "recording.png", "twin_*.png", "residuals*.png"),
 )
 
 

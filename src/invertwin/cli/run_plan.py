@@ -58,7 +58,7 @@ def run_plan(
         }
         for one in added
     ]
-    metrics |= _compared(run, table.fits, found.deviations, folder, console, say)
+    metrics |= _compared(replace(own, run=run), found.deviations, folder, console, say)
     metrics["wall_seconds"] = time.perf_counter() - begin
     parts = [replace(certainty_table(metrics), title="Expected error bars")]
     if added:
@@ -82,18 +82,17 @@ def _at_truth(problem: Problem) -> Any:
 
 
 def _compared(
-    run: RunFile,
-    count: int,
+    problem: Problem,
     stated: dict[str, float],
     folder: RunFolder,
     console: Console,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Fits of simulated recordings that begin at the truth, and how far they scatter."""
+    count = problem.run.plan.fits if problem.run.plan else 0
     if not count:
         return {}
     rows, begin, done = [], time.perf_counter(), 0
-    problem = problem_of(run, console)
     for number in range(count):
         part = f"{PARTS}/fit_{number:03d}.json"
         row = folder.read_json(part)
