@@ -50,6 +50,11 @@ class RunFolder:
     Attributes:
         path: Where the results are in the end.
         complete: Whether the run had ended before it was opened again.
+
+    Args:
+        path: Of the folder.
+        manifest: What it holds.
+        held: Its lock.
     """
 
     def __init__(self, path: Path, manifest: Manifest, held: ExitStack):
@@ -100,16 +105,31 @@ class RunFolder:
         return path
 
     def write_bytes(self, name: str, data: bytes) -> None:
-        """Write a result file so that a kill leaves the old or the new one, never half of it."""
+        """Write a result file so that a kill leaves the old or the new one, never half of it.
+
+        Args:
+            name: Its path in the folder.
+            data: What it holds.
+        """
         with replacing(self.file(name)) as part:
             part.write_bytes(data)
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a result file as UTF-8, in the way of `write_bytes`."""
+        """Write a result file as UTF-8, in the way of `write_bytes`.
+
+        Args:
+            name: Its path in the folder.
+            text: What it holds.
+        """
         self.write_bytes(name, text.encode("utf-8"))
 
     def write_json(self, name: str, value: Any) -> None:
-        """Write a JSON file; tensors and arrays become lists, numbers that are not finite null."""
+        """Write a JSON file; tensors and arrays become lists, numbers that are not finite null.
+
+        Args:
+            name: Its path in the folder.
+            value: What it holds.
+        """
         text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
         self.write_text(name, text + "\n")
 

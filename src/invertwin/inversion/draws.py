@@ -127,7 +127,12 @@ def coarse(power: Tensor) -> Tensor:
 
 
 def zscore(value: float, drawn: Sequence[float]) -> float:
-    """How many standard deviations a number is above the mean of others."""
+    """How many standard deviations a number is above the mean of others.
+
+    Args:
+        value: The number.
+        drawn: The others.
+    """
     others = torch.tensor(drawn, dtype=torch.float64)
     return (value - float(others.mean())) / max(float(others.std()), 1e-30)
 
