@@ -31,7 +31,7 @@ def row(number, right, word, first):
     return {
         "number": number,
         "fit": {"right": right, "word": word},
-        "search": {"right": first},
+        "search": {"right": first, "word": word},
         "seconds": 1.0,
     }
 

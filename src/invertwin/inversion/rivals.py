@@ -21,7 +21,7 @@ from invertwin.scene.scene import Object, Scene
 
 REJECTED = 2.33  # standard deviations: one right rival in a hundred is rejected
 SAME_PLACE, SAME_TURN = 0.03, 0.1  # m and rad: ends as near are one
-_PARTS = (3, 4, 5, 6)  # of a whole turn, tried where the object nearly keeps its shape
+_PARTS = (4, 3)  # of a whole turn: the first after which the object nearly keeps its shape
 _NEARLY = 0.06  # of the diagonal: distance of surfaces that look much the same
 _EQUAL = 1.3  # times the distance of two draws from one surface
 _CLEAR = 5.0  # standard deviations of a loss: so large a difference needs no looks
@@ -68,7 +68,7 @@ def rivals(end: End) -> Iterator[Rival]:
 def turns(module: nn.Module, twin: Scene) -> Iterator[Float64[Tensor, "3"]]:
     """Rotation vectors after which an object may look much the same, as far as it may turn.
 
-    Half turns are always among them; other parts of a turn if the object nearly keeps its shape.
+    Half turns are always among them; quarters or thirds if the object nearly keeps its shape.
     What brings it back exactly is not.
 
     Args:
@@ -88,16 +88,17 @@ def turns(module: nn.Module, twin: Scene) -> Iterator[Float64[Tensor, "3"]]:
         return _placed(displaced(item, torch.zeros(3, dtype=torch.float64), vector))
 
     for axis, name in zip(own, ("pitch", "yaw", "roll"), strict=True):
-        for parts in (2, *_PARTS) if name in free else ():
-            once = turned(2 * math.pi / parts * axis)
-            if parts > 2 and _distance(once, kept[0]) > _NEARLY * float(extent.norm()):
-                continue
-            for k in range(1, parts):
-                vector = 2 * math.pi * (k / parts - (2 * k > parts)) * axis
-                found = turned(vector)
-                if all(_distance(found, other) > _EQUAL * _spread(found) for other in kept):
-                    kept.append(found)
-                    yield vector
+        if name not in free:
+            continue
+        near = (_distance(turned(2 * math.pi / n * axis), kept[0]) for n in _PARTS)
+        shapes = zip(_PARTS, near, strict=True)
+        parts = next((n for n, far in shapes if far < _NEARLY * float(extent.norm())), None)
+        for share in (0.5, *((k / parts for k in range(1, parts)) if parts else ())):
+            vector = 2 * math.pi * (share - (share > 0.5)) * axis
+            found = turned(vector)
+            if all(_distance(found, other) > _EQUAL * _spread(found) for other in kept):
+                kept.append(found)
+                yield vector
 
 
 def score(best: End, other: End) -> float | None:
