@@ -14,10 +14,11 @@ from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.radar_fields import labelled
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import existing_file, replacing
+from invertwin.scene.files import existing_file
 
 Recorded = TypeVar("Recorded", bound=Capture | ChirpCapture)
 _DEAD = 1e-3

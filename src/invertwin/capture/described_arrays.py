@@ -13,10 +13,11 @@ import torch
 
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.radar.boards import Elements, Mounting
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import UNREADABLE, existing_file, replacing
+from invertwin.scene.files import UNREADABLE, existing_file
 
 # The data tell these settings by their shape and kind.
 _TOLD = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}

@@ -6,7 +6,8 @@ import numpy as np
 import xarray as xr
 
 from invertwin.errors import InputError
-from invertwin.scene.files import existing_file, replacing
+from invertwin.folders import replacing
+from invertwin.scene.files import existing_file
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:

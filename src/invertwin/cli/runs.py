@@ -26,11 +26,11 @@ from invertwin.folders import (
     place_in,
     read_manifest,
     remove_empty,
+    replacing,
     require_free,
     save_manifest,
     without_unfinished,
 )
-from invertwin.scene.files import replacing
 
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
     from matplotlib.figure import Figure

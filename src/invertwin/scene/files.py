@@ -1,11 +1,9 @@
 """Read meshes and scene geometry from files, and write meshes to files."""
 
 import math
-import os
 import xml.etree.ElementTree as ElementTree
 import zlib
-from collections.abc import Collection, Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -17,6 +15,7 @@ from trimesh import transformations
 from trimesh.exchange.gltf import export_glb
 
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.scene import shapes
 from invertwin.scene.checks import checked_tensor
 from invertwin.scene.material.materials import RoughDielectric
@@ -102,29 +101,6 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
     with replacing(file) as part:
         glb = file.suffix.lower() == ".glb"
         part.write_bytes(export_glb(written) if glb else _ply(written.to_mesh()))
-
-
-@contextmanager
-def replacing(path: str | Path) -> Generator[Path]:
-    """Write a new file beside a path; it takes its place when it is complete.
-
-    A failure leaves an existing file as it was.
-
-    Args:
-        path: the file, in an existing folder; the new one has its suffix.
-
-    Raises:
-        InputError: no such folder.
-    """
-    file = Path(path)
-    if not file.parent.is_dir():
-        raise InputError(f"expected an existing folder, got {file.parent}; create it first")
-    part = file.with_name(f".{file.stem}.{os.getpid()}.part{file.suffix}")
-    try:
-        yield part
-        os.replace(part, file)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def read_arrays(

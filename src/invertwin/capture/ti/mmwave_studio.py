@@ -19,7 +19,8 @@ from invertwin.capture.ti.chirp_table import (
     text,
 )
 from invertwin.errors import InputError
-from invertwin.scene.files import existing_file, replacing
+from invertwin.folders import replacing
+from invertwin.scene.files import existing_file
 
 # Names of the numbers of a profile, and of the frame.
 _PROFILE = (

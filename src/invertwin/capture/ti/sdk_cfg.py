@@ -16,7 +16,7 @@ from invertwin.capture.ti.chirp_table import (
     text,
 )
 from invertwin.errors import InputError
-from invertwin.scene.files import replacing
+from invertwin.folders import replacing
 
 # Fewest arguments of the commands that are read.
 _ARGUMENTS = {
