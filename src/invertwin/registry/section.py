@@ -37,7 +37,7 @@ def _beside_run_file(name: str, info: Any) -> str:
         os.environ.get("INVERTWIN_DATA", _DATA_BESIDE_CHECKOUT),
     ]
     paths = [Path(folder, name).absolute() for folder in folders]
-    return str(next((path for path in paths if path.exists()), paths[0]))
+    return str(next(filter(os.path.exists, paths), paths[0]))
 
 
 InputPath = Annotated[str, MinLen(1), AfterValidator(_beside_run_file)]

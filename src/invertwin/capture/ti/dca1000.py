@@ -20,7 +20,7 @@ from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.errors import InputError
 from invertwin.folders import replacing
 from invertwin.radar.waveform import PhysicsWarning
-from invertwin.scene.files import existing_file
+from invertwin.untrusted import existing_file
 
 _WORD = np.dtype("<i2")
 _LANE_COUNT = 4
