@@ -231,7 +231,7 @@ def _loaded(path: Path, ending: str, variable: str | None, *, trusted: bool) -> 
     if ending == ".npy":
         return read_npy(path)
     if ending == ".npz":
-        return read_arrays(path, "copy it again", [str(variable)])[str(variable)]
+        return read_arrays(path, "it is damaged or of another kind", [str(variable)])[str(variable)]
     matlab = ending == ".mat" and not h5py.is_hdf5(path)
     if not trusted:
         try_apart(path, "matlab" if matlab else "hdf5", str(variable))
