@@ -1,5 +1,7 @@
 """The one exception type for bad input, raised at the public edge."""
 
+_LONGEST = 2_000  # characters of a line
+
 
 class InputError(ValueError):
     """What was expected, what came, and what to do, in one line.
@@ -14,5 +16,19 @@ class InputError(ValueError):
             text: The line.
             at: The argument that it is about: the key of a run file.
         """
-        super().__init__(text)
+        super().__init__(one_line(text))
         self.at = at
+
+
+def one_line(text: str) -> str:
+    """A text that a terminal shows as it is: one line, no control characters, not endless.
+
+    Args:
+        text: May hold what strangers wrote, such as names from a file.
+    """
+    if not text.isprintable():
+        plain = (c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
+        text = "".join(plain)
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
+    return text

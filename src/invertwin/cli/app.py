@@ -25,7 +25,7 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.run_file import about_file
 from invertwin.cli.running import load_runs, now_and_then, print_tables, run_folder
-from invertwin.errors import InputError
+from invertwin.errors import InputError, one_line
 
 
 class _Commands(TyperGroup):
@@ -201,7 +201,7 @@ def _shown_once() -> Callable[..., None]:
     said: set[str] = set()
 
     def show(message: Warning | str, *_: Any) -> None:
-        line = f"invertwin: warning: {message}"
+        line = one_line(f"invertwin: warning: {message}")
         if line not in said:
             said.add(line)
             print(line, file=sys.stderr)

@@ -40,6 +40,13 @@ def _beside_run_file(name: str, info: Any) -> str:
     return str(next(filter(os.path.exists, paths), paths[0]))
 
 
+def _without_control(text: str) -> str:
+    if not text.isprintable():
+        raise PydanticCustomError("words", "expected text without control characters")
+    return text
+
+
+Words = Annotated[str, AfterValidator(_without_control)]
 InputPath = Annotated[str, MinLen(1), AfterValidator(_beside_run_file)]
 """Path of a file or folder, from the run file's folder, then from INVERTWIN_DATA."""
 
