@@ -1,4 +1,4 @@
-"""The one exception type for bad input, raised at the public edge."""
+"""The one exception type for bad input, raised at the public edge, and the one warning."""
 
 _LONGEST = 2_000  # characters of a line
 
@@ -18,6 +18,10 @@ class InputError(ValueError):
         """
         super().__init__(one_line(text))
         self.at = at
+
+
+class PhysicsWarning(UserWarning):
+    """The input is valid, but its result will not mean what one may expect."""
 
 
 def one_line(text: str) -> str:

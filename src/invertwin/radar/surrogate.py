@@ -326,8 +326,8 @@ def _warn_if_coarse(radar: Radar, grid: Grid, sigmas: dict[int, float]) -> None:
     ]
     if coarse:
         warnings.warn(
-            f"less than 2 bins per cell along {', '.join(coarse)}: the surrogate is not the mean of "
-            "exact spectra there, and a fit may end a little off; use oversample=2",
+            f"less than 2 bins per cell along {', '.join(coarse)}: the surrogate is not the mean "
+            "of exact spectra there, and a fit may end a little off; use oversample=2",
             PhysicsWarning,
             stacklevel=2,
         )
