@@ -7,13 +7,12 @@ ways along a direction that is tangential there, so that no silhouette is ever s
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.passage import Hit, land, passage
-from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
+from invertwin.channel.rays.arrays import between, opaque, point_at, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.contacts import IN_PLANE
 from invertwin.channel.rays.scene import NEAR, RayScene
@@ -24,6 +23,9 @@ _RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's pla
 # roundings): a fine mesh's own triangles, nearly edge-on, would else lie in their way.
 _BESIDE = 1e-6
 _BEFORE = 3e-5  # how much before an edge, of its distance, such rays start among close surfaces
+# Of a mesh, so many triangles are looked at from an edge on, and more until rays that pass beside
+# the edge clear them, up to so many.
+_LEAST_FOLDS, _MOST_FOLDS = 8, 256
 _LAST_BELOW_ONE = 1 - 2.0**-24
 _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 
@@ -33,7 +35,8 @@ class EdgePoints:
     """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
 
     ``open`` and ``covered`` are the transmittances of the edge's own triangles: 1 where there is
-    none, 0 where it is opaque.
+    none, 0 where it is opaque. The covered side is that of the triangle that leaves the plane
+    through edge and ray most.
     """
 
     index: Any  # of the sample
@@ -41,15 +44,15 @@ class EdgePoints:
     frame: Any  # radar pose
     first: Any  # vertices at the ends of the edge
     second: Any
-    opposite: Any  # third vertex of its triangle on the covered side
+    side: Any  # ±1: whether ray × edge points to the covered side
     along: Any  # place from the first end to the second, 0 to 1
     face: Any  # triangle on which the shadow falls
     weight: Any  # one over (samples × probability per ``along``)
     transmittance: Any  # of all other sheets on the way, and the length [m] that these add
     extra: Any
-    open: Any  # beside the edge, on the side away from ``opposite``
+    open: Any  # beside the edge, on the other side
     open_extra: Any
-    covered: Any  # on the side of ``opposite``
+    covered: Any  # on the covered side
     covered_extra: Any
 
     @property
@@ -178,15 +181,13 @@ class EdgeSampler:
         self.rays, self.inputs, self.centres, self.close = rays, inputs, centres, close
         entries = len(centres) * rays.link.frame_count * len(topology.edges)
         edge, _, receiver, origin = self._seen(dr.arange(mi.UInt32, entries))
-        y0, y1 = (
-            point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
-            for ends in topology.device_edges
-        )
-        sides = _sides(rays, inputs, edge, y0, y1, 0.5 * (y0 + y1) - origin)
+        y0, y1 = rays.exact_ends(edge)
+        away = 0.5 * (y0 + y1) - mi.Vector3d(origin)
+        sides = _sides(rays, inputs, edge, away)
         self.size = samples if entries else 0
         if self.size:
             # Both antennas get the same number of samples.
-            length = dr.norm(y1 - y0) / dr.norm(0.5 * (y0 + y1) - origin)
+            length = mi.Float(dr.norm(y1 - y0) / dr.norm(away))
             of, totals = dr.select(receiver, mi.UInt32(1), 0), dr.zeros(mi.Float, 2)
             dr.scatter_add(totals, length, of, sides.unlike)
             share = length / dr.gather(mi.Float, totals, of)
@@ -211,22 +212,23 @@ class EdgeSampler:
         place, along, pmf = place_along(self.choice, index, self.size, self.seed)
         edge, frame, receiver, origin = self._seen(place)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
-        y0 = point_at(rays.vertices, first)
-        y1 = point_at(rays.vertices, second)
-        y = y0 + (y1 - y0) * along
-        away = y - origin
-        sides = _sides(rays, self.inputs, edge, y0, y1, away)
-        beside = y + sides.outwards * (_BESIDE * dr.norm(y))
+        y0, y1 = rays.exact_ends(edge)
+        y = y0 + (y1 - y0) * mi.Float64(along)
+        exact = y - mi.Vector3d(origin)
+        sides = _sides(rays, self.inputs, edge, exact)
+        aside = _BESIDE * dr.norm(y)
+        beside, away = mi.Point3f(y + sides.outwards * aside), mi.Vector3f(exact)
         reach = beside - away * _BEFORE if self.close else beside
         before = passage(rays, self.inputs, origin, reach, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
+        valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, valid)
         key = index, self.dice
         hit = _ahead(
             rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close
         )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
         found = EdgePoints(
-            index, receiver, frame, first, second, sides.opposite, along, hit.face,
+            index, receiver, frame, first, second, sides.side, along, hit.face,
             weight=1 / (pmf * self.size * hit.chance),
             transmittance=before.transmittance * hit.transmittance,
             extra=before.extra + hit.extra,
@@ -338,11 +340,15 @@ class InteriorEdgeSampler:
         edge, along, pmf = place_along(self.choice, within, self.per_frame, self.seeds[0], index)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = (point_at(rays.vertices, end) for end in (first, second))
-        y = y0 + (y1 - y0) * along
         omega, density = self._direction(index, edge, y0, y1)
-        sides = _sides(rays, self.inputs, edge, y0, y1, omega)
+        exact = mi.Vector3d(omega)
+        sides = _sides(rays, self.inputs, edge, exact)
+        y0, y1 = rays.exact_ends(edge)
+        place = y0 + (y1 - y0) * mi.Float64(along)
+        aside = _BESIDE * dr.norm(place)
+        y, beside = mi.Point3f(place), mi.Point3f(place + sides.outwards * aside)
         valid = (pmf > 0) & sides.unlike
-        beside = mi.Point3f(y + sides.outwards * (_BESIDE * dr.norm(y)))
+        valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, valid)
         hits = []
         for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
             hit = _ahead(
@@ -359,7 +365,7 @@ class InteriorEdgeSampler:
         measure = dr.squared_norm(point - y) / cosine
         chance = behind.chance * ahead.chance
         points = EdgePoints(
-            index, False, frame, first, second, sides.opposite, along, ahead.face,
+            index, False, frame, first, second, sides.side, along, ahead.face,
             weight=measure / (pmf * density * self.per_frame * chance),
             transmittance=behind.transmittance * ahead.transmittance,
             extra=behind.extra + ahead.extra,
@@ -407,7 +413,7 @@ def place_along(
 class _Sides:
     """What an edge's triangles let through on either side of a direction; see ``EdgePoints``."""
 
-    opposite: Any
+    side: Any
     open: Any
     open_extra: Any
     covered: Any
@@ -421,24 +427,23 @@ class _Sides:
         return ~((dr.abs(self.open - self.covered) <= 1e-6) & same_length)
 
 
-def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, direction: Any) -> _Sides:
+def _sides(rays: RayScene, inputs: Inputs, edge: Any, direction: Any) -> _Sides:
     """Sort an edge's triangles by the side of the plane through edge and direction they lie on.
 
-    An opaque edge is a silhouette if nothing is on one side. The covered side is that of the
-    triangle that leaves the plane most.
+    An opaque edge is a silhouette if nothing is on one side. In float64: the triangles of a fine
+    mesh are nearly edge-on where they end a shadow.
     """
     topology = rays.topology
+    y0, y1 = rays.exact_ends(edge)
     plane = dr.cross(direction, y1 - y0)
     offsets, heights = [], []
-    opposite, most = mi.UInt32(0), mi.Float(0.0)
+    most = mi.Float64(0.0)
     for column in topology.device_opposite:
         apex = dr.gather(mi.Int32, column, edge)
-        place = mi.UInt32(dr.maximum(apex, 0))
-        offset = point_at(rays.vertices, place) - y0
+        offset = rays.exact(mi.UInt32(dr.maximum(apex, 0))) - y0
         height = dr.select(apex >= 0, dr.dot(plane, offset), 0.0)
         # Squares, since Dr.Jit 1.5 drops the abs of a select on an abs.
-        further = dr.square(height) > dr.square(most)
-        opposite, most = dr.select(further, place, opposite), dr.select(further, height, most)
+        most = dr.select(dr.square(height) > dr.square(most), height, most)
         offsets.append(offset)
         heights.append(height)
     transmittances, lengths = [mi.Float(1.0), mi.Float(1.0)], [mi.Float(0.0), mi.Float(0.0)]
@@ -449,7 +454,7 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, directio
             row = dr.gather(mi.UInt32, inputs.face_surface, face)
             normal = dr.cross(y1 - y0, offset)
             cosine = dr.abs(dr.dot(normal, direction)) / (dr.norm(normal) * dr.norm(direction))
-            transmittance, extra = inputs.surfaces.through(row, cosine, height != 0)
+            transmittance, extra = inputs.surfaces.through(row, mi.Float(cosine), height != 0)
         for index, on in enumerate((height * most < 0, height * most > 0)):
             transmittances[index] = dr.select(
                 on, transmittances[index] * transmittance, transmittances[index]
@@ -458,12 +463,12 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, directio
     free = (transmittances[0] == 1) & (lengths[0] == 0)
     outwards = dr.select(free, -dr.mulsign(dr.normalize(plane), most), 0.0)
     return _Sides(
-        opposite,
+        mi.Float(dr.sign(most)),
         transmittances[0],
         lengths[0],
         transmittances[1],
         lengths[1],
-        mi.Vector3f(outwards),
+        mi.Vector3d(outwards),
     )
 
 
@@ -511,9 +516,8 @@ def _ahead(
         is_there = dr.gather(mi.Int32, apex, edge) >= 0
         own |= is_there & (dr.gather(mi.UInt32, beside_edge, edge) == hit.face)
     own &= near
-    corner = partial(dr.gather, mi.Vector3d, rays.exact_vertices)
-    y0, y1 = (corner(dr.gather(mi.UInt32, e, edge)) for e in rays.topology.device_edges)
-    p0, p1, p2 = map(corner, dr.gather(mi.Vector3u, rays.topology.device_faces, hit.face))
+    y0, y1 = rays.exact_ends(edge)
+    p0, p1, p2 = map(rays.exact, dr.gather(mi.Vector3u, rays.topology.device_faces, hit.face))
     normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
     height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(along) - p0)
     crossed = -dr.mulsign(height, dr.dot(normal, mi.Vector3d(way))) < -IN_PLANE
@@ -521,6 +525,69 @@ def _ahead(
     pairs = zip(vars(again).values(), vars(hit).values(), strict=True)
     hit = Hit(*(dr.select(own, second, first) for second, first in pairs))
     return replace(hit, valid=hit.valid & ~(near & ~own & crossed))
+
+
+def folded(
+    rays: RayScene, edge: Any, place: Any, way: Any, outwards: Any, aside: Any, active: Any
+) -> Any:
+    """Whether the mesh around an edge leads back into the way past it.
+
+    Rays pass a little beside the edge, where they miss the folds of a fine mesh. So the curve in
+    which the mesh meets the plane through ray and edge's height is followed from the edge both
+    ways, in float64, until it is as far below the ray as rays pass beside, or ends.
+
+    Args:
+        rays: Rays.
+        edge: Edges.
+        place: Points on them, float64.
+        way: Directions of rays past them, float64.
+        outwards: Unit directions off the edge's own triangles; zero where there are some all round.
+        aside: How far beside the edge rays pass [m].
+        active: Lanes.
+    """
+    topology, most = rays.topology, opaque(_MOST_FOLDS)
+    across = dr.cross(way, outwards)
+    start, found = mi.UInt32(edge), mi.Bool(False)
+
+    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
+        state = dict(state)
+        entry, face, going = state["edge"], state["face"], state["going"]
+        corners = dr.gather(mi.Vector3u, topology.device_welded, face, going)
+        sides = dr.gather(mi.Vector3i, topology.device_face_edges, face, going)
+        offsets = [rays.exact(corner, going) - place for corner in corners]
+        beyond = [dr.dot(across, offset) for offset in offsets]
+        leaving, height = mi.Int32(-1), mi.Float64(0.0)
+        for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+            crosses = ((beyond[i] >= 0) != (beyond[j] >= 0)) & (sides[k] != mi.Int32(entry))
+            share = beyond[i] / (beyond[i] - beyond[j])
+            at = dr.dot(outwards, offsets[i] + (offsets[j] - offsets[i]) * share)
+            leaving, height = dr.select(crosses, sides[k], leaving), dr.select(crosses, at, height)
+        on = going & (leaving >= 0)
+        state["found"] = state["found"] | (on & (height > IN_PLANE))
+        low = (height < -aside) & (state["count"] >= _LEAST_FOLDS)
+        on &= (height <= IN_PLANE) & ~low
+        edge, after, others = mi.UInt32(dr.maximum(leaving, 0)), mi.UInt32(0), mi.UInt32(0)
+        for column, apex in zip(topology.device_beside, topology.device_opposite, strict=True):
+            next_face = dr.gather(mi.UInt32, column, edge, on)
+            other = (dr.gather(mi.Int32, apex, edge, on) >= 0) & (next_face != face)
+            after = dr.select(other, next_face, after)
+            others += dr.select(other, mi.UInt32(1), 0)
+        state["edge"], state["face"], state["count"] = edge, after, state["count"] + 1
+        state["going"] = on & (others == 1) & (state["count"] < most)
+        return (state,)
+
+    for column, apex in zip(topology.device_beside[:2], topology.device_opposite[:2], strict=True):
+        there = active & (dr.gather(mi.Int32, apex, edge) >= 0) & (dr.squared_norm(across) > 0)
+        state = {
+            "edge": start,
+            "face": dr.gather(mi.UInt32, column, edge),
+            "going": there & ~found,
+            "found": dr.zeros(mi.Bool, dr.width(edge)),
+            "count": dr.zeros(mi.UInt32, dr.width(edge)),
+        }
+        (state,) = rays.loop((state,), lambda state: state["going"], body)
+        found |= state["found"]
+    return found
 
 
 def _not_grazing(rays: RayScene, face: Any, direction: Any, active: Any) -> Any:
@@ -561,9 +628,7 @@ def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
     def projected(vector: Any) -> Any:
         return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
 
-    apex, _ = integrand.edge_ends(fixed, points.opposite, points.opposite)
-    tangent = dr.cross(normal, projected(edge))
-    tangent = dr.mulsign(tangent, dr.dot(tangent, projected(apex - dr.detach(y))))
+    tangent = dr.mulsign(dr.cross(normal, projected(edge)), points.side * slope)
     return Shadow(b1, b2, dr.dot(tangent, moving - material) * points.weight)
 
 

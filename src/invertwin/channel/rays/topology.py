@@ -78,6 +78,16 @@ class Topology:
             table[face[edge], slot] = edge
         return table
 
+    @cached_property
+    def device_welded(self) -> Any:
+        """``welded`` as a flat array of the ray tracer."""
+        return to_index(self.welded)
+
+    @cached_property
+    def device_face_edges(self) -> Any:
+        """``face_edges`` as a flat array of the ray tracer."""
+        return mi.Int32(self.face_edges.int().ravel().numpy())
+
     def around(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
         """Triangles and all that share an edge with them (−1: none)."""
         edges = self.face_edges[faces]
