@@ -36,9 +36,9 @@ from invertwin.scene import Isotropic, Mesh, Object, RoughDielectric, Scene, pla
 
 SUBDIVISIONS = (4, 6, 7)
 METRES = (1.5, 30.0, 100.0, 500.0)
-SAMPLES, SEEDS = 400_000, 8
+SAMPLES, SEEDS = 200_000, 4
 TOLERANCE = 0.01
-RADIUS, BUMPS, HEIGHT = 0.3, 25.0, 0.1  # m, 1/m, of the radius
+RADIUS, BUMPS, HEIGHT = 0.3, 12.0, 0.15  # m, per radius, of the radius
 ASIDE = (0.12, -0.07, 1.0)  # direction of the ball
 BEHIND = 2.0  # how much further the wall is [m]
 STEP = 1e-4  # relative change of size, of the truth's differences
@@ -51,7 +51,7 @@ class Task:
 
     def __init__(self, subdivisions: int, metres: float) -> None:
         ball = sphere(1.0, subdivisions=subdivisions)
-        waves = torch.sin(RADIUS * BUMPS * ball.vertices + 0.3).prod(1, keepdim=True)
+        waves = torch.sin(BUMPS * ball.vertices).prod(1, keepdim=True)
         self.mesh = Mesh(RADIUS * ball.vertices * (1 + HEIGHT * waves), ball.faces)
         aside = torch.tensor(ASIDE, dtype=torch.float64)
         self.centre = metres * aside / aside.norm()

@@ -534,7 +534,7 @@ def folded(
 
     Rays pass a little beside the edge, where they miss the folds of a fine mesh. So the curve in
     which the mesh meets the plane through ray and edge's height is followed from the edge both
-    ways, in float64, until it is as far below the ray as rays pass beside, or ends.
+    ways, in float64.
 
     Args:
         rays: Rays.
