@@ -19,9 +19,9 @@ from invertwin.channel.rays.scene import NEAR, RayScene
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
 _RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's place within it
-# Boundary rays pass beside the edge, by this much of its distance from the origin (fifteen
-# roundings): a fine mesh's own triangles, nearly edge-on, would else lie in their way.
-_BESIDE = 1e-6
+# Boundary rays start beside the edge, by this much (two roundings) of its distance from the origin
+# and its length: its own triangles, nearly edge-on, would else lie in their way.
+_BESIDE = 1e-7
 _BEFORE = 3e-5  # how much before an edge, of its distance, such rays start among close surfaces
 # Of a mesh, so many triangles are looked at from an edge on, and more until rays that pass beside
 # the edge clear them, up to so many.
@@ -216,10 +216,10 @@ class EdgeSampler:
         y = y0 + (y1 - y0) * mi.Float64(along)
         exact = y - mi.Vector3d(origin)
         sides = _sides(rays, self.inputs, edge, exact)
-        aside = _BESIDE * dr.norm(y)
+        aside = _BESIDE * (dr.norm(y) + dr.norm(y1 - y0))
         beside, away = mi.Point3f(y + sides.outwards * aside), mi.Vector3f(exact)
         reach = beside - away * _BEFORE if self.close else beside
-        before = passage(rays, self.inputs, origin, reach, pmf > 0)
+        before = passage(rays, self.inputs, reach, origin, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
         valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, valid)
         key = index, self.dice
@@ -345,7 +345,7 @@ class InteriorEdgeSampler:
         sides = _sides(rays, self.inputs, edge, exact)
         y0, y1 = rays.exact_ends(edge)
         place = y0 + (y1 - y0) * mi.Float64(along)
-        aside = _BESIDE * dr.norm(place)
+        aside = _BESIDE * (dr.norm(place) + dr.norm(y1 - y0))
         y, beside = mi.Point3f(place), mi.Point3f(place + sides.outwards * aside)
         valid = (pmf > 0) & sides.unlike
         valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, valid)
