@@ -150,6 +150,30 @@ class Proportional:
         return place, rest, dr.select(weight > 0, weight / self.total, 0.0)
 
 
+def by_object(rays: RayScene, edge: Any, weight: Any, receiver: Any, centres: int) -> Any:
+    """Weights of edges by which no object drowns another.
+
+    An object gets the square root of the sum of its edges' weights, which is between a share by
+    size and one share for each. Both antennas get the same sum.
+
+    Args:
+        rays: The scene.
+        edge: Edges.
+        weight: Of each, by itself.
+        receiver: Whether it is the receiver's silhouette.
+        centres: 2 if there are silhouettes of a receiver, else 1.
+    """
+    objects = len(rays.geometry.names)
+    antenna = dr.select(receiver, mi.UInt32(1), 0)
+    row = dr.gather(mi.UInt32, rays.topology.device_edge_object, edge) + antenna * objects
+    totals, sums = dr.zeros(mi.Float, centres * objects), dr.zeros(mi.Float, centres)
+    dr.scatter_add(totals, weight, row)
+    roots = dr.sqrt(totals)
+    dr.scatter_add(sums, roots, dr.arange(mi.UInt32, centres * objects) // objects)
+    share: Any = weight / (dr.gather(mi.Float, roots, row) * dr.gather(mi.Float, sums, antenna))
+    return dr.select(weight > 0, share, 0.0)
+
+
 class EdgeSampler:
     """Points on the silhouettes seen from one antenna or both, and where their shadows fall.
 
@@ -186,12 +210,9 @@ class EdgeSampler:
         sides = _sides(rays, inputs, edge, away)
         self.size = samples if entries else 0
         if self.size:
-            # Both antennas get the same number of samples.
-            length = mi.Float(dr.norm(y1 - y0) / dr.norm(away))
-            of, totals = dr.select(receiver, mi.UInt32(1), 0), dr.zeros(mi.Float, 2)
-            dr.scatter_add(totals, length, of, sides.unlike)
-            share = length / dr.gather(mi.Float, totals, of)
-            self.choice = Proportional(dr.select(sides.unlike, share, 0.0))
+            seen = mi.Float(dr.norm(y1 - y0) / dr.norm(away))
+            weight = dr.select(sides.unlike, seen, 0.0)
+            self.choice = Proportional(by_object(rays, edge, weight, receiver, len(centres)))
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
 
     def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:

@@ -50,6 +50,7 @@ class Topology:
         self.device_faces = to_index(faces)
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
+        self.device_edge_object = to_index(owner[self.edges[:, 0]])
         self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
         self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]
         mesh = mi.Mesh("scene", vertex_count=len(vertices), face_count=len(faces))
