@@ -245,7 +245,8 @@ class EdgeSampler:
         valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, valid)
         key = index, self.dice
         hit = _ahead(
-            rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close
+            rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close,
+            dealt=index,
         )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
         found = EdgePoints(
@@ -503,6 +504,7 @@ def _ahead(
     key: tuple[Any, Any],
     *,
     close: bool,
+    dealt: Any = None,
 ) -> Hit:
     """What lies behind points on edges.
 
@@ -520,13 +522,14 @@ def _ahead(
         active: Lanes.
         key: See ``land``.
         close: Whether other surfaces may be close to edges.
+        dealt: See ``land``.
     """
     towards, distance = dr.normalize(way), dr.norm(way)
     past = mi.Ray3f(mi.Point3f(beside + way * NEAR), mi.Vector3f(towards))
     if not close:
-        return land(rays, inputs, past, active, key, coherent=False)
+        return land(rays, inputs, past, active, key, coherent=False, dealt=dealt)
     early = mi.Ray3f(mi.Point3f(beside - way * _BEFORE), mi.Vector3f(towards))
-    hit = land(rays, inputs, early, active, key, coherent=False)
+    hit = land(rays, inputs, early, active, key, coherent=False, dealt=dealt)
     point = between(rays.corners(hit.face, hit.valid), hit.b1, hit.b2)
     near = hit.valid & (dr.norm(point - beside) < 2 * _BEFORE * distance)
     edge, along = place
@@ -542,7 +545,7 @@ def _ahead(
     normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
     height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(along) - p0)
     crossed = -dr.mulsign(height, dr.dot(normal, mi.Vector3d(way))) < -IN_PLANE
-    again = land(rays, inputs, past, active & own, key, coherent=False)
+    again = land(rays, inputs, past, active & own, key, coherent=False, dealt=dealt)
     pairs = zip(vars(again).values(), vars(hit).values(), strict=True)
     hit = Hit(*(dr.select(own, second, first) for second, first in pairs))
     return replace(hit, valid=hit.valid & ~(near & ~own & crossed))
