@@ -27,7 +27,6 @@ import torch
 from jaxtyping import Float64
 from report import MetricTable, write
 from rich.table import Table
-from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, backend, deposit_power
 from invertwin.channel.rays.geometry import flatten
@@ -159,9 +158,7 @@ def table(metrics: dict[str, Any]) -> Table:
         triangles, distance = key.split("_")
         held = "yes" if abs(value - 1) <= TOLERANCE else "NO"
         text = f"± {metrics['error'][key]:.4f}; {triangles} triangles at {distance} m"
-        page.grid.add_row(
-            f"boundary_ratio.{key}", f"{value:.4f}", f"1 ± {TOLERANCE} {held}", text
-        )
+        page.grid.add_row(f"boundary_ratio.{key}", f"{value:.4f}", f"1 ± {TOLERANCE} {held}", text)
     return page.grid
 
 
