@@ -23,7 +23,9 @@ def growth(body: Object, rest: Object, grid: Grid, sampling: Sampling, seed: int
         grown = Object(Mesh(body.mesh.vertices * size, body.mesh.faces), body.material, body.pose)
         scene = Scene({"rest": rest, "body": grown})
         out = deposit_power(scene, link(), grid, sampling=sampling, seed=seed)
-        return forward_ad.unpack_dual(out).tangent.double()
+        found = forward_ad.unpack_dual(out.double()).tangent
+    assert found is not None
+    return found
 
 
 def drawn(weights, count):

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from invertwin.channel.power import integrand
+from invertwin.channel.power.folds import folded
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.passage import Hit, land, passage
-from invertwin.channel.rays.arrays import between, opaque, point_at, scrambled, uniform_pair
+from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.contacts import IN_PLANE
 from invertwin.channel.rays.scene import NEAR, RayScene
@@ -23,9 +24,6 @@ _RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's pla
 # and its length: its own triangles, nearly edge-on, would else lie in their way.
 _BESIDE = 1e-7
 _BEFORE = 3e-5  # how much before an edge, of its distance, such rays start among close surfaces
-# Of a mesh, so many triangles are looked at from an edge on, and more until rays that pass beside
-# the edge clear them, up to so many.
-_LEAST_FOLDS, _MOST_FOLDS = 8, 256
 _LAST_BELOW_ONE = 1 - 2.0**-24
 _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 
@@ -291,15 +289,12 @@ class InteriorEdgeSampler:
         self.rays, self.inputs, self.weighted, self.close = rays, inputs, weighted, close
         self.frames = rays.link.frame_count
         edge = dr.arange(mi.UInt32, len(topology.edges))
-        y0, y1 = (
-            point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
-            for ends in topology.device_edges
-        )
-        length = dr.norm(y1 - y0)
+        y0, y1 = rays.exact_ends(edge)
+        length = mi.Float(dr.norm(y1 - y0))
         _, span = self._opening(edge, y0, y1)
         weight = dr.select(span > _FLAT, length, 0.0)
         if weighted:
-            middle = 0.5 * (y0 + y1)
+            middle = mi.Point3f(0.5 * (y0 + y1))
             near = mi.Float(0.0)
             for frame in range(min(self.frames, 8)):
                 at = mi.UInt32(frame * self.frames // min(self.frames, 8))
@@ -326,8 +321,8 @@ class InteriorEdgeSampler:
             return start, span
         x, y = self._azimuth_axes(edge, y0, along)
         apex = dr.gather(mi.Int32, topology.device_opposite[1], edge)
-        offset = point_at(self.rays.vertices, mi.UInt32(dr.maximum(apex, 0))) - y0
-        angle = dr.atan2(dr.dot(offset, y), dr.dot(offset, x))
+        offset = self.rays.exact(mi.UInt32(dr.maximum(apex, 0))) - y0
+        angle = mi.Float(dr.atan2(dr.dot(offset, y), dr.dot(offset, x)))
         turn = dr.abs(angle)
         # Behind a fold the free azimuths are those beyond the second triangle, up to π.
         start = dr.select(apex >= 0, dr.select(angle > 0, turn, 0.0), start)
@@ -351,7 +346,7 @@ class InteriorEdgeSampler:
     def _azimuth_axes(self, edge: Any, y0: Any, along: Any) -> tuple[Any, Any]:
         topology = self.rays.topology
         apex = mi.UInt32(dr.maximum(dr.gather(mi.Int32, topology.device_opposite[0], edge), 0))
-        offset = point_at(self.rays.vertices, apex) - y0
+        offset = self.rays.exact(apex) - y0
         x = dr.normalize(offset - along * dr.dot(along, offset))
         return x, dr.cross(along, x)
 
@@ -361,11 +356,10 @@ class InteriorEdgeSampler:
         frame, within = index // self.per_frame, index % self.per_frame
         edge, along, pmf = place_along(self.choice, within, self.per_frame, self.seeds[0], index)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
-        y0, y1 = (point_at(rays.vertices, end) for end in (first, second))
+        y0, y1 = rays.exact_ends(edge)
         omega, density = self._direction(index, edge, y0, y1)
         exact = mi.Vector3d(omega)
         sides = _sides(rays, self.inputs, edge, exact)
-        y0, y1 = rays.exact_ends(edge)
         place = y0 + (y1 - y0) * mi.Float64(along)
         aside = _BESIDE * (dr.norm(place) + dr.norm(y1 - y0))
         y, beside = mi.Point3f(place), mi.Point3f(place + sides.outwards * aside)
@@ -549,69 +543,6 @@ def _ahead(
     pairs = zip(vars(again).values(), vars(hit).values(), strict=True)
     hit = Hit(*(dr.select(own, second, first) for second, first in pairs))
     return replace(hit, valid=hit.valid & ~(near & ~own & crossed))
-
-
-def folded(
-    rays: RayScene, edge: Any, place: Any, way: Any, outwards: Any, aside: Any, active: Any
-) -> Any:
-    """Whether the mesh around an edge leads back into the way past it.
-
-    Rays pass a little beside the edge, where they miss the folds of a fine mesh. So the curve in
-    which the mesh meets the plane through ray and edge's height is followed from the edge both
-    ways, in float64.
-
-    Args:
-        rays: Rays.
-        edge: Edges.
-        place: Points on them, float64.
-        way: Directions of rays past them, float64.
-        outwards: Unit directions off the edge's own triangles; zero where there are some all round.
-        aside: How far beside the edge rays pass [m].
-        active: Lanes.
-    """
-    topology, most = rays.topology, opaque(_MOST_FOLDS)
-    across = dr.cross(way, outwards)
-    start, found = mi.UInt32(edge), mi.Bool(False)
-
-    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
-        state = dict(state)
-        entry, face, going = state["edge"], state["face"], state["going"]
-        corners = dr.gather(mi.Vector3u, topology.device_welded, face, going)
-        sides = dr.gather(mi.Vector3i, topology.device_face_edges, face, going)
-        offsets = [rays.exact(corner, going) - place for corner in corners]
-        beyond = [dr.dot(across, offset) for offset in offsets]
-        leaving, height = mi.Int32(-1), mi.Float64(0.0)
-        for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-            crosses = ((beyond[i] >= 0) != (beyond[j] >= 0)) & (sides[k] != mi.Int32(entry))
-            share = beyond[i] / (beyond[i] - beyond[j])
-            at = dr.dot(outwards, offsets[i] + (offsets[j] - offsets[i]) * share)
-            leaving, height = dr.select(crosses, sides[k], leaving), dr.select(crosses, at, height)
-        on = going & (leaving >= 0)
-        state["found"] = state["found"] | (on & (height > IN_PLANE))
-        low = (height < -aside) & (state["count"] >= _LEAST_FOLDS)
-        on &= (height <= IN_PLANE) & ~low
-        edge, after, others = mi.UInt32(dr.maximum(leaving, 0)), mi.UInt32(0), mi.UInt32(0)
-        for column, apex in zip(topology.device_beside, topology.device_opposite, strict=True):
-            next_face = dr.gather(mi.UInt32, column, edge, on)
-            other = (dr.gather(mi.Int32, apex, edge, on) >= 0) & (next_face != face)
-            after = dr.select(other, next_face, after)
-            others += dr.select(other, mi.UInt32(1), 0)
-        state["edge"], state["face"], state["count"] = edge, after, state["count"] + 1
-        state["going"] = on & (others == 1) & (state["count"] < most)
-        return (state,)
-
-    for column, apex in zip(topology.device_beside[:2], topology.device_opposite[:2], strict=True):
-        there = active & (dr.gather(mi.Int32, apex, edge) >= 0) & (dr.squared_norm(across) > 0)
-        state = {
-            "edge": start,
-            "face": dr.gather(mi.UInt32, column, edge),
-            "going": there & ~found,
-            "found": dr.zeros(mi.Bool, dr.width(edge)),
-            "count": dr.zeros(mi.UInt32, dr.width(edge)),
-        }
-        (state,) = rays.loop((state,), lambda state: state["going"], body)
-        found |= state["found"]
-    return found
 
 
 def _not_grazing(rays: RayScene, face: Any, direction: Any, active: Any) -> Any:
