@@ -51,6 +51,7 @@ class Topology:
         self.device_faces = to_index(faces)
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
+        self.device_edge_object = to_index(owner[self.edges[:, 0]])
         self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
         self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]
         mesh = mi.Mesh("scene", vertex_count=len(vertices), face_count=len(faces))
@@ -101,6 +102,16 @@ class Topology:
             for k in owner[smooth].unique():
                 self._facets[k] = angle[smooth & (owner == k)].median()
         return float(self._facets[number])
+
+    @cached_property
+    def device_welded(self) -> Any:
+        """``welded`` as a flat array of the ray tracer."""
+        return to_index(self.welded)
+
+    @cached_property
+    def device_face_edges(self) -> Any:
+        """``face_edges`` as a flat array of the ray tracer."""
+        return mi.Int32(self.face_edges.int().ravel().numpy())
 
     def around(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
         """Triangles and all that share an edge with them (−1: none)."""
