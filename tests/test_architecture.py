@@ -33,9 +33,10 @@ ALLOWED = {
     "capture": CAPTURE,
     "models": MODELS,
     "inversion": INVERSION,
+    "runs": FOUNDATION | {"runs"},
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION | {"doctor", "plotting", "registry", "cli", "__init__"},
+    "cli": INVERSION | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

@@ -100,6 +100,21 @@ def reconstruct(options: Resumable, file: FileArgument) -> None:
 
 @app.command()
 @with_options(Resumable)
+def plan(options: Resumable, file: FileArgument) -> None:
+    """State the error bars of a fit before anything is recorded, and rank positions to add."""
+    runs = load_runs([file], options, "plan", ("radar", "data", "grid", "parameters"))
+    with run_folder(options, Path("out", file.stem), runs) as folder:
+        if folder.complete:
+            return
+        from invertwin.cli.run_plan import run_plan
+
+        with about_file(file):
+            tables = run_plan(runs[file.stem], folder, console, now_and_then())
+        print_tables(tables)
+
+
+@app.command()
+@with_options(Resumable)
 def demo(options: Resumable) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.

@@ -17,6 +17,7 @@ from invertwin.cli.schema.fits import (
     Landscape,
     Measures,
     Part,
+    Plan,
     Reconstruct,
     Stage,
     Variant,
@@ -117,6 +118,10 @@ class _RunFile(Section):
         "[[parameters]]: what is unknown", []
     )
     starts: AnyStarts | None = key("where fits start; without it where the scene says", None)
+    search: Annotated[Any, OneOf("search")] | None = key(
+        "several poses to begin from at every start; the best end counts", None
+    )
+    plan: Plan | None = key("what `invertwin plan` compares and tries", None)
     initial: AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
     )
