@@ -25,11 +25,11 @@ from invertwin.folders import (
     place_in,
     read_manifest,
     remove_empty,
+    replacing,
     require_free,
     save_manifest,
     without_unfinished,
 )
-from invertwin.scene.files import replacing
 
 CHECKPOINT = "checkpoint.pt"
 # What commands write, beside run files and the pictures that are named after them.

@@ -22,6 +22,7 @@ def script(name: str) -> Any:
 basin = script("basin")
 crash_safety = script("crash_safety")
 edges = script("edges")
+fine_meshes = script("fine_meshes")
 house = script("house")
 many_objects = script("many_objects")
 multibounce = script("multibounce")

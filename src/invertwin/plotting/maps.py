@@ -15,7 +15,7 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.inversion.draws import coarse
-from invertwin.plotting.figures import numbers
+from invertwin.plotting.figures import legible, numbers
 from invertwin.radar import DopplerMaps
 
 U_LABEL, V_LABEL = "direction cosine u (to the right)", "direction cosine v (up)"
@@ -252,7 +252,7 @@ def _image(cell: Any, title: str, panel: Panel, values: NDArray, **style: Any) -
         extent=(*_edges(panel.across), *_edges(panel.ranges)),
         **style,
     )
-    cell.set_title(title, fontsize=9)
+    cell.set_title(legible(title), fontsize=9)
     cell.set_xlabel(panel.label, fontsize=8)
     cell.tick_params(labelsize=7)
     return image

@@ -18,6 +18,7 @@ _MOST = 32  # surfaces that a segment may pass
 # Probability of passing a sheet on which the ray may end. It is not the transmittance: a
 # probability that follows the material would throw the dice anew under differences.
 _CHANCE = 0.5
+DEALT = 6  # sheets
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,14 @@ class Hit:
 
 
 def land(
-    rays: RayScene, inputs: Inputs, ray: Any, active: Any, key: tuple[Any, Any], *, coherent: bool
+    rays: RayScene,
+    inputs: Inputs,
+    ray: Any,
+    active: Any,
+    key: tuple[Any, Any],
+    *,
+    coherent: bool,
+    dealt: Any = None,
 ) -> Hit:
     """Follow a ray to a surface; every sheet on the way is passed or not by a throw of dice.
 
@@ -144,6 +152,8 @@ def land(
         active: Lanes.
         key: Index and seed of the dice.
         coherent: Whether neighbouring rays are alike.
+        dealt: Whether the first sheets are passed, a bit each, instead of dice: so that those that
+            pass are spread as evenly as all.
     """
     one = mi.Float(1.0)
     hit = rays.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
@@ -177,6 +187,9 @@ def land(
         transmittance, extra = _through(inputs, face, origin, origin + ray.d, found)
         chance = dr.select(transmittance > 0, _CHANCE, 0.0)
         dice, _ = uniform_pair(index, seed + state["count"] * 0x85EBCA6B)
+        if dealt is not None:
+            bit = ((dealt ^ seed) >> state["count"]) & 1
+            dice = dr.select(state["count"] < DEALT, mi.Float(bit), dice)
         passes = found & (dice < chance)
         ends = found & ~passes
         for name, value in (("face", face), ("b1", hit.prim_uv.x), ("b2", hit.prim_uv.y)):

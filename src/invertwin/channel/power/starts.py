@@ -13,7 +13,7 @@ import numpy as np
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.passage import land, passage
+from invertwin.channel.power.passage import DEALT, land, passage
 from invertwin.channel.rays.arrays import (
     between,
     point_at,
@@ -82,10 +82,11 @@ class RaySampler:
         centre = point_at(self.centres, frame)
         axis, height, _ = self.spheres.cap(own, centre)
         jitter = uniform_pair(index, self.seed)
+        column, row = place % self.columns, place // self.columns
         disk = mi.warp.square_to_uniform_disk_concentric(
             mi.Point2f(
-                (mi.Float(place % self.columns) + jitter[0]) / self.columns,
-                (mi.Float(place // self.columns) + jitter[1]) / self.rows,
+                (mi.Float(column) + jitter[0]) / self.columns,
+                (mi.Float(row) + jitter[1]) / self.rows,
             )
         )
         depth = dr.squared_norm(disk) * height
@@ -97,13 +98,25 @@ class RaySampler:
         density = per_block * (found + around / (4 * dr.pi))
         centre = point_at(rays.tx, frame)
         ray = mi.Ray3f(centre, direction)
-        hit = land(rays, inputs, ray, mi.Bool(True), (index, self.dice), coherent=True)
+        key = index, self.dice
+        hit = land(
+            rays, inputs, ray, mi.Bool(True), key, coherent=True, dealt=_dealt(column, row)
+        )  # fmt: skip
         point = integrand.place(inputs, hit.face, hit.b1, hit.b2)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
         counts = hit.valid & (self.spheres.group(hit.face) == group)
         weight = dr.select(counts, distance / (cosine * density * hit.chance), 0.0)
         return Samples(frame, hit.face, hit.b1, hit.b2, weight, hit.transmittance, hit.extra)
+
+
+def _dealt(column: Any, row: Any) -> Any:
+    """Bits by which a grid falls into halves that are as even as it is, and these again."""
+    bits = mi.UInt32(0)
+    for k in range(DEALT // 2):
+        x, y = column >> k, row >> k
+        bits |= (((x ^ y) & 1) | ((y & 1) << 1)) << (2 * k)
+    return bits
 
 
 class AreaSampler:

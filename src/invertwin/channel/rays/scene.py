@@ -107,6 +107,24 @@ class RayScene(Occluders):
         """Vertices in float64, three numbers each."""
         return mi.Float64((self.geometry.vertices.detach() - self.origin).ravel().numpy())
 
+    def exact(self, vertex: Any, active: Any = True) -> Any:
+        """Vertices in float64.
+
+        Args:
+            vertex: Their numbers.
+            active: Lanes.
+        """
+        return dr.gather(mi.Vector3d, self.exact_vertices, vertex, active)
+
+    def exact_ends(self, edge: Any) -> tuple[Any, Any]:
+        """Both ends of edges in float64.
+
+        Args:
+            edge: Their numbers.
+        """
+        first, second = self.topology.device_edges
+        return tuple(self.exact(dr.gather(mi.UInt32, ends, edge)) for ends in (first, second))  # type: ignore[return-value]
+
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Corners of triangles, detached.
 

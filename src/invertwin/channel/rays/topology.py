@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
@@ -17,6 +17,7 @@ from invertwin.scene.checks import plain
 from invertwin.scene.mesh import Mesh
 
 _KEPT_TOPOLOGIES = 8
+_FLAT, _SHARP = 1e-6, 0.35  # radians: rounding of coordinates; an edge of the object itself
 _UNGROUPED = 256  # triangles that are not worth a group
 
 
@@ -50,12 +51,14 @@ class Topology:
         self.device_faces = to_index(faces)
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
+        self.device_edge_object = to_index(owner[self.edges[:, 0]])
         self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
         self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]
         mesh = mi.Mesh("scene", vertex_count=len(vertices), face_count=len(faces))
         self._parameters = mi.traverse(mesh)
         self._parameters["faces"] = self.device_faces
         self._uploaded: Tensor | None = None
+        self._facets: Tensor | None = None
         self._mesh = mesh
         self._scene: Any = None
 
@@ -77,6 +80,38 @@ class Topology:
             slot = (self.welded[face[edge]] == apex[edge, None]).int().argmax(1)
             table[face[edge], slot] = edge
         return table
+
+    def facet_angle(self, number: int, vertices: Float64[Tensor, "v 3"]) -> float:
+        """By how much normals of neighbours turn where an object is curved [rad]; 0 = nowhere.
+
+        The median over its smooth edges, as the mesh is when this is first asked for.
+
+        Args:
+            number: Of the object.
+            vertices: World positions [m].
+        """
+        if self._facets is None:
+            a, b, c = vertices.detach()[self.faces].unbind(1)
+            normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+            both = self.beside[(self.beside >= 0).all(1)]
+            first, second = normals[both[:, 0]], normals[both[:, 1]]
+            angle = 2 * torch.asin((0.5 * (first - second).norm(dim=1)).clamp_max(1.0))
+            owner = self.face_object[both[:, 0]]
+            smooth = (angle > _FLAT) & (angle < _SHARP)
+            self._facets = torch.zeros(int(self.face_object.max()) + 1, dtype=torch.float64)
+            for k in owner[smooth].unique():
+                self._facets[k] = angle[smooth & (owner == k)].median()
+        return float(self._facets[number])
+
+    @cached_property
+    def device_welded(self) -> Any:
+        """``welded`` as a flat array of the ray tracer."""
+        return to_index(self.welded)
+
+    @cached_property
+    def device_face_edges(self) -> Any:
+        """``face_edges`` as a flat array of the ray tracer."""
+        return mi.Int32(self.face_edges.int().ravel().numpy())
 
     def around(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
         """Triangles and all that share an edge with them (−1: none)."""

@@ -30,7 +30,7 @@ from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
-from invertwin.registry.section import InputPath, Section, Seed, Vector, fail, key
+from invertwin.registry.section import InputPath, Section, Seed, Vector, Words, fail, key
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "whole", "seen", "count", "m", "number", "consistency")
@@ -99,7 +99,7 @@ class _RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
     task: Annotated[str, NameOf("task")] = key("what the file is for")
-    title: str = key("heading of the report", "")
+    title: Words = key("heading of the report", "")
     note: str = key("shown in the report", "")
     seed: Seed = key("seed of all random numbers", 0)
     scene: dict[str, Annotated[Any, OneOf("object")]] = key("[scene.<name>]: an object each", {})
