@@ -20,7 +20,7 @@ def make_run(**changes) -> RunFile:
     material = {"kind": "rough_dielectric", "permittivity": 4.0}
     raw = {
         "task": "reconstruct",
-        "title": 'A "quoted" title \\ with ✓ and \u007f',
+        "title": 'A "quoted" title \\ with ✓ and ü',
         "scene": {
             "letter one": {"shape": "text", "text": "A", "material": material},
             "slits": {

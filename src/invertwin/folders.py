@@ -75,7 +75,12 @@ def in_one_line(do: str) -> Iterator[None]:
 
 
 def not_ours(path: Path, name: str) -> InputError:
-    """The error of a file in the way that no run has written."""
+    """The error of a file in the way that no run has written.
+
+    Args:
+        path: Of the folder.
+        name: Path in the folder.
+    """
     return InputError(
         f"expected no file of others where results go, got {name!r} in {path}, which no run has "
         "written; move it away or choose another -o"
@@ -83,7 +88,12 @@ def not_ours(path: Path, name: str) -> InputError:
 
 
 def lock_folder(path: Path, held: ExitStack) -> None:
-    """Lock a folder until the stack is closed, or the process dies."""
+    """Lock a folder until the stack is closed, or the process dies.
+
+    Args:
+        path: Of the folder.
+        held: Keeps the lock.
+    """
     file = path / LOCK
     if file.is_symlink() or (file.exists() and (not file.is_file() or file.stat().st_size)):
         raise not_ours(path, LOCK)
@@ -121,13 +131,23 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def save_manifest(path: Path, manifest: Manifest) -> None:
-    """Write the manifest, the old or the new one whole."""
+    """Write the manifest, the old or the new one whole.
+
+    Args:
+        path: Of the folder.
+        manifest: What it holds.
+    """
     with replacing(path / MANIFEST) as part:
         part.write_text(manifest.model_dump_json(indent=1), encoding="utf-8")
 
 
 def place_in(path: Path, name: str) -> Path:
-    """A file in the folder, if its name is plain: it does not lead elsewhere, nor do links."""
+    """A file in the folder, if its name is plain: it does not lead elsewhere, nor do links.
+
+    Args:
+        path: Of the folder.
+        name: Path in the folder.
+    """
     parts = PurePosixPath(name).parts
     above = (path.joinpath(*parts[:k]) for k in range(1, len(parts)))
     if not parts or parts[0] == "/" or {"..", LOCK, MANIFEST} & {*parts} or "\0" in name:
@@ -140,14 +160,25 @@ def place_in(path: Path, name: str) -> Path:
 
 
 def require_free(path: Path, name: str, own: Iterable[str]) -> None:
-    """Refuse a name at which something lies that is no file of our own."""
+    """Refuse a name at which something lies that is no file of our own.
+
+    Args:
+        path: Of the folder.
+        name: Path in the folder.
+        own: Names of files that may be replaced.
+    """
     place = place_in(path, name)
     if os.path.lexists(place) and (name not in own or place.is_symlink() or place.is_dir()):
         raise not_ours(path, name)
 
 
 def moved(path: Path, manifest: Manifest) -> Manifest:
-    """Put the files of a complete run in their places; go on where a kill has cut it short."""
+    """Put the files of a complete run in their places; go on where a kill has cut it short.
+
+    Args:
+        path: Of the folder.
+        manifest: What it holds.
+    """
     work = manifest.unfinished
     assert work is not None
     results = [name for name in work.files if not name.startswith(f"{PARTS}/")]
@@ -163,7 +194,12 @@ def moved(path: Path, manifest: Manifest) -> Manifest:
 
 
 def without_unfinished(path: Path, manifest: Manifest) -> Manifest:
-    """Remove what an unfinished run has left."""
+    """Remove what an unfinished run has left.
+
+    Args:
+        path: Of the folder.
+        manifest: What it holds.
+    """
     if manifest.unfinished is None:
         return manifest
     _remove(path, [f"{UNFINISHED}/{name}" for name in manifest.unfinished.files])

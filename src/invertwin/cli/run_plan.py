@@ -64,11 +64,10 @@ def run_plan(
     if added:
         ranked = enumerate(metrics["candidates"], 1)
         rows = [[str(rank), row["position"], row["share"]] for rank, row in ranked]
-        heads = ["rank", "position [m]", "standard deviations, times"]
-        parts.append(Table("Positions to add", heads, rows, texts("notes")["candidates"]))
-    title = run.title or "Plan"
+        heads, note = ("rank", "position [m]", "deviations, times"), texts("notes")["candidates"]
+        parts.append(Table("Positions to add", heads, rows, note))
     status = f"{len(found.names)} parameters, {len(found.unobserved)} directions not observed."
-    return finish(folder, metrics, title, status, parts, again="plan", note=run.note)
+    return finish(folder, metrics, run.title or "Plan", status, parts, again="plan", note=run.note)
 
 
 def _at_truth(problem: Problem) -> Any:
@@ -105,11 +104,9 @@ def _compared(
         rows.append(row)
     errors = torch.tensor([list(row.values()) for row in rows], dtype=torch.float64)
     spread = dict(zip(rows[0], errors.std(0).tolist(), strict=True))
-    ratios = {name: stated[name] / spread[name] for name in stated if spread.get(name)}
-    means = dict(zip(rows[0], errors.mean(0).tolist(), strict=True))
     return {
         "simulated_fits": count,
         "observed_deviations": spread,
-        "observed_means": means,
-        "predicted_over_observed": ratios,
+        "observed_means": dict(zip(rows[0], errors.mean(0).tolist(), strict=True)),
+        "predicted_over_observed": {n: stated[n] / spread[n] for n in stated if spread.get(n)},
     }

@@ -13,12 +13,12 @@ def certainty_table(metrics: dict[str, Any]) -> Table:
         unit, factor = metrics["units"][name], 1.0
         if unit == "rad":
             unit, factor = "°", math.degrees(1)
-        shown = [factor * value, factor * metrics["within_95"][name]]
-        shown.append(metrics.get("coverage_95", {}).get(name.split(".")[-1]))
-        shown.append(metrics.get("predicted_over_observed", {}).get(name))
-        cells.append([f"{name} [{unit}]" if unit else name, *shown])
-    heads = ["parameter", "standard deviation", "95 % of errors within", "coverage"]
-    heads.append("over that of simulated fits")
+        row = [f"{name} [{unit}]" if unit else name, factor * value]
+        row += [factor * metrics["within_95"][name]]
+        row += [metrics.get("coverage_95", {}).get(name.split(".")[-1])]
+        cells.append([*row, metrics.get("predicted_over_observed", {}).get(name)])
+    heads = ["parameter", "standard deviation", "95 % of errors within"]
+    heads += ["coverage", "over that of simulated fits"]
     kept = [k for k in range(len(heads)) if k < 3 or any(row[k] is not None for row in cells)]
     heads, cells = [heads[k] for k in kept], [[row[k] for k in kept] for row in cells]
     told = ("verdict_reasons", "ambiguities", "unobserved")

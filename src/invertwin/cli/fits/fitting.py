@@ -1,14 +1,11 @@
 """The fits themselves: calibration, one fit per start, progress, interruptions."""
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -46,7 +43,7 @@ from invertwin.inversion import (
     reconstruct,
     search,
 )
-from invertwin.inversion.callbacks import stage_file
+from invertwin.inversion.callbacks import interrupted_between_steps, stage_file
 from invertwin.inversion.certainty import certainty
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runs import RunFolder
@@ -204,7 +201,7 @@ def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
     words, lines = TextColumn("{task.description}"), not console.is_terminal
     bar = Progress(*columns, words, console=console, disable=lines)
     task = bar.add_task("", total=steps)
-    with bar, _interrupted_between_steps() as heed:
+    with bar, interrupted_between_steps() as heed:
 
         def show(row: dict[str, Any]) -> None:
             values = " ".join(
@@ -220,33 +217,3 @@ def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
             heed()
 
         yield [Report(show)]
-
-
-@contextmanager
-def _interrupted_between_steps() -> Iterator[Callable[[], None]]:
-    """Ctrl-C waits for the end of the step, when nothing is half done; a second one does not.
-
-    Gives a function that raises KeyboardInterrupt if one is due.
-    """
-    due = False
-
-    def heed() -> None:
-        if due:
-            raise KeyboardInterrupt
-
-    def note(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal due
-        heed()
-        due = True
-
-    # Another handler, or another thread than the main one, is not ours to change.
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not ours or threading.current_thread() is not threading.main_thread():
-        yield heed
-        return
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield heed
-        heed()
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
