@@ -166,5 +166,7 @@ def test_residuals_beyond_the_mark_are_framed():
     assert frame.get_xy() == pytest.approx((-0.4 + 0.05 * 7.5, 1.0 + 0.1 * 3.5))
     assert (frame.get_width(), frame.get_height()) == pytest.approx((0.2, 0.4))
     (image,) = cell.images
-    assert float(image.get_array()[1, 2]) == 8.0
+    shown = image.get_array()
+    assert shown is not None
+    assert float(shown[1, 2]) == 8.0
     assert image.get_clim() == (-10.0, 10.0)
