@@ -71,3 +71,14 @@ def deviation(x: float, frames: int) -> float:
     assert isinstance(slopes, Tensor)
     # A fitted gain takes what is common to all bins.
     return float((frames * (slopes - slopes.mean()).square().sum()).rsqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class Needle(Blob):
+    """Shows where the object's own x axis points, but hardly at which end."""
+
+    def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
+        way = scene["ball"].transform[:3, 0]
+        power = 0.05 + sum(torch.exp(-((BINS - s * way[2]) ** 2) / 0.08) for s in (1.0, -1.0))
+        assert isinstance(power, Tensor)
+        return power.expand(self.frames, -1)[..., None, None]

@@ -6,7 +6,7 @@ on from there. A lock keeps a second run out.
 """
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from glob import escape
 from pathlib import Path, PurePosixPath
@@ -15,7 +15,6 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, ValidationError
 
 from invertwin.errors import InputError
-from invertwin.scene.files import replacing
 
 MANIFEST = ".invertwin.json"
 LOCK = ".invertwin.lock"
@@ -38,6 +37,29 @@ class Manifest(BaseModel):
     digest: str = ""
     files: list[str] = []
     unfinished: Work | None = None
+
+
+@contextmanager
+def replacing(path: str | Path) -> Generator[Path]:
+    """Write a new file beside a path; it takes its place when it is complete.
+
+    A failure leaves an existing file as it was.
+
+    Args:
+        path: the file, in an existing folder; the new one has its suffix.
+
+    Raises:
+        InputError: no such folder.
+    """
+    file = Path(path)
+    if not file.parent.is_dir():
+        raise InputError(f"expected an existing folder, got {file.parent}; create it first")
+    part = file.with_name(f".{file.stem}.{os.getpid()}.part{file.suffix}")
+    try:
+        yield part
+        os.replace(part, file)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -25,6 +25,29 @@ def test_a_run_states_verdict_and_error_bars(run_file, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+def test_a_search_about_a_bad_start_finds_the_right_place(run_file, monkeypatch, capsys):
+    search = """
+[search]
+object = "plate"
+kind = "given"
+positions = [[0.02, 0.01, 1.18], [0.4, 0.0, 1.4]]
+
+[loss]
+kind = "likelihood"
+"""
+    begun = RUN.replace("position = [0.0, 0.0, 1.2]", "position = [-0.5, 0.0, 1.45]")
+    run_file.write_text(begun + search)
+    assert call(monkeypatch, "reconstruct", run_file, "-o", "out") == 0
+    metrics = read_metrics(run_file.parent / "out")
+    assert metrics["position_error_m"] < 0.1
+    assert metrics["ambiguities"] == []
+    assert {"pose", "loss", "score"} == set(metrics["other_ends"][0])
+    assert metrics["other_ends"][0]["loss"] > metrics["loss"]
+    assert (run_file.parent / "out" / "checkpoint.pt").exists()
+    assert (run_file.parent / "out" / "residuals.png").exists()
+
+
+@pytest.mark.slow
 def test_every_start_with_a_recording_of_its_own(run_file, monkeypatch):
     run_file.write_text(RUN.replace("snr_db = 20.0", "snr_db = 20.0\nevery_start = true") + STARTS)
     assert call(monkeypatch, "reconstruct", run_file, "-o", "out") == 0

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from blobs import BINS, LAW, Blob, scene
+from blobs import BINS, LAW, Blob, Needle, scene
 from invertwin.errors import InputError
 from invertwin.inversion import Observation, Optimizer, Schedule, nearby, pose_grid
 from invertwin.inversion.minima import Search, search
@@ -74,17 +74,6 @@ def test_a_right_competitor_is_not_rejected(seed):
     right = min(range(2), key=lambda k: abs(places_of(result)[k] - 0.8))
     score = result.rivals[right]
     assert score is None or score < 2.33
-
-
-@dataclass(frozen=True, eq=False)
-class Needle(Blob):
-    """Shows where the object's own x axis points, but hardly at which end."""
-
-    def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
-        way = scene["ball"].transform[:3, 0]
-        power = 0.05 + sum(torch.exp(-((BINS - s * way[2]) ** 2) / 0.08) for s in (1.0, -1.0))
-        assert isinstance(power, Tensor)
-        return power.expand(self.frames, -1)[..., None, None]
 
 
 def test_half_turns_are_tried_without_being_asked():

@@ -16,7 +16,7 @@ from invertwin.inversion import (
     Schedule,
     reconstruct,
 )
-from invertwin.inversion.uncertainty import _coordinates
+from invertwin.inversion.uncertainty import coordinates
 from invertwin.radar.parameters import RadarPose, RangeBias
 from invertwin.scene import Pose, Scale, Scene, Translation
 from invertwin.scene.parameters import Coordinate
@@ -116,7 +116,7 @@ def test_a_mixed_direction_is_named_with_its_parts():
     assert both**0.5 == pytest.approx(deviation(0.1, 4), rel=0.25)
 
 
-def test_modules_name_their_coordinates():
+def test_modules_name_theircoordinates():
     named = nn.ModuleList(
         [
             Pose("ball", rotation=[0.0, 0.4, 0.0], axes="x", rotation_axes="y"),
@@ -126,7 +126,7 @@ def test_modules_name_their_coordinates():
             Translation("ball").requires_grad_(False),
         ]
     )
-    found = {c.name: c for c in _coordinates(named)}
+    found = {c.name: c for c in coordinates(named)}
     assert list(found) == [
         *("ball.x", "ball.yaw", "ball.scale", "range_bias", "3.weight[0]", "3.weight[1]")
     ]

@@ -12,9 +12,8 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.report import Picture, Table, finish, texts
+from invertwin.cli.report import Picture, Table, finish, picture, texts
 from invertwin.cli.run_file import about_file, need
-from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.errors import InputError
@@ -23,6 +22,7 @@ from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
 from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
+from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 
 _COLUMNS = (
@@ -158,15 +158,15 @@ def _check(
         seed=run.seed,
         progress=say,
     )
-    folder.write_figure(f"{name}.png", _maps(report, grid, settings))
+    picture(folder, f"{name}", _maps(report, grid, settings))
     moved = filter(None, [getattr(settings.parameter, "object", None)])
-    folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=[*moved]))
+    picture(folder, f"{name}_scene", plotting.scene(scene, radar, highlight=[*moved]))
     kept = {key: value for key in _KEPT if (value := getattr(report, key)) is not None}
     found = {k: asdict(v) if isinstance(v, Agreement) else v for k, v in kept.items()}
     checked = Checked(run, scene, radar, grid, check.step, report, say)
     for key, study in _studies(run).items():
         found[key], figure = study.compare(checked)
-        folder.write_figure(f"{name}_{key}.png", figure)
+        picture(folder, f"{name}_{key}", figure)
     return found | {"seconds": time.perf_counter() - begin}
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.inversion.fit import Callback, Fit
-from invertwin.scene.files import replacing
 from invertwin.scene.scene import Scene
 
 

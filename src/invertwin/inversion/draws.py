@@ -38,14 +38,29 @@ class End:
 
     Args:
         fit: A fit that has ended.
+        maps, looks: Those of some frames only, in place of its own.
     """
 
-    def __init__(self, fit: Fit) -> None:
-        self.fit = fit
+    def __init__(
+        self, fit: Fit, maps: Maps | None = None, looks: Sequence[list[Tensor]] | None = None
+    ) -> None:
+        self.fit, self._maps, self._looks = fit, maps, looks
+
+    def frames(self, chosen: Sequence[int], looks: Sequence[list[Tensor]]) -> "End":
+        """The same for some frames of every observation.
+
+        Args:
+            chosen: Their numbers.
+            looks: Those of all frames.
+        """
+        maps = [(a[chosen], b[chosen]) for a, b in self.maps]
+        return End(self.fit, maps, [[power[chosen] for power in look] for look in looks])
 
     @cached_property
     def maps(self) -> Maps:
         """The predicted and the observed map of every observation, sharp and with all frames."""
+        if self._maps is not None:
+            return self._maps
         with torch.no_grad():
             ends = [self.fit.sharp_maps(number) for number in (0, 1)]
         return [((a + c) / 2, b) for (a, b), (c, _) in zip(*ends, strict=True)]
@@ -75,6 +90,9 @@ class End:
 
     def looks(self) -> Iterator[list[Tensor]]:
         """Maps of every observation as recordings of the twin would show them, with noise."""
+        if self._looks is not None:
+            yield from self._looks
+            return
         looks = [look for look in self.fit.looks(0) if look is not None]
         if not min(self.gains) > 0 or len(looks) < len(self.maps):
             return
@@ -109,7 +127,12 @@ def coarse(power: Tensor) -> Tensor:
 
 
 def zscore(value: float, drawn: Sequence[float]) -> float:
-    """How many standard deviations a number is above the mean of others."""
+    """How many standard deviations a number is above the mean of others.
+
+    Args:
+        value: The number.
+        drawn: The others.
+    """
     others = torch.tensor(drawn, dtype=torch.float64)
     return (value - float(others.mean())) / max(float(others.std()), 1e-30)
 

@@ -1,5 +1,6 @@
 """One stage of a fit: a model predicts, a loss compares, an optimiser steps."""
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -193,16 +194,18 @@ class Fit:
             pairs.append((predicted, model.blurred(observed, sensor)))
         return pairs
 
-    def sharp_maps(self, number: int) -> Maps:
+    def sharp_maps(self, number: int, **sampled: Any) -> Maps:
         """The predicted and the observed map of every observation, with all frames, not blurred.
 
         Args:
             number: Other numbers have other random numbers.
+            sampled: Fields of the models' ``sampling`` in place of their own.
         """
         scene, sensors = self.applied()
         pairs = []
         for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True)):
             key = derived_seed(self._settings.seed, _SHARP, number, k)
+            model = model.sampled_by(**sampled) if sampled else model
             predicted = model.narrowed(0.0).predict(scene, sensor, key)
             pairs.append((predicted, self._observed[k]))
         return pairs
@@ -247,6 +250,23 @@ class Fit:
     def parameters(self) -> dict[str, Tensor]:
         """A copy of the present parameters."""
         return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
+
+    def copied(self) -> "Fit":
+        """The same fit with parameters of its own, which are as they are now."""
+        other = copy.copy(self)
+        own = (self.unknowns, self.sensor_unknowns, self.modules)
+        other.unknowns, other.sensor_unknowns, other.modules = copy.deepcopy(own)
+        return other
+
+    def descended(self, descent: GaussNewton, step: int) -> float:
+        """The loss before a Gauss–Newton step with the random numbers of a step.
+
+        Args:
+            descent: Of the modules of this fit.
+            step: Its number.
+        """
+        penalty = self.penalty if self._settings.regularizers else None
+        return descent.step(partial(self.maps, step), penalty)
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on later."""
@@ -319,8 +339,7 @@ class Fit:
     def _stepped(self, step: int) -> float:
         """The loss of the present parameters, which then take a step down."""
         if isinstance(self.optimizer, GaussNewton):
-            penalty = self.penalty if self._settings.regularizers else None
-            return self.optimizer.step(partial(self.maps, step), penalty)
+            return self.descended(self.optimizer, step)
         self.optimizer.zero_grad()
         value = self.evaluate(step)
         number = float(value.detach())

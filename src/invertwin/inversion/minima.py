@@ -2,31 +2,34 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
+from invertwin.channel import Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.draws import End, zscore
+from invertwin.inversion.fit import Callback
 from invertwin.inversion.loss import Objective, SpectrumLoss
 from invertwin.inversion.metrics import residual
 from invertwin.inversion.observation import Observation, Unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.regularization import Regularizer
+from invertwin.inversion.rivals import REJECTED, same, score, turns, way
 from invertwin.inversion.schedule import Schedule
 from invertwin.inversion.starts import displaced
+from invertwin.limits import Count, Positive
+from invertwin.models import ForwardModel
+from invertwin.scene.checks import Point
 from invertwin.scene.scene import Object, Scene
 from invertwin.seeds import derived_seed
 
 _FITS = 4  # full fits of the best starts
-_REJECTED = 2.33  # standard deviations: one right competitor in a hundred is rejected
-_SAME_PLACE, _SAME_TURN = 0.03, 0.1  # m and rad: ends as near are one
-_SAME_SURFACE = 0.02  # m, between vertices: poses as near look alike
+_FEWER = 8  # samples of a screened start: a share of those of a fit
 _NEAR_PLACE, _NEAR_TURN = 0.1, 0.35  # m and rad: of starts as near one is enough
 
 
@@ -40,31 +43,44 @@ class Search:
         rivals: For every end how unlikely the difference of its loss and the best one's is, were it
             right, in standard deviations over looks at its twin. None where there are no looks.
         ambiguities: A sentence for every end that the data do not reject.
+        number: Of the best fit, as ``callbacks`` got it.
+        objects: Names of those with several starts.
     """
 
     best: Reconstruction
     ends: list[Reconstruction]
     rivals: list[float | None]
     ambiguities: tuple[str, ...]
+    number: int
+    objects: tuple[str, ...]
+
+    def rows(self) -> dict[str, Any]:
+        """The other ends as numbers: how they differ from the best, loss, score."""
+        best = self.best.scene
+        ends = [
+            {"pose": way(best, end.scene, self.objects), "loss": end.loss, "score": score}
+            for end, score in zip(self.ends[1:], self.rivals[1:], strict=True)
+        ]
+        return {"other_ends": ends, "ambiguities": list(self.ambiguities)}
 
 
 def pose_grid(
     item: Object,
-    low: Sequence[float],
-    high: Sequence[float],
-    step: float,
-    turns: int = 4,
-    axis: Sequence[float] = (0.0, 1.0, 0.0),
+    low: Point,
+    high: Point,
+    step: Positive,
+    turns: Count = 4,
+    axis: Point = (0.0, 1.0, 0.0),
 ) -> Iterator[Object]:
     """An object on a coarse grid over a box of poses, as copies of it.
 
     Args:
         item: The object.
-        low: Corner of the box of its centre [m].
-        high: The opposite corner.
-        step: From one place to the next at most [m].
-        turns: Turns about the axis at every place, evenly spread over a whole one.
-        axis: Of the turns, in the world.
+        low: m, corner of the box of its centre
+        high: m, the opposite corner
+        step: m, from one place to the next at most
+        turns: about the axis at every place, evenly spread over a whole one
+        axis: of the turns, in the world
     """
     axes = [
         torch.linspace(a, b, 1 + math.ceil((b - a) / step - 1e-9), dtype=torch.float64)
@@ -79,18 +95,19 @@ def search(
     scene: Scene,
     observations: Observation | Sequence[Observation],
     parameters: Unknowns,
-    starts: dict[str, Sequence[Object]],
+    starts: Mapping[str, Sequence[Object]],
     *,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
     optimizer: Optimizer | None = None,
     schedule: Schedule | Sequence[Schedule] | None = None,
     regularizers: Sequence[Regularizer] = (),
+    callbacks: Callable[[int], Sequence[Callback]] = lambda _: (),
     seed: int = 0,
 ) -> Search:
     """Fit from many starts, and say which ends the data tell apart.
 
     All starts are compared at the first, widest blur; the best four are fitted. Then the best end
-    is turned by half a turn about its own axes as far as a ``Pose`` may turn it, and fitted again.
+    is turned as ``rivals.turns`` says, by half a turn first, and fitted again.
     Ends that differ are compared in pairs with looks at the twin of the worse one: speckle that
     both losses share cancels in their difference.
 
@@ -104,6 +121,7 @@ def search(
         optimizer: Kind and rates.
         schedule: Of every fit.
         regularizers: Added to the loss.
+        callbacks: For the number of a fit, from 0, what watches it.
         seed: Of all random numbers.
 
     Raises:
@@ -126,46 +144,25 @@ def search(
             optimizer=optimizer,
             schedule=schedule,
             regularizers=regularizers,
+            callbacks=callbacks(number),
             seed=derived_seed(seed, number),
         )
 
-    found = [fit(start, number) for number, start in enumerate(_apart(screened, names)[:_FITS])]
+    found = [fit(start, number) for number, start in enumerate(_apart(screened, names))]
     best = min(found, key=_sharp)
-    for start in _half_turns(best):
+    for start in _turned(best):
         found.append(fit(start, len(found)))
     ends: list[Reconstruction] = []
     for end in sorted(found, key=_sharp):
-        if not any(_same(end.scene, other.scene, names) for other in ends):
+        if not any(same(end.scene, other.scene, names) for other in ends):
             ends.append(end)
-    rivals = [None if k == 0 else rival(ends[0].end, end.end) for k, end in enumerate(ends)]
+    rivals = [None if k == 0 else score(ends[0].end, end.end) for k, end in enumerate(ends)]
     told = tuple(
-        f"{_way(ends[0].scene, end.scene, names)} explains the data nearly as well: z = {z:.1f}"
+        f"{way(ends[0].scene, end.scene, names)} explains the data nearly as well: z = {z:.1f}"
         for end, z in zip(ends, rivals, strict=True)
-        if z is not None and z < _REJECTED
+        if z is not None and z < REJECTED
     )
-    return Search(ends[0], ends, rivals, told)
-
-
-def rival(best: End, other: End) -> float | None:
-    """How unlikely the difference of two losses is, were the other end right.
-
-    Args:
-        best: The end with the lower loss.
-        other: Another end of the same data.
-
-    Returns:
-        Standard deviations over looks at the twin of the other end; None where there are none.
-    """
-
-    def difference(observed: Sequence[Tensor]) -> float:
-        pairs = (
-            [(a, b) for (a, _), b in zip(end.maps, observed, strict=True)] for end in (other, best)
-        )
-        first, second = (float(best.fit.objective(maps)) for maps in pairs)
-        return first - second
-
-    drawn = [difference(look) for look in other.looks()]
-    return zscore(difference([b for _, b in best.maps]), drawn) if drawn else None
+    return Search(ends[0], ends, rivals, told, found.index(ends[0]), tuple(names))
 
 
 def _screening(
@@ -176,10 +173,12 @@ def _screening(
         tuple(o.loss or loss for o in observations), tuple(o.weight for o in observations)
     )
     blurred = [o.model.blurred(o.observed(), o.sensor) for o in observations]
+    models = [_coarse(o.model) for o in observations]
 
     def score(scene: Scene) -> float:
         with torch.no_grad():
-            maps = [o.model.predict(scene, o.sensor, seed) for o in observations]
+            drawn = zip(models, observations, strict=True)
+            maps = [model.predict(scene, o.sensor, seed) for model, o in drawn]
             lit = all(bool(power.any()) for power in maps)
             pairs = list(zip(maps, blurred, strict=True))
             return float(objective(pairs)) if lit else math.inf
@@ -187,64 +186,39 @@ def _screening(
     return score
 
 
+def _coarse(model: ForwardModel) -> ForwardModel:
+    """The model with few samples: enough for a blurred map."""
+    sampling = getattr(model, "sampling", None)
+    if not isinstance(sampling, Sampling):
+        return model
+    return model.sampled_by(samples=max(1, sampling.samples // _FEWER), boundary=False)
+
+
 def _sharp(found: Reconstruction) -> float:
     return float(found.end.fit.objective(found.end.maps))
 
 
-def _half_turns(found: Reconstruction) -> Iterator[Scene]:
-    """The twin with an object turned by half a turn about each of its axes that are free."""
+def _turned(found: Reconstruction) -> Iterator[Scene]:
+    """The twin with an object turned so that it looks much the same."""
+    none = torch.zeros(3, dtype=torch.float64)
     for module in found.parameters:
-        coordinates = getattr(module, "coordinates", list)()
-        turns = [c.name.split(".")[-1] for c in coordinates if c.unit == "rad"]
-        name = getattr(module, "object", None)
-        if name is None or not turns:
-            continue
-        item = found.scene[name]
-        own = item.transform.detach()[:3, :3].T
-        free = len(turns) == 3
-        for axis, turn in enumerate(("pitch", "yaw", "roll")):
-            if turn in turns:
-                about = own[axis] if free else torch.eye(3, dtype=torch.float64)[axis]
-                moved = displaced(item, torch.zeros(3, dtype=torch.float64), math.pi * about)
-                yield found.scene.replace(name, pose=moved.transform.detach())
+        for turn in turns(module, found.scene):
+            moved = displaced(found.scene[str(module.object)], none, turn)
+            yield found.scene.replace(str(module.object), pose=moved.transform.detach())
 
 
 def _apart(scenes: Sequence[Scene], names: Sequence[str]) -> list[Scene]:
-    """The scenes in order, without those that a better one stands for."""
+    """The first scenes, without those that a better one stands for."""
     kept: list[Scene] = []
     for scene in scenes:
-        if not any(_same(scene, other, names, _NEAR_PLACE, _NEAR_TURN) for other in kept):
+        if len(kept) == _FITS:
+            break
+        if not any(_near(scene, other, names) for other in kept):
             kept.append(scene)
     return kept
 
 
-def _same(
-    first: Scene,
-    second: Scene,
-    names: Sequence[str],
-    place: float = _SAME_PLACE,
-    turn: float = _SAME_TURN,
-) -> bool:
-    """Whether objects stand alike: in one pose, or in poses that look alike."""
-    for name in names:
-        a, b = first[name], second[name]
-        off = residual(a, b)
-        if off is not None and off.distance < place and off.angle < turn:
-            continue
-        tree = KDTree(b.vertices.detach().numpy())
-        if float(tree.query(a.vertices.detach().numpy())[0].max()) > _SAME_SURFACE:
-            return False
-    return True
-
-
-def _way(best: Scene, other: Scene, names: Sequence[str]) -> str:
-    """How one end differs from another, in words."""
-    told = []
-    for name in names:
-        off = residual(other[name], best[name])
-        if off is not None:
-            axis = "xyz"[int(off.turn.abs().argmax())]
-            turned = f"turned by {math.degrees(off.angle):.1f}° about {axis}, "
-            far = f"{name} {turned if off.angle > _SAME_TURN else ''}moved by {off.distance:.3f} m"
-            told.append(far)
-    return ", ".join(told) or "another shape"
+def _near(first: Scene, second: Scene, names: Sequence[str]) -> bool:
+    """Whether one start stands for another."""
+    offs = [residual(first[name], second[name]) for name in names]
+    return all(o and o.distance < _NEAR_PLACE and o.angle < _NEAR_TURN for o in offs)

@@ -16,7 +16,7 @@ from invertwin.inversion.observation import Observation, Unknown, Unknowns, name
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
-from invertwin.inversion.uncertainty import Uncertainty, uncertainty
+from invertwin.inversion.uncertainty import Evidence, Uncertainty
 from invertwin.inversion.verdict import Verdict, verdict
 from invertwin.models import ForwardModel
 from invertwin.scene.geometry.density import without_clouds
@@ -54,9 +54,9 @@ class Reconstruction:
         """The error bars of the parameters, computed when they are first asked for.
 
         Raises:
-            InputError: See :func:`invertwin.inversion.uncertainty.uncertainty`.
+            InputError: See :class:`invertwin.inversion.uncertainty.Evidence`.
         """
-        return uncertainty(self.end)
+        return Evidence(self.end).bars()
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -155,6 +155,38 @@ def reconstruct(
         final = fit.progress.best[1]
     return Reconstruction(
         twin, sensors, fit.modules, history, status, len(history), final, End(fit)
+    )
+
+
+def fit_at(
+    scene: Scene,
+    observations: Sequence[Observation],
+    parameters: Unknowns,
+    *,
+    loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+    regularizers: Sequence[Regularizer] = (),
+    seed: int = 0,
+) -> Fit:
+    """A fit that has not begun, to look at where it stands. The arguments are `reconstruct`'s.
+
+    Args:
+        scene: Where it stands.
+        observations: What was observed.
+        parameters: Modules Scene → Scene.
+        loss: How maps are compared.
+        regularizers: Added to the loss.
+        seed: Of all random numbers.
+    """
+    modules, terms = _made(scene, named_unknowns(parameters))
+    return Fit(
+        scene,
+        observations,
+        list(modules.values()),
+        [[u.made(o.sensor) for u in named_unknowns(o.parameters).values()] for o in observations],
+        stage=Stage(),
+        settings=Settings(loss or SpectrumLoss(), Optimizer(), (*regularizers, *terms), seed),
+        rates={},
+        position=(0, 0, True),
     )
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -72,8 +72,8 @@ class Uncertainty:
         return {name: factor * value for name, value in self.deviations.items()}
 
 
-def uncertainty(end: End) -> Uncertainty:
-    """The covariance of what a fit has found.
+class Evidence:
+    """What the maps at the end of a fit, and looks at its twin, tell about its parameters.
 
     ``Cov θ = H⁻¹ Cov(g) H⁻¹``: H the Gauss–Newton matrix of the loss, g its gradient on looks at
     the twin with other speckle and noise, both with a gain fitted anew. Derivatives of the map are
@@ -88,56 +88,80 @@ def uncertainty(end: End) -> Uncertainty:
         end: Of the fit.
 
     Raises:
-        InputError: More than 64 coordinates, a loss that is no ``SpectrumLoss``, or a single frame
-            of a model without looks.
+        InputError: More than 64 coordinates, or a loss that is no ``SpectrumLoss``.
     """
-    fit = end.fit
-    found = list(_coordinates(fit.modules))
-    others = [x for x in fit.objective.losses if not isinstance(x, SpectrumLoss)]
-    if len(found) > _MOST or others:
-        raise InputError(
-            f"expected a SpectrumLoss and at most {_MOST} parameters for error bars, got "
-            f"{type(others[0]).__name__ if others else len(found)}; they are not known for this fit"
-        )
-    maps, (first, second) = end.maps, (_derivatives(fit, found, number) for number in (0, 1))
-    # What nothing depends on is held fixed, unless it has a meaning of its own.
-    moves = [any(bool(rows[k].any()) for rows in first) for k in range(len(found))]
-    kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
-    found = [found[k] for k in kept]
-    first, second = ([rows[kept] for rows in side] for side in (first, second))
-    # J₁J₂ᵀ + J₂J₁ᵀ = 2 (mean mean − half half), with half the difference of J₁ and J₂.
-    rows = [[(a + b) / 2 for a, b in zip(first, second, strict=True)]]
-    rows.append([(a - b) / 2 for a, b in zip(first, second, strict=True)])
-    curvature, feigned = (fit.objective.curvature(maps, some) for some in rows)
-    if end.draws is not None:
-        count, by = len(end.draws.losses), "looks"
-        scatter, chance = (_covariance(end.draws.slopes, some) for some in rows)
-    else:
-        count, by = min(len(b) for _, b in maps), "frames"
-        if count < 2:
+
+    def __init__(self, end: End) -> None:
+        fit = end.fit
+        found = list(coordinates(fit.modules))
+        others = [x for x in fit.objective.losses if not isinstance(x, SpectrumLoss)]
+        if len(found) > _MOST or others:
             raise InputError(
-                "expected looks at the twin or several frames for error bars, got one frame of a "
-                "model without looks; they are not known for this fit"
+                f"expected a SpectrumLoss and at most {_MOST} parameters for error bars, got "
+                f"{type(others[0]).__name__ if others else len(found)}; they are not known for "
+                "this fit"
             )
-        scatter, chance = (_frame_scatter(end.slopes(maps)[1], some) for some in rows)
-    curvature = curvature - feigned + _penalty(fit, found)
-    spans = torch.tensor([c.span for c in found], dtype=torch.float64)
-    own = curvature.diagonal().clamp_min(1e-30).rsqrt()
-    spans = torch.where(spans.isinf(), own, spans)
-    square = spans * spans[:, None]
-    covariance = _inverted(*(m * square for m in (curvature, feigned, scatter, chance)))
-    return Uncertainty(
-        tuple(c.name for c in found),
-        tuple(c.unit for c in found),
-        covariance * square,
-        tuple(_unobserved(found, covariance)),
-        count,
-        by,
-    )
+        self._end = end
+        first, second = (_derivatives(fit, found, number) for number in (0, 1))
+        # What nothing depends on is held fixed, unless it has a meaning of its own.
+        moves = [any(bool(rows[k].any()) for rows in first) for k in range(len(found))]
+        kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
+        self._found = [found[k] for k in kept]
+        first, second = ([rows[kept] for rows in side] for side in (first, second))
+        # J₁J₂ᵀ + J₂J₁ᵀ = 2 (mean mean − half half), with half the difference of J₁ and J₂.
+        pairs = list(zip(first, second, strict=True))
+        self._rows = [(a + b) / 2 for a, b in pairs], [(a - b) / 2 for a, b in pairs]
+
+    def bars(self, frames: Sequence[int] | None = None, looks: Sequence[Any] = ()) -> Uncertainty:
+        """The error bars.
+
+        Args:
+            frames: Numbers of those that count; None = all.
+            looks: At all frames, where only some count.
+
+        Raises:
+            InputError: A single frame of a model without looks.
+        """
+        end, found, rows = self._end, self._found, self._rows
+        if frames is not None:
+            end = end.frames(frames, looks)
+            rows = [[part[:, frames] for part in side] for side in rows]
+        objective = end.fit.objective
+        curvature, feigned = (objective.curvature(end.maps, some) for some in rows)
+        if end.draws is not None:
+            count, by = len(end.draws.losses), "looks"
+            scatter, chance = (_covariance(end.draws.slopes, some) for some in rows)
+        else:
+            count, by = min(len(b) for _, b in end.maps), "frames"
+            if count < 2:
+                raise InputError(
+                    "expected looks at the twin or several frames for error bars, got one frame "
+                    "of a model without looks; they are not known for this fit"
+                )
+            scatter, chance = (_frame_scatter(end.slopes(end.maps)[1], some) for some in rows)
+        curvature = curvature - feigned + _penalty(end.fit, found)
+        spans = torch.tensor([c.span for c in found], dtype=torch.float64)
+        own = curvature.diagonal().clamp_min(1e-30).rsqrt()
+        spans = torch.where(spans.isinf(), own, spans)
+        square = spans * spans[:, None]
+        covariance = _inverted(*(m * square for m in (curvature, feigned, scatter, chance)))
+        return Uncertainty(
+            tuple(c.name for c in found),
+            tuple(c.unit for c in found),
+            covariance * square,
+            tuple(_unobserved(found, covariance)),
+            count,
+            by,
+        )
 
 
-def _coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
-    """What a module and its parts find, with parameters by their whole name."""
+def coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
+    """What a module and its parts find, with parameters by their whole name.
+
+    Args:
+        module: What is fitted.
+        path: Name of the module, with a dot at its end.
+    """
     if hasattr(module, "coordinates"):
         for own in module.coordinates():  # type: ignore[operator]
             if all(module.get_parameter(name).requires_grad for name in own.tangents):
@@ -160,7 +184,7 @@ def _coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
             yield Coordinate(shown, "", {path + entry.parameter: tangent})
     for name, child in module.named_children():
         if not any(whole.startswith(f"{name}.") for whole in held):
-            yield from _coordinates(child, f"{path}{name}.")
+            yield from coordinates(child, f"{path}{name}.")
 
 
 def _derivatives(fit: Fit, found: Sequence[Coordinate], number: int) -> list[Tensor]:

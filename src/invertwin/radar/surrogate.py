@@ -69,8 +69,9 @@ class Surrogate:
 
         A convolution with the power point spread (peak 1), divided in the Fourier domain by the
         transform sinc³ of the deposit's quadratic B-spline, so that the deposit adds no blur.
-        Nothing wraps around: what leaves the grid is lost. On a grid that is coarser than two bins
-        a cell, maps have negative bins and are not the mean of the exact spectra; it warns.
+        Nothing wraps around: what leaves the grid is lost. Power is never negative: what the
+        division leaves below zero, 4e-5 of the peak with two bins a cell, counts as zero. On a
+        coarser grid it is 3 % of the peak, and maps are not the mean of exact spectra; it warns.
 
         Args:
             deposit: From ``deposit_power`` on the same grid.
@@ -88,7 +89,7 @@ class Surrogate:
             if kernel.dims == (1,) and radar.biased:
                 offset = torch.as_tensor(radar.range_bias) / grid.range_step
             deposit = kernel.apply(deposit, [sigmas[dim] for dim in kernel.dims], offset)
-        return deposit
+        return deposit.clamp_min(0.0)
 
     def blur(
         self, power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
@@ -325,8 +326,8 @@ def _warn_if_coarse(radar: Radar, grid: Grid, sigmas: dict[int, float]) -> None:
     ]
     if coarse:
         warnings.warn(
-            f"less than 2 bins per cell along {', '.join(coarse)}: the surrogate gets negative "
-            "bins there and is not the mean of exact spectra; use oversample=2",
+            f"less than 2 bins per cell along {', '.join(coarse)}: the surrogate is not the mean "
+            "of exact spectra there, and a fit may end a little off; use oversample=2",
             PhysicsWarning,
             stacklevel=2,
         )

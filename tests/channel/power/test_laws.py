@@ -148,7 +148,7 @@ def test_a_plate_of_gentle_slopes_is_a_mirror(slope, bounces):
     if bounces == 2:  # a roof: to the side, and back beside the transmitter
         small, tilt = plate(24 * slope, 24 * slope), math.pi / 4
         turned = thing(small, (0.0, 0.0, 2.0), (0.0, tilt, 0.0), metal)
-        wide = thing(plate(60 * slope, 60 * slope), (-1.0, 0.0, 2.0), (0.0, -tilt, 0.0), metal)
+        wide = thing(plate(120 * slope, 120 * slope), (-1.0, 0.0, 2.0), (0.0, -tilt, 0.0), metal)
         scene, antennas = Scene({"a": turned, "b": wide}), link(((0.0,) * 3,), ((-1.0, 0.0, 0.0),))
         length, share = 5.0, 0.5
     found = deposit_power(

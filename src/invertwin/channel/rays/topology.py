@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
@@ -17,6 +17,7 @@ from invertwin.scene.checks import plain
 from invertwin.scene.mesh import Mesh
 
 _KEPT_TOPOLOGIES = 8
+_FLAT, _SHARP = 1e-6, 0.35  # radians: rounding of coordinates; an edge of the object itself
 _UNGROUPED = 256  # triangles that are not worth a group
 
 
@@ -57,6 +58,7 @@ class Topology:
         self._parameters = mi.traverse(mesh)
         self._parameters["faces"] = self.device_faces
         self._uploaded: Tensor | None = None
+        self._facets: Tensor | None = None
         self._mesh = mesh
         self._scene: Any = None
 
@@ -78,6 +80,28 @@ class Topology:
             slot = (self.welded[face[edge]] == apex[edge, None]).int().argmax(1)
             table[face[edge], slot] = edge
         return table
+
+    def facet_angle(self, number: int, vertices: Float64[Tensor, "v 3"]) -> float:
+        """By how much normals of neighbours turn where an object is curved [rad]; 0 = nowhere.
+
+        The median over its smooth edges, as the mesh is when this is first asked for.
+
+        Args:
+            number: Of the object.
+            vertices: World positions [m].
+        """
+        if self._facets is None:
+            a, b, c = vertices.detach()[self.faces].unbind(1)
+            normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+            both = self.beside[(self.beside >= 0).all(1)]
+            first, second = normals[both[:, 0]], normals[both[:, 1]]
+            angle = 2 * torch.asin((0.5 * (first - second).norm(dim=1)).clamp_max(1.0))
+            owner = self.face_object[both[:, 0]]
+            smooth = (angle > _FLAT) & (angle < _SHARP)
+            self._facets = torch.zeros(int(self.face_object.max()) + 1, dtype=torch.float64)
+            for k in owner[smooth].unique():
+                self._facets[k] = angle[smooth & (owner == k)].median()
+        return float(self._facets[number])
 
     @cached_property
     def device_welded(self) -> Any:

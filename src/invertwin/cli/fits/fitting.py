@@ -19,10 +19,10 @@ from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
-from invertwin.cli.fits.certainty import judged
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
+    known_of,
     models_of,
     observations_of,
     recorded_anew,
@@ -33,10 +33,10 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
-from invertwin.cli.runs import RunFolder
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import (
+    Callback,
     Checkpoint,
     Observation,
     Reconstruction,
@@ -44,10 +44,13 @@ from invertwin.inversion import (
     Stage,
     Watch,
     reconstruct,
+    search,
 )
 from invertwin.inversion.callbacks import stage_file
+from invertwin.inversion.certainty import certainty
 from invertwin.radar.parameters import ClockOffset, RangeBias
-from invertwin.scene import Scene
+from invertwin.runs import RunFolder
+from invertwin.scene import Object, Scene
 from invertwin.seeds import derived_seed
 
 
@@ -121,11 +124,11 @@ def fit(
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
-        return row, again
+        return row, lambda: again()[0]
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
     with watched(console, name, sum(stage.steps for stage in stages)) as shown:
-        found = again(shown)
+        found, found_ends = again(shown)
     row = {
         "start": index,
         **scores(own, start, found.scene),
@@ -134,14 +137,15 @@ def fit(
         "steps": found.steps,
         "seconds": time.perf_counter() - begin,
         "values": _values(found.parameters),
-        "checkpoint": checkpoint,
-        **(judged(own, found) if recorded_anew(own.run) else {}),
+        "checkpoint": found_ends.pop("checkpoint", checkpoint),
+        **found_ends,
+        **(certainty(found, known_of(own)) if recorded_anew(own.run) else {}),
         "losses": [step["loss"] for step in found.history],
         "curve": [[step["step"] + 1, step[CURVE]] for step in found.history if CURVE in step],
     }
     folder.write_json(f"{part}.json", row)
     # The twins of many recordings are read again, not kept.
-    return row, again if recorded_anew(own.run) else lambda: found
+    return row, (lambda: again()[0]) if recorded_anew(own.run) else lambda: found
 
 
 def _staged(
@@ -152,25 +156,28 @@ def _staged(
     folder: RunFolder,
     checkpoint: str,
     shown: Sequence[Report] = (),
-) -> Reconstruction:
+) -> tuple[Reconstruction, dict[str, Any]]:
+    """A fit, or a search about its start; and what the row says of the search."""
     run, watch = problem.run, watch_of(problem)
-    for k in range(len(stages) - 1):
-        folder.file(str(stage_file(Path(checkpoint), k)))
     every = run.measures.every if run.measures else 1
-    return reconstruct(
-        start,
-        observations_of(problem),
-        unknowns_of(run),
-        loss=build.made(run, "loss"),
-        optimizer=build.made(run, "optimizer"),
-        schedule=stages,
-        callbacks=[
-            *([] if watch is None else [Watch(watch, every)]),
-            *shown,
-            _checkpoint(problem, folder, checkpoint),
-        ],
-        seed=derived_seed(run.seed, index),
-    )
+
+    def callbacks(file: str) -> list[Callback]:
+        for k in range(len(stages) - 1):
+            folder.file(str(stage_file(Path(file), k)))
+        watching = [] if watch is None else [Watch(watch, every)]
+        return [*watching, *shown, _checkpoint(problem, folder, file)]
+
+    given = start, observations_of(problem), unknowns_of(run)
+    how: dict[str, Any] = {key: build.made(run, key) for key in ("loss", "optimizer")}
+    how |= {"schedule": stages, "seed": derived_seed(run.seed, index)}
+    if run.search is None:
+        return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
+    name, part = run.search.object, f"{PARTS}/{Path(checkpoint).stem}_fit"
+    chance = torch.Generator().manual_seed(how["seed"])
+    poses = build.made(run, "search", {Object: start[name], torch.Generator: chance})
+    starts = {name: [start[name], *poses]}
+    found = search(*given, starts, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
+    return found.best, {"checkpoint": f"{part}{found.number}.pt", **found.rows()}
 
 
 def _checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:

@@ -107,10 +107,14 @@ def recorded_anew(run: RunFile) -> bool:
 
 def recorded_for(problem: Problem, start: int, console: Console) -> Problem:
     """The problem with the recording of a start, where each has one of its own."""
+    return another(problem, start, console) if start and recorded_anew(problem.run) else problem
+
+
+def another(problem: Problem, number: int, console: Console) -> Problem:
+    """The problem with another simulated recording."""
     run, data = problem.run, problem.run.data
-    if not (isinstance(data, SimulatedData) and recorded_anew(run) and start):
-        return problem
-    seed = derived_seed(run.seed if data.seed is None else data.seed, _RECORDINGS, start)
+    assert isinstance(data, SimulatedData)
+    seed = derived_seed(run.seed if data.seed is None else data.seed, _RECORDINGS, number)
     run = run.model_copy(update={"data": data.model_copy(update={"seed": seed})})
     return replace(problem, run=run, sights=_sights(run, problem.truth, console))
 
@@ -162,6 +166,12 @@ def _recorded(run: RunFile, truth: Scene, console: Console) -> tuple[Capture, Ra
 def fitted_objects(run: RunFile) -> list[str]:
     """Objects that have parameters."""
     return [p.object for p in run.parameters if getattr(p, "object", None)]
+
+
+def known_of(problem: Problem) -> dict[str, Object]:
+    """The object that is scored as it really is, where that is known."""
+    name = problem.target
+    return {name: problem.truth[name]} if name is not None and name in problem.known else {}
 
 
 def starts_of(problem: Problem) -> list[Scene]:

@@ -19,9 +19,9 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
-from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion.metrics import residual
+from invertwin.runs import RunFolder
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
 
@@ -48,6 +48,7 @@ class Fitted:
     start: Scene
     twin: Scene
     maps: Mapping[str, list[torch.Tensor]]  # by what they show, one for every sensor
+    residuals: list[torch.Tensor]  # of the best one, one for every sensor or none
 
     @property
     def ways(self) -> list[tuple[str, list[dict[str, Any]]]]:
@@ -169,6 +170,10 @@ def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
         titled = {titles[key]: maps[number] for key, maps in fitted.maps.items()}
         file = f"spectra_{name}" if name else "spectra"
         found.append(picture(folder, file, plotting.spectrum(titled, sight.grid), note="spectra"))
+    for (name, sight), apart in zip(problem.sights.items(), fitted.residuals, strict=False):
+        figure = plotting.residuals(apart, sight.grid)
+        file = f"residuals_{name}" if name else "residuals"
+        found.append(picture(folder, file, figure, note="residuals"))
     losses = {way: [row["losses"] for row in fits] for way, fits in fitted.ways}
     annealed, notes = annealed_until(run), texts("notes")
     before = metrics["start_loss_sharp"] if annealed else None

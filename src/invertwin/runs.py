@@ -10,9 +10,8 @@ from contextlib import ExitStack
 from fnmatch import fnmatchcase
 from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from invertwin.cli.run_file import to_toml
 from invertwin.errors import InputError
 from invertwin.folders import (
     PARTS,
@@ -26,14 +25,11 @@ from invertwin.folders import (
     place_in,
     read_manifest,
     remove_empty,
+    replacing,
     require_free,
     save_manifest,
     without_unfinished,
 )
-from invertwin.scene.files import replacing
-
-if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
-    from matplotlib.figure import Figure
 
 CHECKPOINT = "checkpoint.pt"
 # What commands write, beside run files and the pictures that are named after them.
@@ -41,7 +37,7 @@ RESULTS = (
     *("metrics.json", "report.html", "checkpoint*.pt", "twin.*", "raw", "capture.nc", "chirps.*"),
     *("channels.json", "points.csv", "prior.npz", "train.log", "turntable.gif", UNFINISHED),
     *("scene.png", "spectra*.png", "doppler.png", "loss*.png", "convergence.png", "landscape.png"),
-    *("look.png", "recording.png", "twin_*.png"),
+    *("look.png", "recording.png", "twin_*.png", "residuals*.png"),
 )
 
 
@@ -54,6 +50,11 @@ class RunFolder:
     Attributes:
         path: Where the results are in the end.
         complete: Whether the run had ended before it was opened again.
+
+    Args:
+        path: Of the folder.
+        manifest: What it holds.
+        held: Its lock.
     """
 
     def __init__(self, path: Path, manifest: Manifest, held: ExitStack):
@@ -104,24 +105,31 @@ class RunFolder:
         return path
 
     def write_bytes(self, name: str, data: bytes) -> None:
-        """Write a result file so that a kill leaves the old or the new one, never half of it."""
+        """Write a result file so that a kill leaves the old or the new one, never half of it.
+
+        Args:
+            name: Its path in the folder.
+            data: What it holds.
+        """
         with replacing(self.file(name)) as part:
             part.write_bytes(data)
 
-    def write_figure(self, name: str, figure: "Figure") -> bytes:
-        """Write a figure as PNG, and return its bytes."""
-        from invertwin.plotting import png_bytes
-
-        png = png_bytes(figure)
-        self.write_bytes(name, png)
-        return png
-
     def write_text(self, name: str, text: str) -> None:
-        """Write a result file as UTF-8, in the way of `write_bytes`."""
+        """Write a result file as UTF-8, in the way of `write_bytes`.
+
+        Args:
+            name: Its path in the folder.
+            text: What it holds.
+        """
         self.write_bytes(name, text.encode("utf-8"))
 
     def write_json(self, name: str, value: Any) -> None:
-        """Write a JSON file; tensors and arrays become lists, numbers that are not finite null."""
+        """Write a JSON file; tensors and arrays become lists, numbers that are not finite null.
+
+        Args:
+            name: Its path in the folder.
+            value: What it holds.
+        """
         text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
         self.write_text(name, text + "\n")
 
@@ -142,13 +150,13 @@ class RunFolder:
 
 
 def open_run(
-    path: Path, runs: Mapping[str, Any], *, overwrite: bool = False, resume: bool = False
+    path: Path, texts: Mapping[str, str], *, overwrite: bool = False, resume: bool = False
 ) -> RunFolder:
     """Take a folder for a run and write the run files as used into it.
 
     Args:
         path: The folder; made with its parents when it does not exist.
-        runs: Run files as used, by file stem; one is written as run.toml, several as
+        texts: Run files as used, by file stem; one is written as run.toml, several as
             runs/<stem>.toml.
         overwrite: Replace the results that are there when this run ends.
         resume: Go on with the interrupted run that is there.
@@ -162,7 +170,6 @@ def open_run(
         raise InputError("expected --overwrite or --resume, got both; choose one")
     if "\0" in str(path):
         raise InputError(f"expected a folder's name, got {str(path)!r}; take the NUL out")
-    texts = {name: to_toml(run) for name, run in runs.items()}
     digest = hashlib.sha256(json.dumps(texts, sort_keys=True).encode()).hexdigest()
     with in_one_line(" or choose another -o"), ExitStack() as held:
         missing = [folder for folder in (path, *path.parents) if not folder.exists()]
