@@ -93,7 +93,7 @@ class Task:
         geometry = flatten(Scene({"wall": self.wall}), self.link.wavelength)
         still = torch.zeros(len(position), dtype=torch.int64)
         normal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(position), 3)
-        place = Place(position, normal, torch.ones(len(position)), still)
+        place = Place(position, normal, torch.ones(len(position), dtype=torch.float64), still)
         power = radar_equation(geometry, self.link, still, [place]).power
         return float(power @ torch.from_numpy(area.ravel()))
 

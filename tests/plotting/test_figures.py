@@ -17,7 +17,9 @@ def test_words_of_users_are_no_formulas(name):
     words = [text.get_text() for text in shown.findobj(Text)]
     assert any(word.replace(r"\$", "$").strip() == name for word in words)
     losses = plotting.convergence({name: [[3.0, 2.0, 1.0]]})
-    (label,) = [text.get_text() for text in losses.axes[0].get_legend().get_texts()]
+    legend = losses.axes[0].get_legend()
+    assert legend is not None
+    (label,) = [text.get_text() for text in legend.get_texts()]
     assert label.replace(r"\$", "$").strip() == f"{name} (1)"
     assert png_bytes(shown)
     assert png_bytes(losses)
