@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
@@ -190,8 +191,11 @@ class Fit:
             sensor, observed = self._subset(k, step, sensor, observed)
             model = model.narrowed(share)
             key = (self.number, step, k) if model.redraws else (k,)
-            predicted = model.predict(scene, sensor, derived_seed(self._settings.seed, *key))
-            pairs.append((predicted, model.blurred(observed, sensor)))
+            seed = derived_seed(self._settings.seed, *key)
+            # On a core that is idle while the prediction's kernels are prepared.
+            with ThreadPoolExecutor(1) as beside:
+                blurred = beside.submit(model.blurred, observed, sensor)
+                pairs.append((model.predict(scene, sensor, seed), blurred.result()))
         return pairs
 
     def sharp_maps(self, number: int, **sampled: Any) -> Maps:
