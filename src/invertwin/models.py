@@ -113,7 +113,9 @@ class ForwardModel(ABC):
         return self
 
     def blurred(self, observed: Tensor, sensor: Any) -> Tensor:
-        """An observed map with the model's extra widths.
+        """An observed map with the model's extra widths, of plain torch: no rays are traced here.
+
+        A fit calls it in a thread of its own, while it predicts.
 
         Args:
             observed: From ``observe``.
