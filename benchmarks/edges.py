@@ -139,7 +139,7 @@ class Estimator:
         start = perf_counter()
         # The samplers of the first family find nothing, so that all samples are of the second.
         with (
-            patch.object(boundary, "EdgeSampler", lambda *_: NOTHING),
+            patch.object(boundary, "EdgeSampler", lambda *_, **__: NOTHING),
             patch.object(
                 boundary,
                 "InteriorEdgeSampler",
