@@ -111,7 +111,7 @@ def test_a_file_that_hangs_its_reader_is_an_error(tmp_path):
     sound = Path(__file__).with_name("capture") / "two_frames.nc"
     assert Capture.load(sound).frame_count == 2
     damaged = bytearray(sound.read_bytes())
-    damaged[2761] = 0
+    damaged[2760] = 0
     (tmp_path / "a.nc").write_bytes(damaged)
     with pytest.raises(InputError, match="takes its reader more than"):
         Capture.load(tmp_path / "a.nc")

@@ -69,9 +69,10 @@ class Surrogate:
 
         A convolution with the power point spread (peak 1), divided in the Fourier domain by the
         transform sinc³ of the deposit's quadratic B-spline, so that the deposit adds no blur.
-        Nothing wraps around: what leaves the grid is lost. Power is never negative: what the
-        division leaves below zero, 4e-5 of the peak with two bins a cell, counts as zero. On a
-        coarser grid it is 3 % of the peak, and maps are not the mean of exact spectra; it warns.
+        Nothing wraps around: what leaves the grid is lost. It is linear, so that derivatives are
+        shaped alike. The division leaves bins below zero, 4e-5 of the peak with two bins a cell.
+        On a coarser grid it is 3 % of the peak, and maps are not the mean of exact spectra; it
+        warns.
 
         Args:
             deposit: From ``deposit_power`` on the same grid.
@@ -89,7 +90,7 @@ class Surrogate:
             if kernel.dims == (1,) and radar.biased:
                 offset = torch.as_tensor(radar.range_bias) / grid.range_step
             deposit = kernel.apply(deposit, [sigmas[dim] for dim in kernel.dims], offset)
-        return deposit.clamp_min(0.0)
+        return deposit
 
     def blur(
         self, power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
@@ -173,6 +174,8 @@ def surrogate_spectrum(
 ) -> Float[Tensor, "frame range u v"]:
     """Power spectrum of a scene, differentiable with respect to it: deposit, then shape.
 
+    Power is never negative: what shaping leaves below zero counts as zero.
+
     Args:
         scene: What is seen.
         radar: Arrays, waveform and poses.
@@ -188,7 +191,7 @@ def surrogate_spectrum(
     deposit = deposit_power(
         scene, radar.link(), grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
     )
-    return surrogate.shape(deposit, radar, grid)
+    return surrogate.shape(deposit, radar, grid).clamp_min(0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,13 +15,16 @@ from invertwin.scene import Mesh, Object, Scene, plate, sphere
 from scenes import float64, link, noise, thing
 
 
-def growth(body: Object, rest: Object, grid: Grid, sampling: Sampling, seed: int) -> Tensor:
-    """∂map/∂size of a body in front of something else."""
+def growth(bodies: list[Object], rest: Object, grid: Grid, sampling: Sampling, seed: int) -> Tensor:
+    """∂map/∂size of bodies in front of something else."""
     with forward_ad.dual_level():
         size = torch.ones((), dtype=torch.float64)
         size = forward_ad.make_dual(size, torch.ones_like(size))
-        grown = Object(Mesh(body.mesh.vertices * size, body.mesh.faces), body.material, body.pose)
-        scene = Scene({"rest": rest, "body": grown})
+        objects = {"rest": rest}
+        for number, body in enumerate(bodies):
+            mesh = Mesh(body.mesh.vertices * size, body.mesh.faces)
+            objects[f"body {number}"] = Object(mesh, body.material, body.pose)
+        scene = Scene(objects)
         out = deposit_power(scene, link(), grid, sampling=sampling, seed=seed)
         found = forward_ad.unpack_dual(out.double()).tangent
     assert found is not None
@@ -61,6 +64,11 @@ def ridges(*tops: tuple[float, float]) -> Mesh:
             line.append((0.5 * (depth + tops[number - 1][0]), -1e-3))
         line.append((depth, height))
     line.append((tops[-1][0], -0.2))
+    return strip(line)
+
+
+def strip(line: list[tuple[float, float]]) -> Mesh:
+    """A strip 0.4 m wide over a line of (depth, height)."""
     vertices = float64([(x, height, depth) for depth, height in line for x in (-0.2, 0.2)])
     faces = [
         f
@@ -79,7 +87,22 @@ def test_of_two_ridges_a_micrometre_apart_one_casts_the_shadow(depths):
         thing(ridges(*sorted(tops)), (0.0, 0.0, 30.0)) for tops in ([lower, higher], [higher])
     )
     behind, sampling = Grid(31.5, 0.1, 20), Sampling(depth=1, samples=4, boundary_samples=20_000)
-    found, truth = (growth(body, wall, behind, sampling, 1).sum() for body in (both, one))
+    found, truth = (growth([body], wall, behind, sampling, 1).sum() for body in (both, one))
+    assert float(truth) < 0
+    assert float(found / truth) == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_shadow_falls_on_what_its_own_mesh_rises_to_behind_the_edge():
+    """A ridge before a slope, as one mesh and cut where neither antenna sees it."""
+    wall = thing(plate(2.0, 2.0), (0.0, 0.0, 5.0))
+    line = [(0.0, -0.2), (0.0, 0.0), (0.05, -0.1), (0.3, 0.1), (0.3, -0.2)]
+    whole, first, last = (
+        thing(strip(part), (0.0, 0.0, 3.0)) for part in (line, line[:3], line[2:])
+    )
+    slope, sampling = Grid(3.1, 0.02, 10), Sampling(depth=1, samples=4, boundary_samples=20_000)
+    found, truth = (
+        growth(bodies, wall, slope, sampling, 1).sum() for bodies in ([whole], [first, last])
+    )
     assert float(truth) < 0
     assert float(found / truth) == pytest.approx(1.0, abs=0.02)
 
@@ -90,5 +113,5 @@ def test_a_large_object_does_not_drown_a_small_one():
     ball = thing(sphere(0.05, subdivisions=3), (0.0, -0.5, 200.0))
     grid = Grid(150.0, 2.0, 180)
     sampling = Sampling(depth=1, samples=50_000, boundary_samples=50_000)
-    derivatives = [growth(ball, ground, grid, sampling, seed) for seed in range(8)]
+    derivatives = [growth([ball], ground, grid, sampling, seed) for seed in range(8)]
     assert noise(derivatives) < 0.002  # without shares for objects: 0.02

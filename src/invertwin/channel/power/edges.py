@@ -23,6 +23,7 @@ _RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's pla
 # Boundary rays start beside the edge, by this much (two roundings) of its distance from the origin
 # and its length: its own triangles, nearly edge-on, would else lie in their way.
 _BESIDE = 1e-7
+_MISSED = 2 * NEAR  # how far off an edge, of its distance, rays may miss what they meet
 _BEFORE = 3e-5  # how much before an edge, of its distance, such rays start among close surfaces
 _LAST_BELOW_ONE = 1 - 2.0**-24
 _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
@@ -240,7 +241,8 @@ class EdgeSampler:
         reach = beside - away * _BEFORE if self.close else beside
         before = passage(rays, self.inputs, reach, origin, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
-        valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, valid)
+        near = _MISSED * dr.norm(exact)
+        valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, near, valid)
         key = index, self.dice
         hit = _ahead(
             rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close,
@@ -364,7 +366,8 @@ class InteriorEdgeSampler:
         aside = _BESIDE * (dr.norm(place) + dr.norm(y1 - y0))
         y, beside = mi.Point3f(place), mi.Point3f(place + sides.outwards * aside)
         valid = (pmf > 0) & sides.unlike
-        valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, valid)
+        near = _MISSED * dr.norm(place)
+        valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, near, valid)
         hits = []
         for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
             hit = _ahead(
