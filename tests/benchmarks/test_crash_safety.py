@@ -26,7 +26,11 @@ def test_difference_is_the_largest_of_a_number(crash_safety, tmp_path):
 def test_a_killed_fit_goes_on_and_two_at_once_do_not_mix(crash_safety, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", crash_safety.os.pathsep.join(crash_safety.sys.path))
     case = crash_safety.Case("stages", tmp_path)
-    killed, lost, apart = case.killed(0.8)
+    # On a busy machine the fit may end before it is killed.
+    for share in (0.8, 0.5, 0.3):
+        killed, lost, apart = case.killed(share)
+        if killed:
+            break
     assert killed
     assert not lost
     assert apart <= 1e-6

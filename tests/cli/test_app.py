@@ -98,6 +98,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert names == {
         *(".invertwin.json", "metrics.json", "run.toml", "report.html", "twin.ply"),
         *("checkpoint.pt", "scene.png", "spectra.png", "loss.png", "landscape.png"),
+        "residuals.png",
     }
     metrics = read_metrics(out)
     assert metrics["status"] in ("budget", "converged")
@@ -108,7 +109,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert 0 < metrics["fit_seconds"] <= metrics["wall_seconds"]
     assert load_run(out / "run.toml").seed == 5
     report = (out / "report.html").read_text()
-    assert report.count("data:image/png;base64,") == 4
+    assert report.count("data:image/png;base64,") == 5
     assert "plate.x [m]" in report
     said = capsys.readouterr().out
     assert "plate.x [m]" in said
