@@ -121,9 +121,9 @@ class Estimator:
         link = task.radar.link()
         geometry = flatten(task.scene, link.wavelength)
         names = task.scene.names
-        owner = torch.zeros(len(geometry.vertices), dtype=torch.bool)
-        owner[geometry.topology.object_vertices[list(names).index(task.moving)]] = True
-        self.moving = owner
+        owners = torch.zeros(len(geometry.vertices), dtype=torch.int64)
+        owners[geometry.faces.ravel()] = geometry.face_object.repeat_interleave(3)
+        self.moving = owners == list(names).index(task.moving)
         self.rays = RayScene(geometry, link)
         self.inputs = Inputs.of(self.rays)
 
@@ -139,7 +139,7 @@ class Estimator:
         start = perf_counter()
         # The samplers of the first family find nothing, so that all samples are of the second.
         with (
-            patch.object(boundary, "EdgeSampler", lambda *_: NOTHING),
+            patch.object(boundary, "EdgeSampler", lambda *_, **__: NOTHING),
             patch.object(
                 boundary,
                 "InteriorEdgeSampler",

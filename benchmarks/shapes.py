@@ -49,8 +49,8 @@ from invertwin.cli import build
 from invertwin.cli.fits.fitting import fit
 from invertwin.cli.fits.problem import FULL, problem_of
 from invertwin.cli.run_file import load_run, to_toml
-from invertwin.cli.runs import open_run
 from invertwin.cli.schema import RunFile
+from invertwin.runs import open_run
 
 RUN = Path(__file__).parents[1] / "experiments" / "shape_car_prior_public.toml"
 CARS = 20
@@ -99,7 +99,7 @@ def fitted(run: RunFile) -> Car:
     problem = problem_of(run, console)
     found: Car = {}
     with tempfile.TemporaryDirectory() as scratch:
-        folder = open_run(Path(scratch) / "car", {"car": run})
+        folder = open_run(Path(scratch) / "car", {"car": to_toml(run)})
         for name, mode in MODES.items():
             row, _ = fit(problem, problem.scene, 0, mode, folder, console, None)
             kept = {key: row[key] for key in KEPT if key in row}

@@ -42,7 +42,7 @@ chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=1
 row, half = iw.scene.linear_array, chirp.wavelength / 2
 looks = [[x, y, 0.0] for x in (-0.6, -0.2, 0.2, 0.6) for y in (-0.4, 0.4)]
 radar = iw.Radar(row(2, 16 * half), row(16, half), chirp, looks)  # 2 × 16 at eight places
-grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6, oversample=1)
+grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6)
 with torch.no_grad():
     sparse = iw.Sampling(depth=1, points_per_m2=3e3)
     recorded = iw.simulate(hidden(start), radar, grid, seed=1, sampling=sparse, snr_db=20.0)

@@ -96,6 +96,12 @@ def relative(found: Tensor, truth: Tensor) -> float:
     return float((found - truth).abs().sum() / truth.abs().sum())
 
 
+def noise(maps: Sequence[Tensor]) -> float:
+    """Standard deviation of one of several estimates, L1 over bins, relative to their mean."""
+    found = torch.stack([each.detach() for each in maps])
+    return float(found.std(0).sum() / found.mean(0).abs().sum())
+
+
 def shift_error(gradients: Sequence[Tensor]) -> float:
     """How far the derivatives with respect to all points [*, 3] are from summing to zero.
 

@@ -8,7 +8,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors", "limits", "seeds"}
+FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "untrusted"}
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "channel"}
 RADAR = CHANNEL - {"doctor"} | {"radar"}
@@ -23,6 +23,8 @@ ALLOWED = {
     "errors": set(),
     "limits": set(),
     "seeds": set(),
+    "folders": {"errors"},
+    "untrusted": {"errors"},
     "doctor": FOUNDATION,
     "scene": SCENE,
     "channel": CHANNEL,
@@ -31,9 +33,10 @@ ALLOWED = {
     "capture": CAPTURE,
     "models": MODELS,
     "inversion": INVERSION,
+    "runs": FOUNDATION | {"runs"},
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION | {"doctor", "plotting", "registry", "cli", "__init__"},
+    "cli": INVERSION | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

@@ -40,6 +40,7 @@ _MENU = {
     "gradcheck": "inversion.gradcheck",
     "load_mesh": "scene.files",
     "reconstruct": "inversion.reconstruction",
+    "search": "inversion.minima",
     "simulate": "simulation",
     "simulate_chirps": "simulation",
 }

@@ -425,9 +425,14 @@ def _remembered(path: str, probe: Callable[[str], Verdict]) -> Verdict:
     return verdict
 
 
-def _cache_file() -> Path:
+def cache_folder() -> Path:
+    """Where what can be found again is kept on disk; it may not exist."""
     root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(root, "invertwin", "llvm.json")
+    return Path(root, "invertwin")
+
+
+def _cache_file() -> Path:
+    return cache_folder() / "llvm.json"
 
 
 def _read_cache() -> dict[str, Verdict]:

@@ -1,4 +1,6 @@
-"""The one exception type for bad input, raised at the public edge."""
+"""The one exception type for bad input, raised at the public edge, and the one warning."""
+
+_LONGEST = 2_000  # characters of a line
 
 
 class InputError(ValueError):
@@ -14,5 +16,23 @@ class InputError(ValueError):
             text: The line.
             at: The argument that it is about: the key of a run file.
         """
-        super().__init__(text)
+        super().__init__(one_line(text))
         self.at = at
+
+
+class PhysicsWarning(UserWarning):
+    """The input is valid, but its result will not mean what one may expect."""
+
+
+def one_line(text: str) -> str:
+    """A text that a terminal shows as it is: one line, no control characters, not endless.
+
+    Args:
+        text: May hold what strangers wrote, such as names from a file.
+    """
+    if not text.isprintable():
+        plain = (c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
+        text = "".join(plain)
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
+    return text

@@ -7,6 +7,7 @@ recording to a map of the same shape; a loss compares the two. A model of one's 
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -19,12 +20,16 @@ from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field, trace_power
 from invertwin.errors import InputError
 from invertwin.radar.doppler import range_doppler_angle, velocity_axis
+from invertwin.radar.looks import Looks
 from invertwin.radar.motion import Chirps
 from invertwin.radar.moving_power import moving_power
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import beat_signal
+from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
+from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
+from invertwin.seeds import derived_seed
 from invertwin.simulation import simulate
 
 
@@ -77,6 +82,22 @@ class ForwardModel(ABC):
             scheme: "rays" or "area": how surfaces are sampled.
         """
         return self
+
+    def looks(self, scene: Scene, sensor: Any, seed: int) -> Callable[[int, float], Tensor] | None:
+        """What the sensor might have recorded of a scene: other speckle and noise each time.
+
+        The error bars of a fit and the test of its goodness draw from it.
+
+        Args:
+            scene: What is seen.
+            sensor: What sees it.
+            seed: Of the points on rough surfaces.
+
+        Returns:
+            A function of a seed and of the mean noise in a bin that returns a map, as ``observe``
+            would show it. None where the model cannot say.
+        """
+        return None
 
     def sampled_by(self, **changes: Any) -> "ForwardModel":
         """The model with other fields of its ``sampling``, where it has one."""
@@ -165,6 +186,34 @@ class SurrogateMap(ForwardModel):
         """The model with sampling probabilities that belong to this scene."""
         sampling = replace(self.sampling, samples=samples, boundary_samples=0)
         return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
+
+    def looks(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Callable[[int, float], Tensor] | None:
+        """Spectra of one scene with other speckle; None for smooth conductors and clouds."""
+        items = scene.objects.values()
+        if not isinstance(sensor.waveform, SampledWaveform) or any(
+            item.cloud is not None or item.material.coherent for item in items
+        ):
+            return None
+        fields = replace(self.sampling, boundary=False)
+        looks = Looks(trace_field(scene, sensor.link(), sampling=fields, seed=seed), sensor)
+        white = torch.randn(
+            *sensor.shape,
+            sensor.waveform.samples,
+            dtype=torch.complex64,
+            generator=torch.Generator().manual_seed(seed),
+        )
+        share = float(exact_spectrum(white, sensor, self.grid).mean())
+
+        def look(number: int, noise: float) -> Tensor:
+            beat = looks.beat(derived_seed(number, 0))
+            generator = torch.Generator().manual_seed(derived_seed(number, 1))
+            white = torch.randn(beat.shape, dtype=beat.dtype, generator=generator)
+            beat += (noise / share) ** 0.5 * white
+            return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
+
+        return look
 
     @property
     def widened(self) -> bool:

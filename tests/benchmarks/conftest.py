@@ -20,11 +20,16 @@ def script(name: str) -> Any:
 
 
 basin = script("basin")
+crash_safety = script("crash_safety")
 edges = script("edges")
+fine_meshes = script("fine_meshes")
 house = script("house")
+many_objects = script("many_objects")
 multibounce = script("multibounce")
 report = script("report")
 shapes = script("shapes")
 signals = script("signals")
 steps = script("steps")
+threads = script("threads")
 throughput = script("throughput")
+verdicts = script("verdicts")

@@ -98,6 +98,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert names == {
         *(".invertwin.json", "metrics.json", "run.toml", "report.html", "twin.ply"),
         *("checkpoint.pt", "scene.png", "spectra.png", "loss.png", "landscape.png"),
+        "residuals.png",
     }
     metrics = read_metrics(out)
     assert metrics["status"] in ("budget", "converged")
@@ -108,7 +109,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert 0 < metrics["fit_seconds"] <= metrics["wall_seconds"]
     assert load_run(out / "run.toml").seed == 5
     report = (out / "report.html").read_text()
-    assert report.count("data:image/png;base64,") == 4
+    assert report.count("data:image/png;base64,") == 5
     assert "plate.x [m]" in report
     said = capsys.readouterr().out
     assert "plate.x [m]" in said
@@ -174,7 +175,7 @@ def test_ended_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypa
     heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     command = [sys.executable, "-c", heed + "from invertwin.cli.app import main; main()"]
     command += ["reconstruct", str(run_file), "-o", "cut"]
-    checkpoint = run_file.parent / "cut" / "parts" / "full_01.pt"
+    checkpoint = run_file.parent / "cut" / "unfinished" / "parts" / "full_01.pt"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen(
         command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
@@ -211,7 +212,7 @@ def test_interruption_says_how_to_go_on(run_file, monkeypatch, capsys):
     error = capsys.readouterr().err
     assert "--resume" in error
     assert error.count("\n") == 1
-    assert (run_file.parent / "out" / "small" / "checkpoint.pt").exists()
+    assert (run_file.parent / "out" / "small" / "unfinished" / "checkpoint.pt").exists()
 
 
 def test_demo_reconstructs_the_run_file_that_comes_along(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from invertwin.capture import Capture
 from invertwin.capture.files import write_dataset
 from invertwin.cli import build
 from invertwin.cli.run_file import load_run
+from invertwin.folders import MANIFEST, Manifest, save_manifest
 from invertwin.scene import Mesh, plate
 from invertwin.scene.files import save_mesh
 
@@ -66,6 +67,7 @@ def folder(run_file, monkeypatch):
     write_dataset(spoiled, folder / "nan.nc")
     (folder / "full").mkdir()
     (folder / "full" / "metrics.json").write_text("{}")
+    save_manifest(folder / "full", Manifest(files=["metrics.json"]))
     return folder
 
 
@@ -148,7 +150,7 @@ def test_one_line_code_2_and_results_untouched(folder, monkeypatch, capfd, text,
     assert error.startswith("invertwin: ")
     assert "expected" in error
     assert error.count("\n") == 1
-    assert [p.name for p in (folder / "full").iterdir()] == ["metrics.json"]
+    assert {p.name for p in (folder / "full").iterdir()} == {"metrics.json", MANIFEST}
     assert (folder / "full" / "metrics.json").read_text() == "{}"
 
 

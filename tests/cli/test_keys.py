@@ -3,13 +3,16 @@
 import pytest
 
 from cli.small import call
-from invertwin.cli.keys import json_schema, key_tables
+from invertwin.cli.keys import json_schema, key_index, key_tables
 from invertwin.errors import InputError
 from invertwin.radar.boards import BOARDS
 
 
 def test_every_key_of_every_section_is_listed_and_explained():
-    listed = {row[0]: row for table in key_tables() for row in table.rows}
+    index = key_index().rows
+    assert all(text for _, text in index)
+    listed = {row[0]: row for name, _ in index for table in key_tables(name) for row in table.rows}
+    listed |= dict.fromkeys(json_schema()["properties"])
     whole = json_schema()
     sections = [whole, *(found for found in whole["$defs"].values() if "properties" in found)]
     assert len(sections) > 70

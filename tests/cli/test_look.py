@@ -215,7 +215,7 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
         (["adc.toml", "--frame", "2"], ["--frame from 0 to 1"]),
         (["adc.toml", "--chirp", "16"], ["number from 0 to 15"]),
         (["adc.toml", "--range-max", "900"], ["--range-max within"]),
-        (["adc.toml", "--channels", "bench.cfg"], ["no calibration"]),
+        (["adc.toml", "--channels", "bench.cfg"], ["expected a calibration", "bench.cfg"]),
         (["adc.toml", "--reflector", "0", "0", "90"], ["reflector within"]),
         (["adc.toml", "--method", "music", "--sources", "12"], ["fewer than the 12 elements"]),
         (["."], ["openradar.npz"]),

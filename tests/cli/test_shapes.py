@@ -181,8 +181,8 @@ def test_a_twin_that_has_collapsed_has_no_measures(tmp_path):
     found = shape_scores(problem, start, twin)
     assert found["start_chamfer_m"] > 0
     assert not {"chamfer_m", "chamfer_seen_m", "iou"} & set(found)
-    metrics = {"steps": 1, "status": "budget", "parameters": {}, **found}
-    result = tables_of(Fitted(problem, metrics, {FULL: [found]}, start, twin, {}))[0]
+    metrics = {"steps": 1, "status": "budget", "verdict": "worse", "parameters": {}, **found}
+    result = tables_of(Fitted(problem, metrics, {FULL: [found]}, start, twin, {}, []))[0]
     assert ["Chamfer distance, mean of both directions [m]", None] in result.rows
 
 

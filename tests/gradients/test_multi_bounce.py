@@ -54,7 +54,7 @@ def test_what_a_board_covers_comes_through_it_late_and_weak():
 
 @pytest.mark.slow
 def test_three_bounces_in_a_corner():
-    found = checked("three_bounce_corner", 800_000, 400_000, pairs=16)
+    found = checked("three_bounce_corner", 800_000, 1_600_000, pairs=16)
     assert found.difference_noise < 0.02
     assert found.full.relative_l1 < 0.04
     assert found.no_interior_edges is not None

@@ -10,7 +10,7 @@ from invertwin.channel import Grid, Link, Sampling
 from invertwin.channel.power import replay
 from invertwin.channel.power.bins import Contribution
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table
-from invertwin.channel.power.trace import Trace
+from invertwin.channel.power.trace import Trace, tables_of
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import mi
 from invertwin.channel.rays.geometry import flatten
@@ -43,7 +43,8 @@ def gradients(
 
         paths.run(dict(paths.state), visit)
     dr.backward(out)
-    by_name: dict[str, Tensor] = dict(zip(DIFFERENTIABLE, trace.tables, strict=True))
+    likes = tables_of(trace.rays.geometry, trace.rays.link)
+    by_name: dict[str, Tensor] = dict(zip(DIFFERENTIABLE, likes, strict=True))
     return {name: from_table(name, dr.grad(tables[name]), by_name[name]) for name in tables}
 
 

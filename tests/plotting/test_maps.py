@@ -154,3 +154,17 @@ def test_maps_and_grids_that_do_not_fit_are_refused():
         plotting.spectrum({}, ROW)
     with pytest.raises(InputError, match="at least one map, got none"):
         plotting.gradient({}, ROW)
+
+
+def test_residuals_beyond_the_mark_are_framed():
+    grid = Grid(1.0, 0.1, 16, u_start=-0.4, u_step=0.05, u_count=16)
+    found = torch.zeros(4, 4, 1)
+    found[1, 2, 0], found[3, 0, 0] = 8.0, -4.0
+    (cell,) = cells(plotting.residuals(found, grid))
+    (frame,) = cell.patches
+    # Bins of four: the second begins at the upper edge of the fourth, in range and in u.
+    assert frame.get_xy() == pytest.approx((-0.4 + 0.05 * 7.5, 1.0 + 0.1 * 3.5))
+    assert (frame.get_width(), frame.get_height()) == pytest.approx((0.2, 0.4))
+    (image,) = cell.images
+    assert float(shown(cell)[1, 2]) == 8.0
+    assert image.get_clim() == (-10.0, 10.0)

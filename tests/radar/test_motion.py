@@ -61,6 +61,7 @@ def relative(a, b):
     return float((a - b).abs().max() / b.abs().max())
 
 
+@pytest.mark.filterwarnings("ignore:the triangles of ball turn")
 @pytest.mark.parametrize("tdm", [True, False])
 @pytest.mark.parametrize("material", [RoughDielectric(4.0), PerfectConductor()])
 def test_doppler_equals_moved_geometry(tdm, material):

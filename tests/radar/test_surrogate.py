@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from invertwin.channel import Grid, Sampling, trace_field
+from invertwin.channel import Grid, Sampling, deposit_power, trace_field
 from invertwin.errors import InputError
 from invertwin.radar import (
     FMCW,
@@ -298,7 +298,8 @@ def test_range_offset_moves_and_differentiates(linear):
     moved = Surrogate().shape(spread, replace(linear, range_bias=offset), grid)
     assert torch.allclose(moved[:, 3:], Surrogate().shape(spread, linear, grid)[:, :-3], atol=1e-9)
     small = replace(grid, u_count=3)
-    spread = spread[:, :, 20:23].contiguous().requires_grad_()
+    # Above zero everywhere, where power has its bound.
+    spread = (spread[:, :, 20:23] + spread.max()).requires_grad_()
     offset = torch.tensor(0.021, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(
         lambda p, d: Surrogate(range_width=0.5).shape(p, replace(linear, range_bias=d), small),
@@ -311,7 +312,8 @@ def test_range_offset_moves_and_differentiates(linear):
 @pytest.mark.parametrize("angle_kernel", ["response", "airy"])
 def test_gradient_of_the_map(angle_kernel, planar):
     grid = planar.grid(4, 4.4, 0.3, 0.3)
-    power = torch.rand(
+    # Above zero everywhere, where power has its bound.
+    power = 3 + torch.rand(
         2, *grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )
     surrogate = Surrogate("gaussian", angle_kernel, range_width=0.3, angle_width=0.2)
@@ -425,3 +427,20 @@ def test_wrong_input(planar):
     pulse = replace(planar, waveform=Impulse(77e9, 1e9))
     with pytest.raises(InputError, match="sampled waveform for the Dirichlet kernel, got Impulse"):
         Surrogate(range_kernel="dirichlet").shape(torch.zeros(1, *grid.shape), pulse, grid)
+
+
+@pytest.mark.parametrize(("oversample", "below"), [(1.0, 0.15), (1.5, 0.02), (2.0, 3e-3)])
+def test_power_is_never_negative(oversample, below, planar):
+    grid = planar.grid(3.5, 4.5, 0.4, 0.4, oversample=oversample)
+    plates = {
+        str(k): Object(plate(0.05, 0.05), RoughDielectric(4.0), rigid(translation=[x, 0.1, 4.0]))
+        for k, x in enumerate((-0.5, 0.2))
+    }
+    scene, drawn = Scene(plates), Sampling(depth=1, samples=20_000)
+    deposit = deposit_power(scene, planar.link(), grid, sampling=drawn, seed=1)
+    for surrogate in (Surrogate(), Surrogate("gaussian", "airy")):
+        shaped = surrogate.shape(deposit, planar, grid)
+        assert -below * shaped.max() < shaped.min() < 0
+        power = surrogate_spectrum(scene, planar, grid, surrogate, sampling=drawn, seed=1)
+        assert power.min() == 0
+        assert torch.allclose(power, shaped.clamp_min(0.0), rtol=1e-4, atol=1e-5 * power.max())

@@ -59,7 +59,7 @@ def test_missing_vehicles_say_where_they_are_from(tmp_path):
     with pytest.raises(InputError, match="expected default1_pc in vehicle3d_pca"):
         load_vehicle_space(tmp_path)
     (tmp_path / "vehicle3d_pca.npz").write_bytes(b"")
-    with pytest.raises(InputError, match=r"plain arrays in vehicle3d_pca.npz.*load the original"):
+    with pytest.raises(InputError, match=r"plain arrays.*vehicle3d_pca\.npz.*load the original"):
         load_vehicle_space(tmp_path)
 
 

@@ -125,13 +125,20 @@ class Capture:
         return cls(xr.Dataset(variables, attrs=attributes))
 
     @classmethod
-    def load(cls, path: str | Path) -> "Capture":
+    def load(cls, path: str | Path, *, trusted: bool = False) -> "Capture":
         """Read what `save` wrote.
+
+        A damaged file can hang or crash the libraries that read it. So a child process tries it
+        first, within limits of time and memory; that takes about a second.
+
+        Args:
+            path: file.
+            trusted: read it at once.
 
         Raises:
             InputError: no such file, a truncated file, or one that holds no capture.
         """
-        return cls(read_dataset(Path(path)))
+        return cls(read_dataset(Path(path), trusted=trusted))
 
     def save(self, path: str | Path) -> None:
         """Write NetCDF (HDF5), bit for bit; an interrupted write leaves an old file as it was.

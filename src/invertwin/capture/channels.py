@@ -14,10 +14,11 @@ from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.radar_fields import labelled
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import existing_file, replacing
+from invertwin.untrusted import existing_file, reading
 
 Recorded = TypeVar("Recorded", bound=Capture | ChirpCapture)
 _DEAD = 1e-3
@@ -68,15 +69,10 @@ class ChannelCalibration:
             InputError: no such file, or one that holds no calibration.
         """
         path = existing_file(path, "a calibration")
-        try:
+        with reading(path, "a calibration, gains [tx][rx][real, imaginary]"):
             parts = torch.tensor(json.loads(path.read_text())["gains"], dtype=torch.float64)
             if parts.ndim != 3 or parts.shape[2] != 2:
                 raise ValueError(f"shape {tuple(parts.shape)}")
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"expected gains [tx][rx][real, imaginary] in {path}, got none ({error}); "
-                "it is no calibration, or damaged"
-            ) from error
         calibration = cls(torch.view_as_complex(parts))
         # As written: normalising again would change the last bit.
         object.__setattr__(calibration, "gains", torch.view_as_complex(parts))

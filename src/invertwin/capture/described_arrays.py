@@ -13,10 +13,11 @@ import torch
 
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.radar.boards import Elements, Mounting
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.files import UNREADABLE, existing_file, replacing
+from invertwin.untrusted import existing_file, read_arrays, read_npy, reading, try_apart
 
 # The data tell these settings by their shape and kind.
 _TOLD = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
@@ -66,7 +67,7 @@ def described_board(
     )
 
 
-def read_chirps(path: str | Path) -> ChirpData:
+def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     """Read every chirp of described samples.
 
     The description, in SI units::
@@ -87,13 +88,20 @@ def read_chirps(path: str | Path) -> ChirpData:
     receivers are numbered from 1 unless ``transmit_order`` and ``receivers`` say otherwise; the
     dimension tx is in the order of sending.
 
+    A damaged file can hang or crash the libraries that read HDF5 and MATLAB files. So a child
+    process tries them first, within limits of time and memory; that takes about a second.
+
+    Args:
+        path: the description.
+        trusted: read the data at once.
+
     Raises:
         InputError: no file, a damaged one, unknown or missing keys, or dimensions that do not fit.
     """
     path = Path(path)
     description = _description(path)
     data, given = description["data"], description["settings"]
-    array = _array(path.parent / str(data["file"]), data.get("variable"))
+    array = _array(path.parent / str(data["file"]), data.get("variable"), trusted=trusted)
     real = array.dtype.kind != "c"
     order = data.get("dimensions", list(CHIRP_DIMS))
     samples = _arranged(array, order, len(given.get("transmit_order", [])) or None)
@@ -174,13 +182,8 @@ def _elements(positions: Any, name: str) -> AntennaArray:
 
 def _description(path: Path) -> dict[str, dict[str, Any]]:
     existing_file(path, "a TOML description")
-    try:
+    with reading(path, "TOML", "give the description of the data, not the data"):
         description = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"expected TOML in {path}, got text that is none ({error}); "
-            "give the description of the data, not the data"
-        ) from error
     for section, keys in description.items():
         known = _KEYS.get(section)
         if known is None or not isinstance(keys, dict) or not set(keys) <= known:
@@ -196,7 +199,7 @@ def _description(path: Path) -> dict[str, dict[str, Any]]:
     return description
 
 
-def _array(path: Path, variable: str | None) -> np.ndarray:
+def _array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray:
     existing_file(path, "the data file that [data] names")
     ending = path.suffix.lower()
     if ending not in _ENDINGS:
@@ -205,17 +208,13 @@ def _array(path: Path, variable: str | None) -> np.ndarray:
         )
     if ending != ".npy" and variable is None:
         raise InputError(f"expected a variable in {path.name}, got none; add it to [data]")
-    try:
-        array = _loaded(path, ending, variable)
-    except KeyError as error:
-        raise InputError(
-            f"expected a variable {variable!r} in {path.name}, got none; check its spelling"
-        ) from error
-    except (*UNREADABLE, scipy.io.matlab.MatReadError) as error:
-        raise InputError(
-            f"expected a whole {ending} file, got {path}, which cannot be read "
-            f"({type(error).__name__}); it is damaged or of another kind"
-        ) from error
+    with reading(path, f"a whole {ending} file"):
+        try:
+            array = _loaded(path, ending, variable, trusted=trusted)
+        except KeyError:
+            raise InputError(
+                f"expected a variable {variable!r} in {path.name}, got none; check its spelling"
+            ) from None
     if array.dtype.names is not None and len(array.dtype.names) == 2:
         # Complex numbers as MATLAB 7.3 stores them: pairs of a real and an imaginary part.
         pairs = np.stack([array[name] for name in array.dtype.names], axis=-1)
@@ -228,12 +227,15 @@ def _array(path: Path, variable: str | None) -> np.ndarray:
     return array
 
 
-def _loaded(path: Path, ending: str, variable: str | None) -> np.ndarray:
-    if ending in (".npy", ".npz"):
-        with path.open("rb") as opened:
-            loaded = np.load(opened, allow_pickle=False)
-            return loaded if ending == ".npy" else loaded[variable]
-    if ending == ".mat" and not h5py.is_hdf5(path):
+def _loaded(path: Path, ending: str, variable: str | None, *, trusted: bool) -> np.ndarray:
+    if ending == ".npy":
+        return read_npy(path)
+    if ending == ".npz":
+        return read_arrays(path, "it is damaged or of another kind", [str(variable)])[str(variable)]
+    matlab = ending == ".mat" and not h5py.is_hdf5(path)
+    if not trusted:
+        try_apart(path, "matlab" if matlab else "hdf5", str(variable))
+    if matlab:
         return np.asarray(scipy.io.loadmat(path, variable_names=[str(variable)])[str(variable)])
     with h5py.File(path, "r") as opened:
         array = np.asarray(opened[str(variable)])

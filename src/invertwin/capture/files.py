@@ -6,7 +6,8 @@ import numpy as np
 import xarray as xr
 
 from invertwin.errors import InputError
-from invertwin.scene.files import existing_file, replacing
+from invertwin.folders import replacing
+from invertwin.untrusted import existing_file, reading, try_apart
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
@@ -26,22 +27,22 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
         real.to_netcdf(part, engine="h5netcdf", encoding=encoding)
 
 
-def read_dataset(path: Path) -> xr.Dataset:
+def read_dataset(path: Path, *, trusted: bool = False) -> xr.Dataset:
     """Read what `write_dataset` wrote.
+
+    Args:
+        path: file.
+        trusted: do not let a child process try it first.
 
     Raises:
         InputError: no such file, or one that is damaged or no NetCDF.
     """
     existing_file(path, "a capture file")
-    try:
+    if not trusted:
+        try_apart(path, "netcdf")
+    with reading(path, "a whole NetCDF file"):
         # Nothing is decoded: seconds stay numbers, and every bit stays what it was.
-        dataset = xr.load_dataset(path, engine="h5netcdf", decode_cf=False)
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise InputError(
-            f"expected a whole NetCDF file, got {path}, which cannot be read "
-            f"({type(error).__name__}); it is damaged or truncated, copy or record it again"
-        ) from error
-    return _joined(dataset)
+        return _joined(xr.load_dataset(path, engine="h5netcdf", decode_cf=False))
 
 
 def _split(dataset: xr.Dataset) -> xr.Dataset:

@@ -16,6 +16,7 @@ def read(
     *,
     board: Mounting | Elements | None = None,
     lanes: int | None = None,
+    trusted: bool = False,
 ) -> Capture | ChirpCapture:
     """Read a recording, as the ending of its file says.
 
@@ -29,6 +30,7 @@ def read(
         board: whose elements recorded, or (transmitters, receivers), see `ChirpData.recorded`;
             None = as the description says.
         lanes: lanes of the LVDS link, where the settings do not say.
+        trusted: do not let a child process try HDF5, NetCDF and MATLAB files first.
 
     Returns:
         One signal per frame and channel, or every chirp of the frames: `ChirpCapture.capture`
@@ -39,9 +41,9 @@ def read(
     """
     ending = Path(path).suffix.lower()
     if ending == ".nc":
-        return Capture.load(path)
+        return Capture.load(path, trusted=trusted)
     if ending == ".toml":
-        chirps = described_arrays.read_chirps(path)
+        chirps = described_arrays.read_chirps(path, trusted=trusted)
         return chirps.recorded(board or described_arrays.described_board(path))
     if ending not in (".bin", ".json"):
         raise InputError(

@@ -9,6 +9,7 @@ from invertwin.channel.paths import Paths as Paths
 from invertwin.channel.paths import Pattern as Pattern
 from invertwin.channel.power.clouds import deposit_density as deposit_density
 from invertwin.channel.power.deposit import deposit_power as deposit_power
+from invertwin.channel.rays.backend import alone as alone
 from invertwin.channel.rays.backend import backend as backend
 from invertwin.channel.rays.backend import torch_threads as torch_threads
 from invertwin.channel.rays.backend import use_backend as use_backend

@@ -24,6 +24,7 @@ class Sampling:
             ablation.
         interior_edges: False leaves out the shadows that surfaces cast on each other, for
             ablation.
+        contacts: False leaves out what moves where surfaces cross or touch, for ablation.
         points_per_m2: Fixed points on rough surfaces, which carry fields of one bounce.
         rough_paths: Fixed rough paths of several bounces that are drawn of each length; at most a
             quarter of them are kept.
@@ -40,6 +41,7 @@ class Sampling:
     boundary_samples: Annotated[int, Ge(0)] = 50_000
     boundary: bool = True
     interior_edges: bool = True
+    contacts: bool = True
     points_per_m2: float = 20_000.0
     rough_paths: int = 200_000
     memory_budget: float = 0.25e9

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import typer.main
+from typer.core import TyperGroup
 
 from invertwin import __version__
 from invertwin.cli.options import (
@@ -23,11 +25,37 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.run_file import about_file
 from invertwin.cli.running import load_runs, now_and_then, print_tables, run_folder
-from invertwin.errors import InputError
-from invertwin.registry.kinds import load_plugins
+from invertwin.errors import InputError, one_line
+
+
+class _Commands(TyperGroup):
+    """Our commands, and those of plugins, which are imported when ours do not answer."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        self._add_plugins()
+        return super().list_commands(ctx)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in self.commands:
+            self._add_plugins()
+        return super().get_command(ctx, cmd_name)
+
+    def _add_plugins(self) -> None:
+        from invertwin.registry.kinds import load_plugins
+
+        found = typer.Typer()
+        for name, function in load_plugins().commands.items():
+            found.command(name)(function)
+        if found.registered_commands:
+            self.commands = {**self.commands, **typer.main.get_group(found).commands}
+
 
 app = typer.Typer(
-    name="invertwin", no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False
+    name="invertwin",
+    cls=_Commands,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
 )
 
 
@@ -72,6 +100,21 @@ def reconstruct(options: Resumable, file: FileArgument) -> None:
 
 @app.command()
 @with_options(Resumable)
+def plan(options: Resumable, file: FileArgument) -> None:
+    """State the error bars of a fit before anything is recorded, and rank positions to add."""
+    runs = load_runs([file], options, "plan", ("radar", "data", "grid", "parameters"))
+    with run_folder(options, Path("out", file.stem), runs) as folder:
+        if folder.complete:
+            return
+        from invertwin.cli.run_plan import run_plan
+
+        with about_file(file):
+            tables = run_plan(runs[file.stem], folder, console, now_and_then())
+        print_tables(tables)
+
+
+@app.command()
+@with_options(Resumable)
 def demo(options: Resumable) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
@@ -111,19 +154,21 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
 def keys(
     section: Annotated[
         str | None,
-        typer.Argument(help="Such as radar or radar.waveform; default: all.", show_default=False),
+        typer.Argument(
+            help="Such as radar or radar.waveform; default: a list of all.", show_default=False
+        ),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json-schema", help="Print the JSON Schema, for editors.")
     ] = False,
 ) -> None:
-    """Print the keys of run files: what may be written where, units, defaults."""
-    from invertwin.cli.keys import json_schema, key_tables
+    """Print the keys of a section of run files: units, defaults, meaning; or list the sections."""
+    from invertwin.cli.keys import json_schema, key_index, key_tables
 
     if as_json:
         print(json.dumps(json_schema(), indent=2, ensure_ascii=False))
     else:
-        print_tables(key_tables(section))
+        print_tables([key_index()] if section is None else key_tables(section))
 
 
 @app.command()
@@ -135,10 +180,6 @@ def doctor(backend: BackendOption = None) -> None:
     console.print(machine.render(report), markup=False, soft_wrap=True)
     if not report["ok"]:
         raise typer.Exit(1)
-
-
-for _name, _function in load_plugins().commands.items():
-    app.command(_name)(_function)
 
 
 def main() -> None:
@@ -175,7 +216,7 @@ def _shown_once() -> Callable[..., None]:
     said: set[str] = set()
 
     def show(message: Warning | str, *_: Any) -> None:
-        line = f"invertwin: warning: {message}"
+        line = one_line(f"invertwin: warning: {message}")
         if line not in said:
             said.add(line)
             print(line, file=sys.stderr)

@@ -2,15 +2,19 @@
 
 from typing import Any
 
+import torch
 from pydantic import model_validator
 
 from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
 from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.minima import pose_grid
 from invertwin.inversion.optimizer import Optimizer
+from invertwin.inversion.starts import nearby, posed
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate
 from invertwin.registry.kinds import Group, Registry, Table
 from invertwin.registry.section import fail, key
+from invertwin.scene.scene import Object
 
 
 class SurrogateTable(Table):
@@ -34,13 +38,22 @@ class SurrogateTable(Table):
         return {"exact": True} if chosen is None else {"exact": False, **vars(chosen)}
 
 
+class SearchTable(Table):
+    """Poses in which an object may begin, beside its start; the best few are fitted."""
+
+    object: str = key("name in the scene")
+
+
 def register(registry: Registry) -> None:
     """Add losses and optimizers; forward models of one's own come from plugins."""
     registry.groups["loss"] = Group(default="mse")
     registry.groups["optimizer"] = Group(default="adam")
     registry.groups["model"] = Group()
-    registry.given |= {Grid, Surrogate, Sampling}
+    registry.groups["search"] = Group(base=SearchTable)
+    registry.given |= {Grid, Surrogate, Sampling, Object, torch.Generator}
     registry.add("loss", "mse", SpectrumLoss, without=("floor",))
     registry.add("loss", "likelihood", SpectrumLoss)
+    for name, make in (("random", nearby), ("grid", pose_grid), ("given", posed)):
+        registry.add("search", name, make)
     for name in ("adam", "sgd", "gauss_newton"):
         registry.add("optimizer", name, Optimizer, without=("module_rates",))

@@ -1,13 +1,21 @@
 """What may be written in a run file, as tables made from its JSON Schema."""
 
+import contextlib
 import difflib
+import hashlib
+import importlib.util
 import json
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from invertwin.cli.report import Table
-from invertwin.cli.schema import RunFile
+from invertwin.doctor import cache_folder
 from invertwin.errors import InputError
+from invertwin.folders import replacing
+from invertwin.registry.kinds import PLUGINS
 
 COLUMNS = ("key", "value", "default", "unit or meaning")
 _WORDS = {"number": "number", "integer": "integer", "boolean": "true or false", "string": "text"}
@@ -16,25 +24,63 @@ Schema = dict[str, Any]
 
 
 def json_schema() -> Schema:
-    """The JSON Schema of run files, for editors; kinds and sections of plugins are in it."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **RunFile.model_json_schema(),
-    }
+    """The JSON Schema of run files, for editors; kinds and sections of plugins are in it.
+
+    Making it imports all that run files may name, which takes seconds; so it is kept on disk until
+    a file of the installed code changes.
+    """
+    file = cache_folder() / f"keys-{_installed()}.json"
+    with contextlib.suppress(OSError, ValueError):
+        return json.loads(file.read_text(encoding="utf-8"))
+    from invertwin.cli.schema import RunFile
+
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    schema |= RunFile.model_json_schema()
+    # Without a place to write, the next call makes it again: slower, not wrong.
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        for old in file.parent.glob("keys-*.json"):
+            old.unlink()
+        with replacing(file) as part:
+            part.write_text(json.dumps(schema), encoding="utf-8")
+    return schema
 
 
-def key_tables(section: str | None = None) -> list[Table]:
-    """One table for every section of a run file, or for one section and what is in it.
+def _installed() -> str:
+    """A digest of the code that says what run files may name, plugins with it."""
+    found = hashlib.sha256(f"{sys.version} {metadata.version('pydantic')}".encode())
+    for name in sorted({"invertwin", *(e.module for e in metadata.entry_points(group=PLUGINS))}):
+        spec = importlib.util.find_spec(name.partition(".")[0])
+        for place in (spec and (spec.submodule_search_locations or [spec.origin])) or ():
+            root = Path(place or "")
+            for file in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
+                status = file.stat()
+                found.update(f"{file} {status.st_size} {status.st_mtime_ns}".encode())
+    return found.hexdigest()[:16]
+
+
+def key_index() -> Table:
+    """The sections of a run file, and what each is."""
+    top = json_schema()
+    rows = [
+        [name, top["properties"][name].get("description", "")]
+        for name in top["properties"]
+        if _below(top["properties"][name], top["$defs"])
+    ]
+    note = "invertwin keys SECTION prints the keys of one, such as radar or radar.waveform."
+    return Table("Sections of a run file", ("section", "what it is"), rows, note)
+
+
+def key_tables(section: str) -> list[Table]:
+    """The tables of a section of a run file and of what is in it.
 
     Args:
-        section: Such as ``radar`` or ``radar.waveform``; None = all.
+        section: Such as ``radar`` or ``radar.waveform``.
 
     Raises:
         InputError: There is no such section.
     """
     found = dict(_sections(json_schema()))
-    if section is None:
-        return [table for tables in found.values() for table in tables]
     wanted = section.strip("[]")
     names = [name for name in found if f"{_plain(name)}.".startswith(f"{wanted}.")]
     if not names:

@@ -3,10 +3,8 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-import numpy as np
 import torch
 from annotated_types import Ge, Gt, Le, MinLen
 from pydantic import model_validator
@@ -29,6 +27,7 @@ from invertwin.scene import (
 )
 from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import RANGES, Value
+from invertwin.untrusted import read_npy
 
 _KINDS: Mapping[str, type[Material]] = {
     "rough_dielectric": RoughDielectric,
@@ -102,12 +101,5 @@ def _value(value: Any, name: str, angle: bool, given: Mapping[type, object]) -> 
             f"expected {name} as a number for the materials of a scene file, got an image; "
             "give textures to objects of their own"
         )
-    try:
-        image = np.load(Path(value.image), allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"expected {name} from a NumPy file (.npy), got {value.image} ({error}); "
-            "write it with numpy.save"
-        ) from None
-    texture = Texture.over(image, mesh)
+    texture = Texture.over(read_npy(value.image), mesh)
     return replace(texture, image=torch.deg2rad(texture.image)) if angle else texture

@@ -6,11 +6,11 @@ from torch import Tensor
 
 from invertwin.capture import ChirpSettings, adc_counts, settings_of, ti
 from invertwin.cli.run_file import about
-from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import Raw, RunFile
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW
+from invertwin.runs import RunFolder
 
 # A largest sample at this part of the full scale leaves room for those of other seeds.
 _HEADROOM = 1.25

@@ -33,6 +33,7 @@ class SimulatedData(Section):
     snr_db: float | None = key("signal-to-noise ratio per sample; without it no noise", None)
     noise_figure_db: float | None = key("thermal noise of a receiver instead of snr_db", None)
     seed: Seed | None = key("without it the run's", None)
+    every_start: bool = key("a recording of its own for every start: coverage of error bars", False)
 
     @model_validator(mode="after")
     def _one_noise_level(self) -> "SimulatedData":
@@ -89,18 +90,19 @@ def register(kinds: Registry) -> None:
     kinds.add("data", "arrays", arrays)
 
 
-def saved(file: InputPath) -> Capture:
+def saved(file: InputPath, trusted: bool = False) -> Capture:
     """A capture saved by the library (NetCDF).
 
     Args:
         file: path, from the run file's folder.
+        trusted: true reads it at once, without a child process that tries whether it is damaged.
     """
     for name in registry.names("waveform"):
         kind = registry.table("waveform", name).made_by
         if isinstance(kind, type):  # a file of a plugin's radar names its waveform
             WAVEFORMS.setdefault(kind.__name__, kind)
     with about("file"):
-        return Capture.load(file)
+        return Capture.load(file, trusted=trusted)
 
 
 def dca1000(
@@ -122,15 +124,16 @@ def dca1000(
     return recorded(chirps, board)
 
 
-def arrays(file: InputPath, board: Mounting | None = None) -> ChirpCapture:
+def arrays(file: InputPath, board: Mounting | None = None, trusted: bool = False) -> ChirpCapture:
     """Samples in a NumPy, HDF5 or MATLAB file with a TOML description beside it.
 
     Args:
         file: the description.
         board: whose elements recorded; without it what the description says.
+        trusted: true reads it at once, without a child process that tries whether it is damaged.
     """
     with about("file"):
-        chirps = described_arrays.read_chirps(file)
+        chirps = described_arrays.read_chirps(file, trusted=trusted)
     if board is not None:
         return recorded(chirps, board)
     with about("board"):

@@ -17,7 +17,7 @@ from invertwin import __version__
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
     from matplotlib.figure import Figure
 
-    from invertwin.cli.runs import RunFolder
+    from invertwin.runs import RunFolder
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,10 @@ def picture(
         title: In the report; without it the name.
         note: A key among the notes of texts.toml, or none.
     """
-    png = folder.write_figure(f"{name}.png", figure)
+    from invertwin.plotting import png_bytes
+
+    png = png_bytes(figure)
+    folder.write_bytes(f"{name}.png", png)
     title = title or name.capitalize().replace("_", ", ")
     return Picture(title, png, texts("notes").get(note, note))
 

@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 from invertwin.errors import InputError
 from invertwin.registry.section import TAG_MARK
 from invertwin.registry.section import about as about
+from invertwin.untrusted import reading
 
 _MOST_ERRORS = 4  # in one line
 # Sections and kinds of the package in experiments/studies.
@@ -55,15 +56,16 @@ def load_run(path: Path) -> Any:
         raise InputError(
             f"{path}: expected a run file, got a path that does not exist; check the path"
         ) from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"{path}: expected a readable run file, got an error: {reason}; give a TOML text file"
         ) from None
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(_syntax_error(path, text, str(error))) from None
+    with reading(path, "a run file in TOML", "simplify it"):
+        try:
+            raw = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise InputError(_syntax_error(path, text, str(error))) from None
     return validate(raw, path)
 
 

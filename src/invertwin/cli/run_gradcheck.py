@@ -12,24 +12,25 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.report import Picture, Table, finish, texts
+from invertwin.cli.report import Picture, Table, finish, picture, texts
 from invertwin.cli.run_file import about_file, need
-from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.errors import InputError
+from invertwin.folders import PARTS
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
 from invertwin.models import SurrogateMap
 from invertwin.radar.radar import Radar
+from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 
 _COLUMNS = (
-    *("scene", "L1 full", "L1 interior", "L1 no interior edges", "ratio", "L2 full"),
-    *("correlation", "noise", "steps differ", "order", "pairs"),
+    *("scene", "L1 full", "L1 interior", "L1 no interior edges", "L1 no contact", "ratio"),
+    *("L2 full", "correlation", "noise", "steps differ", "order", "pairs"),
 )
 _KEPT = (
-    *("full", "interior", "no_interior_edges"),
+    *("full", "interior", "no_interior_edges", "no_contact"),
     *("difference_noise", "step_agreement", "pairs"),
 )
 # Units of a derivative with respect to θ, by the value that θ changes; angles are told apart.
@@ -114,7 +115,7 @@ def run_gradcheck(
             studies.append(study.table(name, found[key]))
             shown[f"{name}_{key}"] = studies[-1].title, study.picture_note
         for file, (title, note) in shown.items():
-            pictures.append(Picture(title, (folder.path / f"{file}.png").read_bytes(), note))
+            pictures.append(Picture(title, folder.file(f"{file}.png").read_bytes(), note))
     metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
         metrics |= compared
@@ -123,9 +124,7 @@ def run_gradcheck(
     table = Table("Agreement with central differences", _COLUMNS, rows, legend)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
     parts = [table, *studies, *pictures]
-    found = finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
-    folder.remove([f"{PARTS}/{name}.json" for name in runs])
-    return found
+    return finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
 
 
 def _check(
@@ -159,15 +158,15 @@ def _check(
         seed=run.seed,
         progress=say,
     )
-    folder.write_figure(f"{name}.png", _maps(report, grid, settings))
+    picture(folder, f"{name}", _maps(report, grid, settings))
     moved = filter(None, [getattr(settings.parameter, "object", None)])
-    folder.write_figure(f"{name}_scene.png", plotting.scene(scene, radar, highlight=[*moved]))
+    picture(folder, f"{name}_scene", plotting.scene(scene, radar, highlight=[*moved]))
     kept = {key: value for key in _KEPT if (value := getattr(report, key)) is not None}
     found = {k: asdict(v) if isinstance(v, Agreement) else v for k, v in kept.items()}
     checked = Checked(run, scene, radar, grid, check.step, report, say)
     for key, study in _studies(run).items():
         found[key], figure = study.compare(checked)
-        folder.write_figure(f"{name}_{key}.png", figure)
+        picture(folder, f"{name}_{key}", figure)
     return found | {"seconds": time.perf_counter() - begin}
 
 
@@ -192,9 +191,9 @@ def _maps(report: GradientReport, grid: Grid, settings: Gradcheck) -> Figure:
 
 def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
     full, interior = found["full"], found["interior"]["relative_l1"]
-    outer = found.get("no_interior_edges", {}).get("relative_l1")
+    less = [found.get(key, {}).get("relative_l1") for key in ("no_interior_edges", "no_contact")]
     ratio = interior / full["relative_l1"] if full["relative_l1"] else None
-    errors = [full["relative_l1"], interior, outer, ratio, full["relative_l2"]]
+    errors = [full["relative_l1"], interior, *less, ratio, full["relative_l2"]]
     differences = [found["difference_noise"], found["step_agreement"], full["order"]]
     return [name, *errors, full["correlation"], *differences, found["pairs"]]
 

@@ -17,7 +17,6 @@ from invertwin.capture import (
 from invertwin.channel import Grid
 from invertwin.cli.options import Look
 from invertwin.cli.report import Table, finish, picture, quantities, texts
-from invertwin.cli.runs import RunFolder
 from invertwin.errors import InputError
 from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
 from invertwin.radar import (
@@ -33,6 +32,7 @@ from invertwin.radar import (
 )
 from invertwin.radar.boards import Mounting
 from invertwin.registry.kinds import load_plugins, registry
+from invertwin.runs import RunFolder
 
 Recording = Capture | ChirpCapture
 _ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"

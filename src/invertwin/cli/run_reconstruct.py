@@ -11,7 +11,16 @@ from rich.console import Console
 from invertwin.cli.fits.fitting import calibrated, fit
 from invertwin.cli.fits.initial import guessed
 from invertwin.cli.fits.mover import run_mover
-from invertwin.cli.fits.problem import FULL, problem_of, settings_of, starts_of, varied
+from invertwin.cli.fits.problem import (
+    FULL,
+    known_of,
+    problem_of,
+    recorded_anew,
+    recorded_for,
+    settings_of,
+    starts_of,
+    varied,
+)
 from invertwin.cli.fits.scores import (
     agreement,
     heldout,
@@ -23,11 +32,12 @@ from invertwin.cli.fits.scores import (
 from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
-from invertwin.cli.report import Table, finish
-from invertwin.cli.runs import CHECKPOINT, PARTS, RunFolder
+from invertwin.cli.report import Table, finish, picture
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.inversion import Reconstruction
+from invertwin.inversion.certainty import certainty, coverage
+from invertwin.runs import CHECKPOINT, RunFolder
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry.density import without_clouds
 
@@ -53,12 +63,14 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         rows[mode] = []
         for i, start in enumerate(starts):
             checkpoint = CHECKPOINT if single else None
-            row, outcome = fit(whole, start, i, mode, folder, console, checkpoint)
+            own = recorded_for(whole, i, console)
+            row, outcome = fit(own, start, i, mode, folder, console, checkpoint)
             rows[mode].append(row)
             if mode == modes[0]:
                 outcomes[i] = outcome
     best = min(rows[modes[0]], key=lambda row: (row["status"] == "diverged", _finite(row["loss"])))
     start, found = starts[best["start"]], outcomes[best["start"]]()
+    problem = varied(recorded_for(whole, best["start"], console), FULL)
     twin, radars = found.scene, found.sensors
     maps = {
         "measured": [s.capture.spectrum(s.grid).float() for s in problem.sights.values()],
@@ -69,6 +81,9 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     metrics = {
         "task": run.task,
         **summary(problem, rows, modes),
+        **(coverage(rows[FULL]) if recorded_anew(run) else {}),
+        **certainty(found, known_of(problem)),
+        **{key: best[key] for key in ("other_ends", "ambiguities") if key in best},
         **{k: best[k] for k in best if (k in COLUMNS or is_shape_key(k)) and k != "seconds"},
         "start_loss_sharp": misfit(problem, maps["start"], maps["measured"]),
         "loss_sharp": misfit(problem, maps["twin"], maps["measured"]),
@@ -86,22 +101,21 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         metrics |= {f"{key}_{mode}": same[key] for key in own}
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         console.print("computing the loss landscape")
-        figure, found = landscape(problem)
-        folder.write_figure("landscape.png", figure)
-        metrics["landscape"] = found
+        figure, minima = landscape(problem)
+        picture(folder, "landscape", figure)
+        metrics["landscape"] = minima
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
-    fitted = Fitted(problem, metrics, rows, start, twin, maps)
+    fitted = Fitted(problem, metrics, rows, start, twin, maps, found.verdict.residuals)
     result, *tables = tables_of(fitted)
     parts = [result, *pictures_of(fitted, folder), *tables]
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:
         save_mesh(folder.file("twin.glb"), twin)
-    if not single:
-        shutil.copyfile(folder.path / best["checkpoint"], folder.file(CHECKPOINT))
+    if best["checkpoint"] != CHECKPOINT:
+        shutil.copyfile(folder.file(best["checkpoint"]), folder.file(CHECKPOINT))
     title, outcome = run.title or "Reconstruction", status(run, metrics)
     tables = finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note)
-    folder.remove([name for name in folder.names if name.startswith(PARTS)])
     return tables, outcome
 
 

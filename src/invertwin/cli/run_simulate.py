@@ -16,13 +16,13 @@ from invertwin.cli import build, sensors
 from invertwin.cli.raw_files import settings_of_run, write_raw
 from invertwin.cli.report import Table, finish, picture, quantities
 from invertwin.cli.run_file import about, need
-from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
+from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 from invertwin.simulation import Simulation, simulate, simulate_chirps

@@ -12,9 +12,9 @@ from rich.text import Text
 
 from invertwin.cli.options import Options, Where, console
 from invertwin.cli.report import Table, is_number, shown
-from invertwin.cli.run_file import about_file, load_run, need
-from invertwin.cli.runs import RunFolder, open_run
+from invertwin.cli.run_file import about_file, load_run, need, to_toml
 from invertwin.errors import InputError
+from invertwin.runs import RunFolder, open_run
 
 _LOG_SECONDS = 10.0  # between lines of progress in a log
 
@@ -31,7 +31,8 @@ def run_folder(
         runs: Run files by stem.
     """
     path, resume = options.out or default, getattr(options, "resume", False)
-    folder = open_run(path, runs or {}, overwrite=options.overwrite, resume=resume)
+    texts = {name: to_toml(run) for name, run in (runs or {}).items()}
+    folder = open_run(path, texts, overwrite=options.overwrite, resume=resume)
     try:
         with folder:
             yield folder
@@ -41,7 +42,7 @@ def run_folder(
             line += f"; the same command with --resume goes on (results so far in {path})"
         print(line, file=sys.stderr)
         sys.exit(130)
-    done = "was complete already" if folder.complete and folder.resumed else "complete"
+    done = "was complete already" if folder.complete else "complete"
     console.print(f"{done}: {path / 'report.html'}", markup=False, soft_wrap=True)
 
 

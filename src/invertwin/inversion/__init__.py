@@ -21,6 +21,9 @@ from invertwin.inversion.metrics import compare_shapes as compare_shapes
 from invertwin.inversion.metrics import residual as residual
 from invertwin.inversion.metrics import topology as topology
 from invertwin.inversion.metrics import volume_iou as volume_iou
+from invertwin.inversion.minima import Search as Search
+from invertwin.inversion.minima import pose_grid as pose_grid
+from invertwin.inversion.minima import search as search
 from invertwin.inversion.mover import Echo as Echo
 from invertwin.inversion.mover import MoverMaps as MoverMaps
 from invertwin.inversion.mover import MoverTwin as MoverTwin
@@ -30,7 +33,9 @@ from invertwin.inversion.mover import strongest_mover as strongest_mover
 from invertwin.inversion.observation import Observation as Observation
 from invertwin.inversion.observation import Unknown as Unknown
 from invertwin.inversion.optimizer import Optimizer as Optimizer
+from invertwin.inversion.planning import planned as planned
 from invertwin.inversion.reconstruction import Reconstruction as Reconstruction
+from invertwin.inversion.reconstruction import fit_at as fit_at
 from invertwin.inversion.reconstruction import reconstruct as reconstruct
 from invertwin.inversion.regularization import Laplacian as Laplacian
 from invertwin.inversion.regularization import LatentNorm as LatentNorm
@@ -40,4 +45,7 @@ from invertwin.inversion.schedule import Schedule as Schedule
 from invertwin.inversion.schedule import Stage as Stage
 from invertwin.inversion.starts import displaced as displaced
 from invertwin.inversion.starts import nearby as nearby
+from invertwin.inversion.starts import posed as posed
 from invertwin.inversion.tangents import Bump as Bump
+from invertwin.inversion.uncertainty import Uncertainty as Uncertainty
+from invertwin.inversion.verdict import Verdict as Verdict

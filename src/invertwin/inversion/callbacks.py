@@ -1,14 +1,19 @@
 """Callbacks of a fit: progress reports, metrics of a known truth, checkpoints."""
 
-import os
-from collections.abc import Callable
+import io
+import signal
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
 
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.inversion.fit import Callback, Fit
 from invertwin.scene.scene import Scene
 
@@ -101,10 +106,10 @@ class Checkpoint(Callback):
 
     def end(self, fit: Fit) -> None:
         """Write the file. If the process is killed, the last whole file is left."""
-        path = self._path(fit)
-        part = path.with_suffix(path.suffix + ".part")
-        torch.save(fit.state(), part)
-        os.replace(part, path)
+        data = io.BytesIO()  # torch would tell of a full disk in its own words
+        torch.save(fit.state(), data)
+        with replacing(self._path(fit)) as part:
+            part.write_bytes(data.getbuffer())
 
     def _path(self, fit: Fit) -> Path:
         path = Path(self.file)
@@ -119,3 +124,33 @@ def stage_file(file: Path, stage: int) -> Path:
         stage: Number of the stage, from 0.
     """
     return file.with_name(f"{file.stem}_stage{stage}{file.suffix}")
+
+
+@contextmanager
+def interrupted_between_steps() -> Generator[Callable[[], None]]:
+    """Ctrl-C waits for the end of the step, when nothing is half done; a second one does not.
+
+    Gives a function that raises KeyboardInterrupt if one is due.
+    """
+    due = False
+
+    def heed() -> None:
+        if due:
+            raise KeyboardInterrupt
+
+    def note(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal due
+        heed()
+        due = True
+
+    # Another handler, or another thread than the main one, is not ours to change.
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not ours or threading.current_thread() is not threading.main_thread():
+        yield heed
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield heed
+        heed()
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

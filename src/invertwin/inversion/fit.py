@@ -1,5 +1,6 @@
 """One stage of a fit: a model predicts, a loss compares, an optimiser steps."""
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,7 @@ _DIVERGED = 1e3  # times the first loss
 _WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
 _WINDOW = 20  # steps over which convergence is judged
 _SUBSETS = 2**16  # keys of the seeds that choose frames, beyond those of observations
+_SHARP, _LOOKS = 2**17, 2**17 + 1  # keys of seeds, beyond those of stages
 
 
 @dataclass(frozen=True)
@@ -196,6 +198,47 @@ class Fit:
                 pairs.append((model.predict(scene, sensor, seed), blurred.result()))
         return pairs
 
+    def sharp_maps(self, number: int, **sampled: Any) -> Maps:
+        """The predicted and the observed map of every observation, with all frames, not blurred.
+
+        Args:
+            number: Other numbers have other random numbers.
+            sampled: Fields of the models' ``sampling`` in place of their own.
+        """
+        scene, sensors = self.applied()
+        pairs = []
+        for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True)):
+            key = derived_seed(self._settings.seed, _SHARP, number, k)
+            model = model.sampled_by(**sampled) if sampled else model
+            predicted = model.narrowed(0.0).predict(scene, sensor, key)
+            pairs.append((predicted, self._observed[k]))
+        return pairs
+
+    def loss_at_start(self) -> float:
+        """The loss without extra widths at the parameters that the stage began with."""
+        present = self.parameters()
+        self.modules.load_state_dict(self.progress.first)
+        try:
+            with torch.no_grad():
+                return float(self.objective(self.sharp_maps(0)))
+        except InputError:  # out of bounds
+            return math.inf
+        finally:
+            self.modules.load_state_dict(present)
+
+    def looks(self, number: int) -> list[Callable[[int, float], Tensor] | None]:
+        """What every sensor might have recorded of the twin, see ``ForwardModel.looks``.
+
+        Args:
+            number: Other numbers have other points on surfaces.
+        """
+        with torch.no_grad():
+            scene, sensors = self.applied()
+            return [
+                model.looks(scene, sensor, derived_seed(self._settings.seed, _LOOKS, number, k))
+                for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True))
+            ]
+
     def penalty(self) -> Tensor:
         """What the regularisers add to the loss."""
         scene, total = self.applied()[0], torch.zeros((), dtype=torch.float64)
@@ -211,6 +254,23 @@ class Fit:
     def parameters(self) -> dict[str, Tensor]:
         """A copy of the present parameters."""
         return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
+
+    def copied(self) -> "Fit":
+        """The same fit with parameters of its own, which are as they are now."""
+        other = copy.copy(self)
+        own = (self.unknowns, self.sensor_unknowns, self.modules)
+        other.unknowns, other.sensor_unknowns, other.modules = copy.deepcopy(own)
+        return other
+
+    def descended(self, descent: GaussNewton, step: int) -> float:
+        """The loss before a Gauss–Newton step with the random numbers of a step.
+
+        Args:
+            descent: Of the modules of this fit.
+            step: Its number.
+        """
+        penalty = self.penalty if self._settings.regularizers else None
+        return descent.step(partial(self.maps, step), penalty)
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on later."""
@@ -283,8 +343,7 @@ class Fit:
     def _stepped(self, step: int) -> float:
         """The loss of the present parameters, which then take a step down."""
         if isinstance(self.optimizer, GaussNewton):
-            penalty = self.penalty if self._settings.regularizers else None
-            return self.optimizer.step(partial(self.maps, step), penalty)
+            return self.descended(self.optimizer, step)
         self.optimizer.zero_grad()
         value = self.evaluate(step)
         number = float(value.detach())

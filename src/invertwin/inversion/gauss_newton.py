@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from invertwin.channel import alone
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Maps, Objective, SpectrumLoss
 from invertwin.scene.checks import checked_count
@@ -132,7 +133,7 @@ class GaussNewton:
         self._age += 1
         curvature = self._known[0]
         if penalty is not None:
-            curvature = curvature + _penalty_curvature(penalty, parameters, free)
+            curvature = curvature + penalty_curvature(penalty, parameters, free)
         start = [parameter.detach().clone() for parameter in parameters]
         given = self.damping
         for _ in range(_TRIES):
@@ -199,32 +200,48 @@ class GaussNewton:
         fixed = [(predicted.detach(), observed) for predicted, observed in pairs]
         tangents: list[list[Tensor]] = [[] for _ in fixed]
         for index in free.nonzero()[:, 0].tolist():
-            with forward_ad.dual_level(), self._along(index):
+            with alone, forward_ad.dual_level(), self._along(index):
                 found = [forward_ad.unpack_dual(predicted).tangent for predicted, _ in maps()]
             for rows, tangent, (predicted, _) in zip(tangents, found, fixed, strict=True):
                 rows.append(torch.zeros_like(predicted) if tangent is None else tangent)
         return self.objective.curvature(fixed, [torch.stack(rows) for rows in tangents])
 
-    @contextmanager
-    def _along(self, index: int) -> Generator[None, None, None]:
+    def _along(self, index: int) -> AbstractContextManager[None]:
         """Parameters as dual numbers whose tangent is one along a single coordinate."""
         sizes = [parameter.numel() for _, _, parameter in self._slots]
         slot = next(k for k in range(len(sizes)) if index < sum(sizes[: k + 1]))
         module, name, parameter = self._slots[slot]
-        value = parameter.detach()
-        tangent = torch.zeros_like(value)
+        tangent = torch.zeros_like(parameter.detach())
         tangent.view(-1)[index - sum(sizes[:slot])] = 1.0
-        own = list(module.named_parameters(recurse=False))
-        delattr(module, name)
-        setattr(module, name, forward_ad.make_dual(value, tangent))
-        try:
-            with torch.no_grad():
-                yield
-        finally:
-            # All of them, in their order, which is that of checkpoints.
-            for key, held in own:
-                delattr(module, key)
-                setattr(module, key, held)
+        return along(module, {name: tangent})
+
+
+@contextmanager
+def along(module: nn.Module, tangents: Mapping[str, Tensor]) -> Generator[None, None, None]:
+    """Parameters of a module as dual numbers, with these tangents by name.
+
+    Args:
+        module: What is moved, within a ``dual_level``.
+        tangents: Of some of its parameters; names may have dots.
+    """
+    held = []
+    for path, tangent in tangents.items():
+        owner, _, name = path.rpartition(".")
+        part = module.get_submodule(owner)
+        held.append((part, list(part.named_parameters(recurse=False))))
+        value = getattr(part, name).detach()
+        delattr(part, name)
+        setattr(part, name, forward_ad.make_dual(value, tangent.to(value)))
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        # All of them, in their order, which is that of checkpoints.
+        for part, own in reversed(held):
+            for key, parameter in own:
+                if hasattr(part, key):
+                    delattr(part, key)
+                setattr(part, key, parameter)
 
 
 def _value(
@@ -257,10 +274,16 @@ def _row(parts: Sequence[Tensor]) -> Float64[Tensor, " q"]:
     return torch.cat([part.flatten().double() for part in parts])
 
 
-def _penalty_curvature(
+def penalty_curvature(
     penalty: Callable[[], Tensor], parameters: list[nn.Parameter], free: Bool[Tensor, " q"]
 ) -> Float64[Tensor, "p p"]:
-    """Second derivatives of a term of the loss, as far as they are positive."""
+    """Second derivatives of a term of the loss, as far as they are positive.
+
+    Args:
+        penalty: The term.
+        parameters: By what it is differentiated.
+        free: Which of their numbers count.
+    """
     count, value = int(free.sum()), penalty()
     total = torch.zeros(count, count, dtype=torch.float64)
     if value.requires_grad:

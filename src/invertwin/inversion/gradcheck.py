@@ -3,13 +3,14 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import torch
 import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.channel import alone
 from invertwin.errors import InputError
 from invertwin.inversion.lines import line_of
 from invertwin.inversion.tangents import Change
@@ -19,6 +20,7 @@ from invertwin.scene.scene import Scene
 from invertwin.seeds import derived_seed
 
 _LEAST_PAIRS = 4
+_ROUNDING = 1e-3  # relative change of a gradient that is none
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class GradientReport:
         interior: Agreement without boundary paths; equal to ``full`` if the model has none.
         no_interior_edges: With boundary paths, but without those of the shadows that surfaces
             cast on each other; None for paths of one bounce, which have none.
+        no_contact: With boundary paths, but without those of the curves in which surfaces cross or
+            touch; None where surfaces do not meet.
         difference_noise: ‖standard error‖₁ / ‖g_FD‖₁.
         step_agreement: ‖FD(ε) − FD(ε/2)‖₁ / ‖FD(ε)‖₁ (holds the noise of both).
         pairs: Number of independent difference pairs.
@@ -78,6 +82,7 @@ class GradientReport:
     full: Agreement
     interior: Agreement
     no_interior_edges: Agreement | None
+    no_contact: Agreement | None
     difference_noise: float
     step_agreement: float
     pairs: int
@@ -141,7 +146,7 @@ def gradcheck(
     def derivative(chosen: ForwardModel) -> tuple[Tensor, Tensor]:
         primals, tangents = [], []
         for number in range(check.repeats):
-            with forward_ad.dual_level():
+            with alone, forward_ad.dual_level():
                 zero = torch.zeros((), dtype=torch.float64)
                 theta = forward_ad.make_dual(zero, torch.ones_like(zero))
                 out = chosen.predict(*seen(line.at(theta)), derived_seed(seed, 0, number)).double()
@@ -160,11 +165,15 @@ def gradcheck(
     with torch.no_grad():
         value, gradient = derivative(model)
         sampling = getattr(model, "sampling", None)
-        interior_gradient, outer_gradient = gradient, None
+        interior_gradient, outer_gradient, apart_gradient = gradient, None, None
         if sampling is not None and sampling.boundary:
             interior_gradient = derivative(model.sampled_by(boundary=False))[1]
             if sampling.depth > 1:
                 outer_gradient = derivative(model.sampled_by(interior_edges=False))[1]
+            if sampling.contacts:
+                apart = derivative(model.sampled_by(contacts=False))[1]
+                changed = (apart - gradient).abs().sum() > _ROUNDING * gradient.abs().sum()
+                apart_gradient = apart if changed else None
         pairs, reached = _converged(lambda n: difference(check.step, n), check, progress)
         truth = pairs.mean(0)
         if not truth.abs().sum() > 0:
@@ -180,9 +189,8 @@ def gradcheck(
     return GradientReport(
         full=_agreement(gradient, truth, far, farther),
         interior=_agreement(interior_gradient, truth, far, farther),
-        no_interior_edges=(
-            None if outer_gradient is None else _agreement(outer_gradient, truth, far, farther)
-        ),
+        no_interior_edges=_agreement(outer_gradient, truth, far, farther),
+        no_contact=_agreement(apart_gradient, truth, far, farther),
         difference_noise=reached,
         step_agreement=float((same - half).abs().sum() / same.abs().sum()),
         pairs=len(pairs),
@@ -215,7 +223,15 @@ def _noise(pairs: Tensor) -> float:
     return float(error.abs().sum() / mean.abs().sum().clamp_min(1e-300))
 
 
-def _agreement(gradient: Tensor, truth: Tensor, far: Tensor, farther: Tensor) -> Agreement:
+@overload
+def _agreement(gradient: Tensor, truth: Tensor, far: Tensor, farther: Tensor) -> Agreement: ...
+@overload
+def _agreement(gradient: None, truth: Tensor, far: Tensor, farther: Tensor) -> None: ...
+def _agreement(
+    gradient: Tensor | None, truth: Tensor, far: Tensor, farther: Tensor
+) -> Agreement | None:
+    if gradient is None:
+        return None
     miss = gradient - truth
     both = torch.stack([gradient.flatten(), truth.flatten()])
     errors = [float((d - gradient).norm()) for d in (far, farther)]

@@ -135,7 +135,7 @@ class SpectrumLoss:
         total = rows.new_zeros(len(rows), len(rows), dtype=torch.float64)
         for level, (a, b) in enumerate(pairs):
             if level > 0:
-                rows = _pooled(rows.flatten(0, 1)).unflatten(0, (len(rows), -1))
+                rows = pooled(rows.flatten(0, 1)).unflatten(0, (len(rows), -1))
             if self.kind == "mse":
                 weight = 2 * gain**2 / b.square().mean().clamp_min(1e-30)
                 weighed = torch.stack([self._cleared(row) for row in rows]).flatten(1)
@@ -151,6 +151,19 @@ class SpectrumLoss:
             own = own - mixed @ mixed.T / total[-1, -1]
         return own
 
+    def fitted_gain(self, simulated: Tensor, measured: Tensor) -> float:
+        """What the simulated map is multiplied by to be nearest to the measured one.
+
+        Args:
+            simulated: Power.
+            measured: Power.
+        """
+        unit, scale = self._units(simulated, measured)
+        pairs = self._pyramid(simulated.detach(), measured)
+        if self.kind == "mse":
+            pairs = [(self._cleared(a), self._cleared(b)) for a, b in pairs]
+        return float(self._gain(pairs) * scale / unit)
+
     def _units(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """What the simulated and the measured map are divided by."""
         scale = _mean_size(measured)
@@ -163,7 +176,7 @@ class SpectrumLoss:
         """A map at all resolutions."""
         found = [power]
         while len(found) < self.levels:
-            found.append(_pooled(found[-1]))
+            found.append(pooled(found[-1]))
         return found
 
     def _pyramid(self, simulated: Tensor, measured: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -398,8 +411,12 @@ def _mean_size(power: Tensor) -> Tensor:
     return power.detach().abs().mean()
 
 
-def _pooled(power: Tensor) -> Tensor:
-    """Half the resolution along every axis that has two bins or more."""
+def pooled(power: Tensor) -> Tensor:
+    """Half the resolution along every axis that has two bins or more.
+
+    Args:
+        power: [frame, …].
+    """
     # Axis by axis, since whole rows are added quickly: half the time of ``avg_pool3d``.
     share = 1.0
     for dim in range(1, power.ndim):

@@ -10,6 +10,7 @@ import torch
 import trimesh
 from jaxtyping import Float64
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from invertwin.channel import visible_points
@@ -19,7 +20,6 @@ from invertwin.scene.checks import ArrayLike, checked_count, checked_number
 from invertwin.scene.material.materials import held_by
 from invertwin.scene.material.values import Value, evaluated
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import rotation_angle
 from invertwin.scene.scene import Object
 
 POINTS = 20_000  # of each surface
@@ -69,13 +69,18 @@ class Residual:
 
     Attributes:
         offset: of its centre [m].
-        angle: of the turn that remains [rad].
+        turn: rotation vector that remains, in the world [rad].
         scale: size over the true one.
     """
 
     offset: Float64[Tensor, "3"]
-    angle: float
+    turn: Float64[Tensor, "3"]
     scale: float
+
+    @property
+    def angle(self) -> float:
+        """Of the turn [rad]."""
+        return float(self.turn.norm())
 
     @property
     def distance(self) -> float:
@@ -103,7 +108,8 @@ def residual(found: Object, truth: Object) -> Residual | None:
     turn = u @ torch.diag(sign) @ vt
     scale = float(b0.square().sum() / (values * sign).sum())
     offset = found.center.detach() - truth.center.detach()
-    return Residual(offset, float(rotation_angle(turn)), 1 / scale if scale else math.nan)
+    vector = torch.from_numpy(Rotation.from_matrix(turn.T.numpy()).as_rotvec())
+    return Residual(offset, vector, 1 / scale if scale else math.nan)
 
 
 def compare_shapes(

@@ -1,19 +1,23 @@
 """Find the parameters of a scene that explain what one or several sensors have observed."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.inversion.draws import End
 from invertwin.inversion.fit import Callback, Fit, Settings, Status
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.observation import Observation, Unknown, Unknowns, named_unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
+from invertwin.inversion.uncertainty import Evidence, Uncertainty
+from invertwin.inversion.verdict import Verdict, verdict
 from invertwin.models import ForwardModel
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene
@@ -30,8 +34,10 @@ class Reconstruction:
         history: One row a step: ``step``, ``stage``, ``loss``, ``values`` (parameters by name).
         status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
             ``diverged`` (not finite, or worse than the start; then the best state is kept).
+            Why the fit stopped: whether it is right is the matter of ``verdict``.
         steps: Steps done.
         loss: Final loss; if the fit diverged, that of the best state, without extra widths.
+        end: Maps at the end, and looks at the twin.
     """
 
     scene: Scene
@@ -41,6 +47,21 @@ class Reconstruction:
     status: Status
     steps: int
     loss: float
+    end: End = field(repr=False)
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """The error bars of the parameters, computed when they are first asked for.
+
+        Raises:
+            InputError: See :class:`invertwin.inversion.uncertainty.Evidence`.
+        """
+        return Evidence(self.end).bars()
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the twin is to be believed, computed when it is first asked for."""
+        return verdict(self.end)
 
 
 def reconstruct(
@@ -132,7 +153,41 @@ def reconstruct(
     final = history[-1]["loss"]
     if status == "diverged" and fit.progress.best is not None:
         final = fit.progress.best[1]
-    return Reconstruction(twin, sensors, fit.modules, history, status, len(history), final)
+    return Reconstruction(
+        twin, sensors, fit.modules, history, status, len(history), final, End(fit)
+    )
+
+
+def fit_at(
+    scene: Scene,
+    observations: Sequence[Observation],
+    parameters: Unknowns,
+    *,
+    loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+    regularizers: Sequence[Regularizer] = (),
+    seed: int = 0,
+) -> Fit:
+    """A fit that has not begun, to look at where it stands. The arguments are `reconstruct`'s.
+
+    Args:
+        scene: Where it stands.
+        observations: What was observed.
+        parameters: Modules Scene → Scene.
+        loss: How maps are compared.
+        regularizers: Added to the loss.
+        seed: Of all random numbers.
+    """
+    modules, terms = _made(scene, named_unknowns(parameters))
+    return Fit(
+        scene,
+        observations,
+        list(modules.values()),
+        [[u.made(o.sensor) for u in named_unknowns(o.parameters).values()] for o in observations],
+        stage=Stage(),
+        settings=Settings(loss or SpectrumLoss(), Optimizer(), (*regularizers, *terms), seed),
+        rates={},
+        position=(0, 0, True),
+    )
 
 
 def _models(stage: Stage, observations: Sequence[Observation]) -> Sequence[ForwardModel]:

@@ -1,14 +1,17 @@
 """Where fits start: random poses about a known one."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Annotated
 
 import torch
+from annotated_types import MinLen
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Axes, Count, NonNegative
+from invertwin.scene.checks import Point
 from invertwin.scene.pose import rigid, rotation_from_vector
 from invertwin.scene.scene import Object
 
@@ -52,6 +55,32 @@ def nearby(
             sign = 1 if uniform(0, 1) < 0.5 else -1
             about = rotation_axis / rotation_axis.norm() * sign
         yield displaced(item, offset, uniform(*angle) * about)
+
+
+def posed(
+    item: Object,
+    positions: Annotated[Sequence[Point], MinLen(1)],
+    rotations: Annotated[Sequence[Point], RADIANS] = (),
+) -> Iterator[Object]:
+    """An object in given poses, as copies of it.
+
+    Args:
+        item: The object.
+        positions: m, of its origin
+        rotations: rotation vectors, one for each position; without them as it is turned
+
+    Raises:
+        InputError: Not as many rotations as positions.
+    """
+    if rotations and len(rotations) != len(positions):
+        raise InputError(
+            f"expected one rotation for each of {len(positions)} positions, got {len(rotations)}; "
+            "give one each, or none"
+        )
+    turns = [rotation_from_vector(torch.as_tensor(r, dtype=torch.float64)) for r in rotations]
+    turns = turns or [item.transform[:3, :3]] * len(positions)
+    for turn, place in zip(turns, positions, strict=True):
+        yield replace(item, pose=rigid(turn, torch.as_tensor(place, dtype=torch.float64)))
 
 
 def displaced(

@@ -19,6 +19,7 @@ from invertwin.plotting.maps import doppler_panels as doppler_panels
 from invertwin.plotting.maps import gradient as gradient
 from invertwin.plotting.maps import panels as panels
 from invertwin.plotting.maps import range_doppler as range_doppler
+from invertwin.plotting.maps import residuals as residuals
 from invertwin.plotting.maps import spectrum as spectrum
 from invertwin.plotting.scenes import scene as scene
 from invertwin.plotting.turntable import turntable as turntable

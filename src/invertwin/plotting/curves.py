@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from invertwin.plotting.figures import color
+from invertwin.plotting.figures import color, legible
 
 Curve = tuple[NDArray, NDArray]
 """Places and values."""
@@ -35,7 +35,7 @@ def convergence(
     left, *others = figure.subplots(1, 1 if errors is None else 2, squeeze=False)[0]
     for i, (name, fits) in enumerate(losses.items()):
         for k, values in enumerate(fits):
-            label = "_" if k else f"{name} ({len(fits)})"
+            label = "_" if k else legible(f"{name} ({len(fits)})")
             left.plot(values, label=label, color=color(i), linewidth=1.1, alpha=0.7)
     positive = [value for fits in losses.values() for row in fits for value in row if value > 0]
     positive += [before] if before else []
@@ -60,7 +60,7 @@ def _draw_errors(axes, losses, errors, label: str) -> None:
     for i, name in enumerate(losses):
         for k, curve in enumerate(errors[name]):
             steps, values = zip(*curve, strict=True) if curve else ((), ())
-            axes.plot(steps, values, color=color(i), marker=".", label="_" if k else name)
+            axes.plot(steps, values, color=color(i), marker=".", label="_" if k else legible(name))
     highest = max(value for fits in errors.values() for curve in fits for _, value in curve)
     axes.set(xlabel="step", ylabel=label, ylim=(0, 1.05 * highest))
 
@@ -77,12 +77,12 @@ def landscape(exact: Curve, surrogates: Mapping[str, Curve], along: str) -> Figu
     left, right = figure.subplots(1, 2)
     left.plot(exact[0] * 1e3, exact[1], color=color(0), linewidth=0.8)
     left.set_title(f"exact signal: {count_minima(exact[1])} local minima", fontsize=9)
-    left.set_xlabel(f"offset of {along} from the truth, in millimetres [mm]", fontsize=9)
+    left.set_xlabel(legible(f"offset of {along} from the truth, in millimetres [mm]"), fontsize=9)
     for i, (name, (offsets, losses)) in enumerate(surrogates.items()):
-        label = f"{name} ({count_minima(losses)})"
+        label = legible(f"{name} ({count_minima(losses)})")
         right.plot(offsets, losses, color=color(i + 1), label=label)
     right.set_title("surrogate, and its number of local minima", fontsize=9)
-    right.set_xlabel(f"offset of {along} from the truth, in metres [m]", fontsize=9)
+    right.set_xlabel(legible(f"offset of {along} from the truth, in metres [m]"), fontsize=9)
     right.legend(fontsize=8)
     for axes in (left, right):
         axes.axvline(0, color="black", linewidth=0.6, linestyle=":")

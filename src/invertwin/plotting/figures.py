@@ -29,3 +29,13 @@ def png_bytes(figure: Figure) -> bytes:
     # No time stamp: a run that is repeated writes the same bytes.
     figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
     return buffer.getvalue()
+
+
+def legible(text: str) -> str:
+    """A user's words in a figure: no formula, and never hidden from a legend.
+
+    Args:
+        text: Such as the name of an object.
+    """
+    plain = text.replace("$", r"\$")
+    return f" {plain}" if plain.startswith("_") else plain

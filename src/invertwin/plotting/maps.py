@@ -8,12 +8,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.plotting.figures import numbers
+from invertwin.inversion.draws import coarse
+from invertwin.plotting.figures import legible, numbers
 from invertwin.radar import DopplerMaps
 
 U_LABEL, V_LABEL = "direction cosine u (to the right)", "direction cosine v (up)"
@@ -163,6 +165,37 @@ def gradient(
     return figure
 
 
+def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float = 5.0) -> Figure:
+    """How far data are from what a twin would show, in standard deviations of its recordings.
+
+    Of the direction that is not shown, the largest counts. Bins beyond ``marked`` are framed: red
+    ones hold more power than the twin explains, blue ones less.
+
+    Args:
+        residual: Of coarse bins, see ``Verdict.residuals``.
+        grid: Bins of the fitted map.
+        marked: Standard deviations.
+    """
+    ranges, u, v = (coarse(axis[None]) for axis in (grid.ranges, grid.u, grid.v))
+    views = [(u, U_LABEL, 2), (v, V_LABEL, 1)]
+    views = [view for view in views if len(view[0]) > 1] or [(u, U_LABEL, 2)]
+    figure = Figure(figsize=(1.2 + 3.9 * len(views), 3.6), layout="constrained")
+    cells = figure.subplots(1, len(views), squeeze=False, sharey=True)[0]
+    image = None
+    for cell, (across, label, dim) in zip(cells, views, strict=True):
+        largest = residual.abs().argmax(dim, keepdim=True)
+        panel = Panel(residual.gather(dim, largest).squeeze(dim), ranges, across, label)
+        image = _signed(cell, "", panel, 2 * marked)
+        half = 0.5 * (_edges(ranges)[1] - _edges(ranges)[0]) / len(ranges)
+        wide = 0.5 * (_edges(across)[1] - _edges(across)[0]) / len(across)
+        for row, column in (panel.values.abs() > marked).nonzero().tolist():
+            corner = float(across[column]) - wide, float(ranges[row]) - half
+            cell.add_patch(Rectangle(corner, 2 * wide, 2 * half, fill=False, linewidth=0.8))
+    cells[0].set_ylabel("range [m]", fontsize=8)
+    _colorbar(figure, image, list(cells), "data − twin [standard deviations]")
+    return figure
+
+
 def _titled(maps: Maps) -> Mapping[str, Tensor]:
     titled = maps if isinstance(maps, Mapping) else {"": maps}
     if not titled:
@@ -219,7 +252,7 @@ def _image(cell: Any, title: str, panel: Panel, values: NDArray, **style: Any) -
         extent=(*_edges(panel.across), *_edges(panel.ranges)),
         **style,
     )
-    cell.set_title(title, fontsize=9)
+    cell.set_title(legible(title), fontsize=9)
     cell.set_xlabel(panel.label, fontsize=8)
     cell.tick_params(labelsize=7)
     return image

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from invertwin.plotting.figures import color, numbers
+from invertwin.plotting.figures import color, legible, numbers
 from invertwin.plotting.triangles import Shape, paint, sharp_edges
 from invertwin.radar import Radar
 from invertwin.scene import Scene
@@ -67,7 +67,7 @@ def scene(
     for axes, (k, title) in zip(grid.flat, (c for row in cells for c in row), strict=True):
         colors = _colors(drawn[title], highlight)
         _draw(axes, drawn[title], colors, edges, marks[k], views[k], windows[k])
-        axes.set_title(f"{title}, {views[k].title}", fontsize=9)
+        axes.set_title(legible(f"{title}, {views[k].title}"), fontsize=9)
     names = {name: c for shapes in drawn.values() for name, c in _colors(shapes, highlight).items()}
     _legend(figure, names, bool(edges), places)
     return figure
@@ -183,7 +183,9 @@ def _legend(
 ) -> None:
     """Which colour is what, over all scenes."""
     labels = {("other objects" if c == _BACKGROUND else name): c for name, c in names.items()}
-    handles: list[Patch | Line2D] = [Patch(color=c, label=name) for name, c in labels.items()]
+    handles: list[Patch | Line2D] = [
+        Patch(color=c, label=legible(name)) for name, c in labels.items()
+    ]
     if outlined:
         handles.append(Line2D([], [], color=_OUTLINE, linewidth=1, label="truth"))
     if places is not None:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import Paths
+from invertwin.channel import Paths, alone
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
@@ -185,7 +185,8 @@ def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
         return 0.5 * ((point - tx).norm(dim=1) + (point - rx).norm(dim=1))
 
     now = torch.zeros((), dtype=torch.float64, device=velocity.device)
-    return torch.func.jvp(half_length, (now,), (torch.ones_like(now),))[1]
+    with alone:
+        return torch.func.jvp(half_length, (now,), (torch.ones_like(now),))[1]
 
 
 def sample_interval(waveform: SampledWaveform) -> float:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.radar.radar import Radar
-from invertwin.scene.parameters import RigidMotion
+from invertwin.scene.parameters import Coordinate, RigidMotion
 
 
 class RadarPose(RigidMotion):
@@ -20,6 +20,10 @@ class RadarPose(RigidMotion):
     def values(self) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] by name, for progress and reports."""
         return self.named_values("radar")
+
+    def coordinates(self) -> list[Coordinate]:
+        """Place and turn of the radar, as far as they are free."""
+        return self.named_coordinates("radar")
 
 
 class RangeBias(nn.Module):
@@ -40,6 +44,10 @@ class RangeBias(nn.Module):
     def values(self) -> dict[str, Tensor]:
         """Bias [m] by name, for progress and reports."""
         return {"range_bias": self.bias.detach().clone()}
+
+    def coordinates(self) -> list[Coordinate]:
+        """The bias."""
+        return [Coordinate("range_bias", "m", {"bias": torch.ones_like(self.bias)})]
 
 
 class ClockOffset(nn.Module):
@@ -68,3 +76,7 @@ class ClockOffset(nn.Module):
     def values(self) -> dict[str, Tensor]:
         """Shift [s] by name, for progress and reports."""
         return {"clock_shift": self.shift.detach().clone()}
+
+    def coordinates(self) -> list[Coordinate]:
+        """The shift."""
+        return [Coordinate("clock_shift", "s", {"shift": torch.ones_like(self.shift)})]

@@ -13,16 +13,13 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.errors import PhysicsWarning as PhysicsWarning
 from invertwin.limits import Bandwidth, Duration, Frequency, Several, Step
 from invertwin.scene.checks import check_fields
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
 SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
-
-
-class PhysicsWarning(UserWarning):
-    """The input is valid, but its result will not mean what one may expect."""
 
 
 class Waveform(ABC):

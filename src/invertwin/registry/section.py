@@ -37,9 +37,16 @@ def _beside_run_file(name: str, info: Any) -> str:
         os.environ.get("INVERTWIN_DATA", _DATA_BESIDE_CHECKOUT),
     ]
     paths = [Path(folder, name).absolute() for folder in folders]
-    return str(next((path for path in paths if path.exists()), paths[0]))
+    return str(next(filter(os.path.exists, paths), paths[0]))
 
 
+def _without_control(text: str) -> str:
+    if not text.isprintable():
+        raise PydanticCustomError("words", "expected text without control characters")
+    return text
+
+
+Words = Annotated[str, AfterValidator(_without_control)]
 InputPath = Annotated[str, MinLen(1), AfterValidator(_beside_run_file)]
 """Path of a file or folder, from the run file's folder, then from INVERTWIN_DATA."""
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from annotated_types import Ge, Gt, Le, Len, Lt
 from torch import Tensor
+from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
 
 from invertwin.errors import InputError
 from invertwin.limits import Among, Usual, marks
@@ -42,13 +43,41 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
     except (TypeError, ValueError, RuntimeError):
         expected = f"expected {what} as numbers of shape {_listed(shape)}"
         raise InputError(f"{expected}, got {type(value).__name__}; {do}") from None
-    check_shape(tensor, shape, f"{what} as numbers", do)
+    check_shape(refuse_batch(tensor), shape, f"{what} as numbers", do)
     bad = int((~torch.isfinite(tensor)).sum())
     if bad:
         raise InputError(
             f"expected finite {what}, got {bad} NaN or infinite of {tensor.numel()}; {do}"
         )
     return tensor
+
+
+def refuse_batch(value: Tensor) -> Tensor:
+    """Return a tensor, unless it is a batch of `torch.func.vmap`.
+
+    Args:
+        value: any tensor.
+
+    Raises:
+        InputError: a batch: rays see one scene at a time.
+    """
+    if is_batchedtensor(value):
+        raise InputError(
+            "expected the tensors of one scene, got a batch of torch.func.vmap; call for one scene "
+            "after another and torch.stack the maps (torch.func.jacfwd and jacrev may batch them)"
+        )
+    return value
+
+
+def plain(value: Tensor) -> Tensor:
+    """The numbers of a tensor, without derivatives and without the wrappers of `torch.func`.
+
+    Args:
+        value: a tensor that is no batch.
+    """
+    while is_functorch_wrapped_tensor(value):
+        value = get_unwrapped(refuse_batch(value))
+    return value.detach()
 
 
 def check_shape(value: Tensor, shape: Sequence[int | None], what: str, do: str) -> None:
@@ -92,13 +121,13 @@ def checked_number(
     opening = "(" if open_low else "["
     closing = ")" if math.isinf(high) else "]"
     expected = f"expected {what} in {opening}{low:g}, {high:g}{closing}"
-    plain = value.detach() if isinstance(value, Tensor) else value
-    if isinstance(plain, bool) or not (
-        isinstance(plain, int | float | np.number)
-        or (isinstance(plain, Tensor) and plain.ndim == 0 and not plain.is_complex())
+    bare = plain(value) if isinstance(value, Tensor) else value
+    if isinstance(bare, bool) or not (
+        isinstance(bare, int | float | np.number)
+        or (isinstance(bare, Tensor) and bare.ndim == 0 and not bare.is_complex())
     ):
         raise InputError(f"{expected}, got {type(value).__name__}; give one real number")
-    number = float(plain)
+    number = float(bare)
     inside = low < number <= high if open_low else low <= number <= high
     if not (math.isfinite(number) and inside):
         raise InputError(f"{expected}, got {number:g}; give a value in that range")

@@ -1,13 +1,9 @@
 """Read meshes and scene geometry from files, and write meshes to files."""
 
 import math
-import os
 import xml.etree.ElementTree as ElementTree
-import zlib
-from collections.abc import Collection, Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -17,18 +13,15 @@ from trimesh import transformations
 from trimesh.exchange.gltf import export_glb
 
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.scene import shapes
 from invertwin.scene.checks import checked_tensor
 from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
+from invertwin.untrusted import existing_file, reading
 
-UNREADABLE = (
-    *(OSError, ValueError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error),
-    RuntimeError,  # archives that need a password or a later version
-)
-"""What reading a damaged file of arrays can raise."""
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
@@ -52,16 +45,10 @@ def load_mesh(file: str | Path) -> Mesh:
         raise InputError(
             f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {path.name}; convert it first"
         )
-    try:
+    with reading(path, f"a readable {path.suffix} mesh"):
         loaded = trimesh.load_scene(path, process=False).to_mesh()
         vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
         faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
-    # A broken file can make the readers fail in any way; every one means the same to the user.
-    except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise InputError(
-            f"expected a readable {path.suffix} mesh, got {path} ({reason}); export the file again"
-        ) from error
     try:
         # The first check sees the file as it is: merging would hide what is wrong with it.
         Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
@@ -104,54 +91,6 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         part.write_bytes(export_glb(written) if glb else _ply(written.to_mesh()))
 
 
-@contextmanager
-def replacing(path: str | Path) -> Generator[Path]:
-    """Write a new file beside a path; it takes its place when it is complete.
-
-    A failure leaves an existing file as it was.
-
-    Args:
-        path: the file, in an existing folder; the new one has its suffix.
-
-    Raises:
-        InputError: no such folder.
-    """
-    file = Path(path)
-    if not file.parent.is_dir():
-        raise InputError(f"expected an existing folder, got {file.parent}; create it first")
-    part = file.with_name(f".{file.stem}.{os.getpid()}.part{file.suffix}")
-    try:
-        yield part
-        os.replace(part, file)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def read_arrays(
-    path: Path, do: str, wanted: Collection[str] | None = None
-) -> dict[str, np.ndarray]:
-    """Read the arrays of an ``.npz`` file by name. Wanted arrays that are missing are left out.
-
-    Args:
-        path: the file.
-        do: what the user can do where it cannot be read, for the message.
-        wanted: names; None = all.
-
-    Raises:
-        InputError: no such file, a damaged one, or pickled objects.
-    """
-    if not path.is_file():
-        raise InputError(f"expected {path.name} in {path.parent}, got no such file; {do}")
-    try:
-        # Opened here: numpy leaves a damaged file open.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
-            return {k: arrays[k] for k in arrays.files if wanted is None or k in wanted}
-    except UNREADABLE as error:
-        raise InputError(
-            f"expected plain arrays in {path.name}, got {type(error).__name__}; {do}"
-        ) from None
-
-
 def load_scene_xml(
     path: str | Path, materials: Mapping[str, Material] | None = None, default: Material = CONCRETE
 ) -> Scene:
@@ -170,32 +109,12 @@ def load_scene_xml(
             material id that no shape refers to.
     """
     file = existing_file(path)
-    try:
+    with reading(file, "an XML scene"):
         root = ElementTree.parse(file).getroot()
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"expected an XML scene, got {file} ({error}); export the file again"
-        ) from error
     try:
         return _scene_of(root, file.parent, dict(materials or {}), default)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-
-
-def existing_file(path: str | Path, what: str = "an existing file") -> Path:
-    """Check that a file exists, and return its path.
-
-    Args:
-        path: the file.
-        what: what it should be, for the error.
-
-    Raises:
-        InputError: no such file.
-    """
-    file = Path(path)
-    if not file.is_file():
-        raise InputError(f"expected {what}, got no file {file}; check the path")
-    return file
 
 
 def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:

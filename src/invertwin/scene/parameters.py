@@ -5,7 +5,7 @@ Any torch module Scene → Scene serves as well.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, TypeVar
 
@@ -38,6 +38,7 @@ from invertwin.scene.pose import (
 from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
+_PLACE, _TURN = 0.1, 0.2  # m and rad: errors of a place and a turn that matter
 _T = TypeVar("_T")
 
 
@@ -56,6 +57,25 @@ class Entries:
     parameter: str
     index: Any = ...
     slope: float | Tensor = 1.0
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One number that a fit finds, as people speak of it.
+
+    A module lists them in ``coordinates()``; for others every entry of a parameter is one.
+
+    Attributes:
+        name: such as "letter.x".
+        unit: SI, or empty.
+        tangents: how the module's parameters change with it, by name.
+        span: an error that matters; infinite where none is known.
+    """
+
+    name: str
+    unit: str
+    tangents: Mapping[str, Tensor]
+    span: float = math.inf
 
 
 class ObjectModule(nn.Module):
@@ -112,6 +132,10 @@ class Translation(ObjectModule):
         motion = rigid(translation=free_part(self.translation, self._axes))
         return scene.replace(self.object, pose=compose(scene[self.object].transform, motion))
 
+    def coordinates(self) -> list[Coordinate]:
+        """x, y and z of the object, as far as they are free."""
+        return _places(self.object, self._axes)
+
 
 class RigidMotion(nn.Module):
     """A translation and a rotation without singularities: quaternion ∝ (w, r/2).
@@ -166,6 +190,23 @@ class RigidMotion(nn.Module):
         """The rotation vector [rad], to first order from the identity."""
         return {"rotation": Entries("rotation", slice(1, None))}
 
+    def named_coordinates(self, name: str) -> list[Coordinate]:
+        """x, y, z and the turns about these axes of the world: pitch, yaw, roll [rad].
+
+        Args:
+            name: of what moves.
+        """
+        found = _places(name, self._axes)
+        free = self._rotation_axes[1:]
+        w, r = self.rotation.detach()[0], self.rotation.detach()[1:]
+        for turn, axis in zip(("pitch", "yaw", "roll"), torch.eye(3, dtype=r.dtype), strict=True):
+            if axis @ free:
+                # The product of the quaternion (1, axis/2) and the present one (w, r/2).
+                change = torch.cat([-axis @ r[:, None] / 4, w * axis + axis.cross(r, 0) / 2])
+                tangents = {"rotation": change * self._rotation_axes}
+                found.append(Coordinate(f"{name}.{turn}", "rad", tangents, _TURN))
+        return found
+
     def named_values(self, name: str) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] of `name`, for progress and reports."""
         return {
@@ -203,6 +244,10 @@ class Pose(RigidMotion):
         """Translation [m] and rotation vector [rad] by name, for progress and reports."""
         return self.named_values(self.object)
 
+    def coordinates(self) -> list[Coordinate]:
+        """Place and turn of the object, as far as they are free."""
+        return self.named_coordinates(self.object)
+
 
 class Scale(ObjectModule):
     """Scales an object about its centre.
@@ -233,6 +278,11 @@ class Scale(ObjectModule):
     def reshaped(self, mesh: Mesh) -> Mesh:
         """The mesh in its new size."""
         return Mesh(mesh.center + (mesh.vertices - mesh.center) * self.scale, mesh.faces)
+
+    def coordinates(self) -> list[Coordinate]:
+        """The factor."""
+        tangents = {"log_scale": 1 / self.scale.detach()}
+        return [Coordinate(f"{self.object}.scale", "", tangents, 0.2)]
 
 
 class Vertices(ObjectModule):
@@ -371,6 +421,13 @@ class MaterialValues(nn.Module):
         slopes = {name: _slope(name, raw.detach()) for name, raw in self.raw.items()}
         return {name: Entries(f"raw.{name}", slope=slope) for name, slope in slopes.items()}
 
+    def at_bounds(self) -> list[str]:
+        """Names of values next to an end of their range."""
+        places = {name: _slope(name, raw.detach()) for name, raw in self.raw.items()}
+        spans = {name: RANGES[name].high - RANGES[name].low for name in places}
+        near = {n: 1e-4 if math.isinf(span) else 0.01 * span for n, span in spans.items()}
+        return [f"{self.object}.{n}" for n, p in places.items() if bool((p < near[n]).any())]
+
     def _bounded(self) -> dict[str, Tensor | Texture]:
         values = {name: _bounded(name, raw) for name, raw in self.raw.items()}
         textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
@@ -443,6 +500,16 @@ def _unbounded(name: str, value: Tensor) -> Tensor:
         )
     above = value - span.low
     return above.log() if math.isinf(span.high) else torch.logit(above / (span.high - span.low))
+
+
+def _places(name: str, mask: Tensor) -> list[Coordinate]:
+    """The coordinates of a translation along the axes that are free."""
+    axes = zip("xyz", torch.diag(mask), mask, strict=True)
+    return [
+        Coordinate(f"{name}.{axis}", "m", {"translation": along}, _PLACE)
+        for axis, along, free in axes
+        if free
+    ]
 
 
 def axes_mask(axes: str) -> Tensor:

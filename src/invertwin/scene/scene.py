@@ -120,9 +120,10 @@ class Scene:
                 f"expected at least one named object, got {got}; give a dict of name: Object(...)"
             )
         for name, value in self.objects.items():
-            if not isinstance(name, str) or not name.strip():
+            if not isinstance(name, str) or not name.strip() or not name.isprintable():
                 raise InputError(
-                    f"expected object names that are not empty, got {name!r}; name every object"
+                    "expected object names that are not empty and have no control characters, got "
+                    f"{name!r}; name every object"
                 )
             if not isinstance(value, Object):
                 raise InputError(

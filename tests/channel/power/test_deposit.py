@@ -19,7 +19,9 @@ from invertwin.scene import (
     RoughDielectric,
     Scene,
     Table,
+    box,
     plate,
+    rigid,
     rotation_from_vector,
     sphere,
 )
@@ -321,3 +323,43 @@ def test_a_plate_seen_through_a_cosine_pattern():
     )
     cosine = 1.5 / (0.6**2 + 1.5**2) ** 0.5
     assert float(weighted / plain) == pytest.approx((8 * cosine**3) ** 2, rel=1e-3)
+
+
+BLOCK, SCREEN = box((0.4, 0.4, 0.4)), plate(2.0, 2.0)  # no transform builds meshes
+
+
+def pushed_aside(offset):
+    """A map of a box before a wall, two bounces, by the box's offset and permittivity."""
+    moved = Object(BLOCK, RoughDielectric(3 + offset[3]), rigid(translation=offset[:3]))
+    wall = thing(SCREEN, (0.0, 0.0, 1.5))
+    few = Sampling(depth=2, samples=20_000, boundary_samples=20_000)
+    around = link(((0.0, 0.0, -1.5),))
+    return deposit_power(Scene({"w": wall, "b": moved}), around, GRID, sampling=few, seed=1)
+
+
+def test_the_transforms_of_torch_func_give_the_same_derivatives():
+    start = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    columns = torch.func.jacfwd(pushed_aside)(start)
+    assert columns.shape == (*pushed_aside(start).shape, 4)
+    along = torch.tensor([0.3, -1.0, 0.5, 0.2], dtype=torch.float64)
+    pushed = torch.func.jvp(pushed_aside, (start,), (along,))[1]
+    assert relative(columns @ along.float(), pushed) < 1e-4
+    weights = torch.linspace(0, 1, columns[..., 0].numel()).reshape(pushed.shape)
+    offset = start.clone().requires_grad_()
+    (pushed_aside(offset) * weights).sum().backward()
+    pulled = torch.func.grad(lambda offset: (pushed_aside(offset) * weights).sum())(start)
+    rows = torch.func.jacrev(lambda o: torch.stack([(pushed_aside(o) * weights).sum()] * 2))(start)
+    truth = (columns * weights[..., None]).double().flatten(0, -2).sum(0)
+    assert offset.grad is not None
+    for found in (offset.grad, pulled, rows[0], rows[1]):
+        assert relative(found, truth) < 1e-3
+
+
+@pytest.mark.parametrize("part", [slice(0, 3), slice(3, 4)], ids=["place", "material"])
+def test_a_batch_of_scenes_says_what_to_do(part):
+    def of(values):
+        offset = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+        return pushed_aside(torch.cat([offset[: part.start], values, offset[part.stop :]]))
+
+    with pytest.raises(InputError, match="one scene after another"):
+        torch.func.vmap(of)(torch.ones(2, part.stop - part.start, dtype=torch.float64))

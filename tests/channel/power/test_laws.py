@@ -8,9 +8,11 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
 from invertwin.scene import (
     Dielectric,
     Material,
+    PerfectConductor,
     RefractingBody,
     RoughConductor,
     RoughDielectric,
@@ -130,3 +132,38 @@ def test_two_bounces_fall_with_the_square_of_each_leg():
     for legs in ((1.0, 1.0, 1.0), (2.0, 1.0, 1.0), (1.0, 2.0, 1.0), (1.0, 1.0, 2.0)):
         found = power(*legs) * math.prod(legs) ** 2 / one
         assert found == pytest.approx(1, abs=0.03), legs
+
+
+@pytest.mark.parametrize("slope", [1e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize("bounces", [1, 2])
+def test_a_plate_of_gentle_slopes_is_a_mirror(slope, bounces):
+    """P = (λ/4πL)² with L the length by way of the mirrors, down to the narrowest lobe.
+
+    A lobe at 45° reflects its share at normal incidence times the cosine.
+    """
+    metal = RoughConductor(rms_slope=slope)
+    first = thing(plate(24 * slope, 24 * slope), (0.0, 0.0, 2.0), material=metal)
+    scene, antennas = Scene({"a": first}), link(((-0.1, 0.0, 0.0),), ((0.1, 0.0, 0.0),))
+    length, share = 2 * math.hypot(2.0, 0.1), 1.0
+    if bounces == 2:  # a roof: to the side, and back beside the transmitter
+        small, tilt = plate(24 * slope, 24 * slope), math.pi / 4
+        turned = thing(small, (0.0, 0.0, 2.0), (0.0, tilt, 0.0), metal)
+        wide = thing(plate(120 * slope, 120 * slope), (-1.0, 0.0, 2.0), (0.0, -tilt, 0.0), metal)
+        scene, antennas = Scene({"a": turned, "b": wide}), link(((0.0,) * 3,), ((-1.0, 0.0, 0.0),))
+        length, share = 5.0, 0.5
+    found = deposit_power(
+        scene,
+        antennas,
+        BINS,
+        sampling=Sampling(depth=bounces, samples=1_000_000, boundary_samples=0),
+        seed=1,
+    )
+    mirrored = share * (WAVELENGTH / (4 * math.pi * length)) ** 2
+    assert float(found.double().sum()) == pytest.approx(mirrored, rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["rms_slope", "lobe_width"])
+def test_lobes_narrower_than_the_kernel_resolves_are_refused(name):
+    kind = RoughConductor if name == "rms_slope" else PerfectConductor
+    with pytest.raises(InputError, match=r"expected .* in \[0.0"):
+        kind(**{name: 9e-5})

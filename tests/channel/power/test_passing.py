@@ -1,15 +1,19 @@
 """What passes: boards, which let through straight on, and bodies, which refract."""
 
 import math
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, deposit_power, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.scene import Object, RefractingBody, RoughConductor, Scene, Slab, box, plate
-from scenes import WAVELENGTH, float64, link, thing
+from invertwin.scene import Mesh, Object, RefractingBody, RoughConductor, Scene, Slab, box, plate
+from scenes import WAVELENGTH, float64, link, noise, thing
 
 WHITE = RoughConductor(scattering=1.0)
 FREQUENCY = SPEED_OF_LIGHT / WAVELENGTH
@@ -51,6 +55,28 @@ def test_a_wall_behind_a_board_is_fainter_and_later(angle):
     assert float(maps[1].sum() / maps[0].sum()) == pytest.approx(share**2, rel=0.01)
     extra = table(surface.extra_length, math.cos(angle))
     assert ranges[1] - ranges[0] == pytest.approx(extra, abs=3e-4)
+
+
+def test_a_board_in_front_adds_little_noise():
+    """What passes it is spread as evenly as what meets it; thrown dice would add 30 times more."""
+    target = thing(plate(0.5, 0.4), (0.1, 0.05, 2.0), (0.1, 0.2, 0.0))
+    scene = {"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0))}
+    board = thing(plate(3.0, 3.0), (0.0, 0.0, 1.0), (0.0, 0.1, 0.0), Slab(2.7, thickness=0.0125))
+    grid = Grid(0.5, 0.1, 40, u_start=-0.6, u_step=0.1, u_count=13)
+    sampling = Sampling(depth=1, samples=50_000, boundary_samples=10_000)
+    found = []
+    for shown in (scene, scene | {"board": board}):
+        derivatives = []
+        for seed in range(8):
+            with forward_ad.dual_level():
+                shift = forward_ad.make_dual(float64([0.0, 0.0, 0.0]), float64([1.0, 0.0, 0.0]))
+                mesh = Mesh(target.mesh.vertices + shift, target.mesh.faces)
+                moved = shown | {"target": Object(mesh, target.material, target.pose)}
+                out = deposit_power(Scene(moved), link(), grid, sampling=sampling, seed=seed)
+                derivatives.append(forward_ad.unpack_dual(out).tangent)
+        found.append(noise(derivatives))
+    assert found[0] < 0.01
+    assert found[1] < 3 * found[0]
 
 
 def block(index: float, thickness: float, near: float, slope: float, width: float) -> Object:
@@ -180,3 +206,41 @@ def test_refraction_shifts_a_ray_as_snell_says():
     ]
     assert abs(gaps[0]) < 0.005
     assert gaps[1] < -0.05
+
+
+FIRST_OF_A_PROCESS = """
+import sys
+from invertwin.channel import Grid, Sampling, deposit_power
+from invertwin.scene import RoughConductor, Scene, Slab, plate
+from scenes import link, thing
+
+white = RoughConductor(scattering=1.0)
+wall = thing(plate(0.5, 0.5), (0.0, 0.0, 2.0), material=white)
+board = thing(plate(0.6, 0.6), (0.0, 0.0, 1.0), material=Slab(2.7, 0.05, thickness=0.0125))
+found = deposit_power(
+    Scene({"wall": wall, "board": board}), link(), Grid(1.8, 0.05, 12),  # without the board
+    sampling=Sampling(depth=2, samples=100_000, boundary_samples=0), seed=0, scheme=sys.argv[1],
+)
+print(float(found.double().sum()))
+"""
+
+
+@pytest.mark.slow
+def test_the_tree_is_there_before_a_loop_is_recorded(repository):
+    """To build it inside aborts the process; only the first call of a process would build it."""
+    folders = ":".join(str(repository / name) for name in ("src", "tests"))
+    environment = {**os.environ, "PYTHONPATH": folders}
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", FIRST_OF_A_PROCESS, scheme],
+            env=environment, check=True, capture_output=True, text=True,
+        ).stdout
+        for scheme in ("area", "rays")
+    ]  # fmt: skip
+    assert float(found[0]) == pytest.approx(float(found[1]), rel=0.02)
+    assert float(found[1]) > 0
+
+
+def test_all_loops_over_rays_are_made_where_the_tree_is_built(repository):
+    users = [p.name for p in (repository / "src").rglob("*.py") if "while_loop(" in p.read_text()]
+    assert users == ["scene.py"]

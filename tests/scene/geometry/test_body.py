@@ -181,10 +181,10 @@ def test_bad_files(tmp_path):
     np.savez(tmp_path / "more.npz", **(model | {"names": pickled["J_regressor"]}))
     assert len(load_smpl(tmp_path / "more.npz").parents) == 4
     np.save(tmp_path / "array.npy", np.zeros(3))
-    with pytest.raises(InputError, match="expected plain arrays in array"):
+    with pytest.raises(InputError, match=r"expected plain arrays.*array\.npy"):
         load_smpl(tmp_path / "array.npy")
     (tmp_path / "text.npz").write_text("no archive")
-    with pytest.raises(InputError, match="expected plain arrays in text"):
+    with pytest.raises(InputError, match=r"expected plain arrays.*text\.npz"):
         load_smpl(tmp_path / "text.npz")
     model["kintree_table"] = np.zeros(4)
     np.savez(tmp_path / "flat.npz", **model)

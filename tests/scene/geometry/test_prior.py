@@ -182,7 +182,7 @@ def test_what_is_no_prior_is_refused(tmp_path):
     (tmp_path / "text.npz").write_text("no numbers")
     (tmp_path / "empty.npz").write_bytes(b"")
     for name in [*wrong, "cut", "text", "empty"]:
-        with pytest.raises(InputError, match=f"in {name}.npz"):
+        with pytest.raises(InputError, match=rf"{name}\.npz"):
             load_prior(tmp_path / f"{name}.npz")
 
 

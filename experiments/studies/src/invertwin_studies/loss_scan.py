@@ -15,7 +15,6 @@ from invertwin.cli.landscape import exact_losses, line_through
 from invertwin.cli.report import Table, finish, picture
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import exact
-from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 from invertwin.inversion import Observation
@@ -25,6 +24,7 @@ from invertwin.models import BeatMap, SurrogateMap
 from invertwin.radar.direction import music
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
+from invertwin.runs import RunFolder
 from invertwin_studies.figures import Curve, deep_minima, scan
 from invertwin_studies.sections import LossScan
 

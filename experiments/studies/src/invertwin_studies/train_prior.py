@@ -10,8 +10,8 @@ import torch
 from matplotlib.figure import Figure
 
 from invertwin.cli.report import Picture, Table, report_html
-from invertwin.cli.runs import RunFolder
 from invertwin.plotting import PALETTE, png_bytes
+from invertwin.runs import RunFolder
 from invertwin.scene import Mesh, ShapePrior, load_prior
 from invertwin_studies.prior_training import Trained, Training, train_prior
 

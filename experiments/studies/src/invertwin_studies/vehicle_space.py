@@ -14,7 +14,8 @@ from invertwin.inversion.remeshing import remeshed
 from invertwin.limits import Count, Positive
 from invertwin.registry.section import InputPath
 from invertwin.scene import LinearShape, Mesh, ShapeSpace
-from invertwin.scene.files import load_mesh, read_arrays
+from invertwin.scene.files import load_mesh
+from invertwin.untrusted import read_arrays
 
 Level = Literal["coarse", "fine"]
 _TRAINED = 79  # vehicles behind the public space: σ of mode k is its singular value over √79

@@ -3,12 +3,10 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal
-from pathlib import Path
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings, shortest_loop
 from invertwin.errors import InputError
-from invertwin.scene.files import existing_file
 
 # By the first two digits of the device; later ones record through several kinds of link.
 _LANES = {"12": 4, "14": 4, "16": 2, "18": 2, "68": 2}
@@ -22,6 +20,7 @@ _PROFILE = {
     "samples": 0,
     "sample_rate": 3,
 }
+_CHIRPS = 512  # that a front end can define
 BITS = {0: 12, 1: 14, 2: 16}
 """Code → resolution of the ADC."""
 BIT_CODES = {bits: code for code, bits in BITS.items()}
@@ -55,25 +54,6 @@ def numbers(mask: int) -> tuple[int, ...]:
 def mask(chosen: Sequence[int]) -> int:
     """The bits of these numbers from 1."""
     return sum(1 << (number - 1) for number in chosen)
-
-
-def read_text(path: Path, what: str) -> str:
-    """The file as text.
-
-    Args:
-        path: the file.
-        what: what it should be, for the error.
-
-    Raises:
-        InputError: no such file, or one that is no text.
-    """
-    existing_file(path, what)
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"expected {what}, got {path}, which is no text; name the settings, not the data"
-        ) from error
 
 
 def lanes_of(device: str) -> int | None:
@@ -116,8 +96,10 @@ def settings(
                 f"expected chirps {first} to {last} as their profile, got variations; "
                 "chirps that differ are not supported"
             )
+        _check_numbers(first, last)
         defined |= dict.fromkeys(range(first, last + 1), (profile, senders))
     first, last, loops, frames = (int(number) for number in frame[:4])
+    _check_numbers(first, last)
     order, used = _turns(defined, first, last)
     if len(used) != 1 or not used <= set(profiles):
         raise InputError(
@@ -136,6 +118,14 @@ def settings(
         frame_period=scaled(frame[4], -3) or None,
         **values,
     )
+
+
+def _check_numbers(first: int, last: int) -> None:
+    if not 0 <= first <= last < _CHIRPS:
+        raise InputError(
+            f"expected chirps from 0 to {_CHIRPS - 1}, the first before the last, got {first} to "
+            f"{last}; correct the settings"
+        )
 
 
 def _turns(

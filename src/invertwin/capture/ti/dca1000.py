@@ -18,8 +18,9 @@ from invertwin.capture.chirps import ChirpData, ChirpSettings
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.errors import InputError
+from invertwin.folders import replacing
 from invertwin.radar.waveform import PhysicsWarning
-from invertwin.scene.files import existing_file, replacing
+from invertwin.untrusted import existing_file
 
 _WORD = np.dtype("<i2")
 _LANE_COUNT = 4

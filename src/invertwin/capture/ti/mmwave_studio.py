@@ -14,12 +14,12 @@ from invertwin.capture.ti.chirp_table import (
     mask,
     numbers,
     profile_texts,
-    read_text,
     settings,
     text,
 )
 from invertwin.errors import InputError
-from invertwin.scene.files import existing_file, replacing
+from invertwin.folders import replacing
+from invertwin.untrusted import existing_file, read_text, reading
 
 # Names of the numbers of a profile, and of the frame.
 _PROFILE = (
@@ -95,12 +95,8 @@ def setup_files(path: str | Path) -> list[Path]:
 
 def _json(path: Path) -> dict[str, Any]:
     whole = read_text(path, "a .json file of mmWave Studio")
-    try:
+    with reading(path, "JSON"):
         content = json.loads(whole, parse_float=Decimal)
-    except ValueError as error:
-        raise InputError(
-            f"expected JSON in {path}, got text that is none ({error}); save it again"
-        ) from error
     if not isinstance(content, dict):
         raise InputError(
             f"expected an object in {path}, got {type(content).__name__}; save it again"

@@ -11,12 +11,12 @@ from invertwin.capture.ti.chirp_table import (
     mask,
     numbers,
     profile_texts,
-    read_text,
     settings,
     text,
 )
 from invertwin.errors import InputError
-from invertwin.scene.files import replacing
+from invertwin.folders import replacing
+from invertwin.untrusted import read_text
 
 # Fewest arguments of the commands that are read.
 _ARGUMENTS = {

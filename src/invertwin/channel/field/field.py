@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invertwin.channel.field.speckle import Speckle, draw_speckle
 from invertwin.channel.paths import Link, Paths, joined
-from invertwin.channel.rays.backend import use_backend
+from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import flatten, require_edges, silhouettes_move
 from invertwin.channel.rays.scene import RayScene, face_areas
 from invertwin.channel.reference.radar_equation import (
@@ -50,7 +50,7 @@ def trace_field(
             ``boundary`` off to accept fixed visibility. A speckle of fewer bounces.
     """
     depth = sampling.depth
-    with use_backend(sampling.backend):
+    with tracing(sampling.backend):
         geometry = flatten(scene, link.wavelength, motion="fixed")
         moves = sampling.boundary and silhouettes_move(geometry, link)
         rays = RayScene(geometry, link)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from invertwin.channel.field.rough_paths import draw_rough_paths
 from invertwin.channel.field.rough_points import draw_rough_points
 from invertwin.channel.paths import Link
-from invertwin.channel.rays.backend import use_backend
+from invertwin.channel.rays.backend import tracing
 from invertwin.channel.reference.radar_equation import SurfacePaths
 from invertwin.channel.sampling import Sampling
 from invertwin.scene.scene import Scene
@@ -33,7 +33,7 @@ def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Spe
         sampling: Points per m², number and depth of rough paths.
         seed: Seed of places and phases.
     """
-    with use_backend(sampling.backend):
+    with tracing(sampling.backend):
         paths = draw_rough_paths(
             scene, link, count=sampling.rough_paths, depth=sampling.depth, seed=seed
         )

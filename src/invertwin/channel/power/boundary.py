@@ -11,6 +11,7 @@ from typing import Any
 
 from invertwin.channel.power import integrand, walk
 from invertwin.channel.power.bins import Contribution
+from invertwin.channel.power.contact import ContactSampler, Meeting, contact_paths
 from invertwin.channel.power.edges import (
     Drawn,
     EdgePoints,
@@ -25,6 +26,7 @@ from invertwin.channel.power.passage import Passage
 from invertwin.channel.power.walk import State, Walk
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.contacts import Contacts
 from invertwin.channel.rays.scene import RayScene
 from invertwin.channel.sampling import Sampling
 
@@ -69,7 +71,7 @@ class BoundaryPaths:
 
 
 class BoundaryPoints:
-    """The edge points of all boundary paths: antenna segments first, then interior ones.
+    """The points of all boundary paths: antenna segments, interior ones, contacts of surfaces.
 
     The first of each family are drawn at once, without waiting for them: this is prepared while
     another kernel runs. They are given away once, so that they take no memory later; the rest, and
@@ -82,6 +84,7 @@ class BoundaryPoints:
         inputs: Inputs,
         sampling: Sampling,
         seed: int,
+        contacts: Contacts | None = None,
         *,
         chunks: Callable[[int], Iterator[Any]],
     ) -> None:
@@ -92,17 +95,26 @@ class BoundaryPoints:
             inputs: Detached.
             sampling: How many edge points over all families, and the most vertices of a path.
             seed: Of the edge points.
+            contacts: Where surfaces meet; None where they cannot.
             chunks: Splits a number of samples into index arrays.
         """
         self.depth = depth = sampling.depth
         samples = sampling.boundary_samples
         centres = ("tx",) if rays.link.shared_visibility and depth == 1 else ("tx", "rx")
-        families = len(centres) + (1 if depth > 1 and sampling.interior_edges else 0)
-        antennas = EdgeSampler(rays, inputs, centres, len(centres) * (samples // families), seed)
-        self._samplers: list[EdgeSampler | InteriorEdgeSampler] = [antennas]
-        if families > len(centres):
-            interior = InteriorEdgeSampler(rays, inputs, samples // families, seed + 2)
-            self._samplers.append(interior)
+        inner = depth > 1 and sampling.interior_edges
+        close = contacts is not None and contacts.close
+        crossing = contacts.chosen(~contacts.touching) if contacts is not None else None
+        meet = crossing is not None and len(crossing.first) > 0
+        share = samples // (len(centres) + inner + meet)
+        antennas = EdgeSampler(rays, inputs, centres, len(centres) * share, seed, close=close)
+        self._samplers: list[Any] = [antennas]
+        self._kinds: list[Callable[..., Iterator[BoundaryPaths]]] = [_antenna_segment]
+        if inner:
+            self._samplers.append(InteriorEdgeSampler(rays, inputs, share, seed + 2, close=close))
+            self._kinds.append(_interior_segment)
+        if crossing is not None and meet:
+            self._samplers.append(ContactSampler(rays, inputs, crossing, share, depth, seed))
+            self._kinds.append(_contact)
         self._chunks = chunks
         self._first = [
             list(map(s.draw, itertools.islice(chunks(s.size), 1))) for s in self._samplers
@@ -111,8 +123,8 @@ class BoundaryPoints:
             for drawn in family:
                 drawn.launch()
 
-    def families(self) -> list[Iterator[Any]]:
-        """``EdgePoints``, and ``TwoSided`` if there are interior segments."""
+    def families(self) -> list[Iterator[tuple[Callable[..., Iterator[BoundaryPaths]], Any]]]:
+        """What makes paths of the points, and the points, a chunk at a time."""
         ahead, self._first = self._first, [[] for _ in self._samplers]
         first = [[drawn.kept() for drawn in family] for family in ahead]
         # Each sampler is bound here: a generator expression would draw all of them from the last.
@@ -120,7 +132,10 @@ class BoundaryPoints:
             map(Drawn.kept, map(s.draw, itertools.islice(self._chunks(s.size), len(now), None)))
             for s, now in zip(self._samplers, first, strict=True)
         ]
-        return [itertools.chain(*family) for family in zip(first, later, strict=True)]
+        return [
+            zip(itertools.repeat(kind), itertools.chain(*family))
+            for kind, *family in zip(self._kinds, first, later, strict=True)
+        ]
 
 
 def boundary_paths(
@@ -139,15 +154,18 @@ def boundary_paths(
     families = points.families()
 
     def segments() -> Iterator[BoundaryPaths]:
-        for edges in families[0]:
-            if dr.width(edges.face):
-                yield from _antenna_segment(rays, inputs, walker, edges, points.depth)
-        for family in families[1:]:
-            for found in family:
-                if dr.width(found.edge.face):
-                    yield from _interior_segment(rays, inputs, walker, found, points.depth)
+        for kind, found in itertools.chain(*families):
+            if found.size:
+                yield from kind(rays, inputs, walker, found, points.depth)
 
     return segments()
+
+
+def _contact(
+    rays: RayScene, inputs: Inputs, walker: Walk, found: Meeting, depth: int
+) -> Iterator[BoundaryPaths]:
+    """Surfaces that meet: either hides what lies behind it of the other."""
+    return itertools.starmap(BoundaryPaths, contact_paths(rays, inputs, walker, found, depth))
 
 
 def _antenna_segment(
@@ -225,18 +243,7 @@ def _interior_segment(
         points.index, points.frame, source.face, source.b1, source.b2, -to_behind,
         throughput, zero,
     )  # fmt: skip
-    first |= {"u": zero, "v": zero, "amount": zero, "so_far": zero, "here": ends_at_receiver}
-
-    def ending(state: State, point: Place) -> None:
-        path, exists = walk.connect(rays, fixed, state, point, state["here"])
-        last = exists & (state["number"] == state["last"])
-        state["amount"] = dr.select(last, path.power, state["amount"])
-        state["so_far"] = dr.select(last, 2 * path.range, state["so_far"])
-        state["u"] = dr.select(last, path.u, state["u"])
-        state["v"] = dr.select(last, path.v, state["v"])
-
-    with dr.suspend_grad():
-        done = walker.run(first, count, ending)
+    done = walker.ended(first, count, ends_at_receiver)
 
     def run(state: State, visit: Callable[[State, Contribution, Any], None]) -> State:
         def connected(state: State, point: Place) -> None:

@@ -19,7 +19,7 @@ from torch.nn.functional import grid_sample
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch
-from invertwin.channel.rays.backend import backend, mi, use_backend
+from invertwin.channel.rays.backend import backend, mi, tracing, use_backend
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.cloud import Cloud
@@ -244,23 +244,24 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, grid: Grid, frames: int, frame: Tensor, *columns: Tensor) -> Tensor:
-        places = [to_float(column) for column in columns]
-        ctx.found = bins.Contribution(mi.Int32(to_index(frame)), *places)
         ctx.grid, ctx.frames, ctx.backend = grid, frames, backend()
-        out = bins.Bins(grid, frames)
-        out.add(ctx.found, True)
-        return out.map()
+        with tracing():
+            places = [to_float(column) for column in columns]
+            ctx.found = bins.Contribution(mi.Int32(to_index(frame)), *places)
+            out = bins.Bins(grid, frames)
+            out.add(ctx.found, True)
+            return out.map()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        with use_backend(ctx.backend):
+        with tracing(ctx.backend):
             bars = bins.gather(to_float(grad), ctx.grid, ctx.found, True)
             return None, None, None, *(to_torch(bar).double() for bar in bars)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
-        with use_backend(ctx.backend):
+        with tracing(ctx.backend):
             dots = tuple(
                 mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[3:]
             )

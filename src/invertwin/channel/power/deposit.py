@@ -4,23 +4,25 @@ No path is ever stored for torch: paths are walked, deposited and forgotten, or 
 while these fit the memory budget, and replayed for the derivative.
 """
 
+from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
 import torch
 from jaxtyping import Float32
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch._C import _DisableFuncTorch
 
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins, replay
 from invertwin.channel.power.clouds import deposit_density
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
-from invertwin.channel.power.trace import Trace
+from invertwin.channel.power.trace import Trace, tables_of, without_derivatives
 from invertwin.channel.rays.arrays import to_float
-from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, use_backend
+from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, tracing
 from invertwin.channel.rays.geometry import differentiated, flatten, require_edges
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
+from invertwin.scene.checks import plain
 from invertwin.scene.scene import Object, Scene
 
 
@@ -68,7 +70,7 @@ def deposit_power(
     soft = [deposit_density(item, link, grid, sampling=sampling, seed=seed) for item in clouds]
     if surfaces is None:
         return torch.stack(soft).sum(0)
-    with use_backend(sampling.backend), torch_threads(1):
+    with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(surfaces, link.wavelength)
         fixed = None
         if reference is not None and (hard := _sorted(reference[0])[0]) is not None:
@@ -80,8 +82,11 @@ def deposit_power(
                 "expected an antenna pattern without derivatives, got one that carries them; "
                 "power paths do not differentiate patterns: detach its values"
             )
-        trace = Trace(geometry, link, sampling, seed, scheme=scheme, reference=fixed)
-        found = _Deposit.apply(trace, grid, *trace.tables)
+        with _DisableFuncTorch():
+            bare = without_derivatives(geometry, link)
+            trace = Trace(*bare, sampling, seed, scheme=scheme, reference=fixed)
+        tables = tables_of(geometry, link)
+        found = _Deposit.apply(trace, grid, any(map(differentiated, tables)), *tables)
     return found + torch.stack(soft).sum(0) if soft else found  # type: ignore[no-any-return]
 
 
@@ -100,76 +105,127 @@ class _Deposit(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, trace: Trace, grid: Grid, *tables: Tensor) -> Tensor:
+    def forward(trace: Trace, grid: Grid, derivative: bool, *tables: Tensor) -> Tensor:
         out = bins.Bins(grid, trace.rays.link.frame_count)
-        derivative = any(ctx.needs_input_grad)
-        ctx.records = trace.deposit(out, record=derivative)
+        trace.recorded = trace.deposit(out, record=derivative)
         if derivative:
             _ = trace.boundary_points  # prepared while the paths are walked
-        ctx.trace, ctx.grid, ctx.backend = trace, grid, backend()
         return out.map()
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        trace: Trace = ctx.trace
-        with use_backend(ctx.backend), torch_threads(1):
-            wanted = [n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[2:], strict=True) if w]
-            tables = _attached(trace, wanted)
-            inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
-            seed = to_float(grad)
-
-            def gather(*path: Any) -> tuple[Any, Any, Any, Any]:
-                return bins.gather(seed, ctx.grid, *path)
-
-            boundary = trace.boundary(inputs)
-            for records in [ctx.records] if ctx.records else trace.records():
-                replay.pull(trace.rays, inputs, records, gather)
-                dr.eval([dr.grad(table) for table in tables.values()])
-                del records  # before the next ones are made
-            for paths in boundary:
-                total = paths.weighted(lambda *path: gather(*path)[0])
-                if dr.grad_enabled(paths.speed):
-                    dr.backward_from(paths.speed * total)
-                dr.eval([dr.grad(table) for table in tables.values()])
-            results: list[Tensor | None] = [None, None]
-            for name, source in zip(DIFFERENTIABLE, trace.tables, strict=True):
-                results.append(
-                    from_table(name, dr.grad(tables[name]), source) if name in tables else None
-                )
-            return tuple(results)
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # type: ignore[override]
+        ctx.trace, ctx.grid, _, *tables = inputs
+        ctx.likes, ctx.backend = [plain(table) for table in tables], backend()
 
     @staticmethod
-    def jvp(ctx: Any, _: None, __: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
-        trace: Trace = ctx.trace
-        with use_backend(ctx.backend), torch_threads(1):
-            given = {
-                name: tangent
-                for name, tangent in zip(DIFFERENTIABLE, tangents, strict=True)
-                if tangent is not None
-            }
-            tables = _attached(trace, list(given))
-            inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
-            out = bins.Bins(ctx.grid, trace.rays.link.frame_count)
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        wanted = tuple(
+            n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[3:], strict=True) if w
+        )
+        found = _Linear.apply(lambda grad: _pulled(ctx, wanted, grad), grad)
+        results = dict(zip(wanted, found, strict=True))
+        return None, None, None, *(results.get(name) for name in DIFFERENTIABLE)
 
-            def point_tangents() -> None:
-                for name, table in tables.items():
-                    dr.set_grad(table, to_table(name, given[name]))
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, ___: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
+        given = {n: t for n, t in zip(DIFFERENTIABLE, tangents, strict=True) if t is not None}
+        return _Linear.apply(
+            lambda *tangents: _pushed(ctx, tuple(given), *tangents), *given.values()
+        )
 
-            boundary = trace.boundary(inputs)
-            for records in [ctx.records] if ctx.records else trace.records():
-                point_tangents()
-                replay.push(trace.rays, inputs, records, out.add_derivative)
-                dr.eval(out.values)
-                del records
-            for paths in boundary:
-                point_tangents()
-                paths.deposit(dr.forward_to(paths.speed), out.add)
-                dr.eval(out.values)
-            return out.map()
+    @staticmethod
+    def vmap(_: Any, __: Any, *inputs: Any) -> tuple[Tensor, None]:  # type: ignore[override]
+        return _Deposit.apply(*inputs), None  # batches of scenes were refused before
 
 
-def _attached(trace: Trace, names: list[str]) -> dict[str, Any]:
+class _Linear(torch.autograd.Function):
+    """A linear map of plain tensors, one after another where ``torch.func`` asks for many."""
+
+    @staticmethod
+    def forward(act: Callable[..., Any], *values: Tensor) -> Any:
+        return act(*values)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # type: ignore[override]
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *_: Any) -> None:  # type: ignore[override]
+        raise InputError(
+            "expected first derivatives of a map, got a request for second ones, which paths do "
+            "not have; use differences of gradients"
+        )
+
+    @staticmethod
+    def vmap(info: Any, dims: tuple[Any, ...], act: Callable[..., Any], *values: Tensor) -> Any:  # type: ignore[override]
+        rows = [
+            _Linear.apply(
+                act,
+                *(
+                    v if dim is None else v.select(dim, k)
+                    for v, dim in zip(values, dims[1:], strict=True)
+                ),
+            )
+            for k in range(info.batch_size)
+        ]
+        if isinstance(rows[0], Tensor):
+            return torch.stack(rows), 0
+        stacked = tuple(torch.stack(column) for column in zip(*rows, strict=True))
+        return stacked, (0,) * len(stacked)
+
+
+def _pulled(ctx: Any, wanted: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ...]:
+    """Gradients with respect to some tables."""
+    trace: Trace = ctx.trace
+    with tracing(ctx.backend), torch_threads(1):
+        tables = _attached(trace, wanted)
+        inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
+        seed = to_float(grad)
+
+        def gather(*path: Any) -> tuple[Any, Any, Any, Any]:
+            return bins.gather(seed, ctx.grid, *path)
+
+        boundary = trace.boundary(inputs)
+        for records in [trace.recorded] if trace.recorded else trace.records():
+            replay.pull(trace.rays, inputs, records, gather)
+            dr.eval([dr.grad(table) for table in tables.values()])
+            del records  # before the next ones are made
+        for paths in boundary:
+            total = paths.weighted(lambda *path: gather(*path)[0])
+            if dr.grad_enabled(paths.speed):
+                dr.backward_from(paths.speed * total)
+            dr.eval([dr.grad(table) for table in tables.values()])
+        likes = dict(zip(DIFFERENTIABLE, ctx.likes, strict=True))
+        return tuple(from_table(name, dr.grad(tables[name]), likes[name]) for name in wanted)
+
+
+def _pushed(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tensor:
+    """The map's derivative along tangents of some tables."""
+    trace: Trace = ctx.trace
+    with tracing(ctx.backend), torch_threads(1):
+        given = dict(zip(names, tangents, strict=True))
+        tables = _attached(trace, names)
+        inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
+        out = bins.Bins(ctx.grid, trace.rays.link.frame_count)
+
+        def point_tangents() -> None:
+            for name, table in tables.items():
+                dr.set_grad(table, to_table(name, given[name]))
+
+        boundary = trace.boundary(inputs)
+        for records in [trace.recorded] if trace.recorded else trace.records():
+            point_tangents()
+            replay.push(trace.rays, inputs, records, out.add_derivative)
+            dr.eval(out.values)
+            del records
+        for paths in boundary:
+            point_tangents()
+            paths.deposit(dr.forward_to(paths.speed), out.add)
+            dr.eval(out.values)
+        return out.map()
+
+
+def _attached(trace: Trace, names: Iterable[str]) -> dict[str, Any]:
     """Copies of some of the kernel's tables that carry derivatives."""
     tables = {name: mi.Float(trace.fixed.table(name)) for name in names}
     dr.enable_grad(list(tables.values()))

@@ -4,6 +4,7 @@ Directions come from both ways, with the probability density of their mixture, s
 objects and narrow lobes are both found. Detached.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,6 +19,28 @@ from invertwin.scene import Surface
 _TOWARDS = 0.5  # share of the directions that aim at other objects, where there are some
 
 
+_TRIES = 4  # to find an object that the point is outside of
+_ANY = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A unit direction, and what its probability depends on.
+
+    Attributes:
+        omega: The direction.
+        scattered: Its probability per solid angle among those along the lobes; infinite where total
+            reflection leaves no direction.
+        group: The group of objects that it is for, if any: it is void where it ends elsewhere.
+        aimed: The object of that group that it aims at, if any.
+    """
+
+    omega: Any
+    scattered: Any
+    group: Any
+    aimed: Any
+
+
 class Directions:
     """Draws directions on the side of a surface from which it is lit.
 
@@ -27,65 +50,73 @@ class Directions:
     """
 
     def __init__(self, rays: RayScene, surfaces: Surfaces) -> None:
-        centres, radii = rays.spheres
-        self.objects = len(radii)
-        self.centres = to_float(centres - rays.origin)
-        self.radii = to_float(1.001 * radii)
+        self.rays, self.spheres = rays, rays.spheres
         self.surfaces = surfaces
         shares = _shares(rays.geometry.surfaces)
         self.shares = to_float(shares)
         self.width = shares.shape[1]
 
-    def draw(self, point: Place, back: Any, numbers: list[Any]) -> tuple[Any, Any]:
-        """A unit direction from four uniform numbers, and its probability per solid angle.
-
-        Where total reflection leaves no direction, that probability is infinite.
+    def draw(self, point: Place, back: Any, numbers: list[Any]) -> Direction:
+        """A direction from five uniform numbers.
 
         Args:
             point: The vertex.
             back: Unit direction from where the path comes.
-            numbers: Four uniform numbers.
+            numbers: Five uniform numbers.
         """
-        caps, outside = self._caps(point)
-        count: Any = mi.Float(0)
-        for away in outside:
-            count += dr.select(away, 1, 0)
-        towards: Any = dr.select(count > 0, _TOWARDS, 0.0)
         facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, back)))
-        aimed, rest = numbers[0] < towards, numbers[0]
-        # The object, counted among those that the point is outside of.
-        wanted = dr.minimum(dr.floor(rest / dr.maximum(towards, 1e-6) * count), count - 1)
-        axis, height, passed = mi.Vector3f(0, 0, 1), mi.Float(2.0), mi.Float(0)
-        for (direction, cap), away in zip(caps, outside, strict=True):
-            chosen = away & (passed == wanted)
-            axis, height = dr.select(chosen, direction, axis), dr.select(chosen, cap, height)
-            passed += dr.select(away, 1, 0)
-        omega = dr.select(
-            aimed, _in_cap(axis, height, numbers[2:]), self._scattered(point, back, facing, numbers)
-        )
-        density = (1 - towards) * self._density(point, back, facing, omega)
-        share = towards / dr.maximum(count, 1)
-        for (direction, cap), away in zip(caps, outside, strict=True):
-            inside = away & (dr.squared_norm(omega - direction) <= 2 * cap)
-            density += dr.select(inside, share / (2 * dr.pi * cap), 0.0)
+        omega = self._scattered(point, back, facing, numbers)
+        group, aimed = mi.UInt32(_ANY), mi.UInt32(_ANY)
+        spheres = self.spheres
+        if spheres.count > 1:
+            towards, rest = numbers[0] < _TOWARDS, numbers[4]
+            drawn = dr.minimum(
+                mi.UInt32(numbers[0] / _TOWARDS * spheres.groups), spheres.groups - 1
+            )
+            members = dr.minimum(spheres.size, spheres.count - drawn * spheres.size)
+            axis, height = mi.Vector3f(0, 0, 1), mi.Float(2.0)
+            # One of the group that the point is outside of, if a few tries find one.
+            for _ in range(_TRIES):
+                rest *= members
+                number = dr.minimum(mi.UInt32(rest), members - 1)
+                rest -= number
+                place = drawn * spheres.size + number
+                direction, cap, outside = spheres.cap(place, point.position)
+                taken = towards & outside & (aimed == _ANY)
+                axis, height = dr.select(taken, direction, axis), dr.select(taken, cap, height)
+                aimed = dr.select(taken, place, aimed)
+            omega = dr.select(aimed != _ANY, _in_cap(axis, height, numbers[2:]), omega)
+            group = dr.select(towards, drawn, _ANY)
+        density = self._density(point, back, facing, omega)
         if self.surfaces.bodies:
             lost = dr.squared_norm(omega) < 0.5
             omega = dr.select(lost, mi.Vector3f(facing), omega)
             density = dr.select(lost, dr.inf, density)
-        return omega, density
+        return Direction(omega, density, group, aimed)
 
-    def _caps(self, point: Place) -> tuple[list[tuple[Any, Any]], list[Any]]:
-        """Axis and height of every object's cap, and whether the point is outside its sphere."""
-        caps, outside = [], []
-        for number in range(self.objects):
-            index = mi.UInt32(number)
-            offset = dr.gather(mi.Point3f, self.centres, index) - point.position
-            radius = dr.gather(mi.Float, self.radii, index)
-            distance = dr.norm(offset)
-            sine2 = dr.minimum(dr.square(radius / distance), 1.0)
-            caps.append((mi.Vector3f(offset / distance), sine2 / (1 + dr.sqrt(1 - sine2))))
-            outside.append(distance > radius)
-        return caps, outside
+    def density(self, point: Place, drawn: Direction, face: Any, active: Any) -> Any:
+        """Probability per solid angle of a direction that ends on a triangle; 0 if it is void.
+
+        Args:
+            point: The vertex.
+            drawn: The direction.
+            face: The triangle.
+            active: Lanes.
+        """
+        spheres = self.spheres
+        if spheres.count == 1:
+            return drawn.scattered
+        group = spheres.group(face, active)
+        found, around = spheres.density(
+            self.rays, group, point.position, drawn.omega, active, drawn.aimed
+        )
+        members = mi.Float(dr.minimum(spheres.size, spheres.count - group * spheres.size))
+        # Tries fail with the share of spheres that the point is inside of.
+        failing = around / members
+        tries: Any = sum(failing**k for k in range(_TRIES))
+        scattered = 1 - _TOWARDS + _TOWARDS / spheres.groups * failing**_TRIES
+        density = scattered * drawn.scattered + _TOWARDS / spheres.groups * tries / members * found
+        return dr.select((drawn.group == _ANY) | (drawn.group == group), density, 0.0)
 
     def _scattered(self, point: Place, back: Any, facing: Any, numbers: list[Any]) -> Any:
         omega = mi.Frame3f(facing).to_world(
@@ -100,7 +131,9 @@ class Directions:
             exponents = self.surfaces.tables["exponents"]
             exponent = dr.gather(mi.Float, exponents, point.surface * 3 + number)
             # Height of the cap that a lobe ((1 + cosψ)/2)^p fills to the share of the number.
-            height = 2 * (1 - dr.exp(dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)))
+            fall = dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)
+            series = -fall * (1 + fall * (1 / 2 + fall / 6))  # a narrow lobe keeps its digits
+            height = 2 * dr.select(fall > -0.01, series, 1 - dr.exp(fall))
             lobe = _in_cap(axis, height, [mi.Float(1.0), numbers[3]])
             share = self._share(point, number + 1)
             chosen = (numbers[1] >= limit) & (numbers[1] < limit + share)
@@ -137,13 +170,11 @@ class Directions:
         return dr.select(first * second < 0, lobe * dr.square(beyond) * dr.abs(second), 0.0)
 
     def _density(self, point: Place, back: Any, facing: Any, omega: Any) -> Any:
-        cosine, between = dr.dot(facing, omega), dr.dot(back, omega)
+        cosine = dr.dot(facing, omega)
         density = self._share(point, 0) * dr.maximum(cosine, 0.0) * dr.inv_pi
-        product = cosine * dr.dot(facing, back)
         for number, present in enumerate(self.surfaces.lobed):
             if present:
-                row = point.surface
-                lobe, exponent = self.surfaces.lobe(number, row, product, between)
+                lobe, exponent = self.surfaces.lobe(number, point.surface, facing, back, omega)
                 lobe = (exponent + 1) / (4 * dr.pi) * lobe
                 density += self._share(point, number + 1) * lobe
         if self.surfaces.bodies:

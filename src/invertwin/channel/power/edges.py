@@ -6,21 +6,25 @@ ways along a direction that is tangential there, so that no silhouette is ever s
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from invertwin.channel.power import integrand
+from invertwin.channel.power.folds import folded
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.passage import land, passage
+from invertwin.channel.power.passage import Hit, land, passage
 from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.contacts import IN_PLANE
 from invertwin.channel.rays.scene import NEAR, RayScene
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
 _RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's place within it
-# Boundary rays pass beside the edge, by this much of its distance from the origin (fifteen
-# roundings): a fine mesh's own triangles, nearly edge-on, would else lie in their way.
-_BESIDE = 1e-6
+# Boundary rays start beside the edge, by this much (two roundings) of its distance from the origin
+# and its length: its own triangles, nearly edge-on, would else lie in their way.
+_BESIDE = 1e-7
+_MISSED = 2 * NEAR  # how far off an edge, of its distance, rays may miss what they meet
+_BEFORE = 3e-5  # how much before an edge, of its distance, such rays start among close surfaces
 _LAST_BELOW_ONE = 1 - 2.0**-24
 _FLAT = 1e-6  # least opening [rad] of an edge that can hide something
 
@@ -30,7 +34,8 @@ class EdgePoints:
     """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
 
     ``open`` and ``covered`` are the transmittances of the edge's own triangles: 1 where there is
-    none, 0 where it is opaque.
+    none, 0 where it is opaque. The covered side is that of the triangle that leaves the plane
+    through edge and ray most.
     """
 
     index: Any  # of the sample
@@ -38,16 +43,21 @@ class EdgePoints:
     frame: Any  # radar pose
     first: Any  # vertices at the ends of the edge
     second: Any
-    opposite: Any  # third vertex of its triangle on the covered side
+    side: Any  # ±1: whether ray × edge points to the covered side
     along: Any  # place from the first end to the second, 0 to 1
     face: Any  # triangle on which the shadow falls
     weight: Any  # one over (samples × probability per ``along``)
     transmittance: Any  # of all other sheets on the way, and the length [m] that these add
     extra: Any
-    open: Any  # beside the edge, on the side away from ``opposite``
+    open: Any  # beside the edge, on the other side
     open_extra: Any
-    covered: Any  # on the side of ``opposite``
+    covered: Any  # on the covered side
     covered_extra: Any
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return dr.width(self.face)
 
     def sides(self, inputs: Inputs) -> list[tuple[float, Any, Any]]:
         """Sign, transmittance and extra length of either side of the shadow's edge."""
@@ -72,6 +82,11 @@ class TwoSided:
 
     edge: EdgePoints  # its weight holds the change of measure from directions to area
     behind: Behind  # where the shadow is cast from
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return self.edge.size
 
 
 @dataclass(frozen=True)
@@ -112,7 +127,7 @@ class Drawn:
         )
 
 
-class _Proportional:
+class Proportional:
     """Draws entries in proportion to weights, without reading any back."""
 
     def __init__(self, weights: Any) -> None:
@@ -134,6 +149,30 @@ class _Proportional:
         return place, rest, dr.select(weight > 0, weight / self.total, 0.0)
 
 
+def by_object(rays: RayScene, edge: Any, weight: Any, receiver: Any, centres: int) -> Any:
+    """Weights of edges by which no object drowns another.
+
+    An object gets the square root of the sum of its edges' weights, which is between a share by
+    size and one share for each. Both antennas get the same sum.
+
+    Args:
+        rays: The scene.
+        edge: Edges.
+        weight: Of each, by itself.
+        receiver: Whether it is the receiver's silhouette.
+        centres: 2 if there are silhouettes of a receiver, else 1.
+    """
+    objects = len(rays.geometry.names)
+    antenna = dr.select(receiver, mi.UInt32(1), 0)
+    row = dr.gather(mi.UInt32, rays.topology.device_edge_object, edge) + antenna * objects
+    totals, sums = dr.zeros(mi.Float, centres * objects), dr.zeros(mi.Float, centres)
+    dr.scatter_add(totals, weight, row)
+    roots = dr.sqrt(totals)
+    dr.scatter_add(sums, roots, dr.arange(mi.UInt32, centres * objects) // objects)
+    share: Any = weight / (dr.gather(mi.Float, roots, row) * dr.gather(mi.Float, sums, antenna))
+    return dr.select(weight > 0, share, 0.0)
+
+
 class EdgeSampler:
     """Points on the silhouettes seen from one antenna or both, and where their shadows fall.
 
@@ -148,28 +187,31 @@ class EdgeSampler:
         centres: Antennas whose silhouettes count: ``tx``, ``rx`` or both.
         samples: Points over all frames.
         seed: Of the points.
+        close: Whether other surfaces may be close to edges.
     """
 
     def __init__(
-        self, rays: RayScene, inputs: Inputs, centres: Sequence[str], samples: int, seed: int
+        self,
+        rays: RayScene,
+        inputs: Inputs,
+        centres: Sequence[str],
+        samples: int,
+        seed: int,
+        *,
+        close: bool = False,
     ) -> None:
         topology = rays.topology
-        self.rays, self.inputs, self.centres = rays, inputs, centres
+        self.rays, self.inputs, self.centres, self.close = rays, inputs, centres, close
         entries = len(centres) * rays.link.frame_count * len(topology.edges)
         edge, _, receiver, origin = self._seen(dr.arange(mi.UInt32, entries))
-        y0, y1 = (
-            point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
-            for ends in topology.device_edges
-        )
-        sides = _sides(rays, inputs, edge, y0, y1, 0.5 * (y0 + y1) - origin)
+        y0, y1 = rays.exact_ends(edge)
+        away = 0.5 * (y0 + y1) - mi.Vector3d(origin)
+        sides = _sides(rays, inputs, edge, away)
         self.size = samples if entries else 0
         if self.size:
-            # Both antennas get the same number of samples.
-            length = dr.norm(y1 - y0) / dr.norm(0.5 * (y0 + y1) - origin)
-            of, totals = dr.select(receiver, mi.UInt32(1), 0), dr.zeros(mi.Float, 2)
-            dr.scatter_add(totals, length, of, sides.unlike)
-            share = length / dr.gather(mi.Float, totals, of)
-            self.choice = _Proportional(dr.select(sides.unlike, share, 0.0))
+            seen = mi.Float(dr.norm(y1 - y0) / dr.norm(away))
+            weight = dr.select(sides.unlike, seen, 0.0)
+            self.choice = Proportional(by_object(rays, edge, weight, receiver, len(centres)))
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
 
     def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
@@ -187,22 +229,28 @@ class EdgeSampler:
     def draw(self, index: Any) -> Drawn:
         """The samples of the given indices below ``size``; those without a shadow are void."""
         rays, topology = self.rays, self.rays.topology
-        place, along, pmf = _along(self.choice, index, self.size, self.seed)
+        place, along, pmf = place_along(self.choice, index, self.size, self.seed)
         edge, frame, receiver, origin = self._seen(place)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
-        y0 = point_at(rays.vertices, first)
-        y1 = point_at(rays.vertices, second)
-        y = y0 + (y1 - y0) * along
-        away = y - origin
-        sides = _sides(rays, self.inputs, edge, y0, y1, away)
-        beside = y + sides.outwards * (_BESIDE * dr.norm(y))
-        before = passage(rays, self.inputs, origin, beside, pmf > 0)
+        y0, y1 = rays.exact_ends(edge)
+        y = y0 + (y1 - y0) * mi.Float64(along)
+        exact = y - mi.Vector3d(origin)
+        sides = _sides(rays, self.inputs, edge, exact)
+        aside = _BESIDE * (dr.norm(y) + dr.norm(y1 - y0))
+        beside, away = mi.Point3f(y + sides.outwards * aside), mi.Vector3f(exact)
+        reach = beside - away * _BEFORE if self.close else beside
+        before = passage(rays, self.inputs, reach, origin, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
-        ray = mi.Ray3f(beside + away * NEAR, dr.normalize(away))
-        hit = land(rays, self.inputs, ray, valid, (index, self.dice), coherent=True)
+        near = _MISSED * dr.norm(exact)
+        valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, near, valid)
+        key = index, self.dice
+        hit = _ahead(
+            rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close,
+            dealt=index,
+        )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
         found = EdgePoints(
-            index, receiver, frame, first, second, sides.opposite, along, hit.face,
+            index, receiver, frame, first, second, sides.side, along, hit.face,
             weight=1 / (pmf * self.size * hit.chance),
             transmittance=before.transmittance * hit.transmittance,
             extra=before.extra + hit.extra,
@@ -226,24 +274,29 @@ class InteriorEdgeSampler:
         seed: Of the points.
         weighted: False takes edges by length alone and directions from the whole sphere: what the
             benchmark compares with.
+        close: Whether other surfaces may be close to edges.
     """
 
     def __init__(
-        self, rays: RayScene, inputs: Inputs, samples: int, seed: int, *, weighted: bool = True
+        self,
+        rays: RayScene,
+        inputs: Inputs,
+        samples: int,
+        seed: int,
+        *,
+        weighted: bool = True,
+        close: bool = False,
     ) -> None:
         topology = rays.topology
-        self.rays, self.inputs, self.weighted = rays, inputs, weighted
+        self.rays, self.inputs, self.weighted, self.close = rays, inputs, weighted, close
         self.frames = rays.link.frame_count
         edge = dr.arange(mi.UInt32, len(topology.edges))
-        y0, y1 = (
-            point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
-            for ends in topology.device_edges
-        )
-        length = dr.norm(y1 - y0)
+        y0, y1 = rays.exact_ends(edge)
+        length = mi.Float(dr.norm(y1 - y0))
         _, span = self._opening(edge, y0, y1)
         weight = dr.select(span > _FLAT, length, 0.0)
         if weighted:
-            middle = 0.5 * (y0 + y1)
+            middle = mi.Point3f(0.5 * (y0 + y1))
             near = mi.Float(0.0)
             for frame in range(min(self.frames, 8)):
                 at = mi.UInt32(frame * self.frames // min(self.frames, 8))
@@ -253,7 +306,7 @@ class InteriorEdgeSampler:
         self.per_frame = max(1, samples // self.frames)
         self.size = self.per_frame * self.frames if len(topology.edges) else 0
         if self.size:
-            self.choice = _Proportional(weight)
+            self.choice = Proportional(weight)
         self.seeds = scrambled(seed, 4), scrambled(seed, 5)
         self.dice = scrambled(seed, 10), scrambled(seed, 11)
 
@@ -270,8 +323,8 @@ class InteriorEdgeSampler:
             return start, span
         x, y = self._azimuth_axes(edge, y0, along)
         apex = dr.gather(mi.Int32, topology.device_opposite[1], edge)
-        offset = point_at(self.rays.vertices, mi.UInt32(dr.maximum(apex, 0))) - y0
-        angle = dr.atan2(dr.dot(offset, y), dr.dot(offset, x))
+        offset = self.rays.exact(mi.UInt32(dr.maximum(apex, 0))) - y0
+        angle = mi.Float(dr.atan2(dr.dot(offset, y), dr.dot(offset, x)))
         turn = dr.abs(angle)
         # Behind a fold the free azimuths are those beyond the second triangle, up to π.
         start = dr.select(apex >= 0, dr.select(angle > 0, turn, 0.0), start)
@@ -295,7 +348,7 @@ class InteriorEdgeSampler:
     def _azimuth_axes(self, edge: Any, y0: Any, along: Any) -> tuple[Any, Any]:
         topology = self.rays.topology
         apex = mi.UInt32(dr.maximum(dr.gather(mi.Int32, topology.device_opposite[0], edge), 0))
-        offset = point_at(self.rays.vertices, apex) - y0
+        offset = self.rays.exact(apex) - y0
         x = dr.normalize(offset - along * dr.dot(along, offset))
         return x, dr.cross(along, x)
 
@@ -303,18 +356,24 @@ class InteriorEdgeSampler:
         """The samples of the given indices below ``size``; those that hide nothing are void."""
         rays, topology = self.rays, self.rays.topology
         frame, within = index // self.per_frame, index % self.per_frame
-        edge, along, pmf = _along(self.choice, within, self.per_frame, self.seeds[0], index)
+        edge, along, pmf = place_along(self.choice, within, self.per_frame, self.seeds[0], index)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
-        y0, y1 = (point_at(rays.vertices, end) for end in (first, second))
-        y = y0 + (y1 - y0) * along
+        y0, y1 = rays.exact_ends(edge)
         omega, density = self._direction(index, edge, y0, y1)
-        sides = _sides(rays, self.inputs, edge, y0, y1, omega)
+        exact = mi.Vector3d(omega)
+        sides = _sides(rays, self.inputs, edge, exact)
+        place = y0 + (y1 - y0) * mi.Float64(along)
+        aside = _BESIDE * (dr.norm(place) + dr.norm(y1 - y0))
+        y, beside = mi.Point3f(place), mi.Point3f(place + sides.outwards * aside)
         valid = (pmf > 0) & sides.unlike
-        beside = mi.Point3f(y + sides.outwards * (_BESIDE * dr.norm(y)))
+        near = _MISSED * dr.norm(place)
+        valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, near, valid)
         hits = []
         for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
-            ray = mi.Ray3f(beside + omega * (sign * NEAR * dr.norm(y)), omega * sign)
-            hit = land(rays, self.inputs, ray, valid, (index, dice), coherent=False)
+            hit = _ahead(
+                rays, self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
+                (index, dice), close=self.close and sign > 0,
+            )  # fmt: skip
             valid &= hit.valid & _not_grazing(rays, hit.face, omega, hit.valid)
             hits.append(hit)
         behind, ahead = hits
@@ -325,7 +384,7 @@ class InteriorEdgeSampler:
         measure = dr.squared_norm(point - y) / cosine
         chance = behind.chance * ahead.chance
         points = EdgePoints(
-            index, False, frame, first, second, sides.opposite, along, ahead.face,
+            index, False, frame, first, second, sides.side, along, ahead.face,
             weight=measure / (pmf * density * self.per_frame * chance),
             transmittance=behind.transmittance * ahead.transmittance,
             extra=behind.extra + ahead.extra,
@@ -352,10 +411,18 @@ class InteriorEdgeSampler:
         return mi.Vector3f(dr.normalize(omega)), 1 / (4 * span)
 
 
-def _along(
-    choice: _Proportional, index: Any, count: int, seed: Any, key: Any = None
+def place_along(
+    choice: Proportional, index: Any, count: int, seed: Any, key: Any = None
 ) -> tuple[Any, Any, Any]:
-    """Entry of the choice, place along its edge and probability, stratified over count."""
+    """Entry of the choice, place along its edge and probability, stratified over count.
+
+    Args:
+        choice: Of edges.
+        index: Number of the sample.
+        count: Of samples.
+        seed: Of the numbers.
+        key: What the numbers belong to, if not the index.
+    """
     jitter, along = uniform_pair(index if key is None else key, seed)
     place, rest, chance = choice.draw((mi.Float(index) + jitter) / count)
     return place, dr.select(chance > _RESOLVED, rest, along), chance
@@ -365,7 +432,7 @@ def _along(
 class _Sides:
     """What an edge's triangles let through on either side of a direction; see ``EdgePoints``."""
 
-    opposite: Any
+    side: Any
     open: Any
     open_extra: Any
     covered: Any
@@ -379,24 +446,23 @@ class _Sides:
         return ~((dr.abs(self.open - self.covered) <= 1e-6) & same_length)
 
 
-def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, direction: Any) -> _Sides:
+def _sides(rays: RayScene, inputs: Inputs, edge: Any, direction: Any) -> _Sides:
     """Sort an edge's triangles by the side of the plane through edge and direction they lie on.
 
-    An opaque edge is a silhouette if nothing is on one side. The covered side is that of the
-    triangle that leaves the plane most.
+    An opaque edge is a silhouette if nothing is on one side. In float64: the triangles of a fine
+    mesh are nearly edge-on where they end a shadow.
     """
     topology = rays.topology
+    y0, y1 = rays.exact_ends(edge)
     plane = dr.cross(direction, y1 - y0)
     offsets, heights = [], []
-    opposite, most = mi.UInt32(0), mi.Float(0.0)
+    most = mi.Float64(0.0)
     for column in topology.device_opposite:
         apex = dr.gather(mi.Int32, column, edge)
-        place = mi.UInt32(dr.maximum(apex, 0))
-        offset = point_at(rays.vertices, place) - y0
+        offset = rays.exact(mi.UInt32(dr.maximum(apex, 0))) - y0
         height = dr.select(apex >= 0, dr.dot(plane, offset), 0.0)
         # Squares, since Dr.Jit 1.5 drops the abs of a select on an abs.
-        further = dr.square(height) > dr.square(most)
-        opposite, most = dr.select(further, place, opposite), dr.select(further, height, most)
+        most = dr.select(dr.square(height) > dr.square(most), height, most)
         offsets.append(offset)
         heights.append(height)
     transmittances, lengths = [mi.Float(1.0), mi.Float(1.0)], [mi.Float(0.0), mi.Float(0.0)]
@@ -407,7 +473,7 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, directio
             row = dr.gather(mi.UInt32, inputs.face_surface, face)
             normal = dr.cross(y1 - y0, offset)
             cosine = dr.abs(dr.dot(normal, direction)) / (dr.norm(normal) * dr.norm(direction))
-            transmittance, extra = inputs.surfaces.through(row, cosine, height != 0)
+            transmittance, extra = inputs.surfaces.through(row, mi.Float(cosine), height != 0)
         for index, on in enumerate((height * most < 0, height * most > 0)):
             transmittances[index] = dr.select(
                 on, transmittances[index] * transmittance, transmittances[index]
@@ -416,13 +482,70 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, y0: Any, y1: Any, directio
     free = (transmittances[0] == 1) & (lengths[0] == 0)
     outwards = dr.select(free, -dr.mulsign(dr.normalize(plane), most), 0.0)
     return _Sides(
-        opposite,
+        mi.Float(dr.sign(most)),
         transmittances[0],
         lengths[0],
         transmittances[1],
         lengths[1],
-        mi.Vector3f(outwards),
+        mi.Vector3d(outwards),
     )
+
+
+def _ahead(
+    rays: RayScene,
+    inputs: Inputs,
+    place: tuple[Any, Any],
+    beside: Any,
+    way: Any,
+    active: Any,
+    key: tuple[Any, Any],
+    *,
+    close: bool,
+    dealt: Any = None,
+) -> Hit:
+    """What lies behind points on edges.
+
+    Where surfaces are close the ray starts before the edge, so that it meets those in which the
+    edge lies; whether the edge is before them is decided in float64. In one that it has crossed, it
+    hides nothing: there the curve of the crossing counts. Rays are traced one by one, since Embree
+    loses some of those of a bundle that start close to a surface.
+
+    Args:
+        rays: Rays.
+        inputs: Detached.
+        place: Edges, and where along them.
+        beside: From where rays start, off the edge.
+        way: Their directions, as long as the edge is far away.
+        active: Lanes.
+        key: See ``land``.
+        close: Whether other surfaces may be close to edges.
+        dealt: See ``land``.
+    """
+    towards, distance = dr.normalize(way), dr.norm(way)
+    past = mi.Ray3f(mi.Point3f(beside + way * NEAR), mi.Vector3f(towards))
+    if not close:
+        return land(rays, inputs, past, active, key, coherent=False, dealt=dealt)
+    early = mi.Ray3f(mi.Point3f(beside - way * _BEFORE), mi.Vector3f(towards))
+    hit = land(rays, inputs, early, active, key, coherent=False, dealt=dealt)
+    point = between(rays.corners(hit.face, hit.valid), hit.b1, hit.b2)
+    near = hit.valid & (dr.norm(point - beside) < 2 * _BEFORE * distance)
+    edge, along = place
+    own = mi.Bool(False)
+    for beside_edge, apex in zip(
+        rays.topology.device_beside, rays.topology.device_opposite, strict=True
+    ):
+        is_there = dr.gather(mi.Int32, apex, edge) >= 0
+        own |= is_there & (dr.gather(mi.UInt32, beside_edge, edge) == hit.face)
+    own &= near
+    y0, y1 = rays.exact_ends(edge)
+    p0, p1, p2 = map(rays.exact, dr.gather(mi.Vector3u, rays.topology.device_faces, hit.face))
+    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(along) - p0)
+    crossed = -dr.mulsign(height, dr.dot(normal, mi.Vector3d(way))) < -IN_PLANE
+    again = land(rays, inputs, past, active & own, key, coherent=False, dealt=dealt)
+    pairs = zip(vars(again).values(), vars(hit).values(), strict=True)
+    hit = Hit(*(dr.select(own, second, first) for second, first in pairs))
+    return replace(hit, valid=hit.valid & ~(near & ~own & crossed))
 
 
 def _not_grazing(rays: RayScene, face: Any, direction: Any, active: Any) -> Any:
@@ -453,7 +576,7 @@ def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
 
     f0, f1, f2 = integrand.corners(fixed, points.face)
     shadow, normal = dr.detach(moving), dr.normalize(dr.cross(f1 - f0, f2 - f0))
-    b1, b2 = _barycentric(shadow, f0, f1, f2)
+    b1, b2 = barycentric(shadow, f0, f1, f2)
     material = between(triangle, b1, b2)
 
     ray, edge = dr.detach(y - c), dr.detach(y1 - y0)
@@ -463,13 +586,17 @@ def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
     def projected(vector: Any) -> Any:
         return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
 
-    apex, _ = integrand.edge_ends(fixed, points.opposite, points.opposite)
-    tangent = dr.cross(normal, projected(edge))
-    tangent = dr.mulsign(tangent, dr.dot(tangent, projected(apex - dr.detach(y))))
+    tangent = dr.mulsign(dr.cross(normal, projected(edge)), points.side * slope)
     return Shadow(b1, b2, dr.dot(tangent, moving - material) * points.weight)
 
 
-def _barycentric(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
+def barycentric(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
+    """Coordinates b1 and b2 of a point in the plane of a triangle.
+
+    Args:
+        point: The point.
+        p0, p1, p2: Corners.
+    """
     a, b, r = p1 - p0, p2 - p0, point - p0
     aa, ab, bb, ra, rb = dr.dot(a, a), dr.dot(a, b), dr.dot(b, b), dr.dot(r, a), dr.dot(r, b)
     determinant = dr.fma(aa, bb, -ab * ab)

@@ -18,6 +18,7 @@ _MOST = 32  # surfaces that a segment may pass
 # Probability of passing a sheet on which the ray may end. It is not the transmittance: a
 # probability that follows the material would throw the dice anew under differences.
 _CHANCE = 0.5
+DEALT = 6  # sheets
 
 
 @dataclass(frozen=True)
@@ -95,12 +96,10 @@ def crossed(
         state["count"] = state["count"] + 1
         return (state,)
 
-    (state,) = dr.while_loop(
+    (state,) = rays.loop(
         ({**state, "active": mi.Bool(active), **carry},),
         lambda state: state["active"] & (state["count"] < most),
         body,
-        labels=("state",),
-        mode="symbolic",
     )
     return state
 
@@ -135,7 +134,14 @@ class Hit:
 
 
 def land(
-    rays: RayScene, inputs: Inputs, ray: Any, active: Any, key: tuple[Any, Any], *, coherent: bool
+    rays: RayScene,
+    inputs: Inputs,
+    ray: Any,
+    active: Any,
+    key: tuple[Any, Any],
+    *,
+    coherent: bool,
+    dealt: Any = None,
 ) -> Hit:
     """Follow a ray to a surface; every sheet on the way is passed or not by a throw of dice.
 
@@ -146,6 +152,8 @@ def land(
         active: Lanes.
         key: Index and seed of the dice.
         coherent: Whether neighbouring rays are alike.
+        dealt: Whether the first sheets are passed, a bit each, instead of dice: so that those that
+            pass are spread as evenly as all.
     """
     one = mi.Float(1.0)
     hit = rays.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
@@ -179,6 +187,9 @@ def land(
         transmittance, extra = _through(inputs, face, origin, origin + ray.d, found)
         chance = dr.select(transmittance > 0, _CHANCE, 0.0)
         dice, _ = uniform_pair(index, seed + state["count"] * 0x85EBCA6B)
+        if dealt is not None:
+            bit = ((dealt ^ seed) >> state["count"]) & 1
+            dice = dr.select(state["count"] < DEALT, mi.Float(bit), dice)
         passes = found & (dice < chance)
         ends = found & ~passes
         for name, value in (("face", face), ("b1", hit.prim_uv.x), ("b2", hit.prim_uv.y)):
@@ -196,8 +207,6 @@ def land(
         state["going"] = passes & (state["count"] < _MOST)
         return (state,)
 
-    (state,) = dr.while_loop(
-        (state,), lambda state: state["going"], body, labels=("state",), mode="symbolic"
-    )
+    (state,) = rays.loop((state,), lambda state: state["going"], body)
     names = ("valid", "face", "b1", "b2", "transmittance", "extra", "chance")
     return Hit(*(state[name] for name in names))

@@ -182,7 +182,7 @@ def pull(
 
             crossed(rays, inputs, start, vertex.ends[1], active, {}, act)
 
-    _swept(records, sweep, backwards=True)
+    _swept(rays, records, sweep, backwards=True)
 
 
 def push(
@@ -243,11 +243,15 @@ def push(
         done = crossed(rays, inputs, start, end, active, carry, act)
         return done["growth"], done["longer"]
 
-    _swept(records, sweep)
+    _swept(rays, records, sweep)
 
 
 def _swept(
-    records: Records, sweep: Callable[[Any, Any, Any], tuple[Any, Any]], *, backwards: bool = False
+    rays: RayScene,
+    records: Records,
+    sweep: Callable[[Any, Any, Any], tuple[Any, Any]],
+    *,
+    backwards: bool = False,
 ) -> None:
     """Carry two sums along all paths, vertex by vertex, from the near end or from the far one."""
     last = opaque(records.depth - 1)
@@ -256,9 +260,8 @@ def _swept(
         if records.depth == 1:
             sweep(mi.UInt32(0), first, second)
             return
-        dr.while_loop(
+        rays.loop(
             (dr.zeros(mi.UInt32, records.lanes), first, second),
             lambda done, *_: done <= last,
             lambda done, *sums: (done + 1, *sweep(last - done if backwards else done, *sums)),
-            mode="symbolic",
         )

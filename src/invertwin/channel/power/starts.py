@@ -9,18 +9,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float64
-from torch import Tensor
 
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.passage import land, passage
-from invertwin.channel.rays.arrays import between, point_at, scrambled, to_float, uniform_pair
+from invertwin.channel.power.passage import DEALT, land, passage
+from invertwin.channel.rays.arrays import (
+    between,
+    point_at,
+    scrambled,
+    to_float,
+    to_points,
+    uniform_pair,
+)
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
-from invertwin.channel.rays.scene import RayScene, bounding_spheres, face_areas
+from invertwin.channel.rays.scene import RayScene, face_areas
+from invertwin.channel.rays.spheres import Spheres
 from invertwin.errors import InputError
 
 
@@ -35,20 +40,6 @@ class Samples:
     weight: Any  # one over (samples × probability per area)
     transmittance: Any  # of the sheets between transmitter and point
     extra: Any  # length that these add [m]
-
-
-def _caps(
-    spheres: tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]],
-    link: Link,
-    margin: float,
-) -> tuple[Float64[Tensor, "frame object 3"], Float64[Tensor, "frame object"]]:
-    """Axis and height 1 − cos of the spherical cap that holds each object, seen from TX."""
-    centres, radii = spheres
-    offset = centres - link.tx.detach()[:, None]
-    distance = offset.norm(dim=2).clamp_min(1e-30)
-    sine = (margin * radii / distance).clamp_max(1.0)
-    height = sine**2 / (1 + (1 - sine**2).sqrt())
-    return offset / distance[:, :, None], torch.where(distance > margin * radii, height, 2.0)
 
 
 class RaySampler:
@@ -68,17 +59,14 @@ class RaySampler:
         seed: int,
         reference: tuple[Geometry, Link] | None = None,
     ) -> None:
+        self.rays, self.spheres, self.centres = rays, rays.spheres, rays.tx
         if reference:
-            axes, heights = _caps(bounding_spheres(reference[0]), reference[1], margin=1.1)
-        else:
-            axes, heights = _caps(rays.spheres, rays.link, margin=1.001)
-        self.rays = rays
-        self.objects = axes.shape[1]
-        blocks = rays.link.frame_count * self.objects
+            self.spheres = Spheres(reference[0], rays.origin, margin=1.1)
+            self.centres = to_points(reference[1].tx.detach() - rays.origin)
+        blocks = rays.link.frame_count * self.spheres.count
         self.rows = max(1, int(np.sqrt(samples / blocks)))
         self.columns = max(1, samples // blocks // self.rows)
         self.size = blocks * self.rows * self.columns
-        self.axes, self.heights = to_float(axes), to_float(heights)
         self.seed, self.dice = scrambled(seed, 0), scrambled(seed, 8)
 
     def draw(self, index: Any, inputs: Inputs) -> Samples:
@@ -90,35 +78,45 @@ class RaySampler:
         """
         rays, per_block = self.rays, self.rows * self.columns
         block, place = index // per_block, index % per_block
-        frame = block // self.objects
+        frame, own = block // self.spheres.count, block % self.spheres.count
+        centre = point_at(self.centres, frame)
+        axis, height, _ = self.spheres.cap(own, centre)
         jitter = uniform_pair(index, self.seed)
+        column, row = place % self.columns, place // self.columns
         disk = mi.warp.square_to_uniform_disk_concentric(
             mi.Point2f(
-                (mi.Float(place % self.columns) + jitter[0]) / self.columns,
-                (mi.Float(place // self.columns) + jitter[1]) / self.rows,
+                (mi.Float(column) + jitter[0]) / self.columns,
+                (mi.Float(row) + jitter[1]) / self.rows,
             )
         )
-        height = dr.gather(mi.Float, self.heights, block)
-        axis = dr.gather(mi.Vector3f, self.axes, block)
         depth = dr.squared_norm(disk) * height
         spread = dr.sqrt(height * (2 - depth))
         local = mi.Vector3f(disk.x * spread, disk.y * spread, 1 - depth)
         direction = dr.normalize(mi.Frame3f(axis).to_world(local))
-        density = mi.Float(0.0)
-        for other in range(self.objects):
-            entry = frame * self.objects + other
-            cap = dr.gather(mi.Float, self.heights, entry)
-            away = direction - dr.gather(mi.Vector3f, self.axes, entry)
-            inside = (dr.squared_norm(away) <= 2 * cap) | (block == entry)
-            density += dr.select(inside, per_block / (2 * dr.pi * cap), 0.0)
+        group = own // self.spheres.size
+        found, around = self.spheres.density(rays, group, centre, direction, mi.Bool(True), own)
+        density = per_block * (found + around / (4 * dr.pi))
         centre = point_at(rays.tx, frame)
         ray = mi.Ray3f(centre, direction)
-        hit = land(rays, inputs, ray, mi.Bool(True), (index, self.dice), coherent=True)
+        key = index, self.dice
+        hit = land(
+            rays, inputs, ray, mi.Bool(True), key, coherent=True, dealt=_dealt(column, row)
+        )  # fmt: skip
         point = integrand.place(inputs, hit.face, hit.b1, hit.b2)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
-        weight = dr.select(hit.valid, distance / (cosine * density * hit.chance), 0.0)
+        counts = hit.valid & (self.spheres.group(hit.face) == group)
+        weight = dr.select(counts, distance / (cosine * density * hit.chance), 0.0)
         return Samples(frame, hit.face, hit.b1, hit.b2, weight, hit.transmittance, hit.extra)
+
+
+def _dealt(column: Any, row: Any) -> Any:
+    """Bits by which a grid falls into halves that are as even as it is, and these again."""
+    bits = mi.UInt32(0)
+    for k in range(DEALT // 2):
+        x, y = column >> k, row >> k
+        bits |= (((x ^ y) & 1) | ((y & 1) << 1)) << (2 * k)
+    return bits
 
 
 class AreaSampler:

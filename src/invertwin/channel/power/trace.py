@@ -11,6 +11,7 @@ from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand, walk
 from invertwin.channel.power.bins import Bins
 from invertwin.channel.power.boundary import BoundaryPaths, BoundaryPoints, boundary_paths
+from invertwin.channel.power.contact import require_unlit
 from invertwin.channel.power.integrand import DIFFERENTIABLE, Inputs, Place
 from invertwin.channel.power.passage import Passage
 from invertwin.channel.power.starts import AreaSampler, RaySampler
@@ -18,11 +19,38 @@ from invertwin.channel.power.surface import SURFACE
 from invertwin.channel.power.walk import Records, State, Walk
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.contacts import contacts_of
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.scene import RayScene
 from invertwin.channel.sampling import Sampling
+from invertwin.scene.checks import plain
 
 _BYTES_PER_VERTEX = 21  # one record: triangle, two barycentrics, throughput, length, seen
+
+
+def tables_of(geometry: Geometry, link: Link) -> list[Tensor]:
+    """What a map can be differentiated with respect to, in the kernel's order.
+
+    Args:
+        geometry: The scene.
+        link: Antennas.
+    """
+    owners = {"vertices": geometry, **dict.fromkeys(SURFACE, geometry.surfaces)}
+    return [getattr(owners.get(name, link), name) for name in DIFFERENTIABLE]
+
+
+def without_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, Link]:
+    """Plain numbers, also within the transforms of ``torch.func``.
+
+    Args:
+        geometry: The scene.
+        link: Antennas.
+    """
+    tables = dict(zip(DIFFERENTIABLE, map(plain, tables_of(geometry, link)), strict=True))
+    rows = replace(geometry.surfaces, **{name: tables.pop(name) for name in SURFACE})
+    return replace(geometry, vertices=tables.pop("vertices"), surfaces=rows), replace(
+        link, **tables
+    )
 
 
 class Trace:
@@ -49,20 +77,18 @@ class Trace:
             reference: What fixes how starts are drawn, see ``deposit_power``.
         """
         self.sampling, self.seed = sampling, seed
+        self.recorded: Records | None = None  # the last paths, where they fit
         self.rays = RayScene(geometry, link)
         sampler = RaySampler if scheme == "rays" else AreaSampler
         self.sampler = sampler(self.rays, sampling.samples, seed, reference)
         self.fixed = Inputs.of(self.rays, monostatic=bool((link.tx == link.rx).all()))
         self._walk = Walk(self.rays, self.fixed, seed)
+        edges = sampling.boundary and sampling.contacts and sampling.boundary_samples
+        self.contacts = contacts_of(self.rays) if edges else None
+        if self.contacts is not None and len(self.contacts.first) and sampling.depth > 1:
+            require_unlit(self.rays, self.fixed, self._walk, self.contacts, sampling.depth, seed)
         per_lane = _BYTES_PER_VERTEX * sampling.depth
         self.chunk = max(1, int(sampling.memory_budget) // per_lane)
-
-    @property
-    def tables(self) -> list[Tensor]:
-        """What the map can be differentiated with respect to, in the kernel's order."""
-        geometry, link = self.rays.geometry, self.rays.link
-        owners = {"vertices": geometry, **dict.fromkeys(SURFACE, geometry.surfaces)}
-        return [getattr(owners.get(name, link), name) for name in DIFFERENTIABLE]
 
     def inputs(self, tables: dict[str, Any] | None = None, *, together: bool = True) -> Inputs:
         """The kernel's inputs, with some arrays replaced by ones that carry derivatives.
@@ -145,8 +171,9 @@ class Trace:
         if not (sampling.boundary and sampling.boundary_samples):
             return None
         return BoundaryPoints(
-            self.rays, self.fixed, sampling, self.seed, chunks=lambda size: chunks(size, self.chunk)
-        )
+            self.rays, self.fixed, sampling, self.seed, self.contacts,
+            chunks=lambda size: chunks(size, self.chunk),
+        )  # fmt: skip
 
     def boundary(self, inputs: Inputs) -> Iterator[BoundaryPaths]:
         """Boundary paths of all segments, a chunk at a time."""

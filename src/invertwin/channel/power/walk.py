@@ -111,18 +111,41 @@ class Walk:
             self._extend(state, point, directions)
             return (state,)
 
-        # Without a second recording of the body, which would gain the kernel nothing.
-        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-            (state,) = dr.while_loop(
-                (state,), lambda state: state["active"], body, labels=("state",), mode="symbolic"
-            )
+        (state,) = self.rays.loop((state,), lambda state: state["active"], body)
         return state
 
-    def step(self, state: State) -> State:
-        """One more vertex, outside any loop."""
+    def step(self, state: State, point: Place | None = None) -> State:
+        """One more vertex, outside any loop.
+
+        Args:
+            state: The path so far.
+            point: Its latest vertex, if not quite where the state has it.
+        """
         state = {**state, "last": state["number"] + 1}
-        self._extend(state, self._place(state), self.directions)
+        self._extend(state, point or self._place(state), self.directions)
         return state
+
+    def ended(self, first: State, count: Any, receiver: Any) -> State:
+        """The one path with ``count`` vertices that ends at an antenna: its amount and ``so_far``.
+
+        Args:
+            first: Paths at their first vertex.
+            count: Vertices, one number per lane.
+            receiver: Whether the path ends at the receiver; then ``u`` and ``v`` are set too.
+        """
+        zero = dr.zeros(mi.Float, dr.width(first["index"]))
+        first = first | {"u": zero, "v": zero, "amount": zero, "so_far": zero, "here": receiver}
+
+        def ending(state: State, point: Place) -> None:
+            path, exists = connect(self.rays, self.inputs, state, point, state["here"])
+            last = exists & (state["number"] == state["last"])
+            state["amount"] = dr.select(last, path.power, state["amount"])
+            state["so_far"] = dr.select(last, 2 * path.range, state["so_far"])
+            state["u"] = dr.select(last, path.u, state["u"])
+            state["v"] = dr.select(last, path.v, state["v"])
+
+        with dr.suspend_grad():
+            return self.run(first, count, ending)
 
     def _place(self, state: State) -> Place:
         return integrand.place(
@@ -133,21 +156,22 @@ class Walk:
         """Draw the next vertex into the state; paths that miss or are too long end."""
         active = state["active"] & (state["number"] < state["last"])
         back = state["back"]
-        omega, density = directions.draw(point, back, self._numbers(state))
+        drawn = directions.draw(point, back, self._numbers(state, 0, 1, 2))
+        omega = drawn.omega
         scattered = self.inputs.surfaces.scattered(
             point.surface, point.normal, back, mi.Vector3f(omega), active
         )
-        ratio: Any = scattered / (density * dr.abs(dr.dot(point.normal, back)))
+        ratio: Any = scattered / (drawn.scattered * dr.abs(dr.dot(point.normal, back)))
         survival = dr.select(
             state["number"] >= _ROULETTE_FROM,
             dr.minimum(dr.maximum(ratio, _LEAST_SURVIVAL), 1.0),
             1.0,
         )
-        active &= (scattered > 0) & (self._numbers(state, 2)[0] < survival)
+        active &= (scattered > 0) & (self._numbers(state, 3)[0] < survival)
         side = dr.mulsign(point.normal, dr.dot(point.normal, omega))
         origin = point.position + side * (NEAR * dr.norm(point.position))
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
-        key = state["index"], self.seed + (state["number"] * 4 + 3) * _STREAM
+        key = state["index"], self.seed + (state["number"] * 5 + 4) * _STREAM
         hit = land(self.rays, self.inputs, ray, active, key, coherent=False)
         active &= hit.valid
         found = integrand.place(self.inputs, hit.face, hit.b1, hit.b2, active)
@@ -155,6 +179,8 @@ class Walk:
         cosine: Any = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
         inside = integrand.medium(self.inputs, point, found, -to_point, active)
+        density = directions.density(point, drawn, hit.face, active)
+        active &= density > 0
         odds = density * survival * cosine * hit.chance
         weight = scattered * hit.transmittance * dr.exp(-inside.attenuation * distance) / odds
         state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
@@ -166,12 +192,11 @@ class Walk:
         state["number"] = state["number"] + 1
         state["active"] = active
 
-    def _numbers(self, state: State, pairs: int = 0) -> list[Any]:
-        """Uniform numbers of this vertex: four, or the two of a later stream."""
-        streams = (pairs,) if pairs else (0, 1)
+    def _numbers(self, state: State, *streams: int) -> list[Any]:
+        """Uniform numbers of this vertex, two of each stream."""
         numbers = []
         for stream in streams:
-            seed = self.seed + (state["number"] * 4 + stream) * _STREAM
+            seed = self.seed + (state["number"] * 5 + stream) * _STREAM
             numbers += uniform_pair(state["index"], seed)
         return numbers
 

@@ -1,7 +1,12 @@
-"""Which backend traces rays, and the only place where Mitsuba and Dr.Jit are imported."""
+"""Which backend traces rays, and the only place where Mitsuba and Dr.Jit are imported.
+
+The ray tracer and torch's forward-mode derivatives have one state for the whole process, so that
+one thread at a time may use them. Threads that use them at once wait for each other.
+"""
 
 import importlib
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -13,7 +18,17 @@ from invertwin import doctor
 from invertwin.errors import InputError
 
 VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
-_chosen: list[str] = []
+alone = threading.RLock()
+"""Held while rays are traced, or a level of forward-mode derivatives is open."""
+
+
+class _ThisThread(threading.local):
+    def __init__(self) -> None:
+        self.chosen: list[str] = []  # backends, the innermost one last
+
+
+_here = _ThisThread()
+_forked = False  # whether the parent of this process had started the ray tracer
 
 
 @cache
@@ -27,14 +42,14 @@ def _cuda_found() -> bool:
 def backend() -> str:
     """The ray tracer's backend in force: ``cpu`` or ``cuda``.
 
-    The innermost :func:`use_backend` wins, then the environment variable ``INVERTWIN_BACKEND``,
-    then ``auto``: CUDA where Dr.Jit finds it, the CPU elsewhere.
+    The innermost :func:`use_backend` of this thread wins, then the environment variable
+    ``INVERTWIN_BACKEND``, then ``auto``: CUDA where Dr.Jit finds it, the CPU elsewhere.
 
     Raises:
         InputError: A name that is not known, or CUDA asked for where there is none.
     """
-    if _chosen:
-        return _chosen[-1]
+    if _here.chosen:
+        return _here.chosen[-1]
     return _resolved(os.environ.get("INVERTWIN_BACKEND", "auto"))
 
 
@@ -54,11 +69,44 @@ def _resolved(name: str) -> str:
 @contextmanager
 def use_backend(name: str | None) -> Iterator[None]:
     """Choose ``cpu``, ``cuda`` or ``auto`` inside a ``with`` block; ``None`` changes nothing."""
-    _chosen.append(backend() if name is None else _resolved(name))
+    _here.chosen.append(backend() if name is None else _resolved(name))
     try:
         yield
     finally:
-        _chosen.pop()
+        _here.chosen.pop()
+
+
+@contextmanager
+def tracing(name: str | None = None) -> Iterator[None]:
+    """What touches Mitsuba or Dr.Jit does so in such a block: one thread at a time.
+
+    Args:
+        name: As for :func:`use_backend`.
+
+    Raises:
+        InputError: A process that was forked from one whose ray tracer had been started.
+    """
+    if _forked:
+        raise InputError(
+            "expected a process with a ray tracer of its own, got a fork of one that had traced "
+            "rays; start processes by multiprocessing.get_context('spawn')"
+        )
+    with alone, use_backend(name):
+        yield
+        # Side effects and kernels under way are the thread's own: others would not wait for them.
+        dr.eval()
+        dr.sync_thread()
+
+
+def _after_fork() -> None:
+    """In a forked child the threads of the ray tracer and of torch are gone; nobody waits."""
+    global _forked
+    _forked = _forked or _loaded.cache_info().currsize > 0
+    if _forked:
+        torch.set_num_threads(1)
+
+
+os.register_at_fork(after_in_child=_after_fork)
 
 
 @contextmanager
@@ -86,7 +134,7 @@ class _Mitsuba:
     """Mitsuba, set to the backend in force; imported when it is first used."""
 
     def __getattr__(self, name: str) -> Any:
-        wanted = _chosen[-1] if _chosen else backend()
+        wanted = backend()
         module = _loaded("mitsuba", wanted)
         if module.variant() != VARIANTS[wanted]:
             module.set_variant(VARIANTS[wanted])

@@ -1,5 +1,7 @@
 """A scene as flat tables: what all paths are computed from, still torch and differentiable."""
 
+import math
+import warnings
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Literal
@@ -12,9 +14,11 @@ from torch import Tensor
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import Material, Surface
 from invertwin.scene.scene import Object, Scene
+
+_WIDE = 0.2  # radians: no mesh is too coarse for such lobes
 
 
 def mixed(corners: tuple[Tensor, Tensor, Tensor], b1: Tensor, b2: Tensor) -> Tensor:
@@ -42,7 +46,10 @@ class Geometry:
         lobed: Which lobes have weight, or a derivative that could give them some.
         sheets: Whether something passes straight through any surface.
         bodies: Whether any surface is the skin of a refracting body.
+        names: Of the objects.
         coherent: Per object, whether its field paths have a deterministic phase.
+        moving: Per object, whether derivatives flow through its place or its shape.
+        deforming: Per object, whether they flow through its shape.
         topology: What depends on the connectivity only.
         velocities: World velocities of the vertices [m/s]; None = all at rest.
     """
@@ -55,7 +62,10 @@ class Geometry:
     lobed: tuple[bool, ...]
     sheets: bool
     bodies: bool
+    names: tuple[str, ...]
     coherent: tuple[bool, ...]
+    moving: tuple[bool, ...]
+    deforming: tuple[bool, ...]
     topology: Topology
     velocities: Float64[Tensor, "v 3"] | None = None
 
@@ -156,7 +166,8 @@ def flatten(
             f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time) "
             "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
         )
-    vertices = torch.cat([item.vertices for item in objects])
+    placed = [item.vertices for item in objects]
+    vertices = torch.cat(placed)
     topology = topology_of([item.mesh for item in objects])
     surfaces, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength)
     skins = surfaces.refraction.any(1)
@@ -164,8 +175,9 @@ def flatten(
         own = topology.face_object == number
         if bool(skins[face_surface[own]].any()):
             _require_solid(
-                name, vertices.detach()[topology.faces[own]], topology.open_objects[number]
+                name, vertices.detach()[topology.faces[own]], number in topology.open_objects
             )
+    _warn_of_facets(list(scene.objects), topology, vertices, surfaces, face_surface)
     weights, free = surfaces.lobes, differentiated(surfaces.lobes)
     return Geometry(
         vertices=vertices,
@@ -176,10 +188,35 @@ def flatten(
         lobed=tuple(free or bool(weight.any()) for weight in weights.T),
         sheets=bool(surfaces.transmittance.any()),
         bodies=bool(skins.any()),
+        names=tuple(scene.objects),
         coherent=tuple(item.material.coherent for item in objects),
+        moving=tuple(map(differentiated, placed)),
+        deforming=tuple(differentiated(item.mesh.vertices) for item in objects),
         topology=topology,
         velocities=torch.cat([_velocities(item) for item in objects]) if moving else None,
     )
+
+
+def _warn_of_facets(
+    names: list[str], topology: Topology, vertices: Tensor, surfaces: Surface, rows: Tensor
+) -> None:
+    """Warn where a curved mesh is so coarse that its narrow lobes do not meet: it glints."""
+    width = surfaces.exponents.detach().clamp_min(1e-9).rsqrt()
+    narrow = torch.where(surfaces.lobes.detach() > 0, width, 1.0).amin(1)[rows]
+    if not bool((narrow < _WIDE).any()):
+        return
+    for number, name in enumerate(names):
+        angle, lobe = topology.facet_angle(number, vertices), float("inf")
+        if angle > 0:
+            lobe = float(narrow[topology.face_object == number].min())
+        if angle > lobe:
+            warnings.warn(
+                f"the triangles of {name} turn by {math.degrees(angle):.2g}° from one to the next, "
+                f"more than its lobes are wide ({math.degrees(lobe):.2g}°): it glints where a "
+                "smooth surface shines; use a finer mesh or a larger rms_slope",
+                PhysicsWarning,
+                stacklevel=2,
+            )
 
 
 def _require_solid(name: str, triangles: Tensor, is_open: bool) -> None:

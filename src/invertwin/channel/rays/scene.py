@@ -1,5 +1,6 @@
 """What rays need: the ray scene and the antennas, in float32 about a local origin."""
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -10,8 +11,9 @@ from torch import Tensor
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import arrays
 from invertwin.channel.rays.arrays import opaque, to_float, to_points, to_torch
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.spheres import Spheres
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_tensor
@@ -43,6 +45,21 @@ class Occluders:
     def scene(self) -> Any:
         """Mitsuba's scene. Asked for anew: other rays on the same objects may have moved them."""
         return self.topology.ray_scene(self.local_vertices)
+
+    def loop(self, state: Any, going: Callable[..., Any], step: Callable[..., Any]) -> Any:
+        """Record a loop in which rays are cast; all loops of kernels over rays are made here.
+
+        The tree is built before: to build it while a loop is recorded aborts the process. The step
+        is not recorded a second time, which would gain the kernel nothing.
+
+        Args:
+            state: What the loop carries, a tuple.
+            going: Takes the state; which lanes go on.
+            step: Takes the state and returns the next one.
+        """
+        _ = self.scene
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+            return dr.while_loop(state, going, step, mode="symbolic")
 
     def clear(self, start: Any, end: Any, active: Any = True) -> Any:
         """Whether nothing lies between two points (their own surfaces excluded).
@@ -81,9 +98,32 @@ class RayScene(Occluders):
         self.sound_face = opaque(_sound_face(geometry))
 
     @cached_property
-    def spheres(self) -> tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]]:
-        """Centre and radius of a sphere around each object [m]."""
-        return bounding_spheres(self.geometry)
+    def spheres(self) -> Spheres:
+        """Around the objects."""
+        return Spheres(self.geometry, self.origin, margin=1.001)
+
+    @cached_property
+    def exact_vertices(self) -> Any:
+        """Vertices in float64, three numbers each."""
+        return mi.Float64((self.geometry.vertices.detach() - self.origin).ravel().numpy())
+
+    def exact(self, vertex: Any, active: Any = True) -> Any:
+        """Vertices in float64.
+
+        Args:
+            vertex: Their numbers.
+            active: Lanes.
+        """
+        return dr.gather(mi.Vector3d, self.exact_vertices, vertex, active)
+
+    def exact_ends(self, edge: Any) -> tuple[Any, Any]:
+        """Both ends of edges in float64.
+
+        Args:
+            edge: Their numbers.
+        """
+        first, second = self.topology.device_edges
+        return tuple(self.exact(dr.gather(mi.UInt32, ends, edge)) for ends in (first, second))  # type: ignore[return-value]
 
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Corners of triangles, detached.
@@ -106,21 +146,6 @@ def _sound_face(geometry: Geometry) -> int:
             return topology.sound_face
     topology.sound_face = int(face_areas(geometry).argmax())
     return topology.sound_face
-
-
-def bounding_spheres(
-    geometry: Geometry,
-) -> tuple[Float64[Tensor, "object 3"], Float64[Tensor, " object"]]:
-    """Centre and radius of a sphere around each object, detached [m]."""
-    centres, radii = [], []
-    positions = geometry.vertices.detach()
-    for used in geometry.topology.object_vertices:
-        corners = positions[used]
-        low, high = torch.aminmax(corners, dim=0)
-        centre = 0.5 * (low + high)
-        centres.append(centre)
-        radii.append((corners - centre).norm(dim=1).max())
-    return torch.stack(centres), torch.stack(radii)
 
 
 def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
@@ -176,10 +201,11 @@ def visible_points(
         InputError: Positions of another shape, or that are not finite.
     """
     places = checked_tensor(positions, (None, 3), "radar positions [m]", "give x, y, z of each")
-    rays = Occluders(mesh.vertices, topology_of([mesh]), places.detach().mean(dim=0))
     seen = torch.zeros(len(points), dtype=torch.bool)
-    for place in places:
-        hidden = torch.nonzero(~seen)[:, 0]
-        clear = visible(rays, points[hidden], place.expand(len(hidden), 3))
-        seen[hidden[clear]] = True
+    with tracing():
+        rays = Occluders(mesh.vertices, topology_of([mesh]), places.detach().mean(dim=0))
+        for place in places:
+            hidden = torch.nonzero(~seen)[:, 0]
+            clear = visible(rays, points[hidden], place.expand(len(hidden), 3))
+            seen[hidden[clear]] = True
     return seen

@@ -2,18 +2,22 @@
 
 import itertools
 from collections import OrderedDict
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.arrays import to_float, to_index
 from invertwin.channel.rays.backend import VARIANTS, backend, mi
+from invertwin.scene.checks import plain
 from invertwin.scene.mesh import Mesh
 
 _KEPT_TOPOLOGIES = 8
+_FLAT, _SHARP = 1e-6, 0.35  # radians: rounding of coordinates; an edge of the object itself
 _UNGROUPED = 256  # triangles that are not worth a group
 
 
@@ -31,26 +35,89 @@ class Topology:
     def __init__(self, faces: Tensor, face_object: Tensor, vertices: Tensor) -> None:
         self.faces = faces
         self.face_object = face_object
-        owners = range(int(face_object.max()) + 1)
-        self.object_vertices = [faces[face_object == owner].unique() for owner in owners]
         self.sound_face: int | None = None  # a triangle that was no sliver when last looked at
-        owner = torch.zeros(len(vertices), 1, dtype=torch.float64)
-        owner[faces.ravel(), 0] = face_object.repeat_interleave(3).double()
-        places = torch.cat([owner, vertices], dim=1).numpy()
-        self.edges, self.opposite, beside = edges_of(faces.numpy(), places)
+        owner = torch.zeros(len(vertices), dtype=torch.int64)
+        owner[faces.ravel()] = face_object.repeat_interleave(3)
+        self.vertex_object = owner
+        used = faces.unique()
+        # Vertices of triangles, the first of each object among them, and the object of each.
+        first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
+        self.used = used.numpy(), first.numpy(), owner[used].numpy()
+        places = torch.cat([owner[:, None].double(), vertices], dim=1).numpy()
+        self.edges, self.opposite, self.beside = edges_of(faces.numpy(), places)
+        beside = self.beside
         alone = (self.opposite >= 0).sum(1) == 1
-        lone_owner = face_object[beside[alone, 0]]
-        self.open_objects = [bool((lone_owner == owner).any()) for owner in owners]
+        self.open_objects = set(face_object[beside[alone, 0]].tolist())
         self.device_faces = to_index(faces)
+        self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
+        self.device_edge_object = to_index(owner[self.edges[:, 0]])
         self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
         self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]
         mesh = mi.Mesh("scene", vertex_count=len(vertices), face_count=len(faces))
         self._parameters = mi.traverse(mesh)
         self._parameters["faces"] = self.device_faces
         self._uploaded: Tensor | None = None
+        self._facets: Tensor | None = None
         self._mesh = mesh
         self._scene: Any = None
+
+    @cached_property
+    def welded(self) -> Int64[Tensor, "f 3"]:
+        """Vertices of triangles, where vertices at one place count as one; in any order."""
+        table = self.faces.clone()
+        for face, apex in zip(self.beside.T, self.opposite.T, strict=True):
+            at = face >= 0
+            table[face[at]] = torch.cat([self.edges[at], apex[at, None]], 1)
+        return table
+
+    @cached_property
+    def face_edges(self) -> Int64[Tensor, "f 3"]:
+        """The edge opposite to each of a triangle's ``welded`` vertices (−1: no proper edge)."""
+        table = torch.full_like(self.faces, -1)
+        for face, apex in zip(self.beside.T, self.opposite.T, strict=True):
+            edge = torch.nonzero(face >= 0)[:, 0]
+            slot = (self.welded[face[edge]] == apex[edge, None]).int().argmax(1)
+            table[face[edge], slot] = edge
+        return table
+
+    def facet_angle(self, number: int, vertices: Float64[Tensor, "v 3"]) -> float:
+        """By how much normals of neighbours turn where an object is curved [rad]; 0 = nowhere.
+
+        The median over its smooth edges, as the mesh is when this is first asked for.
+
+        Args:
+            number: Of the object.
+            vertices: World positions [m].
+        """
+        if self._facets is None:
+            a, b, c = vertices.detach()[self.faces].unbind(1)
+            normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+            both = self.beside[(self.beside >= 0).all(1)]
+            first, second = normals[both[:, 0]], normals[both[:, 1]]
+            angle = 2 * torch.asin((0.5 * (first - second).norm(dim=1)).clamp_max(1.0))
+            owner = self.face_object[both[:, 0]]
+            smooth = (angle > _FLAT) & (angle < _SHARP)
+            self._facets = torch.zeros(int(self.face_object.max()) + 1, dtype=torch.float64)
+            for k in owner[smooth].unique():
+                self._facets[k] = angle[smooth & (owner == k)].median()
+        return float(self._facets[number])
+
+    @cached_property
+    def device_welded(self) -> Any:
+        """``welded`` as a flat array of the ray tracer."""
+        return to_index(self.welded)
+
+    @cached_property
+    def device_face_edges(self) -> Any:
+        """``face_edges`` as a flat array of the ray tracer."""
+        return mi.Int32(self.face_edges.int().ravel().numpy())
+
+    def around(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
+        """Triangles and all that share an edge with them (−1: none)."""
+        edges = self.face_edges[faces]
+        nearby = torch.where(edges[..., None] >= 0, self.beside[edges.clamp_min(0)], -1)
+        return torch.cat([faces[:, None], nearby.flatten(1)], 1)
 
     def ray_scene(self, vertices: Tensor) -> Any:
         """The Mitsuba scene with these vertices (float32, never changed in place hereafter)."""
@@ -98,11 +165,12 @@ def topology_of(meshes: list[Mesh]) -> Topology:
     key = (VARIANTS[backend()], *map(id, owners))
     if key not in _topologies:
         starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
-        faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-        objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
-        # In the objects' own frames, where equal positions are equal to the last bit.
-        vertices = torch.cat([mesh.vertices.detach() for mesh in meshes])
-        made = Topology(torch.cat(faces), torch.cat(objects), vertices)
+        with _DisableFuncTorch():
+            faces = [plain(mesh.faces) + start for mesh, start in zip(meshes, starts, strict=False)]
+            objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
+            # In the objects' own frames, where equal positions are equal to the last bit.
+            vertices = torch.cat([plain(mesh.vertices) for mesh in meshes])
+            made = Topology(torch.cat(faces), torch.cat(objects), vertices)
         _topologies[key] = (owners, made)
         while len(_topologies) > _KEPT_TOPOLOGIES:
             _topologies.popitem(last=False)

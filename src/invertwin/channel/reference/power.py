@@ -8,7 +8,7 @@ from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.power.trace import Trace
 from invertwin.channel.power.walk import Records
 from invertwin.channel.rays.arrays import to_torch
-from invertwin.channel.rays.backend import use_backend
+from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import Geometry, flatten, require_edges, silhouettes_move
 from invertwin.channel.reference.radar_equation import Echo, SurfacePaths, path_view
 from invertwin.channel.reference.shadows import ShadowEdge, boundary_rows
@@ -35,7 +35,7 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
             several bounces of objects in motion.
     """
     boundary, edges, depth = sampling.boundary, sampling.boundary_samples, sampling.depth
-    with use_backend(sampling.backend):
+    with tracing(sampling.backend):
         geometry = flatten(scene, link.wavelength, motion="free")
         if depth > 1:
             geometry.require_rest(depth)
@@ -48,6 +48,11 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
         if boundary and simple:
             require_edges(geometry, link, edges)
         trace = Trace(geometry, link, sampling, seed)
+        if trace.contacts is not None and len(trace.contacts.first):
+            raise InputError(
+                "expected surfaces that do not meet for derivatives of explicit paths, got some "
+                "that cross or touch; use deposit_power, or contacts=False to leave out what moves"
+            )
         parts = [paths for records in trace.records() for paths in _walked(trace, records)]
         if boundary and simple and edges:
             parts += boundary_rows(trace.rays, edges, seed, lambda *found: _row(geometry, *found))

@@ -70,9 +70,8 @@ def shadow_edge(rays: RayScene, points: EdgePoints) -> ShadowEdge:
         along = _dot(normal, vector) / _dot(normal, ray)
         return stretch[:, None] * (vector - ray * along[:, None])
 
-    covered = geometry.vertices.detach()[points.opposite] - y.detach()
-    tangent = torch.linalg.cross(normal, projected(edge))
-    tangent = tangent * _dot(tangent, projected(covered)).sign()[:, None]
+    covered = points.side * _dot(normal, ray).sign()
+    tangent = torch.linalg.cross(normal, projected(edge)) * covered[:, None]
     weight = points.weight
     if not link.shared_visibility:
         weight = weight * visible(rays, shadow, other)

@@ -1,14 +1,11 @@
 """The fits themselves: calibration, one fit per start, progress, interruptions."""
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -22,8 +19,10 @@ from invertwin.cli import build
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
+    known_of,
     models_of,
     observations_of,
+    recorded_anew,
     schedule_of,
     settings_of,
     unknowns_of,
@@ -31,9 +30,10 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
-from invertwin.cli.runs import PARTS, RunFolder
 from invertwin.errors import InputError
+from invertwin.folders import PARTS
 from invertwin.inversion import (
+    Callback,
     Checkpoint,
     Observation,
     Reconstruction,
@@ -41,10 +41,13 @@ from invertwin.inversion import (
     Stage,
     Watch,
     reconstruct,
+    search,
 )
-from invertwin.inversion.callbacks import stage_file
+from invertwin.inversion.callbacks import interrupted_between_steps, stage_file
+from invertwin.inversion.certainty import certainty
 from invertwin.radar.parameters import ClockOffset, RangeBias
-from invertwin.scene import Scene
+from invertwin.runs import RunFolder
+from invertwin.scene import Object, Scene
 from invertwin.seeds import derived_seed
 
 
@@ -118,11 +121,11 @@ def fit(
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
-        return row, again
+        return row, lambda: again()[0]
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
     with watched(console, name, sum(stage.steps for stage in stages)) as shown:
-        found = again(shown)
+        found, found_ends = again(shown)
     row = {
         "start": index,
         **scores(own, start, found.scene),
@@ -131,12 +134,15 @@ def fit(
         "steps": found.steps,
         "seconds": time.perf_counter() - begin,
         "values": _values(found.parameters),
-        "checkpoint": checkpoint,
+        "checkpoint": found_ends.pop("checkpoint", checkpoint),
+        **found_ends,
+        **(certainty(found, known_of(own)) if recorded_anew(own.run) else {}),
         "losses": [step["loss"] for step in found.history],
         "curve": [[step["step"] + 1, step[CURVE]] for step in found.history if CURVE in step],
     }
     folder.write_json(f"{part}.json", row)
-    return row, lambda: found
+    # The twins of many recordings are read again, not kept.
+    return row, (lambda: again()[0]) if recorded_anew(own.run) else lambda: found
 
 
 def _staged(
@@ -147,25 +153,28 @@ def _staged(
     folder: RunFolder,
     checkpoint: str,
     shown: Sequence[Report] = (),
-) -> Reconstruction:
+) -> tuple[Reconstruction, dict[str, Any]]:
+    """A fit, or a search about its start; and what the row says of the search."""
     run, watch = problem.run, watch_of(problem)
-    for k in range(len(stages) - 1):
-        folder.file(str(stage_file(Path(checkpoint), k)))
     every = run.measures.every if run.measures else 1
-    return reconstruct(
-        start,
-        observations_of(problem),
-        unknowns_of(run),
-        loss=build.made(run, "loss"),
-        optimizer=build.made(run, "optimizer"),
-        schedule=stages,
-        callbacks=[
-            *([] if watch is None else [Watch(watch, every)]),
-            *shown,
-            _checkpoint(problem, folder, checkpoint),
-        ],
-        seed=derived_seed(run.seed, index),
-    )
+
+    def callbacks(file: str) -> list[Callback]:
+        for k in range(len(stages) - 1):
+            folder.file(str(stage_file(Path(file), k)))
+        watching = [] if watch is None else [Watch(watch, every)]
+        return [*watching, *shown, _checkpoint(problem, folder, file)]
+
+    given = start, observations_of(problem), unknowns_of(run)
+    how: dict[str, Any] = {key: build.made(run, key) for key in ("loss", "optimizer")}
+    how |= {"schedule": stages, "seed": derived_seed(run.seed, index)}
+    if run.search is None:
+        return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
+    name, part = run.search.object, f"{PARTS}/{Path(checkpoint).stem}_fit"
+    chance = torch.Generator().manual_seed(how["seed"])
+    poses = build.made(run, "search", {Object: start[name], torch.Generator: chance})
+    starts = {name: [start[name], *poses]}
+    found = search(*given, starts, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
+    return found.best, {"checkpoint": f"{part}{found.number}.pt", **found.rows()}
 
 
 def _checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
@@ -192,7 +201,7 @@ def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
     words, lines = TextColumn("{task.description}"), not console.is_terminal
     bar = Progress(*columns, words, console=console, disable=lines)
     task = bar.add_task("", total=steps)
-    with bar, _interrupted_between_steps() as heed:
+    with bar, interrupted_between_steps() as heed:
 
         def show(row: dict[str, Any]) -> None:
             values = " ".join(
@@ -208,33 +217,3 @@ def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
             heed()
 
         yield [Report(show)]
-
-
-@contextmanager
-def _interrupted_between_steps() -> Iterator[Callable[[], None]]:
-    """Ctrl-C waits for the end of the step, when nothing is half done; a second one does not.
-
-    Gives a function that raises KeyboardInterrupt if one is due.
-    """
-    due = False
-
-    def heed() -> None:
-        if due:
-            raise KeyboardInterrupt
-
-    def note(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal due
-        heed()
-        due = True
-
-    # Another handler, or another thread than the main one, is not ours to change.
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not ours or threading.current_thread() is not threading.main_thread():
-        yield heed
-        return
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield heed
-        heed()
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)

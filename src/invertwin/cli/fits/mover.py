@@ -19,7 +19,6 @@ from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import chirp_train
-from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.errors import InputError
@@ -36,6 +35,7 @@ from invertwin.inversion import (
 from invertwin.models import MotionMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
 from invertwin.radar import doppler_maps
+from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 
@@ -108,7 +108,7 @@ def _mover(run: RunFile) -> Mover:
     if others:
         kinds = ", ".join(parameter.kind for parameter in run.parameters)
         raise InputError(f"parameters: expected a mover alone, got {kinds}; leave only the mover")
-    for name in ("starts", "calibration", "landscape", "initial"):
+    for name in ("starts", "search", "calibration", "landscape", "initial"):
         if getattr(run, name):
             raise InputError(
                 f"{name}: expected no such section with a mover, got one; remove it: the fit "

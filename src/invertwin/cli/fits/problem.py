@@ -32,6 +32,7 @@ from invertwin.seeds import derived_seed
 FULL, INTERIOR = "full", "interior_only"
 
 _POINTS_PER_M2 = 2_000.0
+_RECORDINGS = 2**16  # key of the seeds of recordings, beyond those of sensors
 
 
 @dataclass(frozen=True)
@@ -92,15 +93,39 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     for name, variant in run.variants.items():
         with about(f"variants.{name}"):
             build.parameters(variant.parameters or [], scene, run.scene)
-    sights, observed = {}, observed_runs(run)
-    for name, own in observed.items():
-        with about(f"observations.{name}") if name else nullcontext():
-            weight = run.observations[name].weight if name else 1.0
-            sights[name] = Sight(*_recorded(own, truth, console), weight)
-    simulated = all(isinstance(own.data, SimulatedData) for own in observed.values())
+    sights = _sights(run, truth, console)
+    simulated = all(isinstance(own.data, SimulatedData) for own in observed_runs(run).values())
     known = frozenset(truth.names if simulated else run.truth)
     target = run.starts.object if run.starts else next(iter(fitted_objects(run)), None)
     return Problem(run, scene, truth, known, sights, target)
+
+
+def recorded_anew(run: RunFile) -> bool:
+    """Whether every start has a recording of its own."""
+    return isinstance(run.data, SimulatedData) and run.data.every_start
+
+
+def recorded_for(problem: Problem, start: int, console: Console) -> Problem:
+    """The problem with the recording of a start, where each has one of its own."""
+    return another(problem, start, console) if start and recorded_anew(problem.run) else problem
+
+
+def another(problem: Problem, number: int, console: Console) -> Problem:
+    """The problem with another simulated recording."""
+    run, data = problem.run, problem.run.data
+    assert isinstance(data, SimulatedData)
+    seed = derived_seed(run.seed if data.seed is None else data.seed, _RECORDINGS, number)
+    run = run.model_copy(update={"data": data.model_copy(update={"seed": seed})})
+    return replace(problem, run=run, sights=_sights(run, problem.truth, console))
+
+
+def _sights(run: RunFile, truth: Scene, console: Console) -> dict[str, Sight]:
+    sights = {}
+    for name, own in observed_runs(run).items():
+        with about(f"observations.{name}") if name else nullcontext():
+            weight = run.observations[name].weight if name else 1.0
+            sights[name] = Sight(*_recorded(own, truth, console), weight)
+    return sights
 
 
 def observed_runs(run: RunFile) -> dict[str, RunFile]:
@@ -141,6 +166,12 @@ def _recorded(run: RunFile, truth: Scene, console: Console) -> tuple[Capture, Ra
 def fitted_objects(run: RunFile) -> list[str]:
     """Objects that have parameters."""
     return [p.object for p in run.parameters if getattr(p, "object", None)]
+
+
+def known_of(problem: Problem) -> dict[str, Object]:
+    """The object that is scored as it really is, where that is known."""
+    name = problem.target
+    return {name: problem.truth[name]} if name is not None and name in problem.known else {}
 
 
 def starts_of(problem: Problem) -> list[Scene]:

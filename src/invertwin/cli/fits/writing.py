@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from invertwin import plotting
+from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.problem import (
     FULL,
     INTERIOR,
@@ -18,9 +19,9 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
-from invertwin.cli.runs import RunFolder
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion.metrics import residual
+from invertwin.runs import RunFolder
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
 
@@ -47,6 +48,7 @@ class Fitted:
     start: Scene
     twin: Scene
     maps: Mapping[str, list[torch.Tensor]]  # by what they show, one for every sensor
+    residuals: list[torch.Tensor]  # of the best one, one for every sensor or none
 
     @property
     def ways(self) -> list[tuple[str, list[dict[str, Any]]]]:
@@ -73,7 +75,7 @@ def tables_of(fitted: Fitted) -> list[Table]:
             tables.append(Table(f"Starts, {way}", heads, cells))
     if len(fitted.ways) > 1 and any(is_shape_key(key) for key in metrics):
         tables.append(_variants(fitted))
-    tables.append(_places(fitted))
+    tables += [_places(fitted), certainty_table(metrics)]
     moves = [[k + _UNITS.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
     if moves:
         tables.append(Table("Moves from the start", ["parameter", "value"], moves))
@@ -83,7 +85,7 @@ def tables_of(fitted: Fitted) -> list[Table]:
 
 
 def _result(run: RunFile, metrics: dict[str, Any]) -> Table:
-    rows: list[list[Any]] = [["how it ended", _ended(metrics)]]
+    rows: list[list[Any]] = [["verdict", metrics["verdict"]], ["why it stopped", _ended(metrics)]]
     if "success" in metrics:
         count, limits = metrics["starts_count"], _limits(run, metrics)
         if count == 1:
@@ -168,6 +170,10 @@ def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
         titled = {titles[key]: maps[number] for key, maps in fitted.maps.items()}
         file = f"spectra_{name}" if name else "spectra"
         found.append(picture(folder, file, plotting.spectrum(titled, sight.grid), note="spectra"))
+    for (name, sight), apart in zip(problem.sights.items(), fitted.residuals, strict=False):
+        figure = plotting.residuals(apart, sight.grid)
+        file = f"residuals_{name}" if name else "residuals"
+        found.append(picture(folder, file, figure, note="residuals"))
     losses = {way: [row["losses"] for row in fits] for way, fits in fitted.ways}
     annealed, notes = annealed_until(run), texts("notes")
     before = metrics["start_loss_sharp"] if annealed else None
@@ -186,7 +192,7 @@ def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
         minima = metrics["landscape"]["local_minima"]["exact"]
         span = {"span_mm": run.landscape.exact_span * 1e3}
         note = notes["landscape"].format(object=run.landscape.object, exact=minima, **span)
-        found.append(Picture("Landscape", (folder.path / "landscape.png").read_bytes(), note))
+        found.append(Picture("Landscape", folder.file("landscape.png").read_bytes(), note))
     return found
 
 
@@ -212,7 +218,7 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
     """What came out, in a sentence or two."""
     count = metrics.get("starts_count", 1)
     which = f"Best of {count} starts: " if count > 1 else ""
-    ended = _ended(metrics)
+    ended, believed = _ended(metrics), texts("verdicts")[metrics["verdict"]]
     many = "joint_error_after_deg" in metrics or count > 1
     if "joint_error_after_deg" in metrics:
         score = f"{which}joints {metrics['joint_error_after_deg']:.1f}° off, mean; {ended}."
@@ -224,11 +230,11 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
         change = f"from {metrics['start_chamfer_m']:.3f} to {metrics['chamfer_m']:.3f} m"
         return f"{which}Chamfer distance {change}; {ended}."
     else:
-        return f"{which}{ended}."
+        return f"{which}{ended}. {believed}"
     limits = _limits(run, metrics)
     if many:
-        return f"{score} {metrics['successes']} of {count} starts end within {limits}."
-    return f"{score} A success is within {limits}: {shown(metrics['success'])}."
+        return f"{score} {metrics['successes']} of {count} starts end within {limits}. {believed}"
+    return f"{score} A success is within {limits}: {shown(metrics['success'])}. {believed}"
 
 
 def _ended(metrics: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from invertwin.cli.recordings import SimulatedData as SimulatedData
 from invertwin.cli.schema.fits import SAMPLED as SAMPLED
 from invertwin.cli.schema.fits import Measures as Measures
+from invertwin.cli.schema.fits import Plan as Plan
 from invertwin.cli.schema.fits import Reconstruct as Reconstruct
 from invertwin.cli.schema.fits import Stage as Stage
 from invertwin.cli.schema.gradcheck import Gradcheck as Gradcheck

@@ -145,6 +145,13 @@ class Measures(Section):
     every: Count = key("steps between two points of the curve", 10)
 
 
+class Plan(Section):
+    """What a plan is compared with, and what it tries."""
+
+    fits: Annotated[int, Ge(0)] = key("simulated fits whose spread it is compared with", 0)
+    candidates: Annotated[Any, OneOf("track")] | None = key("m, positions that may be added", None)
+
+
 class Landscape(Section):
     """Losses along a line through the truth: exact signal beside surrogate."""
 

@@ -17,6 +17,7 @@ from invertwin.cli.schema.fits import (
     Landscape,
     Measures,
     Part,
+    Plan,
     Reconstruct,
     Stage,
     Variant,
@@ -29,7 +30,7 @@ from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
-from invertwin.registry.section import InputPath, Section, Seed, Vector, fail, key
+from invertwin.registry.section import InputPath, Section, Seed, Vector, Words, fail, key
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "whole", "seen", "count", "m", "number", "consistency")
@@ -98,7 +99,7 @@ class _RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
     task: Annotated[str, NameOf("task")] = key("what the file is for")
-    title: str = key("heading of the report", "")
+    title: Words = key("heading of the report", "")
     note: str = key("shown in the report", "")
     seed: Seed = key("seed of all random numbers", 0)
     scene: dict[str, Annotated[Any, OneOf("object")]] = key("[scene.<name>]: an object each", {})
@@ -117,6 +118,10 @@ class _RunFile(Section):
         "[[parameters]]: what is unknown", []
     )
     starts: AnyStarts | None = key("where fits start; without it where the scene says", None)
+    search: Annotated[Any, OneOf("search")] | None = key(
+        "several poses to begin from at every start; the best end counts", None
+    )
+    plan: Plan | None = key("what `invertwin plan` compares and tries", None)
     initial: AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
     )

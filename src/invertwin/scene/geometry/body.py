@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
-from invertwin.scene.files import read_arrays
 from invertwin.scene.mesh import Mesh, joined
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
 from invertwin.scene.pose import rotation_angle, rotation_from_vector
+from invertwin.untrusted import read_arrays
 
 _DO = "give arrays of one template"
 _ALONE = 0.95  # share of a vertex that a joint moves nearly alone

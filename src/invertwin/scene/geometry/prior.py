@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.scene.checks import ArrayLike, checked_tensor
-from invertwin.scene.files import read_arrays
 from invertwin.scene.geometry.iso_surface import follow, surface_of
 from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
+from invertwin.untrusted import read_arrays
 
 _MODEL = "vehicle_prior.npz"
 _FORMAT = "invertwin shape prior 1"

@@ -138,7 +138,7 @@ class PerfectConductor(_Values, Material):
     antenna, so there it is a narrow lobe around the mirror direction.
 
     Attributes:
-        lobe_width: full width at half maximum of that lobe [rad], in (0, π].
+        lobe_width: full width at half maximum of that lobe [rad], in [3.4e-4, π].
 
     Raises:
         InputError: a width outside its range.
@@ -176,7 +176,7 @@ class RoughDielectric(Medium, Material):
         diffuse: fraction of the reflected power in the Lambertian part, in [0, 1]; the rest goes
             into the lobe.
         lobe_width: full width at half maximum of the lobe around the mirror direction [rad],
-            in (0, π].
+            in [3.4e-4, π].
     """
 
     diffuse: Value = 1.0

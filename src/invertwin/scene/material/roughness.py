@@ -40,7 +40,7 @@ def lobe_exponent(width: Value) -> Float64[Tensor, "*row"]:
     From cos^2p(width/4) = 1/2; log1p keeps narrow lobes accurate.
 
     Raises:
-        InputError: a width outside (0, π].
+        InputError: a width outside [3.4e-4, π].
     """
     checked_value(width, "lobe_width")
     return -math.log(2) / (2 * torch.log1p(-2 * torch.sin(evaluated(width) / 8) ** 2))
@@ -53,7 +53,7 @@ def slope_exponent(rms_slope: Value) -> Float64[Tensor, "*row"]:
     gentle slopes that is exp(−tan²β/m²), the distribution of Gaussian slopes (Beckmann).
 
     Args:
-        rms_slope: root mean square of the height's gradient, in (0, 1].
+        rms_slope: root mean square of the height's gradient, in [1e-4, 1].
 
     Raises:
         InputError: a slope outside its range.
@@ -93,8 +93,8 @@ class EffectiveRoughness:
 
     Attributes:
         scattering: S in [0, 1]; the share S² of the reflected power is scattered.
-        rms_slope: root mean square slope of the surface, in (0, 1]; it makes the width of the lobe
-            that holds the rest (`slope_exponent`).
+        rms_slope: root mean square slope of the surface, in [1e-4, 1]; it makes the width of the
+            lobe that holds the rest (`slope_exponent`).
         lambertian: share of the scattered power that goes in all directions alike, in [0, 1].
         directive: share Λ of the rest that goes into the directive lobe about the mirror direction;
             what is left goes back towards the source. In [0, 1].

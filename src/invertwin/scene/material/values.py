@@ -120,14 +120,14 @@ RANGES: Mapping[str, Range] = {
     "loss_tangent": Range("loss tangent", 0.0),
     "thickness": Range("thickness [m]", 0.0),
     "diffuse": Range("diffuse fraction", 0.0, 1.0),
-    "lobe_width": Range("lobe width [rad]", 0.0, math.pi, open_low=True),
+    "lobe_width": Range("lobe width [rad]", 3.4e-4, math.pi),
     "scattering": Range("scattering coefficient", 0.0, 1.0),
-    "rms_slope": Range("rms slope", 0.0, 1.0, open_low=True),
+    "rms_slope": Range("rms slope", 1e-4, 1.0),
     "lambertian": Range("Lambertian share", 0.0, 1.0),
     "directive": Range("directive share", 0.0, 1.0),
-    "directive_exponent": Range("exponent of the directive lobe", 0.0),
-    "backscatter_exponent": Range("exponent of the backscattering lobe", 0.0),
-}
+    "directive_exponent": Range("exponent of the directive lobe", 0.0, 1e8),
+    "backscatter_exponent": Range("exponent of the backscattering lobe", 0.0, 1e8),
+}  # The kernel's float32 holds lobes down to an rms slope of 1e-4.
 """Every value of the library's materials by the name of its field."""
 
 MaterialValue = Annotated[str, Among(tuple(RANGES))]

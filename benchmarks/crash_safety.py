@@ -1,0 +1,267 @@
+"""Kills at random moments, and two runs at once in one folder: nothing is lost, nothing mixed.
+
+    python benchmarks/crash_safety.py [-o DIR] [--kills N] [--pairs N] [--seed N]
+
+Prints a table and writes `metrics.json` into DIR (default `out/crash_safety`). Every case is a
+process that runs one of `COMMANDS` over earlier results of its own, and is killed (`kill -9`) at a
+moment drawn evenly from the time it takes. Then the same command goes on with `--resume` where a
+fit was begun, and with `--overwrite` else.
+
+- `lost`: cases in which a file of the user's was gone or changed, earlier results were not whole
+  while the new ones were unfinished, or the command did not come to its end afterwards.
+- `largest_difference`: of the fitted numbers and signals from those of a run that was not killed
+  [m, relative for signals].
+- `kills`: cases that were killed before their end.
+- `mixed`: of two commands at once in one folder, pairs that ended otherwise than with one whole
+  result and one refusal in one line, or with two whole results one after the other.
+- `pairs`: pairs of them.
+"""
+
+import argparse
+import json
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from report import MetricTable, Required, write
+
+from invertwin.capture import Capture
+from invertwin.folders import UNFINISHED
+
+KILLS, PAIRS, SECONDS = 100, 20, 900.0
+REQUIRED: Required = {
+    "lost": ("<=", 0),
+    "largest_difference": ("<=", 1e-6),
+    "mixed": ("<=", 0),
+}
+COUNTED = {
+    "lost": "cases with something lost, or that did not go on",
+    "largest_difference": "from runs that were not killed [m, or relative]",
+    "kills": "cases killed before their end",
+    "mixed": "pairs that mixed their results",
+    "pairs": "pairs in one folder at once",
+}
+RUN = """
+task = "reconstruct"
+seed = 1
+
+[scene.ball]
+shape = "sphere"
+radius = 0.15
+position = [0.0, 0.0, 2.0]
+material = { kind = "rough_dielectric", permittivity = 4.0 }
+
+[truth.ball]
+position = [0.03, 0.0, 2.04]
+
+[radar]
+waveform = { kind = "fmcw", start_frequency = 77e9, bandwidth = 2e9, duration = 5e-5, samples = 64 }
+transmitters = { kind = "positions", positions = [[0.0, 0.0, 0.0]] }
+receivers = { kind = "linear", count = 8, spacing = 1.92e-3 }
+positions = { kind = "grid", center = [0.0, 0.0, 0.0], size = [1.0, 0.4], count = [2, 1] }
+
+[grid]
+range_min = 1.4
+range_max = 2.8
+u_max = 0.5
+
+[data]
+kind = "simulated"
+points_per_m2 = 1e3
+snr_db = 20.0
+depth = 1
+
+[[parameters]]
+kind = "translation"
+object = "ball"
+axes = ["x", "z"]
+
+[loss]
+kind = "likelihood"
+
+[surrogate]
+range_width = 3.0
+angle_width = 1.0
+
+[optimizer]
+rate = 0.004
+
+[reconstruct]
+steps = 8
+depth = 1
+samples = 4_000
+boundary_samples = 1_000
+checkpoint_every = 1
+"""
+MANY = RUN + '\n[starts]\nobject = "ball"\ncount = 2\ndistance = [0.03, 0.05]\naxes = ["x", "z"]\n'
+STAGED = (
+    RUN + "\n[[stages]]\nreconstruct = { steps = 4 }\n\n[[stages]]\nreconstruct = { steps = 3 }\n"
+)
+#: By name: the run file, and the arguments before its folder.
+COMMANDS = {
+    "reconstruct": (RUN, ["reconstruct", "reconstruct.toml"]),
+    "starts": (MANY, ["reconstruct", "starts.toml"]),
+    "stages": (STAGED, ["reconstruct", "stages.toml"]),
+    "simulate": (RUN.replace("reconstruct", "simulate", 1), ["simulate", "simulate.toml"]),
+    "train-prior": ("", ["train-prior", "--cars", "100", "--latent", "4", "--epochs", "2"]),
+}
+OWN = "notes.txt"  # a file of the user's
+
+
+def command(name: str, out: Path, *more: str) -> list[str]:
+    """The command line of a case."""
+    call = "from invertwin.cli.app import main; main()"
+    return [sys.executable, "-c", call, *COMMANDS[name][1], "-o", str(out), *more]
+
+
+def ended(name: str, out: Path, *more: str) -> tuple[int, str]:
+    """Exit code and errors of a command that is left to its end."""
+    done = subprocess.run(
+        command(name, out, *more),
+        cwd=out.parent,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=SECONDS,
+    )
+    return done.returncode, done.stderr
+
+
+def results(out: Path) -> dict[str, bytes]:
+    """The files of a folder, without those of a run in progress."""
+    files = [path for path in out.rglob("*") if path.is_file()]
+    found = {str(path.relative_to(out)): path.read_bytes() for path in files}
+    return {k: v for k, v in found.items() if not k.startswith((".invertwin", UNFINISHED))}
+
+
+def numbers(out: Path) -> list[np.ndarray]:
+    """What a run found, as numbers that another run of it must find again."""
+    metrics = json.loads((out / "metrics.json").read_text())
+    if (out / "capture.nc").exists():
+        beat = Capture.load(out / "capture.nc").beat.numpy()
+        return [beat / np.abs(beat).max()]
+    if "starts" not in metrics:
+        return [np.array(metrics["held_out_error_m"])]
+    return [np.array(row["values"][key]) for row in metrics["starts"] for key in row["values"]]
+
+
+def difference(out: Path, whole: Sequence[np.ndarray]) -> float:
+    """The largest of a number."""
+    found = numbers(out)
+    if [a.shape for a in found] != [b.shape for b in whole]:
+        return math.inf
+    return max(float(np.abs(a - b).max()) for a, b in zip(found, whole, strict=True))
+
+
+class Case:
+    """A command with its run file, made once without a kill: its results, numbers and time."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        self.name, self.out = name, folder / name
+        if COMMANDS[name][0]:
+            (folder / COMMANDS[name][1][1]).write_text(COMMANDS[name][0])
+        for more in ((), ("--overwrite",)):  # the second time kernels are in the cache
+            begun = time.monotonic()
+            code, said = ended(name, self.out, *more)
+            assert code == 0, said
+        self.seconds = time.monotonic() - begun
+        self.numbers = numbers(self.out)
+        (self.out / OWN).write_text("mine")
+
+    def killed(self, share: float) -> tuple[bool, bool, float]:
+        """Whether a kill came before the end, whether something was lost, and the difference."""
+        before = results(self.out)
+        process = subprocess.Popen(
+            command(self.name, self.out, "--overwrite"),
+            cwd=self.out.parent,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            process.wait(share * self.seconds)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+        after = results(self.out)
+        whole = after == before or process.returncode == 0
+        # A kill amid the moves leaves files of both; the next command finishes them.
+        begun = (self.out / UNFINISHED).exists()
+        resumes = self.name not in ("simulate", "train-prior")
+        code, said = ended(self.name, self.out, "--resume" if begun and resumes else "--overwrite")
+        moving = begun and not whole
+        lost = code != 0 or not (whole or moving) or (self.out / OWN).read_text() != "mine"
+        if code:
+            print(f"{self.name}, killed after {share * self.seconds:.2f} s: {said}")
+        return process.returncode != 0, lost, difference(self.out, self.numbers)
+
+    def together(self, random_moment: float) -> bool:
+        """Whether two of the command at once in one folder mix their results."""
+        processes = []
+        for delay in (0.0, random_moment):
+            time.sleep(delay)
+            processes.append(
+                subprocess.Popen(
+                    command(self.name, self.out, "--overwrite"),
+                    cwd=self.out.parent,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                )
+            )
+        said = [process.communicate(timeout=SECONDS)[1] for process in processes]
+        codes = [process.returncode for process in processes]
+        refused = [text for code, text in zip(codes, said, strict=True) if code]
+        clean = 0 in codes and all(
+            text.count("\n") == 1 and "no other run uses" in text for text in refused
+        )
+        left = (self.out / UNFINISHED).exists() or (self.out / OWN).read_text() != "mine"
+        mixed = not clean or left or difference(self.out, self.numbers) > 1e-6
+        if mixed:
+            print(f"{self.name}, two at once: {codes} {said}")
+        return mixed
+
+
+def measure(kills: int, pairs: int, seed: int) -> dict[str, Any]:
+    """All cases, in a folder that is gone afterwards."""
+    moments, found = random.Random(seed), []
+    with tempfile.TemporaryDirectory() as scratch:
+        cases = [Case(name, Path(scratch)) for name in COMMANDS]
+        for k in range(kills):
+            found.append(cases[k % len(cases)].killed(moments.random()))
+        mixed = [cases[k % 3].together(moments.random() * 2) for k in range(pairs)]
+    return {
+        "lost": sum(lost for _, lost, _ in found),
+        "largest_difference": max((apart for _, _, apart in found), default=None),
+        "kills": sum(killed for killed, _, _ in found),
+        "mixed": sum(mixed),
+        "pairs": pairs,
+    }
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/crash_safety"))
+    parser.add_argument("--kills", type=int, default=KILLS)
+    parser.add_argument("--pairs", type=int, default=PAIRS)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)
+    metrics = measure(given.kills, given.pairs, given.seed)
+    table = MetricTable("Crash safety", REQUIRED)
+    for key, text in COUNTED.items():
+        table.row(key, metrics[key], ".3g", text)
+    write(metrics, table.grid, given.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,329 @@
+"""Boundary paths of the curves in which surfaces meet: what lies behind the other is hidden.
+
+With both unit normals turned to where a path comes from, each surface is seen on the side that the
+other's normal points to. As θ moves, the curve sweeps ``n_B · (x_A − x_B) / |n_A × n_B|`` of the
+surface A per metre, with the material points x_A and x_B of the curve's point; B likewise
+(derivations §3). Any vertex of a path may lie on the curve.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from invertwin.channel.power import integrand, walk
+from invertwin.channel.power.bins import Contribution
+from invertwin.channel.power.edges import Drawn, Proportional, barycentric, place_along
+from invertwin.channel.power.integrand import Inputs, Place
+from invertwin.channel.power.passage import Passage, land, passage
+from invertwin.channel.power.walk import State, Walk
+from invertwin.channel.rays.arrays import (
+    opaque,
+    point_at,
+    scrambled,
+    to_index,
+    to_points,
+    uniform_pair,
+)
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.contacts import Contacts
+from invertwin.channel.rays.scene import NEAR, RayScene
+from invertwin.errors import InputError
+
+_LOOKED_AT = 65_536  # points that tell whether paths run between surfaces that meet
+_ACUTE = -0.98  # least cosine between the normals of surfaces between which rays start
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A point of a surface.
+
+    Attributes:
+        face: Triangle.
+        b1, b2: Barycentric coordinates.
+    """
+
+    face: Any
+    b1: Any
+    b2: Any
+
+    def place(self, inputs: Inputs, active: Any = True) -> Place:
+        """Where it is.
+
+        Args:
+            inputs: Tables of the kernel.
+            active: Lanes.
+        """
+        return integrand.place(inputs, self.face, self.b1, self.b2, active)
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """What is drawn of points of the curve.
+
+    Attributes:
+        index: Number of the sample.
+        frame: Radar pose.
+        weight: One over (samples × probability per metre).
+        transmittance, extra: Of the sheets on the way to where the path comes from.
+    """
+
+    index: Any
+    frame: Any
+    weight: Any
+    transmittance: Any
+    extra: Any
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Points of the curve.
+
+    Attributes:
+        drawn: What is drawn of them.
+        first, second: On either surface.
+        source: The surface points from which paths come, if not from an antenna.
+    """
+
+    drawn: Crossing
+    first: Spot
+    second: Spot
+    source: Spot
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return dr.width(self.drawn.index)
+
+
+class ContactSampler:
+    """Points of the curves in which surfaces meet, and where paths come from that pass there."""
+
+    def __init__(
+        self,
+        rays: RayScene,
+        inputs: Inputs,
+        contacts: Contacts,
+        samples: int,
+        depth: int,
+        seed: int,
+    ) -> None:
+        """Prepare the choice of segments.
+
+        Args:
+            rays: The scene and its antennas.
+            inputs: Detached tables.
+            contacts: Segments of the curves.
+            samples: How many points are drawn.
+            depth: Most vertices of a path.
+            seed: Of the points.
+        """
+        self.rays, self.inputs, self.size, self.depth = rays, inputs, samples, depth
+        ends = [(end - rays.origin).float() for end in (contacts.start, contacts.end)]
+        self.ends = list(map(to_points, ends))
+        self.faces = [to_index(face) for face in (contacts.first, contacts.second)]
+        self.segments = len(contacts.first)
+        entries = dr.arange(mi.UInt32, self.segments * rays.link.frame_count)
+        start, offset, frame = self._segment(entries)
+        legs = [dr.norm(start + 0.5 * offset - point_at(t, frame)) for t in (rays.tx, rays.rx)]
+        self.choice = Proportional(dr.norm(offset) / (legs[0] * legs[1]))
+        self.seeds = [scrambled(seed, stream) for stream in (12, 13, 14)]
+
+    def _segment(self, entry: Any) -> tuple[Any, Any, Any]:
+        start, end = (point_at(ends, entry % self.segments) for ends in self.ends)
+        return start, end - start, entry // self.segments
+
+    def draw(self, index: Any) -> Drawn:
+        """The samples of the given indices below ``size``; those out of sight are void."""
+        rays, inputs, deep = self.rays, self.inputs, self.depth > 1
+        entry, along, chance = place_along(self.choice, index, self.size, self.seeds[0])
+        start, offset, frame = self._segment(entry)
+        x, valid = start + offset * along, chance > 0
+        spots = []
+        for faces in self.faces:
+            face = dr.gather(mi.UInt32, faces, entry % self.segments)
+            spots.append(Spot(face, *barycentric(x, *rays.corners(face))))
+        places = [spot.place(inputs) for spot in spots]
+        normals = [place.normal for place in places]
+        count, receiver = parts(index, self.depth)
+        antenna = inputs.antenna(frame, receiver)
+        way = dr.normalize(antenna - x)
+        if deep:
+            numbers = mi.Point2f(*uniform_pair(index, self.seeds[1]))
+            sphere = mi.Vector3f(mi.warp.square_to_uniform_sphere(numbers))
+            way = dr.select(count > 0, sphere, way)
+        origin = _beside(places[0], normals, way).position
+        seen = passage(rays, inputs, origin, antenna, valid & (count == 0))
+        exists, transmittance, extra = seen.transmittance > 0, seen.transmittance, seen.extra
+        odds, source = mi.Float(1.0), Spot(mi.UInt32(0), mi.Float(0.0), mi.Float(0.0))
+        if deep:
+            ray, key = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(way)), (index, self.seeds[2])
+            hit = land(rays, inputs, ray, valid & (count > 0), key, coherent=False)
+            exists, odds, source = exists | hit.valid, hit.chance, Spot(hit.face, hit.b1, hit.b2)
+            transmittance = dr.select(count > 0, hit.transmittance, transmittance)
+            extra = dr.select(count > 0, hit.extra, extra)
+        weight = dr.norm(offset) / (chance * self.size * odds)
+        drawn = Crossing(index, frame, weight, transmittance, extra)
+        return Drawn(valid & exists, (drawn, *spots, source), Meeting)
+
+
+def parts(index: Any, depth: int) -> tuple[Any, Any]:
+    """How many surface points a path comes from, and whether it comes from the receiver.
+
+    Args:
+        index: Number of the sample.
+        depth: Most vertices of a path.
+    """
+    if depth == 1:
+        return mi.UInt32(0), False
+    return (index // 2) % opaque(depth), (index % 2) == 1
+
+
+def _beside(place: Place, normals: Sequence[Any], way: Any) -> Place:
+    """The place a little off both surfaces, in the wedge between them that a direction leads to."""
+    first, second = (dr.mulsign(normal, dr.dot(normal, way)) for normal in normals)
+    step = 2 * NEAR * dr.norm(place.position) / (1 + dr.maximum(dr.dot(first, second), _ACUTE))
+    return replace(place, position=place.position + (first + second) * step)
+
+
+def contact_paths(
+    rays: RayScene, inputs: Inputs, walker: Walk, found: Meeting, depth: int
+) -> Iterator[tuple[Any, State, Callable[..., State]]]:
+    """Speed, state and walk (see ``BoundaryPaths``) of the paths with a vertex on the curve.
+
+    Args:
+        rays: The scene and its antennas.
+        inputs: Attached tables.
+        walker: Continues the paths.
+        found: Points of the curve.
+        depth: Most vertices of a path.
+    """
+    fixed, drawn, spots = inputs.detached(), found.drawn, (found.first, found.second)
+    frame, index = drawn.frame, drawn.index
+    places = [spot.place(fixed) for spot in spots]
+    count, at_receiver = parts(index, depth)
+    shared = rays.link.shared_visibility and depth == 1
+    other_end = True if depth == 1 else ~at_receiver
+    back, distance = integrand.segment(places[0].position, fixed.antenna(frame, at_receiver))
+    seen = integrand.to_radar(fixed, frame, -back)
+    throughput = fixed.gain(frame, at_receiver, seen) / dr.square(distance)
+    length, more = distance + drawn.extra, {}
+    if depth > 1:
+        source, deep = found.source.place(fixed, count > 0), count > 0
+        way, step = integrand.segment(places[0].position, source.position)
+        inside = integrand.medium(fixed, places[0], source, way, deep)
+        odds = dr.abs(dr.dot(source.normal, way)) / (4 * dr.pi)
+        kept = dr.select(deep & (odds > 0), dr.exp(-inside.attenuation * step) / odds, 0.0)
+        first = walk.start(
+            index, frame, found.source.face, found.source.b1, found.source.b2, -way,
+            kept, inside.index * step + drawn.extra,
+        )  # fmt: skip
+        done = walker.ended(first, count, at_receiver)
+        back, throughput = dr.select(deep, way, back), dr.select(deep, done["amount"], throughput)
+        length = dr.select(deep, done["so_far"], length)
+        more = {
+            "to_receiver": other_end,
+            "u": dr.select(deep, done["u"], seen.x),
+            "v": dr.select(deep, done["v"], seen.y),
+        }
+    normals = [place.normal for place in places]
+    throughput *= fixed.scale * depth * drawn.transmittance
+    for own, other in ((0, 1), (1, 0)):
+        here, hiding = places[own], places[other]
+        facing = dr.mulsign(hiding.normal, dr.dot(hiding.normal, back))
+        sine = dr.norm(dr.cross(here.normal, hiding.normal))
+        for sign in (1.0, -1.0) if fixed.surfaces.sheets else (1.0,):
+            through = partial(_through, fixed, hiding, facing * sign)
+
+            def run(
+                state: State,
+                visit: Callable[[State, Contribution, Any], None],
+                here: Place = here,
+                through: Callable[[Any], tuple[Any, Any]] = through,
+            ) -> State:
+                end = fixed.antenna(frame, at_receiver if shared else other_end)
+                onwards, _ = integrand.segment(here.position, end)
+                point = _beside(here, normals, onwards)
+                path, exists = walk.connect(rays, fixed, state, point, other_end, shared=shared)
+                let, longer = through(onwards)
+                path = replace(path, power=path.power * let, range=path.range + 0.5 * longer)
+                visit(state, path, exists & (let > 0))
+                if depth == 1:
+                    return state
+
+                def connected(state: State, point: Place) -> None:
+                    end = state["to_receiver"]
+                    visit(state, *walk.connect(rays, fixed, state, point, end))
+
+                state["active"] &= count + 1 < opaque(depth)
+                state = walker.step(state, _beside(here, normals, back))
+                let, longer = through(-state["back"])
+                state["active"] &= let > 0
+                state["throughput"] = state["throughput"] * let
+                state["length"] = state["length"] + longer
+                return walker.run(state, opaque(depth) - count, connected)
+
+            let, longer = through(back)
+            state = walk.start(
+                index + (1 << 29), frame, spots[own].face, spots[own].b1, spots[own].b2, back,
+                throughput=throughput * let * sign,
+                length=length + longer,
+                passed=Passage(drawn.transmittance, drawn.extra) if shared else None,
+            )  # fmt: skip
+            apart = spots[own].place(inputs).position - spots[other].place(inputs).position
+            speed = dr.dot(facing, apart) * (drawn.weight / sine)
+            yield speed, state | more, run
+
+
+def _through(fixed: Inputs, sheet: Place, facing: Any, way: Any) -> tuple[Any, Any]:
+    """What a surface lets through of a way to its back, and the length that this adds."""
+    cosine = dr.dot(facing, way)
+    if not fixed.surfaces.sheets:
+        return dr.select(cosine > 0, 1.0, 0.0), mi.Float(0.0)
+    let, longer = fixed.surfaces.through(sheet.surface, dr.abs(cosine))
+    return dr.select(cosine > 0, 1.0, let), dr.select(cosine > 0, 0.0, longer)
+
+
+def require_unlit(
+    rays: RayScene, fixed: Inputs, walker: Walk, contacts: Contacts, depth: int, seed: int
+) -> None:
+    """Refuse paths between surfaces that meet: the derivative of such paths does not converge.
+
+    There are some wherever a path with one vertex less runs by way of the curve and both surfaces
+    scatter it.
+
+    Args:
+        rays: The scene and its antennas.
+        fixed: Detached tables.
+        walker: Continues the paths.
+        contacts: Where surfaces meet.
+        depth: Most vertices of a path.
+        seed: Of the points on the curve.
+
+    Raises:
+        InputError: There are such paths.
+    """
+    sampler = ContactSampler(rays, fixed, contacts, _LOOKED_AT, depth - 1, seed)
+    found = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept()
+    if not dr.width(found.drawn.index):
+        return
+    lit = [dr.zeros(mi.Bool, dr.width(found.drawn.index)) for _ in range(2)]
+
+    for number, (_, state, run) in enumerate(contact_paths(rays, fixed, walker, found, depth - 1)):
+
+        def visit(state: State, _: Contribution, exists: Any) -> None:
+            state["lit"] = state["lit"] | exists
+
+        state["lit"] = dr.zeros(mi.Bool, dr.width(found.drawn.index))
+        lit[number % 2] |= run(state, visit)["lit"]
+    both = lit[0] | lit[1] if fixed.surfaces.sheets else lit[0] & lit[1]
+    lanes = dr.compress(both)
+    if dr.width(lanes):
+        faces = [dr.gather(mi.UInt32, spot.face, lanes[0]) for spot in (found.first, found.second)]
+        owners = [int(rays.topology.face_object[int(face[0])]) for face in faces]
+        names = " and ".join(dict.fromkeys(rays.geometry.names[owner] for owner in owners))
+        raise InputError(
+            f"expected no paths between surfaces that meet and move past each other, got {names} "
+            f"at depth {depth}: the derivative of such paths does not converge; leave a gap, take "
+            f"depth {depth - 1}, or contacts=False in Sampling, which leaves out what moves there"
+        )

@@ -1,0 +1,215 @@
+"""Where surfaces meet: the segments that pairs of triangles have in common, in float64.
+
+Edges are rays through the tree: each end of such a segment is where an edge of one triangle meets
+the other. The tree, in float32, only proposes pairs; float64 decides (derivations §3).
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.rays.arrays import point_at, to_index, to_torch
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.scene import NEAR, RayScene
+from invertwin.channel.rays.topology import Topology
+
+IN_PLANE = 1e-9  # closer than this to a plane [m] is in it
+_FLAT = 1e-7  # least sine of the angle between two planes that cross
+_BEYOND = 4e-7  # how far an edge's ray goes beyond its ends, relative to their coordinates
+_MOST = 64  # surfaces that an edge may pass
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Segments that two triangles have in common.
+
+    Attributes:
+        first, second: The triangles.
+        start, end: Of the segments, in the world [m].
+        touching: Where one surface ends in the other: no segment of a crossing.
+        close: Whether two objects are so close that one's edges may lie in the other.
+    """
+
+    first: Int64[Tensor, " n"]
+    second: Int64[Tensor, " n"]
+    start: Float64[Tensor, "n 3"]
+    end: Float64[Tensor, "n 3"]
+    touching: Bool[Tensor, " n"]
+    close: bool = False
+
+    def chosen(self, mask: Bool[Tensor, " n"]) -> "Contacts":
+        """Some of them."""
+        rows = {k: v[mask] for k, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **rows)
+
+
+def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
+    """Which objects' boxes overlap while one moves past the other, and where, per object.
+
+    An object meets itself where its own shape changes.
+
+    Args:
+        geometry: The scene.
+    """
+    count = len(geometry.moving)
+    owner = geometry.topology.vertex_object[:, None].expand(-1, 3)
+    points = geometry.vertices.detach()
+    reduced = (
+        points.new_zeros(count, 3).scatter_reduce(0, owner, points, how, include_self=False)
+        for how in ("amin", "amax")
+    )
+    low, high = reduced
+    margin = 1e-5 * (high - low).amax().clamp_min(1.0)
+    low, high = low - margin, high + margin
+    moving, deforming = (torch.tensor(flags) for flags in (geometry.moving, geometry.deforming))
+    pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
+    pairs &= ((low[:, None] <= high) & (low <= high[:, None])).all(2)
+    place = torch.where(pairs[..., None], torch.maximum(low[:, None], low), torch.inf).amin(1)
+    until = torch.where(pairs[..., None], torch.minimum(high[:, None], high), -torch.inf).amax(1)
+    return pairs, place, until
+
+
+def contacts_of(rays: RayScene) -> Contacts | None:
+    """All segments in which surfaces meet that move past each other; None if none can.
+
+    Args:
+        rays: The scene.
+    """
+    geometry, topology = rays.geometry, rays.topology
+    if not any(geometry.moving):
+        return None
+    pairs, low, high = may_meet(geometry)
+    if not bool(pairs.any()):
+        return None
+    points = geometry.vertices.detach()
+    owner = topology.vertex_object[topology.edges[:, 0]]
+    ends = points[topology.edges]
+    inside = (ends.amin(1) <= high[owner]) & (ends.amax(1) >= low[owner])
+    edges = torch.nonzero(inside.all(1))[:, 0]
+    others = pairs.clone().fill_diagonal_(False).any(1)
+    edge, face = _passed(rays, edges, others[owner[edges]])
+    beside, face = topology.beside[edge], face[:, None].expand(-1, topology.beside.shape[1])
+    pairs_met = torch.stack([beside[beside >= 0], face[beside >= 0]])
+    seen, parts = torch.zeros(0, dtype=torch.int64), []
+    while True:
+        # Where rays slip through a seam, the curve leads on: neighbours of a pair that meets.
+        couple = pairs_met.sort(0).values
+        key = (couple[0] * len(geometry.faces) + couple[1]).unique()
+        key = key[~torch.isin(key, seen)]
+        seen = torch.cat([seen, key])
+        first, second = key // len(geometry.faces), key % len(geometry.faces)
+        met = pairs[geometry.face_object[first], geometry.face_object[second]]
+        corners = topology.welded[first], topology.welded[second]
+        met &= ~(corners[0][:, :, None] == corners[1][:, None]).flatten(1).any(1)
+        found = _common(points, topology, first[met], second[met])
+        parts.append(found)
+        if not len(found.first):
+            break
+        around = [topology.around(face) for face in (found.first, found.second)]
+        pairs_met = torch.stack(torch.broadcast_tensors(around[0][:, :, None], around[1][:, None]))
+        pairs_met = pairs_met.flatten(1)
+        pairs_met = pairs_met[:, (pairs_met >= 0).all(0)]
+    rows = {
+        name: torch.cat([getattr(part, name) for part in parts])
+        for name, value in vars(found).items()
+        if isinstance(value, Tensor)
+    }
+    return Contacts(**rows, close=bool(others.any()))
+
+
+def _passed(
+    rays: RayScene, edges: Int64[Tensor, " n"], beyond: Bool[Tensor, " n"]
+) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
+    """Edges and the triangles that they pass, one row each; some a little beyond their ends."""
+    # Both ways, so that of two surfaces close to each other neither hides the other.
+    edge = to_index(torch.cat([edges, edges[beyond]]))
+    longer = to_index(torch.cat([beyond, beyond[beyond]])) > 0
+    back = dr.arange(mi.UInt32, dr.width(edge)) >= len(edges)
+    y0, y1 = (
+        point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
+        for ends in rays.topology.device_edges
+    )
+    start, offset = dr.select(back, y1, y0), dr.select(back, y0 - y1, y1 - y0)
+    step = _BEYOND * (dr.norm(y0) + dr.norm(y1)) / dr.maximum(dr.norm(offset), 1e-30)
+    step = dr.minimum(step + NEAR, 0.5)
+    at = dr.select(longer, -step, NEAR)
+    until = dr.select(longer, 1 + step, 1 - NEAR)
+    rows, faces = [edges[:0]], [edges[:0]]
+    for _ in range(_MOST):
+        ray = mi.Ray3f(mi.Point3f(start + offset * at), mi.Vector3f(offset), until - at, 0.0, [])
+        hit = rays.scene.ray_intersect_preliminary(ray, active=at < until)
+        at = at + hit.t + step
+        lanes = dr.compress(hit.is_valid())
+        if not dr.width(lanes):
+            break
+        face = dr.gather(mi.UInt32, hit.prim_index, lanes)
+        edge, start, offset, at, until, step = (
+            dr.gather(type(value), value, lanes)
+            for value in (edge, mi.Point3f(start), mi.Vector3f(offset), at, until, step)
+        )
+        rows.append(to_torch(mi.Int32(edge)).long())
+        faces.append(to_torch(mi.Int32(face)).long())
+    return torch.cat(rows), torch.cat(faces)
+
+
+def _common(
+    points: Float64[Tensor, "v 3"],
+    topology: Topology,
+    first: Int64[Tensor, " n"],
+    second: Int64[Tensor, " n"],
+) -> Contacts:
+    """What pairs of triangles have in common, where it is a segment."""
+    faces = first, second
+    triangles = [points[topology.welded[face]] for face in faces]
+    normals = [_unit(torch.linalg.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])) for t in triangles]
+    line = torch.linalg.cross(normals[0], normals[1])
+    kept = line.norm(dim=1) > _FLAT
+    line = _unit(line)
+    sides, spans, touching = [], [], torch.zeros(len(first), dtype=torch.bool)
+    for own, other in ((0, 1), (1, 0)):
+        plane, normal = triangles[other][:, 0], normals[other]
+        height = ((triangles[own] - plane[:, None]) * normal[:, None]).sum(2)
+        height = torch.where(height.abs() < IN_PLANE, 0.0, height)
+        kept &= (height.amin(1) <= 0) & (height.amax(1) >= 0)
+        # An edge in the plane: the surface crosses there if it goes on to the plane's other side.
+        lies = (height == 0).sum(1) == 2
+        apex = height.abs().argmax(1, keepdim=True)
+        edge = topology.face_edges[faces[own]].gather(1, apex)[:, 0]
+        nearby = topology.opposite[edge.clamp_min(0)]
+        there = ((points[nearby.clamp_min(0)] - plane[:, None]) * normal[:, None]).sum(2)
+        mine = height.gather(1, apex)
+        across = ((nearby >= 0) & (there * mine < 0) & (there.abs() >= IN_PLANE)).any(1)
+        touching |= lies & ~across
+        kept &= ~(lies & across & (mine[:, 0] > 0))  # the triangle on the other side has it
+        sides.append(height)
+        spans.append(_span(triangles[own], height, line))
+    (low, high, place), (others_low, others_high, _) = spans
+    low, high = torch.maximum(low, others_low), torch.minimum(high, others_high)
+    kept &= high > low
+    at = (place * line).sum(1)
+    ends = (place + line * (value - at)[:, None] for value in (low, high))
+    start, end = (value[kept] for value in ends)
+    return Contacts(first[kept], second[kept], start, end, touching[kept])
+
+
+def _span(
+    triangle: Float64[Tensor, "n 3 3"], height: Float64[Tensor, "n 3"], line: Float64[Tensor, "n 3"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """From where to where along the line a triangle is in a plane, and a point of it there."""
+    places, there = [*triangle.unbind(1)], [*(height == 0).unbind(1)]
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        share = height[:, i] / (height[:, i] - height[:, j])
+        places.append(triangle[:, i] + (triangle[:, j] - triangle[:, i]) * share[:, None])
+        there.append(height[:, i] * height[:, j] < 0)
+    place, valid = torch.stack(places, 1), torch.stack(there, 1)
+    along = (place * line[:, None]).sum(2)
+    low = torch.where(valid, along, torch.inf).min(1)
+    high = torch.where(valid, along, -torch.inf).amax(1)
+    return low.values, high, place[torch.arange(len(place)), low.indices]
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-300)

@@ -1,0 +1,112 @@
+"""`invertwin plan`: error bars before any recording, and what further positions would add."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from invertwin.cli import build
+from invertwin.cli.fits.certainty import certainty_table
+from invertwin.cli.fits.problem import Problem, another, observations_of, problem_of, unknowns_of
+from invertwin.cli.report import Table, finish, texts
+from invertwin.cli.run_file import need
+from invertwin.cli.schema import Plan, RunFile, SimulatedData
+from invertwin.errors import InputError
+from invertwin.folders import PARTS
+from invertwin.inversion import fit_at, planned
+from invertwin.inversion.certainty import bars
+from invertwin.inversion.planning import missed
+from invertwin.runs import RunFolder
+
+
+def run_plan(
+    run: RunFile, folder: RunFolder, console: Console, say: Callable[[str], None]
+) -> list[Table]:
+    """State the error bars of a run that has not been recorded; return the tables to print.
+
+    Simulated fits that an interrupted run has finished are not done again.
+
+    Raises:
+        InputError: Data that are measured, not simulated; candidates of several sensors.
+    """
+    begin, table = time.perf_counter(), run.plan or Plan()
+    for own in [run, *run.observations.values()]:
+        if own.data is not None and not isinstance(own.data, SimulatedData):
+            raise InputError(
+                f'data.kind: expected "simulated" for a plan, got "{own.data.kind}"; a plan comes '
+                "before the recording: give [radar] and the noise of [data]"
+            )
+    wide, places = run, torch.zeros(0, 3)
+    if table.candidates is not None:
+        radar = need(run, "radar", "positions to add")
+        places = radar.model_copy(update={"positions": table.candidates}).poses(1)[0]
+        every = [*radar.poses(1)[0].tolist(), *places.tolist()]
+        wide = run.model_copy(update={"radar": radar.model_copy(update={"positions": every})})
+    own = problem_of(wide, console)
+    console.print("error bars")
+    found, added = planned(_at_truth(own), len(places))
+    metrics: dict[str, Any] = {"task": "plan", **bars(found), "verdict_reasons": []}
+    first = len(own.first.radar.positions) - len(places)
+    metrics["candidates"] = [
+        {
+            "position": places[one.frame - first].tolist(),
+            "share": one.share,
+            "standard_deviations": one.bars.deviations,
+        }
+        for one in added
+    ]
+    metrics |= _compared(replace(own, run=run), found.deviations, folder, console, say)
+    metrics["wall_seconds"] = time.perf_counter() - begin
+    parts = [replace(certainty_table(metrics), title="Expected error bars")]
+    if added:
+        ranked = enumerate(metrics["candidates"], 1)
+        rows = [[str(rank), row["position"], row["share"]] for rank, row in ranked]
+        heads, note = ("rank", "position [m]", "deviations, times"), texts("notes")["candidates"]
+        parts.append(Table("Positions to add", heads, rows, note))
+    status = f"{len(found.names)} parameters, {len(found.unobserved)} directions not observed."
+    return finish(folder, metrics, run.title or "Plan", status, parts, again="plan", note=run.note)
+
+
+def _at_truth(problem: Problem) -> Any:
+    return fit_at(
+        problem.truth,
+        observations_of(problem),
+        unknowns_of(problem.run),
+        loss=build.made(problem.run, "loss"),
+        seed=problem.run.seed,
+    )
+
+
+def _compared(
+    problem: Problem,
+    stated: dict[str, float],
+    folder: RunFolder,
+    console: Console,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Fits of simulated recordings that begin at the truth, and how far they scatter."""
+    count = problem.run.plan.fits if problem.run.plan else 0
+    if not count:
+        return {}
+    rows, begin, done = [], time.perf_counter(), 0
+    for number in range(count):
+        part = f"{PARTS}/fit_{number:03d}.json"
+        row = folder.read_json(part)
+        if row is None:
+            row = missed(_at_truth(another(problem, number + 1, console)))
+            folder.write_json(part, row)
+            done += 1
+        left = (time.perf_counter() - begin) / max(done, 1) * (count - number - 1)
+        say(f"simulated fit {number + 1} of {count}, {left / 60:.0f} min left")
+        rows.append(row)
+    errors = torch.tensor([list(row.values()) for row in rows], dtype=torch.float64)
+    spread = dict(zip(rows[0], errors.std(0).tolist(), strict=True))
+    return {
+        "simulated_fits": count,
+        "observed_deviations": spread,
+        "observed_means": dict(zip(rows[0], errors.mean(0).tolist(), strict=True)),
+        "predicted_over_observed": {n: stated[n] / spread[n] for n in stated if spread.get(n)},
+    }

@@ -1,0 +1,72 @@
+"""How sure fits are, as numbers: verdict, error bars, and how often these hold."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from invertwin.errors import InputError
+from invertwin.inversion.metrics import residual
+from invertwin.inversion.reconstruction import Reconstruction
+from invertwin.inversion.uncertainty import Uncertainty
+from invertwin.scene.scene import Object
+
+_COORDINATES = ("x", "y", "z", "pitch", "yaw", "roll")
+
+
+def certainty(found: Reconstruction, truth: Mapping[str, Object]) -> dict[str, Any]:
+    """Verdict and error bars of a fit, and how far it is from what is known.
+
+    Args:
+        found: The fit.
+        truth: Objects as they really are, by name.
+    """
+    seen = found.verdict
+    rows: dict[str, Any] = {"verdict": seen.word, "loss_excess": seen.excess}
+    rows |= {"structure_excess": seen.structure, "verdict_reasons": list(seen.reasons)}
+    rows["rivals"] = [{"pose": rival.told, "score": rival.score} for rival in seen.rivals]
+    errors: dict[str, float] = {}
+    for name, item in truth.items():
+        off = residual(found.scene[name], item)
+        if off is not None:
+            values = [*off.offset.tolist(), *off.turn.tolist()]
+            keys = [f"{name}.{coordinate}" for coordinate in _COORDINATES]
+            errors |= dict(zip(keys, values, strict=True))
+    rows |= {"errors": errors} if errors else {}
+    try:
+        return rows | bars(found.uncertainty)
+    except InputError as error:
+        return {**rows, "no_error_bars": str(error)}
+
+
+def bars(found: Uncertainty) -> dict[str, Any]:
+    """Error bars as numbers by name.
+
+    Args:
+        found: The error bars.
+    """
+    return {
+        "standard_deviations": found.deviations,
+        "within_95": found.interval(),
+        "units": dict(zip(found.names, found.units, strict=True)),
+        "correlations": found.correlations,
+        "unobserved": list(found.unobserved),
+    }
+
+
+def coverage(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Over recordings: the share of errors within the error bars, and how large these are.
+
+    Args:
+        rows: Of every recording, what ``certainty`` says.
+    """
+    names = [n for n in rows[0].get("errors", {}) if n in rows[0].get("within_95", {})]
+    hits, ratios = {}, {}
+    for name in names:
+        errors = [row["errors"][name] for row in rows]
+        stated = [row["standard_deviations"][name] for row in rows]
+        inside = [abs(e) <= row["within_95"][name] for e, row in zip(errors, rows, strict=True)]
+        short = name.split(".")[-1]
+        hits[short] = sum(inside) / len(rows)
+        ratios[short] = math.hypot(*stated) / math.hypot(*errors)
+    consistent = sum(row["verdict"] == "consistent" for row in rows) / len(rows)
+    return {"coverage_95": hits, "stated_over_observed": ratios, "called_consistent": consistent}

@@ -1,0 +1,224 @@
+"""Several minima: fits from many starts, and which of their ends the data tell apart."""
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from invertwin.channel import Sampling
+from invertwin.errors import InputError
+from invertwin.inversion.fit import Callback
+from invertwin.inversion.loss import Objective, SpectrumLoss
+from invertwin.inversion.metrics import residual
+from invertwin.inversion.observation import Observation, Unknowns
+from invertwin.inversion.optimizer import Optimizer
+from invertwin.inversion.reconstruction import Reconstruction, reconstruct
+from invertwin.inversion.regularization import Regularizer
+from invertwin.inversion.rivals import REJECTED, same, score, turns, way
+from invertwin.inversion.schedule import Schedule
+from invertwin.inversion.starts import displaced
+from invertwin.limits import Count, Positive
+from invertwin.models import ForwardModel
+from invertwin.scene.checks import Point
+from invertwin.scene.scene import Object, Scene
+from invertwin.seeds import derived_seed
+
+_FITS = 4  # full fits of the best starts
+_FEWER = 8  # samples of a screened start: a share of those of a fit
+_NEAR_PLACE, _NEAR_TURN = 0.1, 0.35  # m and rad: of starts as near one is enough
+
+
+@dataclass(frozen=True)
+class Search:
+    """What fits from many starts have found.
+
+    Attributes:
+        best: The fit with the lowest loss.
+        ends: All ends that differ, the best first.
+        rivals: For every end how unlikely the difference of its loss and the best one's is, were it
+            right, in standard deviations over looks at its twin. None where there are no looks.
+        ambiguities: A sentence for every end that the data do not reject.
+        number: Of the best fit, as ``callbacks`` got it.
+        objects: Names of those with several starts.
+    """
+
+    best: Reconstruction
+    ends: list[Reconstruction]
+    rivals: list[float | None]
+    ambiguities: tuple[str, ...]
+    number: int
+    objects: tuple[str, ...]
+
+    def rows(self) -> dict[str, Any]:
+        """The other ends as numbers: how they differ from the best, loss, score."""
+        best = self.best.scene
+        ends = [
+            {"pose": way(best, end.scene, self.objects), "loss": end.loss, "score": score}
+            for end, score in zip(self.ends[1:], self.rivals[1:], strict=True)
+        ]
+        return {"other_ends": ends, "ambiguities": list(self.ambiguities)}
+
+
+def pose_grid(
+    item: Object,
+    low: Point,
+    high: Point,
+    step: Positive,
+    turns: Count = 4,
+    axis: Point = (0.0, 1.0, 0.0),
+) -> Iterator[Object]:
+    """An object on a coarse grid over a box of poses, as copies of it.
+
+    Args:
+        item: The object.
+        low: m, corner of the box of its centre
+        high: m, the opposite corner
+        step: m, from one place to the next at most
+        turns: about the axis at every place, evenly spread over a whole one
+        axis: of the turns, in the world
+    """
+    axes = [
+        torch.linspace(a, b, 1 + math.ceil((b - a) / step - 1e-9), dtype=torch.float64)
+        for a, b in zip(low, high, strict=True)
+    ]
+    about = 2 * math.pi / turns * torch.tensor(axis, dtype=torch.float64)
+    for place, turn in product(torch.cartesian_prod(*axes), range(turns)):
+        yield displaced(item, place - item.center.detach(), turn * about)
+
+
+def search(
+    scene: Scene,
+    observations: Observation | Sequence[Observation],
+    parameters: Unknowns,
+    starts: Mapping[str, Sequence[Object]],
+    *,
+    loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+    optimizer: Optimizer | None = None,
+    schedule: Schedule | Sequence[Schedule] | None = None,
+    regularizers: Sequence[Regularizer] = (),
+    callbacks: Callable[[int], Sequence[Callback]] = lambda _: (),
+    seed: int = 0,
+) -> Search:
+    """Fit from many starts, and say which ends the data tell apart.
+
+    All starts are compared at the first, widest blur; the best four are fitted. Then the best end
+    is turned as ``rivals.turns`` says, by half a turn first, and fitted again.
+    Ends that differ are compared in pairs with looks at the twin of the worse one: speckle that
+    both losses share cancels in their difference.
+
+    Args:
+        scene: As known. The other arguments are those of ``reconstruct``.
+        observations: What was observed.
+        parameters: Unknowns of the scene; every fit takes a copy.
+        starts: By the name of an object, the poses in which it may begin: given ones, random ones
+            from ``nearby``, or those of ``pose_grid``.
+        loss: How maps are compared.
+        optimizer: Kind and rates.
+        schedule: Of every fit.
+        regularizers: Added to the loss.
+        callbacks: For the number of a fit, from 0, what watches it.
+        seed: Of all random numbers.
+
+    Raises:
+        InputError: No starts; see ``reconstruct``.
+    """
+    names = list(starts)
+    begun = [scene.replace(name, pose=o.transform) for name, all_ in starts.items() for o in all_]
+    if not begun:
+        raise InputError("expected at least one start, got none; give poses of an object")
+    watched = [observations] if isinstance(observations, Observation) else list(observations)
+    rule = loss or SpectrumLoss()
+    screened = sorted(begun, key=_screening(watched, rule, seed))
+
+    def fit(start: Scene, number: int) -> Reconstruction:
+        return reconstruct(
+            start,
+            [replace(o, parameters=copy.deepcopy(o.parameters)) for o in watched],
+            copy.deepcopy(parameters),
+            loss=rule,
+            optimizer=optimizer,
+            schedule=schedule,
+            regularizers=regularizers,
+            callbacks=callbacks(number),
+            seed=derived_seed(seed, number),
+        )
+
+    found = [fit(start, number) for number, start in enumerate(_apart(screened, names))]
+    best = min(found, key=_sharp)
+    for start in _turned(best):
+        found.append(fit(start, len(found)))
+    ends: list[Reconstruction] = []
+    for end in sorted(found, key=_sharp):
+        if not any(same(end.scene, other.scene, names) for other in ends):
+            ends.append(end)
+    rivals = [None if k == 0 else score(ends[0].end, end.end) for k, end in enumerate(ends)]
+    told = tuple(
+        f"{way(ends[0].scene, end.scene, names)} explains the data nearly as well: z = {z:.1f}"
+        for end, z in zip(ends, rivals, strict=True)
+        if z is not None and z < REJECTED
+    )
+    return Search(ends[0], ends, rivals, told, found.index(ends[0]), tuple(names))
+
+
+def _screening(
+    observations: Sequence[Observation], loss: Callable[[Tensor, Tensor], Tensor], seed: int
+) -> Callable[[Scene], float]:
+    """The loss of a scene at the widest blur."""
+    objective = Objective(
+        tuple(o.loss or loss for o in observations), tuple(o.weight for o in observations)
+    )
+    blurred = [o.model.blurred(o.observed(), o.sensor) for o in observations]
+    models = [_coarse(o.model) for o in observations]
+
+    def score(scene: Scene) -> float:
+        with torch.no_grad():
+            drawn = zip(models, observations, strict=True)
+            maps = [model.predict(scene, o.sensor, seed) for model, o in drawn]
+            lit = all(bool(power.any()) for power in maps)
+            pairs = list(zip(maps, blurred, strict=True))
+            return float(objective(pairs)) if lit else math.inf
+
+    return score
+
+
+def _coarse(model: ForwardModel) -> ForwardModel:
+    """The model with few samples: enough for a blurred map."""
+    sampling = getattr(model, "sampling", None)
+    if not isinstance(sampling, Sampling):
+        return model
+    return model.sampled_by(samples=max(1, sampling.samples // _FEWER), boundary=False)
+
+
+def _sharp(found: Reconstruction) -> float:
+    return float(found.end.fit.objective(found.end.maps))
+
+
+def _turned(found: Reconstruction) -> Iterator[Scene]:
+    """The twin with an object turned so that it looks much the same."""
+    none = torch.zeros(3, dtype=torch.float64)
+    for module in found.parameters:
+        for turn in turns(module, found.scene):
+            moved = displaced(found.scene[str(module.object)], none, turn)
+            yield found.scene.replace(str(module.object), pose=moved.transform.detach())
+
+
+def _apart(scenes: Sequence[Scene], names: Sequence[str]) -> list[Scene]:
+    """The first scenes, without those that a better one stands for."""
+    kept: list[Scene] = []
+    for scene in scenes:
+        if len(kept) == _FITS:
+            break
+        if not any(_near(scene, other, names) for other in kept):
+            kept.append(scene)
+    return kept
+
+
+def _near(first: Scene, second: Scene, names: Sequence[str]) -> bool:
+    """Whether one start stands for another."""
+    offs = [residual(first[name], second[name]) for name in names]
+    return all(o and o.distance < _NEAR_PLACE and o.angle < _NEAR_TURN for o in offs)

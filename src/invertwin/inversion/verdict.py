@@ -1,0 +1,147 @@
+"""Whether a fit is to be believed: apart from why it stopped."""
+
+import contextlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from invertwin.channel import Sampling
+from invertwin.errors import InputError
+from invertwin.inversion.draws import End, coarse, zscore
+from invertwin.inversion.rivals import Rival, rivals
+
+Word = Literal["consistent", "inconsistent", "ambiguous", "at a bound", "worse", "lost", "unknown"]
+
+_DOUBT = 3.5  # standard deviations of the loss on looks at the twin
+_MARKED = 5.0  # the same of a coarse bin
+_EMPTY = 1e-3  # of the observed power: a twin that explains less shows nothing
+_DEEPER = 3.0  # standard deviations by which more bounces must lower the loss to be named
+_WORSE = 1.02  # times the loss of the start: more than the noise of samples
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Whether the data look like recordings of the twin.
+
+    A wrong minimum may look right by itself, such as a letter that is turned by half a turn. So
+    the twin is turned in all ways that leave it much the same, fitted again and compared. Other
+    minima are found from several starts (``search``).
+
+    Attributes:
+        word: ``consistent``: nothing speaks against the twin. ``inconsistent``: the data do not
+            look like recordings of it. ``ambiguous``: another pose explains them as well.
+            ``at a bound``: a value is at the end of its range.
+            ``worse``: the fit is worse than its start. ``lost``: the twin shows next to nothing of
+            what was observed, so nothing tells the fit where to go. ``unknown``: the model gives no
+            looks to compare with.
+        excess: The loss of the data above the mean of that of looks at the twin, in their standard
+            deviations; None where there are none.
+        structure: The same of the mean square of ``residuals``, which speckle hardly moves.
+        reasons: What speaks against the twin, in sentences.
+        residuals: For every observation how far its coarse map, summed over frames, is from that
+            of looks, in their standard deviations; beyond 5 is marked in the report.
+        rivals: Ends that look much like this one, with how far the data speak against them.
+    """
+
+    word: Word
+    excess: float | None = None
+    structure: float | None = None
+    reasons: tuple[str, ...] = ()
+    residuals: list[Tensor] = field(default_factory=list)
+    rivals: tuple[Rival, ...] = ()
+
+    @property
+    def consistent(self) -> bool:
+        """Whether nothing speaks against the twin."""
+        return self.word == "consistent"
+
+
+def verdict(end: End) -> Verdict:
+    """Judge the end of a fit.
+
+    Args:
+        end: Of the fit.
+    """
+    fit = end.fit
+    explained = [
+        gain * float(a.mean()) / max(float(b.mean()), 1e-300)
+        for gain, (a, b) in zip(end.gains, end.maps, strict=True)
+    ]
+    if min(explained) < _EMPTY:
+        shown = f"{100 * min(explained):.2g} % of the power of observation {_least(explained)}"
+        return Verdict("lost", reasons=(f"the twin explains {shown}; start nearer to the truth",))
+    loss = float(fit.objective(end.maps))
+    begun = fit.loss_at_start()
+    if loss > _WORSE * begun:
+        return Verdict("worse", reasons=(f"the loss is {loss:.4g}, at the start {begun:.4g}",))
+    bounds = tuple(
+        f"{name} is at the end of its range"
+        for module in fit.modules.modules()
+        for name in getattr(module, "at_bounds", list)()
+    )
+    if end.draws is None:
+        return Verdict("at a bound" if bounds else "unknown", reasons=bounds)
+    excess = zscore(loss, end.draws.losses)
+    residuals, structure = _residuals(end)
+    if max(excess, structure) > _DOUBT:
+        mean = sum(end.draws.losses) / len(end.draws.losses)
+        reasons = [f"the loss is {loss:.4g}, on recordings of the twin itself {mean:.4g}", *bounds]
+        reasons += [text for map_ in enumerate(residuals) if (text := _marked(*map_))]
+        reasons += _deeper(end, loss - _DEEPER * float(torch.tensor(end.draws.losses).std()))
+        return Verdict("inconsistent", excess, structure, tuple(reasons), residuals)
+    others = tuple(rivals(end))
+    open_ = [f"{rival.told} explains the data as well{_score(rival)}" for rival in others]
+    open_ = [text for text, rival in zip(open_, others, strict=True) if not rival.rejected]
+    word: Word = "at a bound" if bounds else "ambiguous" if open_ else "consistent"
+    return Verdict(word, excess, structure, (*bounds, *open_), residuals, others)
+
+
+def _score(rival: Rival) -> str:
+    return "" if rival.score is None else f": z = {rival.score:.1f}"
+
+
+def _deeper(end: End, limit: float) -> Iterator[str]:
+    """Says so if one bounce more explains the data better."""
+    sampling = getattr(end.fit.observations[0].model, "sampling", None)
+    if isinstance(sampling, Sampling):
+        depth = sampling.depth + 1
+        with contextlib.suppress(InputError), torch.no_grad():
+            loss = float(end.fit.objective(end.fit.sharp_maps(0, depth=depth)))
+            if loss < limit:
+                yield f"with depth = {depth} its loss is {loss:.4g}: the fit leaves out bounces"
+
+
+def _least(values: list[float]) -> int:
+    return min(range(len(values)), key=values.__getitem__) + 1
+
+
+def _residuals(end: End) -> tuple[list[Tensor], float]:
+    """For every observation, coarse bins in standard deviations of looks; how large they are."""
+    assert end.draws is not None
+    found, squares = [], []
+    looks = zip(*end.draws.coarse, strict=True)
+    for maps, (_, observed), gain in zip(looks, end.maps, end.gains, strict=True):
+        drawn = torch.stack(maps)
+        mean, spread = drawn.mean(0), drawn.std(0).clamp_min(1e-30)
+        found.append((coarse(observed) / gain - mean) / spread)
+        # A look is part of its own mean, the data are not.
+        count = len(drawn)
+        own = ((drawn - mean) / spread).square() * ((count + 1) / (count - 1))
+        squares.append((found[-1].square().mean(), own.flatten(1).mean(1)))
+    data, drawn = (torch.stack(list(part)).sum(0) for part in zip(*squares, strict=True))
+    return found, zscore(float(data), drawn.tolist())
+
+
+def _marked(number: int, residual: Tensor) -> str:
+    """What a residual map shows."""
+    more, less = int((residual > _MARKED).sum()), int((residual < -_MARKED).sum())
+    if not more + less:
+        return ""
+    return (
+        f"observation {number + 1}: {more} of {math.prod(residual.shape)} coarse bins hold more "
+        f"power than the twin explains, {less} less"
+    )

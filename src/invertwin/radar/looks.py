@@ -1,0 +1,78 @@
+"""Looks: recordings of one scene that differ in the phases of its rough surfaces."""
+
+import math
+
+import torch
+from jaxtyping import Complex64, Float, Float64
+from torch import Tensor
+
+from invertwin.channel import Paths
+from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.spectrum import aperture
+
+_CELLS = 4  # per resolution cell and axis: less than a tenth of a percent of the power is lost
+_SAME = 1e-7  # m: points this near are one point
+
+
+class Looks:
+    """What a radar might record of a scene, quickly: a look costs a few matrix products.
+
+    Every point of a rough surface has a random amplitude, circular and Gaussian, which is the same
+    in all frames. So frames share as much speckle as their poses are near. Points are gathered in
+    cells of range and direction, a quarter of the radar's own, with their exact phases.
+
+    Args:
+        paths: Field paths of rough surfaces, from ``trace_field``.
+        radar: What records them. Its range bias is added.
+    """
+
+    def __init__(self, paths: Paths, radar: Radar) -> None:
+        waveform, array, link = sampled(radar), aperture(radar), radar.link()
+        self._shape, self._array = radar.shape, array
+        places = torch.cat([paths.first, paths.last], dim=1)
+        mixed = places @ torch.sqrt(torch.tensor([2.0, 3, 5, 7, 11, 13], dtype=torch.float64))
+        points, self._point = torch.unique((mixed / _SAME).round(), return_inverse=True)
+        self._count = len(points)
+        way = paths.last - link.rx[paths.frame]
+        way = way / way.norm(dim=1)[:, None]
+        u, v, _ = torch.einsum("ni,nij->jn", way, link.rotations[paths.frame])
+        ranges = paths.range + torch.as_tensor(radar.range_bias).detach()
+        steps = (waveform.range_resolution, *radar.beamwidth)
+        axes = [_axis(x, step / _CELLS) for x, step in zip((ranges, u, v), steps, strict=True)]
+        (ranges, rows), (u, columns), (v, layers) = axes
+        self._cells = len(ranges), len(u), len(v)
+        self._cell = (rows * len(u) + columns) * len(v) + layers
+        turn = 2 * math.pi * waveform.center_frequency * paths.delay - paths.coefficient.angle()
+        self._field = torch.polar(paths.coefficient.abs(), turn).to(torch.complex64)
+        order = torch.argsort(paths.frame, stable=True)
+        counts = torch.bincount(paths.frame, minlength=self._shape[0]).tolist()
+        self._frames = torch.split(order, counts)
+        cycles = torch.arange(waveform.samples) - 0.5 * (waveform.samples - 1)
+        phase = 2 * math.pi * cycles[:, None] * (ranges / waveform.max_range)
+        self._ramp = torch.polar(torch.ones_like(phase), phase).to(torch.complex64)
+        self._across = array.steering(u, array.x).conj().to(torch.complex64)
+        self._up = array.steering(v, array.y).conj().to(torch.complex64)
+
+    def beat(self, seed: int) -> Complex64[Tensor, "frame tx rx sample"]:
+        """The beat signals of one look, without noise.
+
+        Args:
+            seed: Of the look.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        drawn = torch.randn(self._count, dtype=torch.complex64, generator=generator)
+        frames = []
+        for rows in self._frames:
+            cells = torch.zeros(math.prod(self._cells), dtype=torch.complex64)
+            cells.index_add_(0, self._cell[rows], self._field[rows] * drawn[self._point[rows]])
+            plane = torch.einsum("ruy,ux->xyr", cells.view(self._cells) @ self._up, self._across)
+            frames.append(plane[self._array.column, self._array.row] @ self._ramp.T)
+        return torch.stack(frames).unflatten(1, self._shape[1:])
+
+
+def _axis(values: Float64[Tensor, " n"], step: float) -> tuple[Float[Tensor, " cell"], Tensor]:
+    """The cells that hold some values: their centres, and the number of each value's cell."""
+    number = (values / step).round().long()
+    least = number.min() if len(values) else number.new_zeros(())
+    count = int(number.max() - least) + 1 if len(values) else 1
+    return step * (least + torch.arange(count, dtype=torch.float64)), number - least

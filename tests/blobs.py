@@ -1,0 +1,84 @@
+"""A model without rays, whose statistics are known: a blob of power at the place of an object."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from invertwin.channel import Sampling
+from invertwin.inversion import SpectrumLoss
+from invertwin.models import ForwardModel
+from invertwin.scene import Scene, sphere
+from scenes import thing
+
+LAW = SpectrumLoss("likelihood", levels=1, floor=1e-4)
+BINS = torch.linspace(-2.0, 2.0, 200, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Blob(ForwardModel):
+    """Power over x: a Gaussian about the object's centre, over a level; speckle bin by bin.
+
+    Attributes:
+        frames: All alike.
+        known: Whether the model gives looks.
+        even: The sign of x has no effect.
+        sampling: Unused.
+    """
+
+    frames: int = 4
+    known: bool = True
+    even: bool = False
+    sampling: Sampling = Sampling(depth=1, boundary=False)
+
+    def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
+        x = scene["ball"].center[0]
+        power = 0.05 + torch.exp(-((BINS - x) ** 2) / 0.08)
+        if self.even:
+            power = power + torch.exp(-((BINS + x) ** 2) / 0.08)
+        return power.expand(self.frames, -1)[..., None, None]
+
+    def observe(self, recording: Tensor) -> Tensor:
+        return recording
+
+    def looks(self, scene: Scene, sensor: Any, seed: int) -> Callable[[int, float], Tensor] | None:
+        if not self.known:
+            return None
+        mean = self.predict(scene, sensor, seed)
+
+        def look(number: int, noise: float) -> Tensor:
+            torch.manual_seed(number)
+            return (mean + noise) * torch.empty_like(mean).exponential_()
+
+        return look
+
+
+def scene(x: float = 0.0) -> Scene:
+    """A ball at x."""
+    return Scene({"ball": thing(sphere(0.1, 1), (x, 0.0, 1.0))})
+
+
+def deviation(x: float, frames: int) -> float:
+    """The least standard deviation of x that speckle allows: the Cramér–Rao bound."""
+    place = torch.tensor(x, dtype=torch.float64, requires_grad=True)
+
+    def level(value: Tensor) -> Tensor:
+        return (0.05 + torch.exp(-((BINS - value) ** 2) / 0.08)).log()
+
+    slopes = torch.autograd.functional.jacobian(level, place)
+    assert isinstance(slopes, Tensor)
+    # A fitted gain takes what is common to all bins.
+    return float((frames * (slopes - slopes.mean()).square().sum()).rsqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class Needle(Blob):
+    """Shows where the object's own x axis points, but hardly at which end."""
+
+    def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
+        way = scene["ball"].transform[:3, 0]
+        power = 0.05 + sum(torch.exp(-((BINS - s * way[2]) ** 2) / 0.08) for s in (1.0, -1.0))
+        assert isinstance(power, Tensor)
+        return power.expand(self.frames, -1)[..., None, None]

@@ -1,0 +1,64 @@
+"""Verdicts and error bars in run folders, and how often they hold over recordings."""
+
+import pytest
+
+from cli.small import RUN, STARTS, call, read_metrics
+
+
+def test_a_run_states_verdict_and_error_bars(run_file, monkeypatch, capsys):
+    assert call(monkeypatch, "reconstruct", run_file, "-o", "out") == 0
+    metrics = read_metrics(run_file.parent / "out")
+    names = ["plate.x", "plate.y", "plate.z"]
+    assert list(metrics["standard_deviations"]) == names
+    for name in names:
+        ratio = metrics["within_95"][name] / metrics["standard_deviations"][name]
+        assert ratio == pytest.approx(1.998, abs=0.001)
+    # A range cell is 75 mm; two looks at a plate before a wall tell its range to a fraction of it.
+    assert 1e-4 < metrics["standard_deviations"]["plate.z"] < 0.03
+    assert metrics["verdict"] in ("consistent", "inconsistent")
+    assert (metrics["loss_excess"] > 3.5) == (metrics["verdict"] == "inconsistent")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Error bars" in said
+    assert "95 % of errors within" in said
+    assert "recordings of the twin" in said.lower()
+    assert "Error bars" in (run_file.parent / "out" / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_search_about_a_bad_start_finds_the_right_place(run_file, monkeypatch, capsys):
+    search = """
+[search]
+object = "plate"
+kind = "given"
+positions = [[0.02, 0.01, 1.18], [0.4, 0.0, 1.4]]
+
+[loss]
+kind = "likelihood"
+"""
+    begun = RUN.replace("position = [0.0, 0.0, 1.2]", "position = [-0.5, 0.0, 1.45]")
+    run_file.write_text(begun + search)
+    assert call(monkeypatch, "reconstruct", run_file, "-o", "out") == 0
+    metrics = read_metrics(run_file.parent / "out")
+    assert metrics["position_error_m"] < 0.1
+    assert metrics["ambiguities"] == []
+    assert {"pose", "loss", "score"} == set(metrics["other_ends"][0])
+    assert metrics["other_ends"][0]["loss"] > metrics["loss"]
+    assert (run_file.parent / "out" / "checkpoint.pt").exists()
+    assert (run_file.parent / "out" / "residuals.png").exists()
+
+
+@pytest.mark.slow
+def test_every_start_with_a_recording_of_its_own(run_file, monkeypatch):
+    run_file.write_text(RUN.replace("snr_db = 20.0", "snr_db = 20.0\nevery_start = true") + STARTS)
+    assert call(monkeypatch, "reconstruct", run_file, "-o", "out") == 0
+    metrics = read_metrics(run_file.parent / "out")
+    first, second = metrics["starts"]
+    # Other speckle, other losses, other errors.
+    assert first["loss"] != pytest.approx(second["loss"], rel=1e-3)
+    inside = [
+        abs(row["errors"]["plate.z"]) <= row["within_95"]["plate.z"] for row in (first, second)
+    ]
+    assert metrics["coverage_95"]["z"] == sum(inside) / 2
+    assert set(metrics["coverage_95"]) == {"x", "y", "z"}
+    assert metrics["stated_over_observed"]["z"] > 0
+    assert metrics["errors"]["plate.z"] in (first["errors"]["plate.z"], second["errors"]["plate.z"])

@@ -1,0 +1,106 @@
+"""Rivals: which turns are tried of which object, and where the turned fit begins."""
+
+import math
+
+import pytest
+import torch
+
+from blobs import LAW, Blob, Needle
+from invertwin.inversion import Observation, Optimizer, Schedule, displaced, reconstruct
+from invertwin.inversion.rivals import rivals, same, turns
+from invertwin.scene import Mesh, Pose, Scene, Translation, box, sphere, text
+from scenes import float64, thing
+
+
+def angles(mesh: Mesh, module: torch.nn.Module) -> list[float]:
+    """Turns about the vertical that are tried [°]."""
+    found = turns(module, Scene({"it": thing(mesh, (0.1, 0.0, 2.0))}))
+    return [round(math.degrees(float(turn[1])), 6) for turn in found]
+
+
+YAW = {"axes": "xz", "rotation_axes": "y"}
+
+
+@pytest.mark.parametrize(
+    ("mesh", "tried"),
+    [
+        (text("L", size=0.6), [180.0]),
+        (text("A", size=0.6), []),  # from behind an A is an A
+        (box([0.5, 0.3, 0.4]), [90.0]),  # nearly square; half a turn brings it back
+        (box([0.6, 0.3, 0.2]), []),
+        (sphere(0.2, 3), []),
+    ],
+)
+def test_turns_that_bring_an_object_back_are_left_out(mesh, tried):
+    assert sorted(angles(mesh, Pose("it", **YAW))) == sorted(tried)
+
+
+def test_what_cannot_turn_has_no_rivals():
+    assert angles(text("L", size=0.6), Translation("it")) == []
+    held = Pose("it", **YAW)
+    held.rotation.requires_grad_(False)
+    assert angles(text("L", size=0.6), held) == []
+
+
+def test_poses_that_look_alike_are_the_same():
+    scene = Scene({"it": thing(box([0.6, 0.3, 0.2]), (0.1, 0.0, 2.0))})
+    none = torch.zeros(3, dtype=torch.float64)
+
+    def turned(degrees: float) -> Scene:
+        return scene.replace(
+            "it", pose=displaced(scene["it"], none, math.radians(degrees) * float64([0, 1, 0])).pose
+        )
+
+    assert same(scene, turned(180.0), ["it"])
+    assert same(scene, turned(4.0), ["it"])
+    assert not same(scene, turned(90.0), ["it"])
+    assert not same(scene, turned(30.0), ["it"])
+    moved = displaced(scene["it"], float64([0.05, 0.0, 0.0])).pose
+    assert not same(scene, scene.replace("it", pose=moved), ["it"])
+
+
+def wedge() -> Scene:
+    mesh = box([0.4, 0.1, 0.2])
+    vertices = mesh.vertices.clone()
+    vertices[vertices[:, 0] > 0] *= 0.5
+    return Scene({"ball": thing(Mesh(vertices, mesh.faces), (0.0, 0.0, 1.0), (0.0, 0.3, 0.0))})
+
+
+def test_a_turn_that_explains_the_data_as_well_makes_the_verdict_ambiguous():
+    scene, model = wedge(), Needle()
+    look = model.looks(scene, None, 0)
+    assert look is not None
+    found = reconstruct(
+        scene,
+        Observation(model, None, look(0, 0.0)),
+        Pose("ball", axes="", rotation_axes="y"),
+        loss=LAW,
+        optimizer=Optimizer("gauss_newton", rate=0.1),
+        schedule=Schedule(5),
+    )
+    before = found.scene["ball"].transform
+    assert found.verdict.word == "ambiguous"
+    (rival,) = found.verdict.rivals
+    assert rival.told.startswith(("ball turned by 180.0° about y", "ball turned by 179."))
+    assert rival.score is not None
+    assert rival.score < 2.33
+    assert found.verdict.reasons == (
+        f"{rival.told} explains the data as well: z = {rival.score:.1f}",
+    )
+    # The fit itself is left as it was.
+    assert torch.equal(found.end.fit.twin()["ball"].transform, before)
+
+
+def test_a_position_alone_has_no_rivals():
+    scene, model = wedge(), Blob()
+    look = model.looks(scene, None, 0)
+    assert look is not None
+    found = reconstruct(
+        scene,
+        Observation(model, None, look(0, 0.0)),
+        Translation("ball", axes="x"),
+        loss=LAW,
+        optimizer=Optimizer("gauss_newton", rate=0.1),
+        schedule=Schedule(5),
+    )
+    assert list(rivals(found.end)) == []

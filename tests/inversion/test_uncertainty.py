@@ -1,0 +1,155 @@
+"""Error bars: against the Cramér–Rao bound of a model without rays, and what is not observed."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from blobs import LAW, Blob, deviation, scene
+from invertwin.errors import InputError
+from invertwin.inversion import (
+    Observation,
+    Optimizer,
+    Reconstruction,
+    Schedule,
+    reconstruct,
+)
+from invertwin.inversion.uncertainty import coordinates
+from invertwin.radar.parameters import RadarPose, RangeBias
+from invertwin.scene import Pose, Scale, Scene, Translation
+from invertwin.scene.parameters import Coordinate
+from scenes import float64
+
+
+def fitted(model: Blob, seed: int = 0, axes: str = "x", loss: Any = LAW) -> Reconstruction:
+    """A fit of one look at a ball at x = 0.1."""
+    look = replace(model, known=True).looks(scene(0.1), None, 0)
+    assert look is not None
+    return reconstruct(
+        scene(0.05),
+        Observation(model, None, look(seed, 0.0)),
+        Translation("ball", axes=axes),
+        loss=loss,
+        optimizer=Optimizer("gauss_newton", rate=0.1),
+        schedule=Schedule(8),
+    )
+
+
+def test_errors_are_those_that_speckle_allows():
+    found = fitted(Blob()).uncertainty
+    assert found.names == ("ball.x",)
+    assert found.units == ("m",)
+    assert found.unobserved == ()
+    # 64 looks tell it to 9 %.
+    assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 4), rel=0.25)
+    # Student's law with 63 degrees of freedom.
+    assert found.interval(0.95)["ball.x"] == pytest.approx(1.998 * found.deviations["ball.x"], 1e-3)
+    assert (found.count, found.by) == (64, "looks")
+
+
+@pytest.mark.slow
+def test_stated_errors_hold():
+    """Over 60 recordings: 95 % of errors within the intervals, and as wide as stated."""
+    fits = [fitted(Blob(), seed) for seed in range(60)]
+    errors = [float(fit.scene["ball"].center[0].detach()) - 0.1 for fit in fits]
+    inside = [
+        abs(e) <= fit.uncertainty.interval()["ball.x"] for e, fit in zip(errors, fits, strict=True)
+    ]
+    assert sum(inside) >= 53
+    spread = float(torch.tensor(errors).std())
+    assert fits[0].uncertainty.deviations["ball.x"] == pytest.approx(spread, rel=0.3)
+
+
+def test_without_looks_the_frames_tell():
+    found = fitted(Blob(frames=40, known=False)).uncertainty
+    assert (found.count, found.by) == (40, "frames")
+    assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 40), rel=0.35)
+    assert found.interval()["ball.x"] > 2.02 * found.deviations["ball.x"]
+
+
+def test_what_has_no_effect_is_not_observed_and_named():
+    found = fitted(Blob(), axes="xz").uncertainty
+    (told,) = found.unobserved
+    assert told.startswith("ball.z: not observed; ")
+    assert told.endswith(" of the information of ball.x")
+    assert found.deviations["ball.z"] >= 0.5
+    assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 4), rel=0.25)
+    assert abs(float(found.correlations[0, 1])) < 0.1
+
+
+class Mixed(nn.Module):
+    """An unknown of one's own: of its three numbers only the sum of two moves the ball."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shares = nn.Parameter(float64([0.0, 0.0, 0.0]))
+
+    def coordinates(self) -> list[Coordinate]:
+        axes = torch.eye(3, dtype=torch.float64)[:2]
+        return [Coordinate(f"share {k}", "m", {"shares": row}, 0.1) for k, row in enumerate(axes)]
+
+    def forward(self, scene: Scene) -> Scene:
+        way = self.shares[0] + self.shares[1]
+        zero = torch.zeros_like(way)
+        moved = {"translation": torch.stack([way, zero, zero])}
+        return torch.func.functional_call(Translation("ball"), moved, (scene,))
+
+
+def test_a_mixed_direction_is_named_with_its_parts():
+    look = Blob().looks(scene(0.1), None, 0)
+    assert look is not None
+    found = reconstruct(
+        scene(),
+        Observation(Blob(), None, look(0, 0.0)),
+        Mixed(),
+        loss=LAW,
+        optimizer=Optimizer("gauss_newton", rate=0.1),
+        schedule=Schedule(5),
+    ).uncertainty
+    (told,) = found.unobserved
+    assert told.startswith(("share 0 and share 1: not", "share 1 and share 0: not"))
+    assert "0.71 share 0" in told
+    # What is known, their sum, is as certain as a single number would be.
+    both = float(torch.tensor([1.0, 1.0], dtype=torch.float64) @ found.covariance.sum(1))
+    assert both**0.5 == pytest.approx(deviation(0.1, 4), rel=0.25)
+
+
+def test_modules_name_theircoordinates():
+    named = nn.ModuleList(
+        [
+            Pose("ball", rotation=[0.0, 0.4, 0.0], axes="x", rotation_axes="y"),
+            Scale("ball", 2.0),
+            RangeBias(),
+            nn.Linear(1, 2, bias=False),
+            Translation("ball").requires_grad_(False),
+        ]
+    )
+    found = {c.name: c for c in coordinates(named)}
+    assert list(found) == [
+        *("ball.x", "ball.yaw", "ball.scale", "range_bias", "3.weight[0]", "3.weight[1]")
+    ]
+    assert found["ball.yaw"].unit == "rad"
+    # A factor of 2 grows by 1 where its logarithm grows by a half.
+    assert float(found["ball.scale"].tangents["1.log_scale"]) == pytest.approx(0.5)
+    assert [c.name for c in RadarPose(axes="", rotation_axes="z").coordinates()] == ["radar.roll"]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_turn_is_about_the_axes_of_the_world(axis):
+    """The tangent of a coordinate, followed a little, turns by as much about that axis."""
+    pose = Pose("ball", rotation=[0.3, -0.5, 0.8])
+    coordinate = pose.coordinates()[3 + axis]
+    before = pose.rotation_matrix.detach()
+    with torch.no_grad():
+        pose.rotation += 1e-5 * coordinate.tangents["rotation"]
+    turn = (pose.rotation_matrix.detach() @ before.T - torch.eye(3, dtype=torch.float64)) / 1e-5
+    vector = torch.stack([turn[2, 1], turn[0, 2], turn[1, 0]])
+    assert vector.tolist() == pytest.approx([float(k == axis) for k in range(3)], abs=1e-4)
+
+
+def test_fits_without_error_bars_say_so():
+    fit = fitted(Blob(frames=1, known=False))
+    with pytest.raises(InputError, match="got one frame of a model without looks"):
+        _ = fit.uncertainty

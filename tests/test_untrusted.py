@@ -1,0 +1,132 @@
+"""Files from strangers: an error of one line, whatever is in them."""
+
+import json
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from invertwin.capture import Capture, described_arrays
+from invertwin.capture.channels import ChannelCalibration
+from invertwin.capture.ti.sdk_cfg import read_cfg
+from invertwin.cli import build
+from invertwin.cli.run_file import load_run
+from invertwin.errors import InputError
+from invertwin.scene.files import load_mesh, load_scene_xml
+from invertwin.untrusted import read_arrays, read_npy, reading, try_apart
+
+DESCRIPTION = """
+[data]
+file = "{}"
+variable = "adc"
+[settings]
+start_frequency = 77e9
+slope = 60e12
+sample_rate = 5e6
+"""
+COMMANDS = """% Platform:xWR18xx
+channelCfg 15 3 0
+adcCfg 2 1
+profileCfg 0 77 7 6 60 0 0 60 1 64 5000 0 0 30
+chirpCfg 0 {} 0 0 0 0 0 1
+frameCfg 0 {} 16 0 100 1 0
+"""
+SCENE = 'task = "simulate"\n[scene.a]\nfile = "{}"\nmaterial = {{ kind = "perfect_conductor" }}'
+
+
+def scene_of(path):
+    return build.scene(load_run(path))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "read"),
+    [
+        ("a.toml", "x=" + "[" * 20_000 + "]" * 20_000, load_run),
+        ("a.toml", "seed=1" + "0" * 5_000, load_run),
+        ("a.toml", SCENE.format("a" * 5_000), scene_of),
+        ("a.toml", SCENE.format("a\\u0000b"), scene_of),
+        ("a.xml", '<?xml version="1.0" encoding="foo"?><scene/>', load_scene_xml),
+        ("a.xml", '<?xml version="1.0" encoding="utf-7"?><scene/>', load_scene_xml),
+        ("a.json", "[" * 100_000, ChannelCalibration.load),
+        ("a.json", '{"gains":[[[1' + "0" * 400 + ",0]]]}", ChannelCalibration.load),
+        ("a.json", json.dumps({"gains": "x"}), ChannelCalibration.load),
+        ("a.gltf", json.dumps({"meshes": [{"primitives": [{}]}], "nodes": [{}]}), load_mesh),
+        ("a.cfg", COMMANDS.format(4_000_000_000, 1), read_cfg),
+        ("a.cfg", COMMANDS.format(1, 4_000_000_000), read_cfg),
+    ],
+)
+def test_text_of_any_kind_is_one_line(tmp_path, name, text, read):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=r"expected .*, got ") as caught:
+        read(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1_000
+
+
+def test_a_name_too_long_for_a_file_is_no_file():
+    with pytest.raises(InputError, match="got no file aaa"):
+        load_mesh("a" * 5_000 + ".ply")
+
+
+def lying(shape, values, kind="<f8"):
+    """A NumPy file whose header says a shape that its numbers do not have."""
+    header = repr({"descr": kind, "fortran_order": False, "shape": shape}).ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + values
+
+
+def test_headers_that_lie_are_refused_before_memory_is_asked_for(tmp_path):
+    file = tmp_path / "a.npy"
+    file.write_bytes(lying((2,), np.ones(2).tobytes()))
+    assert read_npy(file).tolist() == [1.0, 1.0]
+    file.write_bytes(lying((10**13,), b"\0" * 16))
+    with pytest.raises(InputError, match="more than the file holds"):
+        read_npy(file)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.write(file, "b.npy")
+    with pytest.raises(InputError, match="more than the file holds"):
+        read_arrays(tmp_path / "a.npz", "copy it again")
+    (tmp_path / "b.npz").write_bytes(file.read_bytes())
+    with pytest.raises(InputError, match=r"b\.npz"):
+        read_arrays(tmp_path / "b.npz", "copy it again")
+
+
+def test_a_file_that_crashes_its_reader_is_an_error(tmp_path):
+    """One wrong byte ends scipy's reader of MATLAB files by a segmentation fault."""
+    scipy.io.savemat(tmp_path / "q.mat", {"adc": np.ones((2, 4, 2, 4, 16), np.complex64)})
+    (tmp_path / "a.toml").write_text(DESCRIPTION.format("q.mat"))
+    assert described_arrays.read_chirps(tmp_path / "a.toml").samples.shape == (2, 4, 2, 4, 16)
+    damaged = bytearray((tmp_path / "q.mat").read_bytes())
+    damaged[192] = 255
+    (tmp_path / "q.mat").write_bytes(damaged)
+    with pytest.raises(InputError, match="it is damaged"):
+        described_arrays.read_chirps(tmp_path / "a.toml")
+
+
+@pytest.mark.slow
+def test_a_file_that_hangs_its_reader_is_an_error(tmp_path):
+    """One byte of a capture makes libhdf5 read for ever."""
+    sound = Path(__file__).with_name("capture") / "two_frames.nc"
+    assert Capture.load(sound).frame_count == 2
+    damaged = bytearray(sound.read_bytes())
+    damaged[2760] = 0
+    (tmp_path / "a.nc").write_bytes(damaged)
+    with pytest.raises(InputError, match="takes its reader more than"):
+        Capture.load(tmp_path / "a.nc")
+
+
+def test_what_the_reader_itself_refuses_is_left_to_it(tmp_path):
+    shutil.copy(__file__, tmp_path / "a.nc")
+    try_apart(tmp_path / "a.nc", "netcdf")
+    with pytest.raises(InputError, match=r"expected a whole NetCDF file, got .*a\.nc"):
+        Capture.load(tmp_path / "a.nc", trusted=True)
+
+
+def test_errors_of_readers_name_the_file_and_pass_input_errors_on():
+    told = r"expected a mesh, got a\.ply \(ValueError: x y\)"
+    with pytest.raises(InputError, match=told), reading("a.ply", "a mesh"):
+        raise ValueError("x\ny")
+    with pytest.raises(InputError, match=r"^as it was$"), reading("a.ply", "a mesh"):
+        raise InputError("as it was")
