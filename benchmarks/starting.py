@@ -3,10 +3,10 @@
     python benchmarks/starting.py [-o DIR] [--steps N] [--load N]
 
 Prints a table and writes `metrics.json` into DIR (default `out/starting`). The fit is that of
-`invertwin demo`; one step is made before, so that its kernels are in the cache. Then it is made alone
-and beside processes that never rest: those of `stress-ng --cpu N` where it is installed, else as
-many of Python (`load_kind` says which). What else runs on the machine counts for both, so it should
-be nothing; `load_before` is what the system says of that.
+`invertwin demo`; one step is made before, so that its kernels are in the cache. Then it is made
+alone and beside processes that never rest: those of `stress-ng --cpu N` where it is installed, else
+as many of Python (`load_kind` says which). What else runs on the machine counts for both, so it
+should be nothing; `load_before` is what the system says of that.
 
 - `version_seconds`: processor time of `invertwin --version`, the least of five [s].
 - `idle_seconds`, `busy_seconds`: wall time of the fit, alone and beside the load [s].

@@ -21,7 +21,8 @@ from invertwin.errors import InputError
 if TYPE_CHECKING:  # the command line starts without NumPy
     import numpy as np
 
-_P, _R = ParamSpec("_P"), TypeVar("_R")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 _DAMAGED = "it is damaged or of another kind; copy or export it again"
 _SECONDS, _BYTES_PER_SECOND = 8.0, 10e6  # of processor time, that of importing a reader with it
 _WAITING = 10.0  # times as long on a busy machine
