@@ -181,7 +181,7 @@ def _hdf5_changed(data: bytes, edit: Edit) -> bytes:
         holders = [file, *(file[name] for name in file)]
         holder = holders[edit.place % len(holders)]
         hostile = HOSTILE[edit.more % len(HOSTILE)]
-        names = [name for name in file if isinstance(file[name], h5py.Dataset)]
+        names = [str(name) for name in file if isinstance(file[name], h5py.Dataset)]
         name = names[edit.place % len(names)]
         keys = list(holder.attrs)
         match edit.kind % 8:
@@ -192,7 +192,7 @@ def _hdf5_changed(data: bytes, edit: Edit) -> bytes:
             case 3:
                 del file[name]
             case 4:
-                kept = file[name][()]
+                kept = _dataset(file, name)[()]
                 del file[name]
                 file[name] = hostile if edit.more % 4 == 0 else _spoiled(kept, edit.more)
             case 5:
@@ -208,10 +208,16 @@ def _hdf5_changed(data: bytes, edit: Edit) -> bytes:
                 del file[name]
                 file.create_group(name)["again"] = file["/"]
             case _:
-                values = file[name][()]
+                values = np.array(_dataset(file, name)[()])
                 values.reshape(-1)[edit.more % values.size] = NUMBERS[edit.more % len(NUMBERS)]
-                file[name][...] = values
+                _dataset(file, name)[...] = values
     return whole.getvalue()
+
+
+def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
+    found = file[name]
+    assert isinstance(found, h5py.Dataset)
+    return found
 
 
 def _words(name: str, data: bytes, edit: Edit) -> bytes:

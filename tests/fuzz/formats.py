@@ -128,7 +128,11 @@ def _meshes() -> list[Files]:
     box = trimesh.creation.box()
 
     def exported(name: str, **how: Any) -> Callable[[Path], str]:
-        return lambda folder: box.export(folder / name, **how) and name
+        def write(folder: Path) -> str:
+            box.export(folder / name, **how)
+            return name
+
+        return write
 
     def parts(name: str) -> Callable[[Path], str]:
         scene = trimesh.Scene({"a": box, "b": trimesh.creation.icosphere(0)})
@@ -243,7 +247,7 @@ def _mats() -> list[Files]:
         text = (folder / "adc.toml").read_text().replace("adc.h5", "adc.mat")
         (folder / "adc.toml").write_text(text)
         with h5py.File(folder / "adc.h5") as old, h5py.File(folder / "adc.mat", "w") as new:
-            new["adc"] = old["adc"][()].T
+            new["adc"] = np.asarray(old["adc"]).T
         (folder / "adc.h5").unlink()
         return "adc.toml"
 
@@ -338,9 +342,9 @@ def _fit() -> Fit:
     fit = object.__new__(Fit)
     fit.modules, fit.number, fit.last = nn.ModuleList([Translation("ball")]), 0, True
     fit.fingerprint = Fingerprint("a fit", torch.arange(3.0))
-    fit.optimizer = torch.optim.Adam(fit.modules.parameters(), lr=0.1)
+    fit.optimizer = optimizer = torch.optim.Adam(fit.modules.parameters(), lr=0.1)
     fit.modules[0].translation.grad = torch.ones(3, dtype=torch.float64)  # type: ignore[union-attr]
-    fit.optimizer.step()
+    optimizer.step()
     first = {name: value.clone() for name, value in fit.modules.state_dict().items()}
     row = {"step": 0, "stage": 0, "loss": 1.5, "values": {"ball.translation": [0.0, 0.0, 0.0]}}
     fit.progress = Progress(first, 1, [row], (0, 1.5, first))
@@ -348,14 +352,17 @@ def _fit() -> Fit:
 
 
 def _checkpoints() -> list[Files]:
-    return _written(
-        lambda folder: Checkpoint(folder / "checkpoint.pt").end(_fit()) or "checkpoint.pt"
-    )
+    def write(folder: Path) -> str:
+        Checkpoint(folder / "checkpoint.pt").end(_fit())
+        return "checkpoint.pt"
+
+    return _written(write)
 
 
 def _read_checkpoint(path: Path) -> None:
     fit = _fit()
     Checkpoint(path, resume=True).begin(fit)
+    assert isinstance(fit.optimizer, torch.optim.Adam)
     fit.optimizer.step()
     torch.save(fit.state(), path.with_name("again"))
 
