@@ -10,8 +10,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
 FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "untrusted"}
 SCENE = FOUNDATION | {"scene"}
-CHANNEL = SCENE | {"doctor", "channel"}
-RADAR = CHANNEL - {"doctor"} | {"radar"}
+CHANNEL = SCENE | {"doctor", "threads", "channel"}
+RADAR = CHANNEL - {"doctor", "threads"} | {"radar"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
 MODELS = SIMULATION | CAPTURE | {"models"}
@@ -25,6 +25,7 @@ ALLOWED = {
     "seeds": set(),
     "folders": {"errors"},
     "untrusted": {"errors"},
+    "threads": set(),
     "doctor": FOUNDATION,
     "scene": SCENE,
     "channel": CHANNEL,
@@ -37,7 +38,7 @@ ALLOWED = {
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
     "cli": INVERSION | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
-    "__init__": INVERSION | {"doctor"},
+    "__init__": INVERSION | {"doctor", "threads"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}
 KNOW_THE_RAY_TRACER = {"channel"}

@@ -20,13 +20,14 @@ from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
-from invertwin.untrusted import existing_file, reading
+from invertwin.untrusted import existing_file, reader, reading
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
 
 
+@reader("a readable mesh")
 def load_mesh(file: str | Path) -> Mesh:
     """A triangle mesh from an OBJ, PLY, STL or glTF file.
 
@@ -91,6 +92,7 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         part.write_bytes(export_glb(written) if glb else _ply(written.to_mesh()))
 
 
+@reader("a readable scene")
 def load_scene_xml(
     path: str | Path, materials: Mapping[str, Material] | None = None, default: Material = CONCRETE
 ) -> Scene:

@@ -16,7 +16,7 @@ from invertwin.scene.geometry.iso_surface import follow, surface_of
 from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
-from invertwin.untrusted import read_arrays
+from invertwin.untrusted import read_arrays, reader
 
 _MODEL = "vehicle_prior.npz"
 _FORMAT = "invertwin shape prior 1"
@@ -263,6 +263,7 @@ def _loaded() -> ShapePrior:
         return _read(file)
 
 
+@reader("a shape prior")
 def _read(path: Path) -> ShapePrior:
     do = "give a file of invertwin train-prior"
     found = read_arrays(path, do)
