@@ -8,7 +8,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "untrusted"}
+FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "memory", "untrusted"}
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "channel"}
 RADAR = CHANNEL - {"doctor"} | {"radar"}
@@ -24,6 +24,7 @@ ALLOWED = {
     "limits": set(),
     "seeds": set(),
     "folders": {"errors"},
+    "memory": {"errors"},
     "untrusted": {"errors"},
     "doctor": FOUNDATION,
     "scene": SCENE,

@@ -114,6 +114,20 @@ def plan(options: Resumable, file: FileArgument) -> None:
 
 
 @app.command()
+def check(file: FileArgument, backend: BackendOption = None) -> None:
+    """Say what a run file needs, memory and time, and do nothing else."""
+    from invertwin.cli.run_file import load_run
+
+    run = load_run(file)
+    from invertwin.cli.run_check import run_check
+
+    with about_file(file):
+        table, line = run_check(run)
+    print_tables([table])
+    console.print(line, markup=False, soft_wrap=True)
+
+
+@app.command()
 @with_options(Resumable)
 def demo(options: Resumable) -> None:
     """Find a hidden letter from its radar echoes."""
