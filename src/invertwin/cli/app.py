@@ -13,6 +13,7 @@ import typer.main
 from typer.core import TyperGroup
 
 from invertwin import __version__
+from invertwin.__main__ import interruptible
 from invertwin.cli.options import (
     BackendOption,
     FileArgument,
@@ -30,6 +31,14 @@ from invertwin.errors import InputError, one_line
 
 class _Commands(TyperGroup):
     """Our commands, and those of plugins, which are imported when ours do not answer."""
+
+    def make_context(self, *args: Any, **given: Any) -> Any:
+        with interruptible():
+            return super().make_context(*args, **given)
+
+    def invoke(self, ctx: Any) -> Any:
+        with interruptible():
+            return super().invoke(ctx)
 
     def list_commands(self, ctx: Any) -> list[str]:
         self._add_plugins()

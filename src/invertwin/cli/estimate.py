@@ -124,18 +124,17 @@ def estimate_of(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> Es
         InputError: A stage that makes too many triangles.
     """
     _require_edges(run, truth)
-    parts, rows, one_frame = [_triangles(run, truth)], 0.0, 0.0
+    parts, rows, one_channel = [_triangles(run, truth)], 0.0, 0.0
     for name, sensor in sensors.items():
         found, traced = of_sensor(sensor, truth)
         parts += [_at(f"observations.{name}.", part) if name else part for part in found]
         rows += traced
-        one_frame += traced / sensor.radar.frame_count
+        one_channel += traced / math.prod(sensor.radar.shape)
     parts += _of_fits(run, sensors)
     again = _recordings(run)
     recordings, rows = again * len(sensors), rows * again
     if run.landscape is not None:
-        recordings += run.landscape.exact_points
-        rows += run.landscape.exact_points * one_frame
+        rows += run.landscape.exact_points * one_channel
     ordered = sorted(parts, key=lambda part: -part.memory)
     kept = tuple(part for part in ordered if part.memory)
     return Estimate(kept, *_rays(run), recordings, rows)

@@ -20,6 +20,7 @@ from invertwin.memory import free_memory, gigabytes
 from invertwin.models import SurrogateMap
 from invertwin.scene import Scene, Translation
 
+_FRAMES = 4  # of the radar, in the probe
 _FEW, _MANY = 10_000, 100_000  # rays or paths that are timed: less than a second of work
 _FITS = ("reconstruct", "demo")
 
@@ -70,15 +71,17 @@ def _sensors(run: RunFile) -> Mapping[str, Sensor]:
 
 def _seconds(run: RunFile, found: Estimate, truth: Scene, sensors: Mapping[str, Sensor]) -> float:
     """Time of the run, from the time of a few rays and a few paths on this machine."""
-    sensor, settings = next(iter(sensors.values())), run.gradcheck or run.reconstruct
+    whole, settings = next(iter(sensors.values())), run.gradcheck or run.reconstruct
     depth = settings.depth if settings else run.data.depth if run.data else 1
-    used = getattr(settings, "frames_per_step", None) or sensor.radar.frame_count
-    fewer = replace(sensor, radar=sensor.radar.frames(range(sensor.radar.frame_count)[:used]))
+    frames = whole.radar.frame_count
+    sensor = replace(whole, radar=whole.radar.frames(range(min(_FRAMES, frames))))
     still = Scene({name: replace(item, velocity=None) for name, item in truth.objects.items()})
-    each, ray = _line(lambda count: _map(fewer, still, depth, count, run.task != "simulate"))
-    seconds = found.maps * each + found.rays * ray
+    each, ray = _line(lambda count: _map(sensor, still, depth, count, run.task != "simulate"))
+    used = min(getattr(settings, "frames_per_step", None) or frames, frames)
+    seconds = found.maps * each * used / sensor.radar.frame_count + found.rays * ray
     if found.rows:
         each, row = _line(lambda count: _signals(sensor, truth, count))
+        each *= frames / sensor.radar.frame_count
         seconds += found.recordings * each + found.rows * row
     return seconds
 

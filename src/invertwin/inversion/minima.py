@@ -84,7 +84,11 @@ def pose_grid(
         turns: about the axis at every place, evenly spread over a whole one
         axis: of the turns, in the world
     """
-    places = math.prod(1 + max(0.0, b - a) / step for a, b in zip(low, high, strict=True)) * turns
+    if not all(a <= b for a, b in zip(low, high, strict=True)):
+        raise InputError(
+            f"expected a box with low <= high, got {list(low)} and {list(high)}; exchange them"
+        )
+    places = math.prod(1 + (b - a) / step for a, b in zip(low, high, strict=True)) * turns
     require_at_most(
         places, _MOST_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
     )

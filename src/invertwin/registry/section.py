@@ -136,8 +136,8 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
     """
     for name, needed in wanted.items():
         if needed != (getattr(section, name) is not None):
-            verb, do = ("", "add it") if needed else ("no ", "remove it")
-            fail(f"expected {verb}`{name}` {when}; {do}")
+            verb, got, do = ("", "none", "add it") if needed else ("no ", "one", "remove it")
+            fail(f"expected {verb}`{name}` {when}, got {got}; {do}")
 
 
 def fail(text: str, path: str = "") -> NoReturn:

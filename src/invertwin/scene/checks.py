@@ -203,7 +203,8 @@ def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]
         if type(mark) in _LIMITS:
             field, words, holds = _LIMITS[type(mark)]
             limit = getattr(mark, field)
-            if not (math.isfinite(number) and holds(number, limit)):
+            finite = isinstance(number, int) or math.isfinite(number)
+            if not (finite and holds(number, limit)):
                 raise InputError(f"expected {name} {words} {limit:g}, got {number}; {do}")
     if usual and not usual.low <= number <= usual.high:
         meant = usual.meant(float(number))

@@ -18,7 +18,7 @@ from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh
 
 _MOST_TRIANGLES = 1e7  # of one shape
-_MOST_LETTERS = 1000  # whose outlines are joined one by one
+_MOST_LETTERS = 200  # whose outlines are joined one by one
 
 
 def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
@@ -223,11 +223,11 @@ def _triangulated_outline(
     scale = height / (top - bottom)
     center = np.array([left + right, bottom + top]) / 2
     outline = shapely.transform(outline, lambda points: (points - center) * scale)
-    # Edges end up between a half and the whole of the longest, and so do the triangles' sides.
-    surface = 2 * outline.area + outline.length * thickness
-    _require_triangles(
-        4 * surface / longest**2, "max_edge", "give sizes in metres, or larger edges"
-    )
+    # Thin triangles across the walls, and across the strokes of letters, a quarter as wide as they
+    # are high, are halved along their long sides again and again: three for one at every halving.
+    thin = sum(max(1.0, min(s / longest, 1e9)) ** 1.585 for s in (thickness, height / 4))
+    pieces = 2 * (outline.length / longest + len(loops)) * thin
+    _require_triangles(pieces, "max_edge", "give sizes in metres, or larger edges")
     fine = shapely.segmentize(outline, longest)
     # The triangulation wants one polygon at a time, and returns rings of four points.
     triangles = np.concatenate(
