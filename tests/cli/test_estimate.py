@@ -7,6 +7,8 @@ import torch
 
 from cli.small import GRADCHECK, RUN, STARTS, call
 from invertwin.cli import estimate as estimates
+from invertwin.cli import run_gradcheck, run_simulate
+from invertwin.cli.fits import problem
 from invertwin.cli.run_check import time_left
 from invertwin.scene import Mesh, shapes
 from invertwin.scene.files import save_mesh
@@ -58,6 +60,15 @@ CASES = {
 }
 
 
+@pytest.fixture
+def idle(monkeypatch):
+    """No work begins."""
+    for module, name in ((problem, "exact"), (run_simulate, "exact"), (run_gradcheck, "gradcheck")):
+        monkeypatch.setattr(module, name, None)
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.filterwarnings("ignore:virtual elements")
 @pytest.mark.parametrize("case", CASES)
 def test_what_would_not_fit_is_refused_before_work(run_file, monkeypatch, capsys, case):
     text, old, new = CASES[case]
@@ -74,6 +85,7 @@ def test_what_would_not_fit_is_refused_before_work(run_file, monkeypatch, capsys
     assert not (run_file.parent / "out").exists()
 
 
+@pytest.mark.usefixtures("idle")
 @pytest.mark.parametrize("command", ["simulate", "gradcheck", "check", "plan"])
 def test_every_command_refuses_the_same(run_file, monkeypatch, capsys, command):
     text = RUN.replace("points_per_m2 = 2e3", "points_per_m2 = 2e12")
@@ -89,6 +101,7 @@ def test_every_command_refuses_the_same(run_file, monkeypatch, capsys, command):
     assert "expected a run within the" in error
 
 
+@pytest.mark.usefixtures("idle")
 def test_a_mesh_in_millimetres_is_refused(run_file, monkeypatch, capsys):
     ball = shapes.sphere(200.0, 2)
     save_mesh(run_file.parent / "ball.ply", ball)
@@ -99,6 +112,7 @@ def test_a_mesh_in_millimetres_is_refused(run_file, monkeypatch, capsys):
     assert "millimetres" in error
 
 
+@pytest.mark.usefixtures("idle")
 def test_less_memory_refuses_what_more_allows(run_file, monkeypatch, capsys):
     monkeypatch.setattr(estimates, "free_memory", lambda: 0.5e9)
     assert call(monkeypatch, "reconstruct", run_file) == 2

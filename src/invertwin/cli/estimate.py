@@ -17,7 +17,7 @@ from invertwin.memory import free_memory, gigabytes
 from invertwin.radar import SampledWaveform
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import fft_bins
-from invertwin.scene import Mesh, Scene
+from invertwin.scene import Mesh, Object, Scene
 
 # Bytes, measured as peaks of whole runs (benchmarks are in docs/limitations.md).
 _PROGRAM = 0.8e9  # the library, compiled kernels and the rays that are alive at a time
@@ -28,7 +28,7 @@ _BIN, _FITTED_BIN = 60, 100  # of a recorded spectrum; of a map with its derivat
 _PHASOR = 32
 _COPY = 10_000  # of an object at another place
 _SIMULATED_RAYS = 2e6  # of the smooth map beside a simulation
-_MOST_RAYS = 1e15  # months of work on any machine
+_MOST_RAYS = 1e13  # twelve days at 10⁷ a second
 _SIZES = ("max_edge", "divisions", "subdivisions", "spacing", "file", "parts", "shape")
 
 
@@ -121,9 +121,9 @@ def estimate_of(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> Es
         sensors: By name; a run without `[observations]` has one without a name.
 
     Raises:
-        InputError: A stage that makes too many triangles.
+        InputError: Too many starts, or a stage that makes too many triangles.
     """
-    _require_edges(run, truth)
+    _require_stated(run, truth)
     parts, rows, one_channel = [_triangles(run, truth)], 0.0, 0.0
     for name, sensor in sensors.items():
         found, traced = of_sensor(sensor, truth)
@@ -282,8 +282,15 @@ def _recordings(run: RunFile) -> int:
     return anew + (run.plan.fits if run.plan is not None else 0)
 
 
-def _require_edges(run: RunFile, scene: Scene) -> None:
-    """Refuse stages that would make too many triangles, before any of them begins."""
+def _require_stated(run: RunFile, scene: Scene) -> None:
+    """Refuse starts and stages beyond the limits of what makes them, before any of them begins."""
+    chance = torch.Generator()
+    for section, more in (("starts", {"generator": chance}), ("search", {})):
+        table = getattr(run, section)
+        if table is not None:
+            given = {Object: scene[table.object], torch.Generator: chance}
+            with about(section):
+                next(iter(table.build(given, **more)), None)
     free = [table.object for table in run.parameters if table.kind == "vertices"]
     for i, stage in enumerate(run.stages):
         for name in free if stage.remesh else ():
