@@ -1,6 +1,6 @@
 """The one exception type for bad input, raised at the public edge, and the one warning."""
 
-_LONGEST = 2_000  # characters of a line
+_LONGEST = 8_000  # characters of a line
 
 
 class InputError(ValueError):

@@ -9,7 +9,7 @@ from cli.small import GRADCHECK, RUN, STARTS, call
 from invertwin.cli import estimate as estimates
 from invertwin.cli import run_gradcheck, run_simulate
 from invertwin.cli.fits import problem
-from invertwin.cli.run_check import time_left
+from invertwin.cli.running import time_left
 from invertwin.scene import Mesh, shapes
 from invertwin.scene.files import save_mesh
 

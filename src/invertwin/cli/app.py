@@ -131,8 +131,8 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
     from invertwin.cli.run_check import run_check
 
     with about_file(file):
-        table, line = run_check(run)
-    print_tables([table])
+        tables, line = run_check(run)
+    print_tables(tables)
     console.print(line, markup=False, soft_wrap=True)
 
 

@@ -18,6 +18,7 @@ from invertwin.radar import SampledWaveform
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import fft_bins
 from invertwin.scene import Mesh, Object, Scene
+from invertwin.scene.scene import warn_of_mirrors
 
 # Bytes, measured as peaks of whole runs (benchmarks are in docs/limitations.md).
 _PROGRAM = 0.8e9  # the library, compiled kernels and the rays that are alive at a time
@@ -142,6 +143,8 @@ def estimate_of(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> Es
 
 def require_room(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> None:
     """Refuse a run that this machine cannot do; arguments and errors as of `estimate_of`."""
+    for sensor in sensors.values():
+        warn_of_mirrors(truth, sensor.radar.waveform.center_frequency)
     estimate_of(run, truth, sensors).require()
 
 

@@ -14,6 +14,7 @@ from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Table, texts
 from invertwin.cli.run_file import need
 from invertwin.cli.run_simulate import chirp_train, exact
+from invertwin.cli.running import time_left
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.memory import free_memory, gigabytes
@@ -25,8 +26,8 @@ _FEW, _MANY = 10_000, 100_000  # rays or paths that are timed: less than a secon
 _FITS = ("reconstruct", "demo")
 
 
-def run_check(run: RunFile) -> tuple[Table, str]:
-    """The table of what a run needs, and a line with its time.
+def run_check(run: RunFile) -> tuple[list[Table], str]:
+    """Tables of what a run needs and of its meshes, and a line with its time.
 
     Raises:
         InputError: What the run's own command refuses before it begins.
@@ -46,15 +47,17 @@ def run_check(run: RunFile) -> tuple[Table, str]:
         f"about {gigabytes(found.memory)} of {gigabytes(free_memory())} free, and "
         f"{time_left(seconds)} for {found.rays:.2g} rays and {found.rows:.2g} paths"
     )
-    return Table("Estimate", heads, rows, texts("notes")["estimate"]), line
+    return [Table("Estimate", heads, rows, texts("notes")["estimate"]), _meshes(truth)], line
 
 
-def time_left(seconds: float) -> str:
-    """A time as people say it."""
-    for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"
+def _meshes(scene: Scene) -> Table:
+    heads = ("object", "size [m]", "triangles", "open edges", "non-manifold edges")
+    rows = []
+    for name, item in scene.objects.items():
+        found = item.mesh.summary()
+        edges = found.open_edges, found.nonmanifold_edges
+        rows.append([name, list(found.extent), found.triangles, *edges])
+    return Table("Meshes", heads, rows)
 
 
 def _sensors(run: RunFile) -> Mapping[str, Sensor]:

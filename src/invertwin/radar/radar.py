@@ -182,8 +182,8 @@ class Radar:
 
         Ranges fall on the bins of a zero-padded FFT and are spaced by one range cell over
         ``oversample`` (2 = Nyquist of the power profile). Direction cosines are spaced by
-        λ/(2·oversample·D), D the virtual aperture (1 = Nyquist of the power pattern). An axis
-        along which the virtual array has no extent is not resolved.
+        λ/(2·oversample·D), D the virtual aperture (1 = Nyquist of the power pattern), and end at
+        ±1. An axis along which the virtual array has no extent is not resolved.
 
         Args:
             range_min: First range to cover [m].
@@ -226,7 +226,7 @@ class Radar:
                 continue
             spacing = self.waveform.wavelength / (2 * oversample * size)
             require_at_most(limit / spacing, MOST / 2 - 1, f"bins of {name}", do, f"{name}_max")
-            side = math.ceil(limit / spacing - 1e-9)
+            side = min(math.ceil(limit / spacing - 1e-9), math.floor(1 / spacing + 1e-9))
             axes |= {
                 f"{name}_start": -side * spacing,
                 f"{name}_step": spacing,

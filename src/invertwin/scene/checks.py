@@ -52,6 +52,22 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
     return tensor
 
 
+def checked_type(value: object, kind: type, what: str, do: str) -> None:
+    """Raise unless a value is of a type.
+
+    Args:
+        value: the value.
+        kind: the type.
+        what: what it is, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: another type.
+    """
+    if not isinstance(value, kind):
+        raise InputError(f"expected {what} ({kind.__name__}), got {value!r:.80}; {do}")
+
+
 def refuse_batch(value: Tensor) -> Tensor:
     """Return a tensor, unless it is a batch of `torch.func.vmap`.
 

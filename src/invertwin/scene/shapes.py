@@ -18,7 +18,7 @@ from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh
 
 _MOST_TRIANGLES = 1e7  # of one shape
-_MOST_LETTERS = 200  # whose outlines are joined one by one
+_MOST_LETTERS = 100  # whose outlines are joined one by one
 
 
 def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:

@@ -152,3 +152,11 @@ def test_every_value_has_a_range():
 def test_unphysical_values_are_refused(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+def test_values_that_a_material_does_not_have_are_refused_by_name():
+    for make in (lambda: RoughConductor("steel"), lambda: RoughConductor(scatering=0.3)):
+        with pytest.raises(InputError, match=r"expected values of RoughConductor by name \(scatt"):
+            make()
+    with pytest.raises(InputError, match="got str"):
+        RoughDielectric("concrete")
