@@ -37,8 +37,8 @@ ALLOWED = {
     "runs": FOUNDATION | {"runs"},
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION | {"doctor", "runs", "plotting", "registry", "cli", "__init__", "__main__"},
-    "__main__": {"cli"},
+    "cli": INVERSION | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
+    "__main__": {"errors", "cli"},
     "__init__": INVERSION | {"doctor"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

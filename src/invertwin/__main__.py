@@ -1,18 +1,6 @@
 """Where the command line begins: an interruption is one line, also while modules are imported."""
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """End the program with one line and exit code 130 on Ctrl-C."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print("invertwin: interrupted", file=sys.stderr)
-        sys.exit(130)
+from invertwin.errors import interruptible
 
 
 def main() -> None:

@@ -152,7 +152,9 @@ def test_wrong_input(planar):
 def test_directions_of_a_grid_end_at_one(count):
     chirp = FMCW(start_frequency=77e9, bandwidth=2e9, duration=5e-5, samples=64)
     row = linear_array(count, chirp.wavelength / 2)
-    radar = Radar(linear_array(1, 0.002), row, chirp, positions=[[0.0, 0.0, 0.0]])
+    radar = Radar(
+        linear_array(1, 0.002), row, chirp, positions=torch.zeros(1, 3, dtype=torch.float64)
+    )
     u = radar.grid(0.5, 1.5).u
     assert 1 - radar.beamwidth[0] < float(u.abs().max()) <= 1.0
 
@@ -160,7 +162,7 @@ def test_directions_of_a_grid_end_at_one(count):
 def test_ranges_beyond_the_unambiguous_one_show_the_period_before():
     chirp = FMCW(start_frequency=77e9, bandwidth=2e9, duration=5e-5, samples=16)
     one = linear_array(1, 0.002)
-    radar = Radar(one, one, chirp, positions=[[0.0, 0.0, 0.0]])
+    radar = Radar(one, one, chirp, positions=torch.zeros(1, 3, dtype=torch.float64))
     grid = radar.grid(0.0, chirp.max_range)
     beat = torch.randn(
         1, 1, 1, 16, dtype=torch.complex128, generator=torch.Generator().manual_seed(1)

@@ -20,6 +20,7 @@ from invertwin.scene import (
     Scene,
     box,
     load_mesh,
+    load_parts,
     load_scene_xml,
     plate,
     rigid,

@@ -13,7 +13,6 @@ import typer.main
 from typer.core import TyperGroup
 
 from invertwin import __version__
-from invertwin.__main__ import interruptible
 from invertwin.cli.options import (
     BackendOption,
     FileArgument,
@@ -26,7 +25,7 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.run_file import about_file
 from invertwin.cli.running import load_runs, now_and_then, print_tables, run_folder
-from invertwin.errors import InputError, one_line
+from invertwin.errors import InputError, interruptible, one_line
 
 
 class _Commands(TyperGroup):

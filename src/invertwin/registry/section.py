@@ -5,7 +5,7 @@ Nothing here imports torch, so that the command line can say what it offers with
 
 import difflib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, get_args
@@ -17,7 +17,6 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
-    ModelWrapValidatorHandler,
     ValidationError,
     model_validator,
 )
@@ -108,7 +107,7 @@ class Section(BaseModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _known_keys_only(cls, data: Any, handler: ModelWrapValidatorHandler) -> Any:
+    def _known_keys_only(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
         """Tell all unknown keys, beside what is wrong with the known ones."""
         names = list(cls.model_fields)
         unknown = [name for name in data if name not in names] if isinstance(data, dict) else []
