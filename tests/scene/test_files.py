@@ -376,11 +376,13 @@ def test_damaged_arrays_are_one_error(damage, tmp_path):
         read_arrays(file, "look")
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_units_parts_and_materials_of_a_file(tmp_path):
     (tmp_path / "two.obj").write_text(
         "v 0 0 0\nv 100 0 0\nv 0 200 0\nv 0 0 300\n"
-        "usemtl steel\nf 1 2 3\nusemtl paint\nf 1 3 4\nf 1 4 2\n"
+        "mtllib two.mtl\nusemtl steel\nf 1 2 3\nusemtl paint\nf 1 3 4\nf 1 4 2\n"
     )
+    (tmp_path / "two.mtl").write_text("newmtl steel\nKd 1 0 0\nnewmtl paint\nKd 0 1 0\n")
     whole = load_mesh(tmp_path / "two.obj", unit="mm")
     found = whole.summary()
     assert found.extent == pytest.approx((0.1, 0.2, 0.3))

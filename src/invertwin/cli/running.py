@@ -87,7 +87,8 @@ def counted(shown: Console, name: str, total: int) -> Iterator[Callable[[], None
     Yields:
         A function to be called after each of them.
     """
-    begin, done, say = time.monotonic(), 0, now_and_then(shown, begin)
+    begin, done = time.monotonic(), 0
+    say = now_and_then(shown, begin)
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=shown, disable=not shown.is_terminal) as bar:
         task = bar.add_task("", total=total)

@@ -64,6 +64,8 @@ def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
         InputError: what `load_mesh` refuses.
     """
 
+    whole = Path(file).name  # how nodes without a name of their own are called
+
     def apart(scene: trimesh.Scene) -> dict[str, trimesh.Trimesh]:
         found: dict[str, trimesh.Trimesh] = {}
         for node in scene.graph.nodes_geometry:
@@ -73,8 +75,9 @@ def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
                 mesh.apply_transform(transform)
                 # In glTF a node has a name, and every part of it a material.
                 material = getattr(getattr(mesh.visual, "material", None), "name", None)
-                label = str(node) if material in (None, name, node) else f"{node}, {material}"
-                found[label] = mesh
+                named = "" if str(node).startswith(whole) else str(node)
+                label = ", ".join(dict.fromkeys(filter(None, (named, material)))) or str(node)
+                found[f"{label} {len(found)}" if label in found else label] = mesh
         return found
 
     return _loaded(file, unit, apart)
