@@ -1,6 +1,7 @@
 """What is to be fitted: scene, observations, unknowns and stages of a run file."""
 
 import math
+import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,7 @@ from invertwin.cli.run_simulate import exact
 from invertwin.cli.schema import SAMPLED, Measures, Reconstruct, RunFile, SimulatedData
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.cli.shape_tables import shape_terms
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
 from invertwin.models import ExactMap, ForwardModel, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
@@ -95,12 +96,28 @@ def problem_of(run: RunFile, console: Console) -> Problem:
         with about(f"variants.{name}"):
             build.parameters(variant.parameters or [], scene, run.scene)
     sensors = sensors_of(run)
+    _warn_of_depths(run, sensors)
     require_room(run, truth, sensors)
     sights = _sights(run, sensors, truth, console)
     simulated = all(isinstance(own.data, SimulatedData) for own in observed_runs(run).values())
     known = frozenset(truth.names if simulated else run.truth)
     target = run.starts.object if run.starts else next(iter(fitted_objects(run)), None)
     return Problem(run, scene, truth, known, sights, target)
+
+
+def _warn_of_depths(run: RunFile, sensors: Mapping[str, Sensor]) -> None:
+    if run.reconstruct is None:
+        return
+    for name, sensor in sensors.items():
+        data, depth = sensor.run.data, run.reconstruct.depth
+        if isinstance(data, SimulatedData) and data.depth != depth and run.chirps is None:
+            at = f"observations.{name}." if name else ""
+            warnings.warn(
+                f"reconstruct.depth is {depth}, {at}data.depth is {data.depth}: the fit explains "
+                "echoes of other numbers of bounces than its data have; make them equal",
+                PhysicsWarning,
+                stacklevel=3,
+            )
 
 
 def recorded_anew(run: RunFile) -> bool:
