@@ -331,10 +331,11 @@ def test_an_interruption_while_modules_are_imported_is_one_line(monkeypatch, cap
 def test_a_log_tells_the_time_that_is_left(monkeypatch):
     now = iter(range(0, 1000, 6))
     monkeypatch.setattr(running.time, "monotonic", lambda: float(next(now)))
-    log = Console(file=io.StringIO(), width=100)
+    written = io.StringIO()
+    log = Console(file=written, width=100)
     with running.counted(log, "landscape", 10) as advance:
         for _ in range(10):
             advance()
-    lines = log.file.getvalue().splitlines()
+    lines = written.getvalue().splitlines()
     assert lines
     assert all(line.startswith("landscape: ") and line.endswith(" left") for line in lines)

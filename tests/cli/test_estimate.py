@@ -1,15 +1,18 @@
 """Limits before work: what would not fit is refused in one line that names the key."""
 
 import time
+import tomllib
 
 import pytest
 import torch
 
 from cli.small import GRADCHECK, RUN, STARTS, call
 from invertwin.cli import estimate as estimates
-from invertwin.cli import run_gradcheck, run_simulate
+from invertwin.cli import run_check, run_gradcheck, run_simulate
 from invertwin.cli.fits import problem
+from invertwin.cli.run_file import validate
 from invertwin.cli.running import time_left
+from invertwin.errors import PhysicsWarning
 from invertwin.scene import Mesh, shapes
 from invertwin.scene.files import save_mesh
 
@@ -63,7 +66,8 @@ CASES = {
 @pytest.fixture
 def idle(monkeypatch):
     """No work begins."""
-    for module, name in ((problem, "exact"), (run_simulate, "exact"), (run_gradcheck, "gradcheck")):
+    work = (problem, "exact"), (run_simulate, "exact"), (run_check, "exact")
+    for module, name in (*work, (run_gradcheck, "gradcheck")):
         monkeypatch.setattr(module, name, None)
 
 
@@ -102,6 +106,7 @@ def test_every_command_refuses_the_same(run_file, monkeypatch, capsys, command):
 
 
 @pytest.mark.usefixtures("idle")
+@pytest.mark.filterwarnings("ignore:.*a mesh 400 m wide")
 def test_a_mesh_in_millimetres_is_refused(run_file, monkeypatch, capsys):
     ball = shapes.sphere(200.0, 2)
     save_mesh(run_file.parent / "ball.ply", ball)
@@ -138,3 +143,11 @@ def test_areas_and_separable_arrays():
     assert estimates._area(plate) == pytest.approx(6.0)
     bent = Mesh(torch.eye(3, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
     assert estimates._area(bent) == pytest.approx(3**0.5 / 2)
+
+
+@pytest.mark.usefixtures("idle")
+def test_a_fit_of_another_depth_than_its_data_gets_a_warning(tmp_path):
+    text = RUN.replace("depth = 1", "depth = 2", 1)  # of the data
+    run = validate(tomllib.loads(text), tmp_path / "run.toml")
+    with pytest.warns(PhysicsWarning, match=r"reconstruct.depth is 1, data.depth is 2"):
+        problem._warn_of_depths(run, problem.sensors_of(run))

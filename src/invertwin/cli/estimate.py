@@ -298,7 +298,7 @@ def _require_stated(run: RunFile, scene: Scene) -> None:
     for i, stage in enumerate(run.stages):
         for name in free if stage.remesh else ():
             with about(f"stages[{i}].remesh"):
-                require_edge(scene[name].mesh, stage.remesh)
+                require_edge(scene[name].mesh, stage.remesh or 0.0)
 
 
 def _separable(radar: Radar) -> bool:

@@ -116,7 +116,7 @@ def _map(sensor: Sensor, truth: Scene, depth: int, count: int, fitted: bool) -> 
 
 def _signals(sensor: Sensor, truth: Scene, count: int) -> float:
     """Simulate exact signals of about so many paths; return their number."""
-    data, whole = sensor.run.data, of_sensor(sensor, truth)[1]
+    data, whole = need(sensor.run, "data", "a simulation"), of_sensor(sensor, truth)[1]
     share = min(1.0, count / whole)
     fewer = {
         "points_per_m2": data.points_per_m2 * share,

@@ -88,7 +88,7 @@ def pose_grid(
         raise InputError(
             f"expected a box with low <= high, got {list(low)} and {list(high)}; exchange them"
         )
-    places = math.prod(1 + (b - a) / step for a, b in zip(low, high, strict=True)) * turns
+    places = math.prod(1 + float(b - a) / step for a, b in zip(low, high, strict=True)) * turns
     require_at_most(
         places, _MOST_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
     )

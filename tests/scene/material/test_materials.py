@@ -1,6 +1,7 @@
 """The materials: what they tell the ray kernel, its gradients, bad values."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -155,7 +156,8 @@ def test_unphysical_values_are_refused(make, message):
 
 
 def test_values_that_a_material_does_not_have_are_refused_by_name():
-    for make in (lambda: RoughConductor("steel"), lambda: RoughConductor(scatering=0.3)):
+    kind: Any = RoughConductor
+    for make in (lambda: kind("steel"), lambda: kind(scatering=0.3)):
         with pytest.raises(InputError, match=r"expected values of RoughConductor by name \(scatt"):
             make()
     with pytest.raises(InputError, match="got str"):
