@@ -8,7 +8,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "untrusted"}
+FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "memory", "untrusted"}
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "threads", "channel"}
 RADAR = CHANNEL - {"doctor", "threads"} | {"radar"}
@@ -24,6 +24,7 @@ ALLOWED = {
     "limits": set(),
     "seeds": set(),
     "folders": {"errors"},
+    "memory": {"errors"},
     "untrusted": {"errors"},
     "threads": set(),
     "doctor": FOUNDATION,
@@ -38,6 +39,7 @@ ALLOWED = {
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
     "cli": INVERSION | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
+    "__main__": {"errors", "cli"},
     "__init__": INVERSION | {"doctor", "threads"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}

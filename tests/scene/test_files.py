@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (
     Mesh,
     Object,
@@ -20,6 +20,7 @@ from invertwin.scene import (
     Scene,
     box,
     load_mesh,
+    load_parts,
     load_scene_xml,
     plate,
     rigid,
@@ -373,3 +374,24 @@ def test_damaged_arrays_are_one_error(damage, tmp_path):
         InputError, match=r"expected plain arrays .*, got .*parts\.npz \(.*\); look$"
     ):
         read_arrays(file, "look")
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_units_parts_and_materials_of_a_file(tmp_path):
+    (tmp_path / "two.obj").write_text(
+        "v 0 0 0\nv 100 0 0\nv 0 200 0\nv 0 0 300\n"
+        "mtllib two.mtl\nusemtl steel\nf 1 2 3\nusemtl paint\nf 1 3 4\nf 1 4 2\n"
+    )
+    (tmp_path / "two.mtl").write_text("newmtl steel\nKd 1 0 0\nnewmtl paint\nKd 0 1 0\n")
+    whole = load_mesh(tmp_path / "two.obj", unit="mm")
+    found = whole.summary()
+    assert found.extent == pytest.approx((0.1, 0.2, 0.3))
+    assert (found.triangles, found.open_edges, found.nonmanifold_edges) == (3, 3, 0)
+    assert str(found) == "0.1 × 0.2 × 0.3 m, 3 triangles, 3 open and 0 non-manifold edges"
+    parts = load_parts(tmp_path / "two.obj", unit="mm")
+    assert {name: len(part.faces) for name, part in parts.items()} == {"steel": 1, "paint": 2}
+    assert parts["paint"].summary().extent == pytest.approx((0.1, 0.2, 0.3))
+    with pytest.raises(InputError, match="a unit among m, cm"):
+        load_mesh(tmp_path / "two.obj", unit="parsec")  # type: ignore[arg-type]
+    with pytest.warns(PhysicsWarning, match=r'300 m wide.*unit = "mm"'):
+        load_mesh(tmp_path / "two.obj")

@@ -25,11 +25,19 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.run_file import about_file
 from invertwin.cli.running import load_runs, now_and_then, print_tables, run_folder
-from invertwin.errors import InputError, one_line
+from invertwin.errors import InputError, interruptible, one_line
 
 
 class _Commands(TyperGroup):
     """Our commands, and those of plugins, which are imported when ours do not answer."""
+
+    def make_context(self, *args: Any, **given: Any) -> Any:
+        with interruptible():
+            return super().make_context(*args, **given)
+
+    def invoke(self, ctx: Any) -> Any:
+        with interruptible():
+            return super().invoke(ctx)
 
     def list_commands(self, ctx: Any) -> list[str]:
         self._add_plugins()
@@ -111,6 +119,20 @@ def plan(options: Resumable, file: FileArgument) -> None:
         with about_file(file):
             tables = run_plan(runs[file.stem], folder, console, now_and_then())
         print_tables(tables)
+
+
+@app.command()
+def check(file: FileArgument, backend: BackendOption = None) -> None:
+    """Say what a run file needs, memory and time, and do nothing else."""
+    from invertwin.cli.run_file import load_run
+
+    run = load_run(file)
+    from invertwin.cli.run_check import run_check
+
+    with about_file(file):
+        tables, line = run_check(run)
+    print_tables(tables)
+    console.print(line, markup=False, soft_wrap=True)
 
 
 @app.command()

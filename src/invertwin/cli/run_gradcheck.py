@@ -12,6 +12,7 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
+from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.report import Picture, Table, finish, picture, texts
 from invertwin.cli.run_file import about_file, need
 from invertwin.cli.schema import RunFile
@@ -140,6 +141,7 @@ def _check(
     scene = build.scene(run)
     radar = build.radar(need(run, "radar", "gradcheck"))
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
+    require_room(run, scene, {"": Sensor(run, radar, grid)})
     module, tangent = build.tangent(run, scene)
     for key in _studies(run) if settings.parameter.kind not in _MOVES else ():
         raise InputError(

@@ -130,8 +130,8 @@ def gradcheck(
     check = check or Check()
     if not model.smooth:
         raise InputError(
-            f"expected a smooth model such as SurrogateMap, got {type(model).__name__}: "
-            "silhouettes of single rough points have no derivative"
+            f"expected a smooth model, got {type(model).__name__}, whose silhouettes of single "
+            "rough points have no derivative; use one such as SurrogateMap"
         )
     target = scene if of == "scene" else sensor
     line = line_of(module, tangent, target)

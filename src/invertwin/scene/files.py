@@ -1,9 +1,11 @@
 """Read meshes and scene geometry from files, and write meshes to files."""
 
 import math
+import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,7 +14,7 @@ from torch import Tensor
 from trimesh import transformations
 from trimesh.exchange.gltf import export_glb
 
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.folders import replacing
 from invertwin.scene import shapes
 from invertwin.scene.checks import checked_tensor
@@ -23,39 +25,98 @@ from invertwin.scene.scene import Object, Scene
 from invertwin.untrusted import existing_file, reader, reading
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
+Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+_LARGE = 100.0  # m
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
 
 
-@reader("a readable mesh")
-def load_mesh(file: str | Path) -> Mesh:
-    """A triangle mesh from an OBJ, PLY, STL or glTF file.
+def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
+    """A triangle mesh from an OBJ, PLY, STL or glTF file; `Mesh.summary` says what came.
 
     Vertices at equal positions are merged, vertices of no triangle are left out, the rest keep
-    their order. All parts of the file become one mesh; units are taken as metres and axes as they
-    are.
+    their order. All parts of the file become one mesh (`load_parts` keeps them apart); axes are
+    taken as they are. A mesh of more than 100 m gets a warning: it may be in millimetres.
 
     Args:
         file: OBJ, PLY, STL or glTF; its suffix tells the format.
+        unit: of the file's numbers
 
     Raises:
-        InputError: no such file, another format, a broken file, no triangles, or NaN.
+        InputError: no such file, another format, a broken file, no triangles, NaN, or another
+            unit.
     """
+    return _loaded(file, unit, lambda scene: {"": scene.to_mesh()})[""]
+
+
+def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
+    """The parts of an OBJ, PLY, STL or glTF file, one for each name and material.
+
+    Their names are those of the file, of its objects or, as in OBJ, of its materials; a further
+    part of the same name has a number. All are in the frame of the file.
+
+    Args:
+        file: OBJ, PLY, STL or glTF; its suffix tells the format.
+        unit: of the file's numbers
+
+    Raises:
+        InputError: what `load_mesh` refuses.
+    """
+
+    whole = Path(file).name  # how nodes without a name of their own are called
+
+    def apart(scene: trimesh.Scene) -> dict[str, trimesh.Trimesh]:
+        found: dict[str, trimesh.Trimesh] = {}
+        for node in scene.graph.nodes_geometry:
+            transform, name = scene.graph[node]
+            mesh = scene.geometry[name].copy()
+            if isinstance(mesh, trimesh.Trimesh):
+                mesh.apply_transform(transform)
+                # In glTF a node has a name, and every part of it a material.
+                material = getattr(getattr(mesh.visual, "material", None), "name", None)
+                named = "" if str(node).startswith(whole) else str(node)
+                label = ", ".join(dict.fromkeys(filter(None, (named, material)))) or str(node)
+                found[f"{label} {len(found)}" if label in found else label] = mesh
+        return found
+
+    return _loaded(file, unit, apart)
+
+
+@reader("a readable mesh")
+def _loaded(
+    file: str | Path, unit: Unit, split: Callable[[trimesh.Scene], Mapping[str, trimesh.Trimesh]]
+) -> dict[str, Mesh]:
     path = existing_file(file)
+    if unit not in _METRES:
+        raise InputError(f"expected a unit among {', '.join(_METRES)}, got {unit!r}; choose one")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
             f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {path.name}; convert it first"
         )
+    found = {}
     with reading(path, f"a readable {path.suffix} mesh"):
-        loaded = trimesh.load_scene(path, process=False).to_mesh()
-        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
+        for name, part in split(trimesh.load_scene(path, process=False)).items():
+            vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
+            faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
+            found[name] = vertices * _METRES[unit], faces
     try:
         # The first check sees the file as it is: merging would hide what is wrong with it.
-        Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
-        return _merged(vertices, faces)
+        for vertices, faces in found.values():
+            Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
+        meshes = {name: _merged(*part) for name, part in found.items()}
+        if not meshes:
+            raise InputError("expected triangles, got none; export the mesh again")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    extent = max(float(np.ptp(vertices, axis=0).max()) for vertices, _ in found.values())
+    if extent > _LARGE:
+        warnings.warn(
+            f'{path}: a mesh {extent:.4g} m wide; if its numbers are millimetres, say unit = "mm"',
+            PhysicsWarning,
+            stacklevel=3,
+        )
+    return meshes
 
 
 def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:

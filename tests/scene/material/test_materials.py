@@ -1,6 +1,7 @@
 """The materials: what they tell the ray kernel, its gradients, bad values."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -152,3 +153,12 @@ def test_every_value_has_a_range():
 def test_unphysical_values_are_refused(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+def test_values_that_a_material_does_not_have_are_refused_by_name():
+    kind: Any = RoughConductor
+    for make in (lambda: kind("steel"), lambda: kind(scatering=0.3)):
+        with pytest.raises(InputError, match=r"expected values of RoughConductor by name \(scatt"):
+            make()
+    with pytest.raises(InputError, match="got str"):
+        RoughDielectric("concrete")

@@ -8,8 +8,10 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.memory import require_at_most
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 
+_MOST_NODES, _MOST_ALONG = 2e7, 2000
 _DO = "give x, y, z of the box's corners"
 
 
@@ -49,6 +51,13 @@ class Lattice:
                 f"expected a box with low < high, got {first.tolist()} and {last.tolist()}; {_DO}"
             )
         x, y, z = (checked_count(count, "nodes along an axis", 2) for count in counts)
+        for count, most, where in (
+            (max(x, y, z), _MOST_ALONG, " along an axis"),
+            (x * y * z, _MOST_NODES, ""),
+        ):
+            require_at_most(
+                count, most, f"nodes of a grid{where}", "take fewer, wider apart", "counts"
+            )
         return cls(first, last, (x, y, z))
 
     @property

@@ -28,6 +28,7 @@ from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.roughness import (
     MIRROR_LOBE_WIDTH,
     ROUGH_LOBE_WIDTH,
+    ROUGH_SCATTERING,
     EffectiveRoughness,
     Weights,
     lobe_exponent,
@@ -45,6 +46,19 @@ _MIRROR = torch.ones_like(_COSINES)
 
 class _Values:
     """Checks the fields of a dataclass by name, and knows for how many triangles they are."""
+
+    def __new__(cls, *values: object, **named: object) -> Any:
+        """Refuse values that the material does not have, before Python does so in its own words."""
+        names = {entry.name: entry.kw_only for entry in fields(cls)}  # type: ignore[arg-type]
+        bare = [name for name, by_name in names.items() if not by_name]
+        others = [repr(value) for value in values[len(bare) :]]
+        others += [name for name in named if name not in names]
+        if others:
+            raise InputError(
+                f"expected values of {cls.__name__} by name ({', '.join(names)}), got "
+                f"{others[0]}; such as {cls.__name__}({next(reversed(names))}=...)"
+            )
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         for name in _value_names(self):
@@ -158,8 +172,10 @@ class PerfectConductor(_Values, Material):
 class RoughConductor(_Values, EffectiveRoughness, Material):
     """A perfect conductor with a rough surface: all power comes back, spread by the roughness.
 
-    Its fields are those of `EffectiveRoughness`.
+    Its fields are those of `EffectiveRoughness`; a rough surface scatters by default.
     """
+
+    scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
@@ -195,8 +211,10 @@ class Dielectric(Medium, EffectiveRoughness, Material):
 
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
-            `EffectiveRoughness`.
+            `EffectiveRoughness`; it scatters by default.
     """
+
+    scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""

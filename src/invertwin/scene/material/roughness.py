@@ -24,6 +24,8 @@ from invertwin.scene.material.values import Value, checked_value, evaluated
 
 MIRROR_LOBE_WIDTH = math.radians(5.0)
 ROUGH_LOBE_WIDTH = math.radians(20.0)
+ROUGH_SCATTERING = 0.4
+"""S of building walls, as measured (Degli-Esposti et al. 2007)."""
 
 
 class Weights(NamedTuple):
