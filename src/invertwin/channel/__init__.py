@@ -16,5 +16,12 @@ from invertwin.channel.rays.backend import torch_threads as torch_threads
 from invertwin.channel.rays.backend import use_backend as use_backend
 from invertwin.channel.rays.geometry import differentiated as differentiated
 from invertwin.channel.rays.scene import visible_points as visible_points
+from invertwin.channel.reference.cross_sections import CrossSection as CrossSection
+from invertwin.channel.reference.cross_sections import DihedralByMoments as DihedralByMoments
+from invertwin.channel.reference.cross_sections import DihedralSection as DihedralSection
+from invertwin.channel.reference.cross_sections import PlateSection as PlateSection
+from invertwin.channel.reference.cross_sections import SphereSection as SphereSection
+from invertwin.channel.reference.cross_sections import SquareTrihedralSection as SquareTrihedralSection
+from invertwin.channel.reference.cross_sections import TrihedralSection as TrihedralSection
 from invertwin.channel.reference.power import trace_power as trace_power
 from invertwin.channel.sampling import Sampling as Sampling

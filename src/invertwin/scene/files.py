@@ -22,20 +22,22 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
 from invertwin.untrusted import existing_file, reading
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
+_CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # of shell elements, by the digit in their type
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
 
 
 def load_mesh(file: str | Path) -> Mesh:
-    """A triangle mesh from an OBJ, PLY, STL or glTF file.
+    """A triangle mesh from an OBJ, PLY, STL, glTF or Abaqus file.
 
     Vertices at equal positions are merged, vertices of no triangle are left out, the rest keep
     their order. All parts of the file become one mesh; units are taken as metres and axes as they
-    are.
+    are. Of an Abaqus file (.inp) shell elements of three and four corners are read, parts where they
+    are defined; quadrilaterals are split.
 
     Args:
-        file: OBJ, PLY, STL or glTF; its suffix tells the format.
+        file: OBJ, PLY, STL, glTF or Abaqus; its suffix tells the format.
 
     Raises:
         InputError: no such file, another format, a broken file, no triangles, or NaN.
@@ -46,9 +48,12 @@ def load_mesh(file: str | Path) -> Mesh:
             f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {path.name}; convert it first"
         )
     with reading(path, f"a readable {path.suffix} mesh"):
-        loaded = trimesh.load_scene(path, process=False).to_mesh()
-        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
+        if path.suffix.lower() == ".inp":
+            vertices, faces = _abaqus(path.read_text(encoding="utf-8-sig"))
+        else:
+            loaded = trimesh.load_scene(path, process=False).to_mesh()
+            vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+            faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
     try:
         # The first check sees the file as it is: merging would hide what is wrong with it.
         Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
@@ -115,6 +120,45 @@ def load_scene_xml(
         return _scene_of(root, file.parent, dict(materials or {}), default)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
+
+
+def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of the nodes and shell elements of an Abaqus file."""
+    nodes: dict[str, int] = {}
+    places: list[list[float]] = []
+    faces: list[list[int]] = []
+    keyword, corners, words = "", 0, []
+    for line in text.splitlines():
+        if line.startswith("**") or not line.strip():
+            continue
+        if line.startswith("*"):
+            keyword, *options = line[1:].upper().replace(" ", "").split(",")
+            if keyword == "PART":
+                nodes = {}  # every part numbers its own
+            kind = next((o[5:] for o in options if o.startswith("TYPE=")), "")
+            corners, words = _corners_of(kind) if keyword == "ELEMENT" else 0, []
+        elif keyword == "NODE":
+            number, *place = line.split(",")[:4]
+            nodes[number.strip()] = len(places)
+            places.append([float(value) for value in place])
+        elif keyword == "ELEMENT":
+            words += [word.strip() for word in line.split(",") if word.strip()]
+            if line.rstrip().endswith(","):
+                continue  # the element goes on
+            used = [nodes[word] for word in words[1 : 1 + corners]]
+            faces += [[used[0], used[k], used[k + 1]] for k in range(1, len(used) - 1)]
+            words = []
+    if not faces:
+        raise ValueError("no shell elements")
+    return np.array(places, dtype=np.float64), np.array(faces, dtype=np.int64)
+
+
+def _corners_of(kind: str) -> int:
+    """Corners of an element type such as S3, STRI65, S4R, R3D3; 0 of other than shells."""
+    if not kind.startswith(("S", "R3D", "M3D", "CPS", "CPE", "DS", "SFM3D")):
+        raise ValueError(f"elements of type {kind}, no shells")
+    digits = [c for c in kind.replace("R3D", "").replace("M3D", "") if c.isdigit()]
+    return _CORNERS[digits[0]]
 
 
 def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:

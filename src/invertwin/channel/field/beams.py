@@ -146,7 +146,7 @@ def _without(facets: Facets, bounce: Bounce, shadow: Tensor) -> Bounce:
     sides = _sides(shadow, bounce.direction)
     covered = bounce.polygon
     for plane, at, proper in sides:
-        covered = clip(covered, plane, torch.where(proper, dot(plane, at), 1.0))
+        covered = clip(covered, plane, torch.where(proper, dot(plane, at), -1.0))
     hidden = area_vector(covered).detach().norm(dim=1) > _EMPTY * facets.size**2
     # The prism of a polygon without area, or seen edge-on, hides nothing.
     hidden &= dot(area_vector(shadow), bounce.direction).detach().abs() > _EMPTY * facets.size**2

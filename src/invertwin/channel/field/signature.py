@@ -9,8 +9,9 @@ mean of both ways, which is. In one place it is the mean of both cross-polar ter
 
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import torch
 from jaxtyping import Complex128, Float64
@@ -18,6 +19,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.beams import Bounce, Facets, beams
+from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
 from invertwin.channel.field.tubes import TubeBounce, tubes
 from invertwin.channel.field.waves import (
@@ -51,6 +53,7 @@ _SMOOTH = (1e-6, 0.35)  # rad that normals turn from facet to facet where a surf
 _SEGMENTS = 2.0  # of an edge per wavelength; each is seen or not
 _OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
 _ROWS_AT_ONCE = 1 << 18
+_Lit = Bounce | TubeBounce
 
 
 @dataclass(frozen=True)
@@ -169,26 +172,36 @@ class _View:
     def _bounces(self, depth: int, spacing: float | None) -> dict[str, Tensor]:
         """Physical optics of every order: of beams, or of tubes where a spacing is given."""
         body, orders = self.body, [list(self._none()) for _ in range(depth)]
-        chains: Iterable[Sequence[Bounce] | Sequence[TubeBounce]]
+        chains: Iterable[tuple[int, Sequence[_Lit]]]
         if spacing is None:
-            chains = [list(beams(body.facets, -self.transmitters, depth))]
+            chains = [(0, list(beams(body.facets, -self.transmitters, depth)))]
         else:
-            corners = body.facets.corners.detach()
-            chains = tubes(body.occluders, corners, -self.transmitters, spacing, depth)
-        for chain in chains:
+            chains = self._sampled(depth, spacing)
+        for first, chain in chains:
             currents: list[Tensor] = []
             for f, k in enumerate(body.wave_numbers):
                 if not (body.plain and currents):
                     currents = self._currents(chain, body.skins[f], 1.0 if body.plain else k)
-                for order, bounce, current in zip(orders, chain, currents, strict=False):
+                rows = zip(orders, chain, currents, strict=False)
+                for order, bounce, current in islice(rows, first, None):
                     towards = self.receivers[bounce.aspect]
                     strength = bounce.integral(k, towards) * (k if body.plain else 1.0)
                     sent = current * strength[:, None, None]
                     order[f] = order[f].index_add(0, bounce.aspect, sent)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
+    def _sampled(self, depth: int, spacing: float) -> Iterator[tuple[int, Sequence[_Lit]]]:
+        """Many facets: the first order triangle by triangle, the others by tubes."""
+        body, incident = self.body, -self.transmitters
+        for lit in lit_triangles(body.facets, body.clear, incident, spacing):
+            yield 0, [lit]
+        if depth > 1:
+            corners = body.facets.corners.detach()
+            for chain in tubes(body.occluders, corners, incident, spacing, depth):
+                yield 1, chain
+
     def _currents(
-        self, chain: Sequence[Bounce] | Sequence[TubeBounce], skins: Skins, k: float
+        self, chain: Sequence[_Lit], skins: Skins, k: float
     ) -> list[Tensor]:
         """S per m² of all patches, order by order: [row, receive, transmit] each."""
         found: list[Tensor] = []
