@@ -99,8 +99,10 @@ class Signature:
         places = torch.as_tensor(points, dtype=torch.float64)
         flat = places.reshape(-1, 3)
         both = self.directions + self.receivers
-        weight = _hann(len(self.frequencies))[:, None] * _hann(len(both)) / (
-            len(self.frequencies) * len(both)
+        weight = (
+            _hann(len(self.frequencies))[:, None]
+            * _hann(len(both))
+            / (len(self.frequencies) * len(both))
         )
         weighted = (self.matrix * weight[..., None, None]).reshape(-1, 4)
         k = 2 * math.pi * self.frequencies / SPEED_OF_LIGHT

@@ -21,7 +21,9 @@ from invertwin.channel.reference.cross_sections import DihedralByMoments as Dihe
 from invertwin.channel.reference.cross_sections import DihedralSection as DihedralSection
 from invertwin.channel.reference.cross_sections import PlateSection as PlateSection
 from invertwin.channel.reference.cross_sections import SphereSection as SphereSection
-from invertwin.channel.reference.cross_sections import SquareTrihedralSection as SquareTrihedralSection
+from invertwin.channel.reference.cross_sections import (
+    SquareTrihedralSection as SquareTrihedralSection,
+)
 from invertwin.channel.reference.cross_sections import TrihedralSection as TrihedralSection
 from invertwin.channel.reference.power import trace_power as trace_power
 from invertwin.channel.sampling import Sampling as Sampling

@@ -80,8 +80,7 @@ def _signature(name: str, run: RunFile, folder: RunFolder) -> _Found:
         found = table.build({Scene: build.scene(run)})
     kept: _Found = {
         "peak_dbsm": {
-            channel: _level(found.dbsm[:, :, i, j])
-            for channel, (i, j) in table.channels.items()
+            channel: _level(found.dbsm[:, :, i, j]) for channel, (i, j) in table.channels.items()
         }
     }
     if table.cases:
@@ -157,8 +156,8 @@ def _of_file(table: Rcs, measurement: Measurement, found: Signature) -> dict[str
     keys: dict[str, _Rows] = {}
     for f in frequency[same].unique().tolist():
         own = same & (frequency == f)
-        letter = measurement.channel[0] if len(set(measurement.channel)) == 1 else (
-            measurement.channel
+        letter = (
+            measurement.channel[0] if len(set(measurement.channel)) == 1 else (measurement.channel)
         )
         name = f"{float(found.frequencies[f]) / 1e9:g}GHz_{letter}"
         keys[name] = (frequency[own], aspect[own], data.dbsm[own], channel)
@@ -178,7 +177,7 @@ def _pictures(
     """Draw what was found; file names and titles."""
     shown = {name: "Radar cross-section"}
     angles, label = table.angles
-    first, second = list(table.channels.values())[0], list(table.channels.values())[3]
+    first, *_, second = table.channels.values()
     names = {at: channel for channel, at in table.channels.items()}
     levels = found.dbsm
     panels: dict[str, dict[str, Tensor]] = {}
@@ -241,7 +240,10 @@ def _rows(table: Rcs, found: Signature) -> str:
             values = [matrix[f, a, i, j] for i, j in table.channels.values()]
             cells = [f"{float(v.real):.9e},{float(v.imag):.9e}" for v in values]
             lines.append(
-                f"{frequency:.9e}," + ",".join(f"{c:.9f}" for c in direction) + "," + ",".join(cells)
+                f"{frequency:.9e},"
+                + ",".join(f"{c:.9f}" for c in direction)
+                + ","
+                + ",".join(cells)
             )
     return "\n".join(lines) + "\n"
 

@@ -33,7 +33,12 @@ def sections(
             style = "--" if name.startswith("measured") else "-"
             marker = "." if len(curve) < 8 else ""
             axes.plot(
-                numbers(across), curve, style, marker=marker, color=color(number), lw=1.1,
+                numbers(across),
+                curve,
+                style,
+                marker=marker,
+                color=color(number),
+                lw=1.1,
                 label=legible(name),
             )
         axes.set(title=legible(title), xlabel=label, ylabel="RCS [dBsm]")

@@ -33,8 +33,8 @@ def load_mesh(file: str | Path) -> Mesh:
 
     Vertices at equal positions are merged, vertices of no triangle are left out, the rest keep
     their order. All parts of the file become one mesh; units are taken as metres and axes as they
-    are. Of an Abaqus file (.inp) shell elements of three and four corners are read, parts where they
-    are defined; quadrilaterals are split.
+    are. Of an Abaqus file (.inp) shell elements are read by their corners, in the coordinates in
+    which they are defined; quadrilaterals are split.
 
     Args:
         file: OBJ, PLY, STL, glTF or Abaqus; its suffix tells the format.

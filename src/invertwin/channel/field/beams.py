@@ -110,9 +110,7 @@ def _next(facets: Facets, incident: Tensor, last: Bounce | None) -> Bounce:
     aspect, facet, before = aspect[keep], facet[keep], before[keep]
     direction, offset = direction[keep], offset[keep]
     normal = -facing[keep].sign()[:, None] * normal[keep]
-    bounce = Bounce(
-        aspect, facet, normal, direction, offset, facets.corners[facet], before
-    )
+    bounce = Bounce(aspect, facet, normal, direction, offset, facets.corners[facet], before)
     if last is not None:
         bounce = _within(facets, bounce, last)
     return _unhidden(facets, bounce, last)

@@ -44,7 +44,9 @@ def lit_triangles(
         facing = dot(facets.normal[number[row]].detach(), incident[aspect])
         turned = (facing < 0) | ~facets.solid[number[row]]
         keep = turned & (facing.abs() > 1e-9)
-        yield _lit(facets, clear, incident, smallest, aspect[keep], number[row[keep]], corners[row[keep]])
+        yield _lit(
+            facets, clear, incident, smallest, aspect[keep], number[row[keep]], corners[row[keep]]
+        )
 
 
 def _lit(
@@ -72,8 +74,8 @@ def _lit(
         aspect = aspect[split].repeat_interleave(4)
         number = number[split].repeat_interleave(4)
         corners = _quarters(corners[split])
-    aspect, number, corners = map(torch.cat, zip(*found, strict=True)) if found else (
-        aspect, number, corners
+    aspect, number, corners = (
+        map(torch.cat, zip(*found, strict=True)) if found else (aspect, number, corners)
     )
     d = incident[aspect]
     normal = _towards(facets.normal[number], d)

@@ -200,15 +200,15 @@ class _View:
             for chain in tubes(body.occluders, corners, incident, spacing, depth):
                 yield 1, chain
 
-    def _currents(
-        self, chain: Sequence[_Lit], skins: Skins, k: float
-    ) -> list[Tensor]:
+    def _currents(self, chain: Sequence[_Lit], skins: Skins, k: float) -> list[Tensor]:
         """S per m² of all patches, order by order: [row, receive, transmit] each."""
         found: list[Tensor] = []
         again = torch.zeros(0)
         for bounce in chain:
             first = not found
-            field = self._sent.to(torch.complex128)[bounce.aspect] if first else again[bounce.before]
+            field = (
+                self._sent.to(torch.complex128)[bounce.aspect] if first else again[bounce.before]
+            )
             surface = (skins.rows(bounce.facet), k, bounce.normal, bounce.direction, field)
             sent = radiated(*surface, self.receivers[bounce.aspect])
             seen = polarisations(self.receivers, self.body.up)[bounce.aspect]
@@ -229,7 +229,7 @@ class _View:
         every = torch.arange(len(self.transmitters))
         for f, k in enumerate(body.wave_numbers if plates else ()):
             several = several_diffractions(
-                wedges, plates, k, -self.transmitters, self._sent, self.receivers, most, body.clear
+                plates, k, -self.transmitters, self._sent, self.receivers, most, body.clear
             )
             for total, sent in zip(totals, several, strict=True):
                 total[f] = self._received(total[f], every, sent)
@@ -307,11 +307,6 @@ def _body(scene: Scene, frequencies: Tensor, up: Tensor) -> _Body:
     topology = topology_of([item.mesh for item in objects.values()])
     corners = vertices[topology.faces]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if not bool((area.detach().norm(dim=1) > 0).all()):
-        keep = area.detach().norm(dim=1) > 0
-        raise InputError(
-            f"expected triangles with an area, got {int((~keep).sum())} without; repair the mesh"
-        )
     volume = dot(corners.detach()[:, 0], area.detach()) / 6
     solid = torch.zeros(len(corners), dtype=torch.bool)
     for number in range(len(objects)):
@@ -350,10 +345,12 @@ def _warn(scene: Scene, body: _Body, density: float, spacing: float | None) -> N
     if spacing is not None and density < 1:
         found.append(f"{density:g} tubes per wavelength are too few: use 1 or more, better 4")
     faces = body.topology.face_object
-    both = body.topology.beside[:, :2]
-    both = torch.where((both >= 0).all(1, keepdim=True), both, 0)
+    both = torch.nn.functional.pad(body.topology.beside, (0, 1), value=-1)[:, :2]
+    both = torch.where(both >= 0, both, both[:, :1])  # an open edge does not turn
     normal = body.facets.normal.detach()
-    turn = 2 * torch.asin((0.5 * (normal[both[:, 0]] - normal[both[:, 1]]).norm(dim=1)).clamp_max(1))
+    turn = 2 * torch.asin(
+        (0.5 * (normal[both[:, 0]] - normal[both[:, 1]]).norm(dim=1)).clamp_max(1)
+    )
     ends = body.vertices.detach()[body.topology.edges]
     # A triangle of side ℓ whose neighbours turn by α is ℓα/√12 off the curved surface.
     off = (ends[:, 1] - ends[:, 0]).norm(dim=1) * turn / math.sqrt(12)

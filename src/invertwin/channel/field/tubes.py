@@ -123,9 +123,7 @@ def _walk(
         normal = -facing.sign()[:, None] * normal
         share = (axes @ normal[..., None])[..., 0] / facing.abs()[:, None]
         sides = axes + share[..., None] * d[:, None]
-        found.append(
-            TubeBounce(aspect, facet, normal, d, position, length, sides, before)
-        )
+        found.append(TubeBounce(aspect, facet, normal, d, position, length, sides, before))
         d, axes, start = mirrored(d, normal), mirrored(axes, normal[:, None]), position
         before = torch.arange(len(aspect))
     return found

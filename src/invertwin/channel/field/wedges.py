@@ -72,6 +72,9 @@ def find_wedges(
         inward = corners[faces].mean(2) - ends[edge, :1]
         inward = normalize(inward - dot(inward, along[:, None])[..., None] * along[:, None], dim=2)
         normal = cross(along[:, None], inward)
+        # Triangles without area have no side to an edge.
+        whole = (normal.detach().norm(dim=2) > 0.5).all(1)
+        edge, faces, inward, normal = edge[whole], faces[whole], inward[whole], normal[whole]
         if count == 1:
             inwards = inward.expand(-1, 2, 3)
             normals = torch.cat([normal, -normal], 1)

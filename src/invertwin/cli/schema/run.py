@@ -45,7 +45,8 @@ AnyData = Annotated[Any, OneOf("data")]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
 AnyGradcheck = Annotated[Any, TableOf(Check, Gradcheck)]
 AnyRcs = Annotated[
-    Any, TableOf(rcs, Rcs, ("directions", "frequencies", "receivers", "polarisation"), checked=False)
+    Any,
+    TableOf(rcs, Rcs, ("directions", "frequencies", "receivers", "polarisation"), checked=False),
 ]
 
 

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import MinLen
-from pydantic import model_validator
+from pydantic import GetCoreSchemaHandler, model_validator
 from torch import Tensor
 
 from invertwin.limits import Positive, Several
@@ -24,7 +24,16 @@ class Sweep(Section):
     count: Several = key("how many, both ends with them")
 
 
-Swept: Any = number_or_list(float, Annotated[list[float], MinLen(1)], Sweep)
+class _Numbers:
+    """Annotates a key that is one number, a list, or a sweep."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        kind = number_or_list(float, Annotated[list[float], MinLen(1)], Sweep)
+        return handler.generate_schema(kind)
+
+
+Swept = Annotated[Any, _Numbers]
 
 
 def swept(value: Any) -> Tensor:
@@ -49,7 +58,9 @@ class Case(Section):
         "received and sent polarisation"
     )
     part: str | None = key('such as "order 3"; without it the whole field', None)
-    statistic: Literal["max", "rms"] = key("of the dB errors over all frequencies and aspects", "max")
+    statistic: Literal["max", "rms"] = key(
+        "of the dB errors over all frequencies and aspects", "max"
+    )
 
 
 class Measurement(Section):
