@@ -107,7 +107,7 @@ def _level(levels: Tensor) -> float | None:
 def _error(table: Rcs, name: str, found: Signature) -> float:
     """How far a case is from what it should be, in dB."""
     case = table.cases[name]
-    with about(f"cases.{name}"):
+    with about(f"rcs.cases.{name}"):
         if case.part is not None and case.part not in found.parts:
             raise InputError(
                 f"expected a part ({', '.join(found.parts)}), got {case.part}; choose one", "part"
@@ -131,7 +131,7 @@ def _measured(table: Rcs, found: Signature) -> tuple[dict[str, _Rows], list[str]
         if not Path(measurement.file).exists():
             skipped.append(measurement.file)
             continue
-        with about(f"measured[{number}]"):
+        with about(f"rcs.measured[{number}]"):
             rows |= _of_file(table, measurement, found)
     return rows, skipped
 

@@ -42,12 +42,20 @@ class Skins(NamedTuple):
 
 
 def dot(first: Tensor, second: Tensor) -> Tensor:
-    """Scalar products of rows, of fields with real vectors, too."""
+    """Scalar products of rows.
+
+    Args:
+        first, second: vectors, or fields and vectors.
+    """
     return (first * second).sum(-1)
 
 
 def cross(first: Tensor, second: Tensor) -> Tensor:
-    """Vector products of rows, of fields with real vectors, too."""
+    """Vector products of rows.
+
+    Args:
+        first, second: vectors, or fields and vectors.
+    """
     first, second = torch.broadcast_tensors(first, second)
     kind = torch.promote_types(first.dtype, second.dtype)
     return torch.linalg.cross(first.to(kind), second.to(kind))
@@ -72,7 +80,12 @@ def polarisations(direction: Vectors, up: Float64[Tensor, "3"]) -> Float64[Tenso
 
 
 def mirrored(vector: Tensor, normal: Vectors) -> Tensor:
-    """A vector reflected by a plane: v − 2(n·v)n."""
+    """A vector reflected by a plane: v − 2(n·v)n.
+
+    Args:
+        vector: v.
+        normal: n.
+    """
     return vector - 2 * dot(normal, vector)[..., None] * normal
 
 
