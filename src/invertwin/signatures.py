@@ -23,7 +23,7 @@ from invertwin.scene.checks import ArrayLike, checked_count, checked_number, che
 _JONES = {"V": (1.0, 0.0), "H": (0.0, 1.0), "circular": (0.5**0.5, 0.5**0.5 * 1j)}
 _LEVELS = "a polarisation as V, H, circular or two complex numbers (V, H)"
 _AT_ONCE = 1 << 22  # frequencies × aspects × points
-_EVEN = 1e-6  # of a step, by which steps of frequencies may differ
+_EVEN = 1e-3  # of a step, by which steps of frequencies may differ: those of float32 do
 
 
 @dataclass(frozen=True, eq=False)
