@@ -16,6 +16,7 @@ SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
 MODELS = SIMULATION | CAPTURE | {"models"}
 INVERSION = MODELS | {"inversion"}
+SIGNATURES = CHANNEL | {"signatures"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
 ALLOWED = {
@@ -32,15 +33,16 @@ ALLOWED = {
     "channel": CHANNEL,
     "radar": RADAR,
     "simulation": SIMULATION,
+    "signatures": SIGNATURES,
     "capture": CAPTURE,
     "models": MODELS,
     "inversion": INVERSION,
     "runs": FOUNDATION | {"runs"},
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
+    "cli": INVERSION | SIGNATURES | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
-    "__init__": INVERSION | {"doctor", "threads"},
+    "__init__": INVERSION | SIGNATURES | {"doctor", "threads"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}
 KNOW_THE_RAY_TRACER = {"channel"}

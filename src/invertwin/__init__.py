@@ -39,6 +39,7 @@ _MENU = {
     "SurrogateMap": "models",
     "gradcheck": "inversion.gradcheck",
     "load_mesh": "scene.files",
+    "rcs": "signatures",
     "reconstruct": "inversion.reconstruction",
     "search": "inversion.minima",
     "simulate": "simulation",

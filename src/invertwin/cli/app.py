@@ -173,6 +173,23 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
 
 
 @app.command()
+@with_options(Resumable)
+def rcs(options: Resumable, files: FilesArgument) -> None:
+    """Compute radar signatures: cross-sections, range profiles, images."""
+    runs = load_runs(files, options, "rcs", ("rcs",))
+    default = Path("out", files[0].stem if len(files) == 1 else "rcs")
+    with run_folder(options, default, runs) as folder:
+        if folder.complete:
+            return
+        from invertwin.cli.run_rcs import run_rcs
+
+        with console.status("tracing") as status:
+            say = status.update if console.is_terminal else now_and_then()
+            tables = run_rcs(runs, {file.stem: file for file in files}, folder, say)
+        print_tables(tables)
+
+
+@app.command()
 def keys(
     section: Annotated[
         str | None,

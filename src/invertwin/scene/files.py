@@ -24,7 +24,8 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
 from invertwin.untrusted import existing_file, reader, reading
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
+_CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # of shell elements, by the digit in their type
 Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _LARGE = 100.0  # m
@@ -33,14 +34,16 @@ CONCRETE = RoughDielectric(permittivity=5.24)
 
 
 def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
-    """A triangle mesh from an OBJ, PLY, STL or glTF file; `Mesh.summary` says what came.
+    """A triangle mesh from a file; `Mesh.summary` says what came.
 
     Vertices at equal positions are merged, vertices of no triangle are left out, the rest keep
     their order. All parts of the file become one mesh (`load_parts` keeps them apart); axes are
     taken as they are. A mesh of more than 100 m gets a warning: it may be in millimetres.
+    Of an Abaqus file (.inp) shell elements are read by their corners, in the coordinates in which
+    they are defined; quadrilaterals are split.
 
     Args:
-        file: OBJ, PLY, STL or glTF; its suffix tells the format.
+        file: OBJ, PLY, STL, glTF or Abaqus; its suffix tells the format.
         unit: of the file's numbers
 
     Raises:
@@ -96,7 +99,7 @@ def _loaded(
         )
     found = {}
     with reading(path, f"a readable {path.suffix} mesh"):
-        for name, part in split(trimesh.load_scene(path, process=False)).items():
+        for name, part in split(_scene_in(path)).items():
             vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
             faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
             found[name] = vertices * _METRES[unit], faces
@@ -178,6 +181,52 @@ def load_scene_xml(
         return _scene_of(root, file.parent, dict(materials or {}), default)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
+
+
+def _scene_in(path: Path) -> trimesh.Scene:
+    if path.suffix.lower() != ".inp":
+        return trimesh.load_scene(path, process=False)
+    vertices, faces = _abaqus(path.read_text(encoding="utf-8-sig"))
+    return trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False))
+
+
+def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of the nodes and shell elements of an Abaqus file."""
+    nodes: dict[str, int] = {}
+    places: list[list[float]] = []
+    faces: list[list[int]] = []
+    keyword, corners, words = "", 0, []
+    for line in text.splitlines():
+        if line.startswith("**") or not line.strip():
+            continue
+        if line.startswith("*"):
+            keyword, *options = line[1:].upper().replace(" ", "").split(",")
+            if keyword == "PART":
+                nodes = {}  # every part numbers its own
+            kind = next((o[5:] for o in options if o.startswith("TYPE=")), "")
+            corners, words = _corners_of(kind) if keyword == "ELEMENT" else 0, []
+        elif keyword == "NODE":
+            number, *place = line.split(",")[:4]
+            nodes[number.strip()] = len(places)
+            places.append([float(value) for value in place])
+        elif keyword == "ELEMENT":
+            words += [word.strip() for word in line.split(",") if word.strip()]
+            if line.rstrip().endswith(","):
+                continue  # the element goes on
+            used = [nodes[word] for word in words[1 : 1 + corners]]
+            faces += [[used[0], used[k], used[k + 1]] for k in range(1, len(used) - 1)]
+            words = []
+    if not faces:
+        raise ValueError("no shell elements")
+    return np.array(places, dtype=np.float64), np.array(faces, dtype=np.int64)
+
+
+def _corners_of(kind: str) -> int:
+    """Corners of an element type such as S3, STRI65, S4R, R3D3; 0 of other than shells."""
+    if not kind.startswith(("S", "R3D", "M3D", "CPS", "CPE", "DS", "SFM3D")):
+        raise ValueError(f"elements of type {kind}, no shells")
+    digits = [c for c in kind.replace("R3D", "").replace("M3D", "") if c.isdigit()]
+    return _CORNERS[digits[0]]
 
 
 def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:

@@ -109,6 +109,7 @@ VALUES = {
     "directive": 0.7,
     "directive_exponent": 3.0,
     "backscatter_exponent": 5.0,
+    "rms_height": 2e-4,
 }
 
 
@@ -116,7 +117,8 @@ VALUES = {
     "kind", [PerfectConductor, RoughConductor, RoughDielectric, Dielectric, RefractingBody, Slab]
 )
 def test_gradients_in_every_value(kind):
-    names = [name for name in VALUES if name in kind.__dataclass_fields__]
+    # Of power, rms_height changes nothing.
+    names = [n for n in VALUES if n in kind.__dataclass_fields__ and n != "rms_height"]
 
     def tables(*values):
         surface = kind(**dict(zip(names, values, strict=True))).surface(FREQUENCY)

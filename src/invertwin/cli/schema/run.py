@@ -23,6 +23,7 @@ from invertwin.cli.schema.fits import (
     Variant,
 )
 from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.shape_tables import LearnedTable
 from invertwin.errors import InputError
@@ -31,6 +32,7 @@ from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
 from invertwin.registry.section import InputPath, Section, Seed, Vector, Words, fail, key
+from invertwin.signatures import rcs
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "whole", "seen", "count", "m", "number", "consistency")
@@ -42,6 +44,10 @@ AnyModel = Annotated[Any, OneOf("model")]
 AnyData = Annotated[Any, OneOf("data")]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
 AnyGradcheck = Annotated[Any, TableOf(Check, Gradcheck)]
+AnyRcs = Annotated[
+    Any,
+    TableOf(rcs, Rcs, ("directions", "frequencies", "receivers", "polarisation"), checked=False),
+]
 
 
 class SceneFile(Section):
@@ -140,6 +146,7 @@ class _RunFile(Section):
     calibration: Calibration | None = key("calibration before the fit", None)
     landscape: Landscape | None = key("losses along a line", None)
     gradcheck: AnyGradcheck | None = key("the gradient check", None)
+    rcs: AnyRcs | None = key("the radar signature", None)
 
     @model_validator(mode="after")
     def _names_exist(self) -> "_RunFile":

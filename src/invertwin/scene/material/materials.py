@@ -35,7 +35,7 @@ from invertwin.scene.material.roughness import (
     specular_weights,
 )
 from invertwin.scene.material.slab import Sheet, slab_tables
-from invertwin.scene.material.surface import ANGLE_COUNT, Material, Surface
+from invertwin.scene.material.surface import ANGLE_COUNT, Material, Skin, Surface
 from invertwin.scene.material.values import RANGES, Value, checked_value, evaluated, row_count
 
 AnyMedium = TypeVar("AnyMedium", bound="Medium")
@@ -182,6 +182,11 @@ class RoughConductor(_Values, EffectiveRoughness, Material):
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         return Surface(_MIRROR, *self.weights())
 
+    def skin(self, frequency: float) -> Skin | None:
+        """What the surface does to fields at `frequency` [Hz]."""
+        checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+        return self.skin_of(None)
+
 
 @dataclass(frozen=True)
 class RoughDielectric(Medium, Material):
@@ -221,6 +226,10 @@ class Dielectric(Medium, EffectiveRoughness, Material):
         epsilon = self.complex_permittivity(frequency)
         return Surface(fresnel_amplitude(epsilon[..., None], _COSINES), *self.weights())
 
+    def skin(self, frequency: float) -> Skin | None:
+        """What the surface does to fields at `frequency` [Hz]."""
+        return self.skin_of(self.complex_permittivity(frequency))
+
 
 @dataclass(frozen=True)
 class RefractingBody(Medium, EffectiveRoughness, Material):
@@ -244,6 +253,10 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
             index=refractive_index(epsilon),
             attenuation=attenuation(epsilon, frequency),
         )
+
+    def skin(self, frequency: float) -> Skin | None:
+        """What the outer face does to fields at `frequency` [Hz]."""
+        return self.skin_of(self.complex_permittivity(frequency))
 
 
 @dataclass(frozen=True)
@@ -280,6 +293,10 @@ class Slab(Layer, EffectiveRoughness, Material):
     def surface(self, frequency: float) -> Surface:
         """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
         return _slab_surface([self], self.weights(), frequency)
+
+    def skin(self, frequency: float) -> Skin | None:
+        """What the sheet does to fields at `frequency` [Hz]."""
+        return self.skin_of(self.complex_permittivity(frequency), self.thickness)
 
 
 @dataclass(frozen=True)
