@@ -124,6 +124,7 @@ _XML = b"""<?xml version="1.0"?>
 
 def _meshes() -> list[Files]:
     import trimesh
+    from trimesh.exchange import gltf
 
     box = trimesh.creation.box()
 
@@ -138,13 +139,13 @@ def _meshes() -> list[Files]:
         scene = trimesh.Scene({"a": box, "b": trimesh.creation.icosphere(0)})
 
         def write(folder: Path) -> str:
-            files = trimesh.exchange.gltf.export_gltf(scene)
+            files = gltf.export_gltf(scene)
             for file, data in files.items():
                 (folder / file).write_bytes(data)
             return "model.gltf"
 
         def write_glb(folder: Path) -> str:
-            (folder / name).write_bytes(trimesh.exchange.gltf.export_glb(scene))
+            (folder / name).write_bytes(gltf.export_glb(scene))
             return name
 
         return write if name.endswith("gltf") else write_glb
