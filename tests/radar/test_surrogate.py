@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from invertwin.channel import Grid, Sampling, trace_field
+from invertwin.channel import Grid, Sampling, deposit_power, trace_field
 from invertwin.errors import InputError
 from invertwin.radar import (
     FMCW,
@@ -429,11 +429,18 @@ def test_wrong_input(planar):
         Surrogate(range_kernel="dirichlet").shape(torch.zeros(1, *grid.shape), pulse, grid)
 
 
-@pytest.mark.parametrize("oversample", [1.0, 1.5, 2.0])
-def test_power_is_never_negative(oversample, planar):
+@pytest.mark.parametrize(("oversample", "below"), [(1.0, 0.15), (1.5, 0.02), (2.0, 3e-3)])
+def test_power_is_never_negative(oversample, below, planar):
     grid = planar.grid(3.5, 4.5, 0.4, 0.4, oversample=oversample)
-    spread = deposited(*cloud(20), grid)
+    plates = {
+        str(k): Object(plate(0.05, 0.05), RoughDielectric(4.0), rigid(translation=[x, 0.1, 4.0]))
+        for k, x in enumerate((-0.5, 0.2))
+    }
+    scene, drawn = Scene(plates), Sampling(depth=1, samples=20_000)
+    deposit = deposit_power(scene, planar.link(), grid, sampling=drawn, seed=1)
     for surrogate in (Surrogate(), Surrogate("gaussian", "airy")):
-        power = surrogate.shape(spread, planar, grid)
-        assert power.min() >= 0
-        assert power.max() > 0
+        shaped = surrogate.shape(deposit, planar, grid)
+        assert -below * shaped.max() < shaped.min() < 0
+        power = surrogate_spectrum(scene, planar, grid, surrogate, sampling=drawn, seed=1)
+        assert power.min() == 0
+        assert torch.allclose(power, shaped.clamp_min(0.0), rtol=1e-4, atol=1e-5 * power.max())

@@ -70,9 +70,9 @@ class Surrogate:
         A convolution with the power point spread (peak 1), divided in the Fourier domain by the
         transform sinc³ of the deposit's quadratic B-spline, so that the deposit adds no blur.
         Nothing wraps around: what leaves the grid is lost. It is linear, so that derivatives are
-        shaped alike. The division leaves bins below zero, 4e-5 of the peak with two bins a cell.
-        On a coarser grid it is 3 % of the peak, and maps are not the mean of exact spectra; it
-        warns.
+        shaped alike. The division leaves bins below zero, with two bins a cell by 4e-5 of the
+        peak for single points and 1.4e-3 for a small plate. On a coarser grid it is 3 % of the
+        peak, and maps are not the mean of exact spectra; it warns.
 
         Args:
             deposit: From ``deposit_power`` on the same grid.
