@@ -12,12 +12,32 @@ from invertwin.channel.rays.backend import dr, mi
 
 def to_float(values: Tensor) -> Any:
     """A flat Dr.Jit float array of a torch tensor (detached, float32)."""
-    return mi.Float(values.detach().to(torch.float32).contiguous().ravel().cpu())
+    return mi.Float(_aligned(values, torch.float32))
+
+
+def to_double(values: Tensor) -> Any:
+    """A flat Dr.Jit float64 array of a torch tensor (detached)."""
+    return mi.Float64(_aligned(values, torch.float64))
 
 
 def to_index(values: Tensor) -> Any:
     """A flat Dr.Jit index array of a torch tensor of non-negative integers."""
-    return mi.UInt32(values.detach().to(torch.int32).contiguous().ravel().cpu().numpy())
+    return mi.UInt32(_aligned(values, torch.int32).view(np.uint32))
+
+
+def to_signed(values: Tensor) -> Any:
+    """A flat Dr.Jit array of a torch tensor of integers."""
+    return mi.Int32(_aligned(values, torch.int32))
+
+
+def _aligned(values: Tensor, kind: torch.dtype) -> np.ndarray:
+    """A flat copy in torch's own memory, which begins at a multiple of 64 bytes.
+
+    Dr.Jit reads such memory in place. Where it begins elsewhere, as NumPy's may, Dr.Jit compiles
+    kernels of their own for it.
+    """
+    flat = values.detach().cpu().ravel()
+    return torch.empty_like(flat, dtype=kind).copy_(flat).numpy()
 
 
 def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> Any:

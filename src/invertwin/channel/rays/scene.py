@@ -10,7 +10,7 @@ from torch import Tensor
 
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import arrays
-from invertwin.channel.rays.arrays import opaque, to_float, to_points, to_torch
+from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_points, to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.spheres import Spheres
@@ -105,7 +105,7 @@ class RayScene(Occluders):
     @cached_property
     def exact_vertices(self) -> Any:
         """Vertices in float64, three numbers each."""
-        return mi.Float64((self.geometry.vertices.detach() - self.origin).ravel().numpy())
+        return to_double(self.geometry.vertices.detach() - self.origin)
 
     def exact(self, vertex: Any, active: Any = True) -> Any:
         """Vertices in float64.

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
-from invertwin.channel.rays.arrays import to_float, to_index
+from invertwin.channel.rays.arrays import to_float, to_index, to_signed
 from invertwin.channel.rays.backend import VARIANTS, backend, mi
 from invertwin.scene.checks import plain
 from invertwin.scene.mesh import Mesh
@@ -52,7 +52,7 @@ class Topology:
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
         self.device_edge_object = to_index(owner[self.edges[:, 0]])
-        self.device_opposite = [mi.Int32(column.copy()) for column in self.opposite.numpy().T]
+        self.device_opposite = [to_signed(column) for column in self.opposite.T]
         self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]
         mesh = mi.Mesh("scene", vertex_count=len(vertices), face_count=len(faces))
         self._parameters = mi.traverse(mesh)
@@ -111,7 +111,7 @@ class Topology:
     @cached_property
     def device_face_edges(self) -> Any:
         """``face_edges`` as a flat array of the ray tracer."""
-        return mi.Int32(self.face_edges.int().ravel().numpy())
+        return to_signed(self.face_edges)
 
     def around(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
         """Triangles and all that share an edge with them (−1: none)."""
