@@ -1,6 +1,7 @@
 """Signatures: laws of waves first, then targets that are known."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,7 +56,12 @@ UP = float64([0.0, 1.0, 0.0])
 
 def traced(scene: Scene, directions: object, receivers: Tensor | None = None, **options) -> dict:
     """All parts of S at one frequency, [aspect, 2, 2] each."""
-    given = {"depth": 3, "edges": 0, "tubes_per_wavelength": 8.0, "up": UP} | options
+    given: dict[str, Any] = {
+        "depth": 3,
+        "edges": 0,
+        "tubes_per_wavelength": 8.0,
+        "up": UP,
+    } | options
     frequencies = float64([given.pop("frequency", FREQUENCY)])
     toward = normalize(torch.as_tensor(directions, dtype=torch.float64), dim=1)
     found = trace_signature(scene, toward, receivers, frequencies, **given)
@@ -63,7 +69,7 @@ def traced(scene: Scene, directions: object, receivers: Tensor | None = None, **
 
 
 def total(*arguments, **options) -> Tensor:
-    return sum(traced(*arguments, **options).values())
+    return torch.stack([*traced(*arguments, **options).values()]).sum(0)
 
 
 def metal(mesh: Mesh, pose: Tensor | None = None) -> Scene:
@@ -230,6 +236,17 @@ def test_roughness_takes_its_share_of_the_coherent_power():
     assert torch.allclose(power, torch.full_like(power, expected))
 
 
+@pytest.mark.parametrize("kind", ["metal", "sheet"])
+def test_roughness_leaves_the_shadow_and_takes_from_the_flash(kind):
+    normal, direction, field = incident(0.5)
+    own = {"conducting": True} if kind == "metal" else {"permittivity": 3, "thickness": 2e-3}
+    smooth, rough = skins(**own), skins(**own, rms_height=5e-4)
+    lost = math.exp(-0.5 * (2 * K * 5e-4 * math.cos(0.5)) ** 2)
+    for towards, expected in ((direction, 1.0), (mirrored(direction, normal), lost)):
+        sent = [radiated(s, K, normal, direction, field, towards) for s in (smooth, rough)]
+        assert torch.allclose(sent[1], sent[0] * expected)
+
+
 def test_polarisations_are_right_handed_and_of_unit_length():
     directions = torch.cat([random_directions(20), UP[None], -UP[None]])
     v, h = polarisations(directions, UP).unbind(1)
@@ -284,7 +301,8 @@ def test_edges_bring_a_plate_to_the_method_of_moments(channel):
     exact = torch.from_numpy(solve(line, K, directions[:, [0, 2]].numpy()))
     exact = 10 * torch.log10(2 * height**2 / WAVELENGTH * exact)
     parts = traced(metal(plate(width, height)), directions, depth=1, edges=2)
-    strength = [parts["order 1"], parts["order 1"] + parts["edges 1"], sum(parts.values())]
+    strength = [parts["order 1"], parts["order 1"] + parts["edges 1"]]
+    strength.append(torch.stack([*parts.values()]).sum(0))
     errors = [float((dbsm(s[:, channel, channel]) - exact).abs().mean()) for s in strength]
     assert errors[0] > 3
     assert errors[1] < (0.6, 2.5)[channel]
@@ -494,7 +512,7 @@ def test_triangles_without_area_and_empty_views_give_zeros():
     )
     lone = Mesh(flat.vertices[:3], flat.faces[:1])
     found = [total(metal(mesh), [[0.1, 0.2, -1.0]], edges=0) for mesh in (flat, lone)]
-    assert torch.allclose(*found)
+    assert torch.allclose(found[0], found[1])
     assert torch.isfinite(total(metal(flat), [[0.1, 0.2, -1.0]], edges=2)).all()
     edge_on = total(metal(lone), [[1.0, 0.0, 0.0]])
     assert float(edge_on.abs().max()) == 0

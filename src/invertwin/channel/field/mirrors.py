@@ -7,6 +7,7 @@ antenna, so that delays are exact for every element of an array.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -58,7 +59,7 @@ def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]
 
 def _weighted(paths: Paths, share: float) -> Paths:
     rows = paths.chosen(paths.coefficient != 0)
-    return Paths(**(vars(rows) | {"coefficient": rows.coefficient * share}))
+    return replace(rows, coefficient=rows.coefficient * share)
 
 
 def _chain(
