@@ -4,11 +4,12 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
 
 import invertwin as iw
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, PerfectConductor, dihedral, joined, plate, rigid, sphere
+from invertwin.scene import Mesh, PerfectConductor, Slab, dihedral, joined, plate, rigid, sphere
 from invertwin.signatures import aspects, decibels
 from scenes import float64
 
@@ -124,3 +125,28 @@ def test_uneven_frequencies_have_no_range_profile():
     found = iw.rcs(target(joined([plate(0.1, 0.1)])), AHEAD, [28e9, 29e9, 31e9])
     with pytest.raises(InputError, match="evenly spaced"):
         found.range_profile()
+
+
+def test_directions_and_frequencies_have_no_derivatives():
+    for change in (
+        {"directions": float64(AHEAD).requires_grad_()},
+        {"frequencies": float64([30e9]).requires_grad_()},
+    ):
+        given = {"directions": AHEAD, "frequencies": 30e9} | change
+        with pytest.raises(InputError, match="without derivatives"):
+            iw.rcs(target(plate(0.1, 0.1)), **given)
+
+
+def test_materials_have_derivatives():
+    def power(values: Tensor) -> Tensor:
+        board = Slab(values[0], thickness=values[1] * 1e-3, rms_height=values[2] * 1e-3)
+        scene = iw.Scene({"board": iw.Object(plate(0.1, 0.1), board)})
+        return iw.rcs(scene, [[0.1, 0.0, -1.0]], 30e9, edges=0).matrix[0, 0, 0, 0].abs().square()
+
+    start = float64([3.0, 2.3, 0.1]).requires_grad_()
+    (gradient,) = torch.autograd.grad(power(start), start)
+    for i in range(3):
+        step = torch.zeros(3, dtype=torch.float64)
+        step[i] = 1e-6
+        difference = float(power(start.detach() + step) - power(start.detach() - step)) / 2e-6
+        assert float(gradient[i]) == pytest.approx(difference, rel=1e-5)

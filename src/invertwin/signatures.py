@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import trace_signature
+from invertwin.channel import differentiated, trace_signature
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
@@ -145,8 +145,8 @@ def rcs(
         up: vertical axis.
 
     Raises:
-        InputError: no direction or frequency, a rough surface, a cloud, or derivatives of a scene
-            of more than 24 triangles.
+        InputError: no direction or frequency, a rough surface, a cloud, derivatives of a scene of
+            more than 24 triangles or with respect to directions or frequencies.
 
     Source: derivations §4, §13, §14.
     """
@@ -164,6 +164,12 @@ def rcs(
     )
     for frequency in swept.tolist():
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+    for value, what in ((sent, "directions"), (received, "receivers"), (swept, "frequencies")):
+        if differentiated(value):
+            raise InputError(
+                f"expected {what} without derivatives, got some that require grad; turn the scene "
+                "instead, or detach them"
+            )
     axis = checked_tensor(up, (3,), "up", "give a vector such as 0, 0, 1")
     parts = trace_signature(
         scene,

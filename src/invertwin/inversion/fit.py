@@ -32,7 +32,7 @@ _WORSE = 1.1  # times the loss of the first parameters, all widths at their end:
 _WINDOW = 20  # steps over which convergence is judged
 _SUBSETS = 2**16  # keys of the seeds that choose frames, beyond those of observations
 # What optimisers remember of a parameter.
-_REMEMBERED = {
+_REMEMBERED: dict[type[torch.optim.Optimizer], set[str]] = {
     torch.optim.Adam: {"step", "exp_avg", "exp_avg_sq"},
     torch.optim.SGD: {"momentum_buffer"},
 }

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from invertwin.channel import Link, Paths, Sampling, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
 from invertwin.scene import Mesh, PerfectConductor, Scene, Slab, dihedral, plate, trihedral
 from scenes import link, thing
 
@@ -113,6 +114,16 @@ def test_nothing_is_mirrored_twice_by_one_plate():
     antennas = link(((0.0, 0.0, -2.0),), wavelength=WAVELENGTH)
     scene = Scene({"a": thing(plate(0.1, 0.1), material=METAL)})
     assert len(paths_of(scene, antennas, depth=3)) == len(paths_of(scene, antennas, depth=1))
+
+
+def test_derivatives_of_mirrored_paths_are_refused():
+    antennas = link(((0.0, 0.0, -2.0),), wavelength=WAVELENGTH)
+    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    corner = trihedral(EDGE)
+    moved = Scene({"a": thing(Mesh(corner.vertices + shift, corner.faces), material=METAL)})
+    with pytest.raises(InputError, match="depth 1 for derivatives of fields between conductors"):
+        paths_of(moved, antennas)
+    assert paths_of(moved, antennas, depth=1).coefficient.requires_grad
 
 
 def test_places_far_from_the_antennas_do_not_meet_themselves():

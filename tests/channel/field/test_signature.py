@@ -236,6 +236,17 @@ def test_roughness_takes_its_share_of_the_coherent_power():
     assert torch.allclose(power, torch.full_like(power, expected))
 
 
+@pytest.mark.parametrize("kind", ["metal", "sheet"])
+def test_roughness_leaves_the_shadow_and_takes_from_the_flash(kind):
+    normal, direction, field = incident(0.5)
+    own = {"conducting": True} if kind == "metal" else {"permittivity": 3, "thickness": 2e-3}
+    smooth, rough = skins(**own), skins(**own, rms_height=5e-4)
+    lost = math.exp(-0.5 * (2 * K * 5e-4 * math.cos(0.5)) ** 2)
+    for towards, expected in ((direction, 1.0), (mirrored(direction, normal), lost)):
+        sent = [radiated(s, K, normal, direction, field, towards) for s in (smooth, rough)]
+        assert torch.allclose(sent[1], sent[0] * expected)
+
+
 def test_polarisations_are_right_handed_and_of_unit_length():
     directions = torch.cat([random_directions(20), UP[None], -UP[None]])
     v, h = polarisations(directions, UP).unbind(1)
@@ -290,11 +301,8 @@ def test_edges_bring_a_plate_to_the_method_of_moments(channel):
     exact = torch.from_numpy(solve(line, K, directions[:, [0, 2]].numpy()))
     exact = 10 * torch.log10(2 * height**2 / WAVELENGTH * exact)
     parts = traced(metal(plate(width, height)), directions, depth=1, edges=2)
-    strength = [
-        parts["order 1"],
-        parts["order 1"] + parts["edges 1"],
-        torch.stack([*parts.values()]).sum(0),
-    ]
+    strength = [parts["order 1"], parts["order 1"] + parts["edges 1"]]
+    strength.append(torch.stack([*parts.values()]).sum(0))
     errors = [float((dbsm(s[:, channel, channel]) - exact).abs().mean()) for s in strength]
     assert errors[0] > 3
     assert errors[1] < (0.6, 2.5)[channel]
@@ -503,8 +511,8 @@ def test_triangles_without_area_and_empty_views_give_zeros():
         torch.tensor([[0, 2, 1], [0, 1, 3]]),
     )
     lone = Mesh(flat.vertices[:3], flat.faces[:1])
-    first, second = (total(metal(mesh), [[0.1, 0.2, -1.0]], edges=0) for mesh in (flat, lone))
-    assert torch.allclose(first, second)
+    found = [total(metal(mesh), [[0.1, 0.2, -1.0]], edges=0) for mesh in (flat, lone)]
+    assert torch.allclose(found[0], found[1])
     assert torch.isfinite(total(metal(flat), [[0.1, 0.2, -1.0]], edges=2)).all()
     edge_on = total(metal(lone), [[1.0, 0.0, 0.0]])
     assert float(edge_on.abs().max()) == 0

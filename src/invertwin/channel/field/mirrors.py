@@ -7,6 +7,7 @@ antenna, so that delays are exact for every element of an array.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,10 +17,12 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.field.waves import dot, mirrored
 from invertwin.channel.paths import Paths
+from invertwin.channel.rays.geometry import silhouettes_move
 from invertwin.channel.rays.scene import NEAR, RayScene, face_areas, next_surface
 from invertwin.channel.reference.radar_equation import SurfacePaths, conductor_field, passed
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
 
 _GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
 _ROWS_AT_ONCE = 1 << 18  # frames × rays
@@ -38,6 +41,9 @@ def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]
         seed: Where rays meet the first conductor.
 
     Source: derivations §13.
+
+    Raises:
+        InputError: There are some, and a derivative flows through the scene or the antennas.
     """
     geometry = rays.geometry
     smooth = torch.tensor(geometry.coherent)[geometry.face_object]
@@ -53,12 +59,17 @@ def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]
                 share = 1.0 if same else 0.5
                 chain = _chain(rays, sampling.depth, smooth, frame, points.keep(row), from_receiver)
                 found += [path for paths in chain if len(path := _weighted(paths, share))]
+    if found and silhouettes_move(geometry, rays.link):
+        raise InputError(
+            "expected depth 1 for derivatives of fields between conductors, got "
+            f"{sampling.depth}: mirrored paths have none; use depth=1, power paths, or rcs"
+        )
     return found
 
 
 def _weighted(paths: Paths, share: float) -> Paths:
     rows = paths.chosen(paths.coefficient != 0)
-    return Paths(**(vars(rows) | {"coefficient": rows.coefficient * share}))
+    return replace(rows, coefficient=rows.coefficient * share)
 
 
 def _chain(

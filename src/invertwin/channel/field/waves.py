@@ -109,16 +109,8 @@ def reflected(
         field: E.
     """
     cosine = -dot(normal, direction)
-    rough = torch.exp(-0.5 * (2 * wave_number * skins.rms_height * cosine) ** 2)
-    n = normal[:, None]
-    whole = 2 * dot(n, field)[..., None] * n - field
-    if not bool(skins.conducting.all()):
-        across, before, after = _frame(normal, direction)
-        r_s, r_p = _coefficients(skins, wave_number, cosine)
-        part = r_s[:, None, None] * dot(across, field)[..., None] * across
-        part = part + r_p[:, None, None] * dot(before, field)[..., None] * after
-        whole = torch.where(skins.conducting[:, None, None], whole, part)
-    return whole * (skins.coherent * rough)[:, None, None]
+    kept = skins.coherent * _kept(skins, wave_number, 2 * cosine)
+    return _mirrored_field(skins, wave_number, normal, direction, field) * kept[:, None, None]
 
 
 def radiated(
@@ -134,7 +126,8 @@ def radiated(
     Currents of the reflected wave on the surface, ηJ = n × (d×E + d_r×E_r) and
     M = −n × (E + E_r), send F = −(jk/4π) [ηJ − s × M] without its part along s. For a conductor
     that is −(jk/2π) n × (d×E), every bounce with its own incident field. A sheet sends what its
-    polarisation current does: F = (k²/4π)(ε − 1) ∫ E_inside dx over its thickness.
+    polarisation current does: F = (k²/4π)(ε − 1) ∫ E_inside dx over its thickness. Roughness takes
+    exp(−½(kσ(cosθ + n·s))²) off: nothing straight on, where the shadow is.
 
     Args:
         skins, wave_number, normal, direction, field: as in ``reflected``.
@@ -143,7 +136,7 @@ def radiated(
     Source: derivations §13 and §14; Balanis, Advanced Engineering Electromagnetics, §6.8.
     """
     n, d, s = normal[:, None], direction[:, None], towards[:, None]
-    again = reflected(skins, wave_number, normal, direction, field)
+    again = _mirrored_field(skins, wave_number, normal, direction, field)
     onwards = mirrored(direction, normal)[:, None]
     electric = cross(n, cross(d, field) + cross(onwards, again))
     magnetic = cross(s, cross(n, field + again))
@@ -152,7 +145,31 @@ def radiated(
     if bool(thin.any()):
         sheet = _sheet_radiated(skins, wave_number, normal, direction, field, towards)
         sent = torch.where(thin[:, None, None], sheet, sent)
+    leaving = dot(normal, towards)
+    kept = _kept(skins, wave_number, leaving - dot(normal, direction))
+    kept = kept * torch.where(leaving > 0, skins.coherent, 1.0)
+    sent = sent * kept[:, None, None]
     return sent - dot(sent, s.to(sent.dtype))[..., None] * s
+
+
+def _kept(skins: Skins, wave_number: float, cosines: Tensor) -> Tensor:
+    """Share of the field that roughness leaves: phases spread by kσ(cosθ + cosθ')."""
+    return torch.exp(-0.5 * (wave_number * skins.rms_height * cosines) ** 2)
+
+
+def _mirrored_field(
+    skins: Skins, wave_number: float, normal: Tensor, direction: Tensor, field: Tensor
+) -> Tensor:
+    """Reflected field of a surface without roughness."""
+    n = normal[:, None]
+    whole = 2 * dot(n, field)[..., None] * n - field
+    if bool(skins.conducting.all()):
+        return whole
+    across, before, after = _frame(normal, direction)
+    r_s, r_p = _coefficients(skins, wave_number, -dot(normal, direction))
+    part = r_s[:, None, None] * dot(across, field)[..., None] * across
+    part = part + r_p[:, None, None] * dot(before, field)[..., None] * after
+    return torch.where(skins.conducting[:, None, None], whole, part)
 
 
 def _frame(normal: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:

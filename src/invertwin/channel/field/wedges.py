@@ -100,8 +100,7 @@ def find_wedges(
 
 
 def outside(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
-    """Whether a direction lies in the exterior region of each wedge, at least ``LEAST_ANGLE``
-    off the edge, and of the faces that it may graze where both are seen from one side.
+    """Whether a direction lies in each wedge's exterior, ``LEAST_ANGLE`` or more off its edge.
 
     Args:
         wedges: one row each.
