@@ -121,7 +121,7 @@ def test_bad_tangents_are_named(module, tangent, message):
 def test_models_without_a_mean_derivative_are_refused():
     device = radar()
     model = ExactMap(device.grid(0.4, 2.8))
-    with pytest.raises(InputError, match="expected a smooth model such as SurrogateMap, got Exact"):
+    with pytest.raises(InputError, match="expected a smooth model, got ExactMap"):
         gradcheck(model, Translation("occluder"), SLIDE, scene=occluder(), sensor=device)
 
 
