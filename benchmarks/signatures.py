@@ -30,7 +30,8 @@ from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin import Object, Scene, backend, rcs
+from invertwin import Object, Scene, rcs
+from invertwin.channel import backend
 from invertwin.channel.field import signature, tubes
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import Mesh, PerfectConductor, load_mesh
@@ -170,7 +171,9 @@ def table(metrics: dict[str, Any]) -> Table:
     )
     page.row("triangles", metrics["triangles"], ".0f")
     page.row("tubes", metrics["tubes"], ".0f", "rays that start, one a wavelength apart")
-    page.row("profile_error_db", metrics["profile_error_db"], ".1f", "of the range profile, complex")
+    page.row(
+        "profile_error_db", metrics["profile_error_db"], ".1f", "of the range profile, complex"
+    )
     for name, value in metrics["order_error_db"].items():
         page.row(f"order_error_db.{name}", value, ".1f", "over the whole profile")
     for density, value in metrics["converging_db"].items():
