@@ -6,7 +6,8 @@
 Bodies of three to five wavelengths turn in front of a radar. Their scattering amplitudes S by
 `invertwin.rcs` are held against those of the method of moments, which are stored in
 `benchmarks/full_wave_data`. `--solve` computes these anew with bempp-cl (`pip install bempp-cl`,
-some minutes a body).
+some minutes a body): its function spaces, and its matrix of triangles that touch. That of the
+others is summed here, which takes a tenth of the time.
 
 Prints a table and writes `metrics.json` into DIR (default `out/full_wave`). For each cut and both
 co-polar terms, `rms_db.<body>_<cut>_<polarisation>` is the rms of the difference in decibels where
@@ -17,9 +18,11 @@ the largest difference in phase where it is within 10 dB.
 import argparse
 import importlib
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -34,6 +37,7 @@ from torch import Tensor
 from invertwin import Object, Scene, rcs
 from invertwin.channel.field.waves import polarisations
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import PhysicsWarning
 from invertwin.scene import Mesh, PerfectConductor
 from invertwin.signatures import aspects
 
@@ -114,7 +118,7 @@ def ogive(length: float, radius: float, step: float) -> Grid:
     rings.append([len(points)])
     points.append((0.0, 0.0, length / 2))
     return np.array(points), np.array(
-        [face for low, high in zip(rings, rings[1:], strict=False) for face in _zipped(low, high)]
+        [face for low, high in pairwise(rings) for face in _zipped(low, high)]
     )
 
 
@@ -327,9 +331,12 @@ def measure(names: Sequence[str] | None = None, edges: int = 2) -> dict[str, Any
         for cut in body.cuts:
             if not np.allclose(stored[f"{cut}_deg"], np.stack(body.cuts[cut], 1)):
                 raise SystemExit(f"{name}: the stored cut {cut} is another one; --solve {name}")
-            signature = rcs(
-                scene, body.directions(cut), [SPEED_OF_LIGHT], depth=body.depth, edges=edges
-            )
+            with warnings.catch_warnings():
+                # Where the physics ends counts here too.
+                warnings.simplefilter("ignore", PhysicsWarning)
+                signature = rcs(
+                    scene, body.directions(cut), [SPEED_OF_LIGHT], depth=body.depth, edges=edges
+                )
             ours = signature.matrix[0].numpy()
             for index, polarisation in enumerate(POLARISATIONS):
                 errors = compare(ours[:, index, index], stored[cut][:, index, index])
