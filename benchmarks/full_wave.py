@@ -323,7 +323,10 @@ def measure(names: Sequence[str] | None = None, edges: int = 2) -> dict[str, Any
     metrics: dict[str, Any] = {
         key: {} for key in ("rms_db", "phase_deg", "worst_db", "phase_rms_deg")
     }
+    metrics["unsolved"] = [name for name in bodies() if not (STORED / f"{name}.npz").exists()]
     for name in names or bodies():
+        if name in metrics["unsolved"]:
+            continue
         body = bodies()[name]
         vertices, faces = map(torch.from_numpy, body.shape(body.coarse))
         scene = Scene({name: Object(Mesh(vertices, faces), PerfectConductor())})
@@ -355,6 +358,8 @@ def table(metrics: dict[str, Any]) -> Table:
         page.row(f"rms_db.{case}", value, ".2f", f"at worst {metrics['worst_db'][case]:.1f} dB")
     for case, value in metrics["phase_deg"].items():
         page.row(f"phase_deg.{case}", value, ".1f", f"rms {metrics['phase_rms_deg'][case]:.1f}°")
+    for name in metrics["unsolved"]:
+        page.row(name, None, "", f"no truth is stored: --solve {name}")
     page.row("seconds", metrics["seconds"], ".1f", "for all signatures")
     return page.grid
 
