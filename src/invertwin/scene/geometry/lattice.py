@@ -29,12 +29,15 @@ class Lattice:
     counts: tuple[int, int, int]
 
     @classmethod
-    def between(cls, low: ArrayLike, high: ArrayLike, counts: Sequence[int]) -> "Lattice":
+    def between(
+        cls, low: ArrayLike, high: ArrayLike, counts: Sequence[int], *, sliced: bool = False
+    ) -> "Lattice":
         """The lattice between two corners, given as any numbers.
 
         Args:
             low, high: opposite corners of the box [m].
             counts: nodes along x, y and z.
+            sliced: whether nodes are visited in slices, so that any number of them has room.
 
         Raises:
             InputError: a box without volume, fewer than two nodes along an axis, wrong shapes, or
@@ -53,7 +56,7 @@ class Lattice:
         x, y, z = (checked_count(count, "nodes along an axis", 2) for count in counts)
         for count, most, where in (
             (max(x, y, z), _MOST_ALONG, " along an axis"),
-            (x * y * z, _MOST_NODES, ""),
+            (0 if sliced else x * y * z, _MOST_NODES, ""),
         ):
             require_at_most(
                 count, most, f"nodes of a grid{where}", "take fewer, wider apart", "counts"
