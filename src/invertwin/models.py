@@ -440,8 +440,8 @@ class SignatureMap(ForwardModel):
     Attributes:
         signature: Takes a scene and ``boundary``: ``invertwin.rcs`` with everything else, such as
             ``partial(rcs, directions=…, frequencies=…)``.
-        boundary: False leaves out of derivatives that edges of beams and shadows move over
-            surfaces, for ablation.
+        boundary: False leaves out of derivatives what moving edges of beams and shadows change,
+            for ablation.
     """
 
     signature: Callable[..., Signature]

@@ -149,7 +149,7 @@ def rcs(
             1 adds fringe currents, 2 the waves between the edges of a flat plate.
         tubes_per_wavelength: at the highest frequency, for scenes of many triangles.
         up: vertical axis.
-        boundary: False leaves out of derivatives that edges of beams and shadows move over surfaces:
+        boundary: False leaves out of derivatives what moving edges of beams and shadows change:
             derivatives at fixed visibility, for ablation.
 
     Raises:

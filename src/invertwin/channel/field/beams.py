@@ -84,7 +84,7 @@ def beams(
         facets: what is lit.
         incident: d of each wave.
         depth: most bounces.
-        boundary: False leaves out of derivatives that edges of beams move over facets.
+        boundary: False leaves out of derivatives what moving edges of beams change.
     """
     last = None
     for _ in range(depth):

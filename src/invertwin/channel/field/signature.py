@@ -121,7 +121,7 @@ def trace_signature(
         edges: most diffractions of a wave by sharp edges of conductors; 0 leaves them out.
         tubes_per_wavelength: at the highest frequency, where the scene has many triangles.
         up: V lies in a plane with this unit vector.
-        boundary: False leaves out of derivatives that edges of beams move over surfaces.
+        boundary: False leaves out of derivatives what moving edges of beams change.
 
     Raises:
         InputError: a cloud, a rough surface, derivatives of a scene of many triangles.
