@@ -443,4 +443,6 @@ def test_power_is_never_negative(oversample, below, planar):
         assert -below * shaped.max() < shaped.min() < 0
         power = surrogate_spectrum(scene, planar, grid, surrogate, sampling=drawn, seed=1)
         assert power.min() == 0
-        assert torch.allclose(power, shaped.clamp_min(0.0), rtol=1e-4, atol=1e-5 * power.max())
+        assert torch.allclose(
+            power, shaped.clamp_min(0.0), rtol=1e-4, atol=1e-5 * float(power.max())
+        )

@@ -1,6 +1,7 @@
 """Is the gradient right? Automatic derivatives of a whole map against central differences."""
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, overload
@@ -207,13 +208,18 @@ def _converged(
 ) -> tuple[Tensor, float]:
     """Difference pairs, as many as the noise asks for, and the noise of their mean."""
     pairs: list[Tensor] = []
-    reached = math.inf
+    reached, begin = math.inf, time.monotonic()
     while len(pairs) < check.max_pairs and (len(pairs) < _LEAST_PAIRS or reached > check.noise):
         pairs.append(difference(len(pairs)))
         if len(pairs) >= 2:
             reached = _noise(torch.stack(pairs))
             if progress:
-                progress(f"{len(pairs)} pairs, difference noise {reached:.4f}")
+                # Noise falls with the root of the number of pairs.
+                enough = len(pairs) * (reached / max(check.noise, 1e-9)) ** 2
+                count = min(check.max_pairs, max(_LEAST_PAIRS, math.ceil(enough)))
+                left = (time.monotonic() - begin) / len(pairs) * max(count - len(pairs), 0)
+                noise = f"difference noise {reached:.4f}, about {left:.0f} s left"
+                progress(f"{len(pairs)} pairs, {noise}")
     return torch.stack(pairs), reached
 
 

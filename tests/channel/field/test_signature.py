@@ -123,13 +123,13 @@ def test_polygon_integral_agrees_with_a_fine_sum():
     for wave in ([3.0, -2.0, 1.0], [0.0, 0.0, 0.0], [40.0, 10.0, -5.0]):
         w = float64([wave])
         sum_ = torch.exp(1j * (points @ w[0])).mean() * torch.linalg.cross(u, v).norm()
-        assert abs(complex(polygon_integral(quad, w)[0] - sum_)) < 2e-4
+        assert abs(complex(polygon_integral(quad, w)(1.0)[0] - sum_)) < 2e-4
 
 
 def test_polygon_integral_is_smooth_where_the_wave_is_broadside():
     triangle = float64([[[0, 0, 0], [1, 0, 0], [0, 2, 0]]])
     values = [
-        complex(polygon_integral(triangle, float64([[x, 0.4 * x, 7.0]]))[0])
+        complex(polygon_integral(triangle, float64([[x, 0.4 * x, 7.0]]))(1.0)[0])
         for x in (9.0e-4, 9.6e-4, 1e-3)
     ]
     slope = (values[2] - values[0]) / 1e-4

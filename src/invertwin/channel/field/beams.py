@@ -6,7 +6,7 @@ in the beam and no other facet stands before it. All parts are convex polygons, 
 whose corners keep their derivatives: what a moving edge changes comes by itself.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -59,16 +59,15 @@ class Bounce:
     before: Int64[Tensor, " row"]
 
     def integral(
-        self, wave_number: float, towards: Float64[Tensor, "row 3"]
-    ) -> Complex128[Tensor, " row"]:
-        """∫ exp(−jk(d·x + c − s·x)) dA over each patch.
+        self, towards: Float64[Tensor, "row 3"]
+    ) -> Callable[[float], Complex128[Tensor, " row"]]:
+        """∫ exp(−jk(d·x + c − s·x)) dA over each patch, by wave number k [1/m].
 
         Args:
-            wave_number: k [1/m].
             towards: s, to the receiver.
         """
-        wave = wave_number * (towards - self.direction)
-        return polygon_integral(self.polygon, wave) * torch.exp(-1j * wave_number * self.offset)
+        patches = polygon_integral(self.polygon, towards - self.direction)
+        return lambda k: patches(k) * torch.exp(-1j * k * self.offset)
 
 
 def beams(

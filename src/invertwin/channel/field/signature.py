@@ -184,13 +184,13 @@ class _View:
             chains = self._sampled(depth, spacing)
         for first, chain in chains:
             currents: list[Tensor] = []
+            integrals = [bounce.integral(self.receivers[bounce.aspect]) for bounce in chain]
             for f, k in enumerate(body.wave_numbers):
                 if not (body.plain and currents):
                     currents = self._currents(chain, body.skins[f], 1.0 if body.plain else k)
-                rows = zip(orders, chain, currents, strict=False)
-                for order, bounce, current in islice(rows, first, None):
-                    towards = self.receivers[bounce.aspect]
-                    strength = bounce.integral(k, towards) * (k if body.plain else 1.0)
+                rows = zip(orders, chain, integrals, currents, strict=False)
+                for order, bounce, integral, current in islice(rows, first, None):
+                    strength = integral(k) * (k if body.plain else 1.0)
                     sent = current * strength[:, None, None]
                     order[f] = order[f].index_add(0, bounce.aspect, sent)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}

@@ -4,7 +4,8 @@ Rays start on a square grid across the wave. A tube keeps its cross section, sin
 where it meets a facet it lights a parallelogram, over which the phase is linear.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,7 @@ from invertwin.channel.field.waves import cross, dot, mirrored, parallelogram_in
 from invertwin.channel.rays.scene import Occluders, next_surface
 
 _RAYS_AT_ONCE = 1 << 20
+_SIDES = 8  # pairs of parallel lines about a scene's outline, outside of which no tube starts
 
 
 @dataclass(frozen=True)
@@ -43,19 +45,22 @@ class TubeBounce:
     before: Int64[Tensor, " row"]
 
     def integral(
-        self, wave_number: float, towards: Float64[Tensor, "row 3"]
-    ) -> Complex128[Tensor, " row"]:
-        """∫ exp(−jk(path − s·x)) dA over each patch, with the phase linear about its middle.
+        self, towards: Float64[Tensor, "row 3"]
+    ) -> Callable[[float], Complex128[Tensor, " row"]]:
+        """∫ exp(−jk(path − s·x)) dA over each patch, by wave number k [1/m].
+
+        The phase is linear about the middle of a patch.
 
         Args:
-            wave_number: k [1/m].
             towards: s, to the receiver.
         """
         first, second = self.sides.unbind(1)
-        wave = wave_number * (towards - self.direction)
-        area = cross(first, second).norm(dim=1) * parallelogram_integral(wave, first, second)
-        turn = -wave_number * (self.length - dot(towards, self.position))
-        return torch.polar(torch.ones_like(turn), turn) * area
+        way = towards - self.direction
+        area = cross(first, second).norm(dim=1)
+        path = self.length - dot(towards, self.position)
+        return lambda k: torch.polar(
+            area * parallelogram_integral(k * way, first, second), -k * path
+        )
 
 
 def tubes(
@@ -85,15 +90,31 @@ def tubes(
         torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=1
     )
     for some in torch.arange(len(incident)).split(max(1, _RAYS_AT_ONCE // len(grid))):
-        aspect = some.repeat_interleave(len(grid))
+        across, starts = _across(incident[some]), []
+        for row, pair in zip(some, across, strict=True):
+            at = grid[_before(grid, (points - middle) @ pair.T)]
+            starts.append((row.expand(len(at)), at @ pair))
+        aspect, aside = map(torch.cat, zip(*starts, strict=True))
         d = incident[aspect]
-        # An axis that is along no edge of what engineers build: few tubes begin on an edge.
-        u = normalize(cross(d, d.new_tensor([0.31, 0.42, 0.85]).expand_as(d)), dim=1)
-        v = cross(d, u)
-        at = grid.repeat(len(some), 1)
-        start = middle + at[:, :1] * u + at[:, 1:] * v - 2 * radius * d
-        axes = spacing * torch.stack([u, v], 1)
+        start = middle + aside - 2 * radius * d
+        axes = spacing * across[aspect - some[0]]
         yield _walk(occluders, corners, normals, (aspect, start, d, axes), 4 * radius, depth)
+
+
+def _across(direction: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 2 3"]:
+    """Unit vectors across waves, along no edge of what engineers build: few tubes begin on one."""
+    aside = direction.new_tensor([0.31, 0.42, 0.85]).expand_as(direction)
+    first = normalize(cross(direction, aside), dim=1)
+    return torch.stack([first, cross(direction, first)], 1)
+
+
+def _before(grid: Float64[Tensor, "cell 2"], points: Float64[Tensor, "v 2"]) -> Tensor:
+    """Which places lie before a scene: within all of ``_SIDES`` lines about its points."""
+    angle = math.pi / _SIDES * torch.arange(_SIDES, dtype=torch.float64)
+    ways = torch.stack([angle.cos(), angle.sin()])
+    low, high = (points @ ways).aminmax(dim=0)
+    at = grid @ ways
+    return ((at >= low) & (at <= high)).all(1)
 
 
 def _walk(

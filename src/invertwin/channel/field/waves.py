@@ -7,6 +7,7 @@ All functions work on rows; fields have one row for each polarisation of the inc
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -47,7 +48,9 @@ def dot(first: Tensor, second: Tensor) -> Tensor:
     Args:
         first, second: vectors, or fields and vectors.
     """
-    return (first * second).sum(-1)
+    # Three products are several times as fast as a sum over an axis of three.
+    (x, y, z), (u, v, w) = first.unbind(-1), second.unbind(-1)
+    return x * u + y * v + z * w
 
 
 def cross(first: Tensor, second: Tensor) -> Tensor:
@@ -273,13 +276,13 @@ def parallelogram_integral(
 
 
 def polygon_integral(
-    polygon: Float64[Tensor, "row corner 3"], wave: Vectors
-) -> Complex128[Tensor, " row"]:
-    """∫ exp(j w·x) dA over flat polygons, exactly: a sum over their sides.
+    polygon: Float64[Tensor, "row corner 3"], way: Vectors
+) -> Callable[[float], Complex128[Tensor, " row"]]:
+    """∫ exp(jk w·x) dA over flat polygons, exactly: a sum over their sides, by wave number k.
 
     Args:
         polygon: corners in order, about any point; some may coincide.
-        wave: w [1/m].
+        way: w; what does not depend on k is computed once.
 
     Source: Gordon, "Far-field approximations to the Kirchhoff-Helmholtz representations of
     scattered fields", IEEE TAP 23, 1975. Near w ⊥ polygon the sum is 0/0; there two terms of the
@@ -289,18 +292,16 @@ def polygon_integral(
     size = area.norm(dim=-1)
     normal = area / size.clamp_min(1e-300)[:, None]
     middle = polygon.mean(1)
-    flat = wave - dot(wave, normal)[:, None] * normal
+    flat = way - dot(way, normal)[:, None] * normal
     square = dot(flat, flat)
     corners = polygon - middle[:, None]
-    extent = corners.detach().norm(dim=-1).amax(1)
+    largest = square.detach() * corners.detach().norm(dim=-1).amax(1) ** 2
     ends = corners.roll(-1, 1)
     sides = ends - corners
     phase = dot(flat[:, None], corners + ends) / 2
     share = dot(cross(sides, normal[:, None]), flat[:, None])
     turn = dot(flat[:, None], sides) / 2
-    whole = (share * _sinc(turn) * torch.exp(1j * phase)).sum(1)
-    broad = square.detach() * extent**2 < 1e-6
-    exact = whole / torch.where(broad, torch.ones_like(square), square) / 1j
+    whole = dot(way, middle)
     # ∫(1 + jw·x − (w·x)²/2) by the triangles about the first corner.
     first = dot(flat[:, None], corners)
     fan = torch.linalg.cross(
@@ -308,9 +309,23 @@ def polygon_integral(
     )
     weight = dot(fan, normal[:, None]) / 2
     a, b, c = first[:, :1], first[:, 1:-1], first[:, 2:]
-    second = (a * a + b * b + c * c + a * b + a * c + b * c) / 6
-    series = (weight * (1 + 1j * (a + b + c) / 3 - second / 2)).sum(1)
-    return torch.where(broad, series, exact) * torch.exp(1j * dot(wave, middle))
+    mean = (weight * (a + b + c)).sum(1) / 3
+    second = (weight * (a * a + b * b + c * c + a * b + a * c + b * c)).sum(1) / 6
+    weight = weight.sum(1)
+
+    def at(k: float) -> Tensor:
+        broad = largest * k**2 < 1e-6
+        exact = (share * _sinc(k * turn) * _turned(k * phase)).sum(1)
+        exact = exact / torch.where(broad, torch.ones_like(square), square * k) / 1j
+        series = weight + 1j * k * mean - k**2 * second / 2
+        return torch.where(broad, series, exact) * _turned(k * whole)
+
+    return at
+
+
+def _turned(phase: Tensor) -> Tensor:
+    """exp(j phase)."""
+    return torch.complex(phase.cos(), phase.sin())
 
 
 def area_vector(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "row 3"]:
