@@ -14,9 +14,9 @@ CHANNEL = SCENE | {"doctor", "threads", "channel"}
 RADAR = CHANNEL - {"doctor", "threads"} | {"radar"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
-MODELS = SIMULATION | CAPTURE | {"models"}
-INVERSION = MODELS | {"inversion"}
 SIGNATURES = CHANNEL | {"signatures"}
+MODELS = SIMULATION | CAPTURE | {"signatures", "models"}
+INVERSION = MODELS | {"inversion"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
 ALLOWED = {

@@ -53,6 +53,11 @@ class Signature:
         return torch.stack([*self.parts.values()]).sum(0)
 
     @property
+    def section(self) -> Float64[Tensor, "frequency aspect 2 2"]:
+        """σ = 4π|S|² [m²]."""
+        return 4 * math.pi * torch.view_as_real(self.matrix).square().sum(-1)
+
+    @property
     def dbsm(self) -> Float64[Tensor, "frequency aspect 2 2"]:
         """σ = 4π|S|² over 1 m², in decibels."""
         return decibels(self.matrix)
@@ -124,6 +129,7 @@ def rcs(
     edges: int = 2,
     tubes_per_wavelength: Positive = 8.0,
     up: Sequence[float] = (0.0, 0.0, 1.0),
+    boundary: bool = True,
 ) -> Signature:
     """Compute the radar cross-section of smooth conductors and dielectrics, far away.
 
@@ -143,6 +149,8 @@ def rcs(
             1 adds fringe currents, 2 the waves between the edges of a flat plate.
         tubes_per_wavelength: at the highest frequency, for scenes of many triangles.
         up: vertical axis.
+        boundary: False leaves out of derivatives what moving edges of beams and shadows change:
+            derivatives at fixed visibility, for ablation.
 
     Raises:
         InputError: no direction or frequency, a rough surface, a cloud, derivatives of a scene of
@@ -182,6 +190,7 @@ def rcs(
             tubes_per_wavelength, "tubes per wavelength", 0.0, open_low=True
         ),
         up=axis / axis.norm(),
+        boundary=boundary,
     )
     basis = _basis(polarisation)
     turned = {name: basis.T @ value @ basis for name, value in parts.items()}

@@ -128,3 +128,42 @@ def test_sweeps_survive_a_run(tmp_path):
     (tmp_path / "plate.toml").write_text(PLATE)
     run("rcs", tmp_path / "plate.toml", "-o", tmp_path / "out")
     assert load_run(tmp_path / "out" / "run.toml") == load_run(tmp_path / "plate.toml")
+
+
+SLOPES = (
+    PLATE.replace("rcs", "gradcheck", 1).replace("count = 21", "count = 4")
+    + """
+[gradcheck]
+parameter = { kind = "scale", object = "plate" }
+tangent = { log_scale = 1.0 }
+step = 1e-5
+"""
+)
+
+
+@pytest.mark.parametrize("across", ["theta_deg = {", "theta_deg = 175.0 # {"])
+def test_derivatives_of_a_signature_are_checked(tmp_path, across):
+    (tmp_path / "slopes.toml").write_text(SLOPES.replace("theta_deg = {", across))
+    run("gradcheck", tmp_path / "slopes.toml", "-o", tmp_path / "out")
+    found = metrics(tmp_path / "out")["scenes"]["slopes"]
+    assert found["full"]["relative_l1"] < 1e-6
+    assert found["pairs"] == 1
+    for name in ("slopes.png", "slopes_scene.png", "report.html"):
+        assert (tmp_path / "out" / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("step = 1e-5", "step = 1e-5\nsamples = 10", "gradcheck.samples: expected nothing with"),
+        (
+            'kind = "scale", object = "plate" }\ntangent = { log_scale = 1.0 }',
+            'kind = "radar_pose" }\ntangent = { translation = 1.0 }',
+            "gradcheck.parameter.kind: expected a parameter of the scene",
+        ),
+        ("[rcs]", "[grid]\nrange_min = 1.0\nrange_max = 2.0\n[rcs]", "grid: expected nothing with"),
+    ],
+)
+def test_what_a_derivative_of_a_signature_does_not_take(tmp_path, old, new, message):
+    with pytest.raises(InputError, match=message):
+        validate(tomllib.loads(SLOPES.replace(old, new)), tmp_path / "run.toml")

@@ -159,7 +159,7 @@ def look(options: Look) -> None:
 @with_options(Resumable)
 def gradcheck(options: Resumable, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
-    runs = load_runs(files, options, "gradcheck", ("gradcheck", "radar", "grid"))
+    runs = load_runs(files, options, "gradcheck", _needs_of_gradcheck)
     default = Path("out", files[0].stem if len(files) == 1 else "gradcheck")
     with run_folder(options, default, runs) as folder:
         if folder.complete:
@@ -170,6 +170,10 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
             say = status.update if console.is_terminal else now_and_then()
             tables = run_gradcheck(runs, {file.stem: file for file in files}, folder, say)
         print_tables(tables)
+
+
+def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
+    return ("gradcheck",) if run.rcs is not None else ("gradcheck", "radar", "grid")
 
 
 @app.command()

@@ -50,11 +50,20 @@ def run_folder(
 
 
 def load_runs(
-    files: Sequence[Path], options: Options, command: str, sections: Sequence[str]
+    files: Sequence[Path],
+    options: Options,
+    command: str,
+    sections: Sequence[str] | Callable[[Any], Sequence[str]],
 ) -> dict[str, Any]:
     """Run files by stem, with the sections that the command cannot do without.
 
     A seed of the options replaces theirs. Run files of another task than the command's are refused.
+
+    Args:
+        files: Where they are.
+        options: What the user has chosen.
+        command: Whose task they must have.
+        sections: What it needs, or what it needs of a run file.
     """
     runs: dict[str, Any] = {}
     for file in files:
@@ -68,7 +77,7 @@ def load_runs(
         if other != command:
             cure = f"its task is {run.task}: use `invertwin {other} {file}`"
         with about_file(file):
-            for section in sections:
+            for section in sections(run) if callable(sections) else sections:
                 need(run, section, command, cure)
         seeded = {} if options.seed is None else {"seed": options.seed}
         runs[file.stem] = run.model_copy(update=seeded)

@@ -25,4 +25,5 @@ from invertwin.plotting.scenes import scene as scene
 from invertwin.plotting.signatures import focused as focused
 from invertwin.plotting.signatures import profile as profile
 from invertwin.plotting.signatures import sections as sections
+from invertwin.plotting.signatures import slopes as slopes
 from invertwin.plotting.turntable import turntable as turntable

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -27,25 +28,45 @@ def sections(
     for axes, (title, curves) in zip(
         figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels.items(), strict=True
     ):
-        values = [numbers(curve) for curve in curves.values()]
-        top = max(float(np.nanmax(curve)) for curve in values)
-        for number, (name, curve) in enumerate(zip(curves, values, strict=True)):
-            style = "--" if name.startswith("measured") else "-"
-            marker = "." if len(curve) < 8 else ""
-            axes.plot(
-                numbers(across),
-                curve,
-                style,
-                marker=marker,
-                color=color(number),
-                lw=1.1,
-                label=legible(name),
-            )
+        top = max(float(np.nanmax(numbers(curve))) for curve in curves.values())
+        _lines(axes, curves, across)
         axes.set(title=legible(title), xlabel=label, ylabel="RCS [dBsm]")
         axes.set_ylim(top - least, top + 3)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
     return figure
+
+
+def slopes(curves: Mapping[str, Tensor], across: Tensor, label: str, unit: str) -> Figure:
+    """Derivatives of a radar cross-section.
+
+    Args:
+        curves: derivatives by name; the last is drawn dashed.
+        across: angles [°] or frequencies [GHz] of the values.
+        label: of the axis across, with its unit.
+        unit: of the derivatives.
+    """
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    axes = figure.subplots()
+    _lines(axes, curves, across, dashed=[*curves][-1])
+    axes.set(xlabel=label, ylabel=unit)
+    return figure
+
+
+def _lines(
+    axes: Axes, curves: Mapping[str, Tensor], across: Tensor, dashed: str = "measured"
+) -> None:
+    """Curves with a legend; dashed are those whose names begin so."""
+    for number, (name, curve) in enumerate(curves.items()):
+        axes.plot(
+            numbers(across),
+            numbers(curve),
+            "--" if name.startswith(dashed) else "-",
+            marker="." if len(curve) < 8 else "",
+            color=color(number),
+            lw=1.1,
+            label=legible(name),
+        )
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
 
 
 def profile(levels: Tensor, ranges: Tensor, across: Tensor, label: str) -> Figure:

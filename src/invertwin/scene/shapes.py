@@ -12,7 +12,7 @@ import trimesh
 from annotated_types import Ge, Le, MinLen
 
 from invertwin.errors import InputError
-from invertwin.limits import Count, Positive
+from invertwin.limits import Angle, Count, Positive
 from invertwin.memory import require_at_most
 from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh
@@ -91,20 +91,24 @@ def sphere(radius: Positive, subdivisions: Annotated[int, Ge(0), Le(8)] = 4) -> 
     return _mesh(unit * length, ball.faces)
 
 
-def dihedral(edge: Positive) -> Mesh:
-    """Two square plates at a right angle that meet on the y axis and open to −z.
+def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
+    """Two square plates that meet on the y axis and open to −z, at a right angle or another.
 
-    Its boresight is −z, and every wave it returns has the range of the y axis.
+    Its boresight is −z. At a right angle every wave it returns after two bounces has the range of
+    the y axis.
 
     Args:
         edge: edge length of the plates [m].
+        opening: angle between the plates.
 
     Raises:
-        InputError: a length that is not positive.
+        InputError: a length that is not positive, or an angle beyond π.
     """
     length = _length(edge, "dihedral edge [m]")
-    reach = length / math.sqrt(2)
-    vertices = [(x, y * length / 2, -abs(x)) for x in (-reach, 0.0, reach) for y in (-1, 1)]
+    half = checked_number(opening, "opening [rad]", 0.0, math.pi, open_low=True) / 2
+    tips = [(s * length * math.sin(half), -length * math.cos(half)) for s in (-1, 1)]
+    places = (tips[0], (0.0, 0.0), tips[1])
+    vertices = [(x, y * length / 2, z) for x, z in places for y in (-1, 1)]
     return _mesh(np.array(vertices), np.array([(0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4)]))
 
 

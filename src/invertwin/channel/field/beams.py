@@ -7,7 +7,7 @@ whose corners keep their derivatives: what a moving edge changes comes by itself
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
@@ -70,17 +70,26 @@ class Bounce:
         return lambda k: patches(k) * torch.exp(-1j * k * self.offset)
 
 
-def beams(facets: Facets, incident: Float64[Tensor, "aspect 3"], depth: int) -> Iterator[Bounce]:
+def beams(
+    facets: Facets,
+    incident: Float64[Tensor, "aspect 3"],
+    depth: int,
+    *,
+    boundary: bool = True,
+) -> Iterator[Bounce]:
     """Lit patches of the first order, of the second, and so on, of plane waves.
 
     Args:
         facets: what is lit.
         incident: d of each wave.
         depth: most bounces.
+        boundary: False leaves out of derivatives what moving edges of beams change.
     """
     last = None
     for _ in range(depth):
         last = _next(facets, incident, last)
+        if not boundary:
+            last = _fixed(facets, last)
         if not len(last.aspect):
             return
         yield last
@@ -113,6 +122,14 @@ def _next(facets: Facets, incident: Tensor, last: Bounce | None) -> Bounce:
     if last is not None:
         bounce = _within(facets, bounce, last)
     return _unhidden(facets, bounce, last)
+
+
+def _fixed(facets: Facets, bounce: Bounce) -> Bounce:
+    """Patches whose corners are points of their facets and move with these alone."""
+    corners = facets.corners[bounce.facet]
+    sides = corners[:, 1:] - corners[:, :1]
+    places = (bounce.polygon - corners[:, :1]).detach() @ torch.linalg.pinv(sides.detach())
+    return replace(bounce, polygon=corners[:, :1] + places @ sides)
 
 
 def _within(facets: Facets, bounce: Bounce, last: Bounce) -> Bounce:

@@ -105,6 +105,7 @@ def trace_signature(
     edges: int,
     tubes_per_wavelength: float,
     up: Float64[Tensor, "3"],
+    boundary: bool = True,
 ) -> dict[str, Complex128[Tensor, "frequency aspect 2 2"]]:
     """Scattering amplitudes S of every part of the field, about the world's origin; σ = 4π|S|².
 
@@ -120,6 +121,7 @@ def trace_signature(
         edges: most diffractions of a wave by sharp edges of conductors; 0 leaves them out.
         tubes_per_wavelength: at the highest frequency, where the scene has many triangles.
         up: V lies in a plane with this unit vector.
+        boundary: False leaves out of derivatives what moving edges of beams change.
 
     Raises:
         InputError: a cloud, a rough surface, derivatives of a scene of many triangles.
@@ -137,7 +139,7 @@ def trace_signature(
         ways = [(transmitters, transmitters if receivers is None else receivers)]
         if receivers is not None:
             ways.append((receivers, transmitters))
-        found = [_View(body, *way).parts(depth, edges, spacing) for way in ways]
+        found = [_View(body, *way).parts(depth, edges, spacing, boundary) for way in ways]
         # The mean of both ways between two antennas, or between polarisations of one.
         return {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
 
@@ -150,9 +152,11 @@ class _View:
     transmitters: Tensor
     receivers: Tensor
 
-    def parts(self, depth: int, edges: int, spacing: float | None) -> dict[str, Tensor]:
+    def parts(
+        self, depth: int, edges: int, spacing: float | None, boundary: bool
+    ) -> dict[str, Tensor]:
         """All parts of the field."""
-        found = self._bounces(depth, spacing)
+        found = self._bounces(depth, spacing, boundary)
         return found | self._diffracted(edges) if edges else found
 
     @property
@@ -169,12 +173,13 @@ class _View:
         seen = polarisations(self.receivers, self.body.up)[aspect]
         return total.index_add(0, aspect, dot(seen[:, :, None], sent[:, None]))
 
-    def _bounces(self, depth: int, spacing: float | None) -> dict[str, Tensor]:
+    def _bounces(self, depth: int, spacing: float | None, boundary: bool) -> dict[str, Tensor]:
         """Physical optics of every order: of beams, or of tubes where a spacing is given."""
         body, orders = self.body, [list(self._none()) for _ in range(depth)]
         chains: Iterable[tuple[int, Sequence[_Lit]]]
         if spacing is None:
-            chains = [(0, list(beams(body.facets, -self.transmitters, depth)))]
+            lit = beams(body.facets, -self.transmitters, depth, boundary=boundary)
+            chains = [(0, list(lit))]
         else:
             chains = self._sampled(depth, spacing)
         for first, chain in chains:
