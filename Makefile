@@ -12,13 +12,22 @@ LLVM_USABLE := $(BIN)/python -c 'from invertwin import doctor; doctor.require()'
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
 NEW_ENOUGH := -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
 
-.PHONY: help demo test test-fast test-gpu check format bench clean
+# Of `make fuzz`.
+MINUTES ?= 30
+# What `make lowest` takes; its set-up is apart from .venv.
+LOWEST := .venv-lowest
+WHEEL := .venv-wheel
+
+.PHONY: help demo test test-fast test-gpu fuzz lowest wheel check format bench clean
 
 help:
 	@echo 'make demo       find a hidden letter from its radar echoes (under 5 minutes)'
 	@echo 'make test       all tests but those that need a GPU'
 	@echo 'make test-fast  the quick ones'
 	@echo 'make test-gpu   those that need a GPU'
+	@echo 'make fuzz       read damaged files of every format for MINUTES=30'
+	@echo 'make lowest     the quick tests with the lowest versions that we allow'
+	@echo 'make wheel      build, check, and run the demo from the wheel in an empty folder'
 	@echo 'make check      format, lint, types, import arrows'
 	@echo 'make format     let ruff format and sort'
 	@echo 'make bench      speed and memory, ours and peers'"'"
@@ -36,6 +45,32 @@ test-fast: .venv/.dev .venv/.llvm
 test-gpu: .venv/.dev .venv/.llvm
 	$(BIN)/python -m pytest -m gpu
 
+fuzz: .venv/.dev
+	PYTHONPATH=tests $(BIN)/python -m fuzz.long --minutes $(MINUTES)
+
+# pip installs what uv has chosen, so that torch comes from where pip is told to look. Old versions
+# warn of what newer ones of their parts deprecate; that is theirs.
+lowest: .venv/.release .venv/.llvm
+	@echo 'set-up: $(LOWEST) with the lowest versions in pyproject.toml'
+	@rm -rf $(LOWEST) && $(BIN)/python -m venv $(LOWEST)
+	@$(BIN)/uv pip compile --quiet pyproject.toml --extra dev --resolution lowest-direct \
+	    --only-binary :all: --python $(LOWEST)/bin/python --no-header --no-annotate \
+	    --output-file $(LOWEST)/versions.txt
+	@$(LOWEST)/bin/pip install --quiet "$$(grep '^torch==' $(LOWEST)/versions.txt)"
+	@$(LOWEST)/bin/pip install --quiet --constraint $(LOWEST)/versions.txt \
+	    --editable '.[dev]' --editable experiments/studies
+	$(LOWEST)/bin/python -m pytest -m 'not gpu and not slow' -W ignore::DeprecationWarning
+
+wheel: .venv/.release .venv/.llvm
+	@rm -rf dist $(WHEEL)
+	$(BIN)/uv build --quiet
+	$(BIN)/twine check dist/*
+	@$(BIN)/python -m venv $(WHEEL)
+	@$(WHEEL)/bin/pip install --quiet --constraint constraints.txt dist/*.whl
+	@set -e; folder=$$(mktemp -d); root=$$PWD; cd $$folder; \
+	    $$root/$(WHEEL)/bin/invertwin doctor; $$root/$(WHEEL)/bin/invertwin demo; \
+	    rm -r $$folder
+
 check: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -50,7 +85,7 @@ bench: .venv/.bench .venv/.dev .venv/.llvm
 	@set -e; for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python "$$script"; done
 
 clean:
-	rm -rf .venv .pytest_cache .ruff_cache
+	rm -rf .venv $(LOWEST) $(WHEEL) .pytest_cache .ruff_cache
 
 $(BIN)/python:
 	@set -e; \
@@ -81,6 +116,11 @@ $(BIN)/python:
 .venv/.dev: .venv/.run
 	@echo 'set-up: tools for tests and checks'
 	@$(PIP) install --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+.venv/.release: .venv/.run
+	@echo 'set-up: tools that build and check the package'
+	@$(PIP) install --constraint constraints.txt --editable '.[release]'
 	@touch $@
 
 .venv/.bench: .venv/.run

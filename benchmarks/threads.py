@@ -55,7 +55,7 @@ def fitted(optimizer: Optimizer, depth: int, seed: int, steps: int) -> Tensor:
     chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=64)
     arrays = linear_array(1, 1e-3), linear_array(8, 1.92e-3)
     places = torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]], dtype=torch.float64)
-    radar = iw.Radar(*arrays, chirp, places)
+    radar = iw.Radar(*arrays, chirp, positions=places)
     grid = radar.grid(range_min=1.5, range_max=2.8, u_max=0.5)
     few = iw.Sampling(depth=1, points_per_m2=1e3)
     data = iw.simulate(scene, radar, grid, seed=seed, sampling=few, snr_db=20.0)

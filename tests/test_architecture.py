@@ -8,13 +8,14 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "untrusted"}
+FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "memory", "untrusted"}
 SCENE = FOUNDATION | {"scene"}
-CHANNEL = SCENE | {"doctor", "channel"}
-RADAR = CHANNEL - {"doctor"} | {"radar"}
+CHANNEL = SCENE | {"doctor", "threads", "channel"}
+RADAR = CHANNEL - {"doctor", "threads"} | {"radar"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
-MODELS = SIMULATION | CAPTURE | {"models"}
+SIGNATURES = CHANNEL | {"signatures"}
+MODELS = SIMULATION | CAPTURE | {"signatures", "models"}
 INVERSION = MODELS | {"inversion"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
@@ -24,20 +25,24 @@ ALLOWED = {
     "limits": set(),
     "seeds": set(),
     "folders": {"errors"},
+    "memory": {"errors"},
     "untrusted": {"errors"},
+    "threads": set(),
     "doctor": FOUNDATION,
     "scene": SCENE,
     "channel": CHANNEL,
     "radar": RADAR,
     "simulation": SIMULATION,
+    "signatures": SIGNATURES,
     "capture": CAPTURE,
     "models": MODELS,
     "inversion": INVERSION,
     "runs": FOUNDATION | {"runs"},
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
-    "__init__": INVERSION | {"doctor"},
+    "cli": INVERSION | SIGNATURES | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
+    "__main__": {"errors", "cli"},
+    "__init__": INVERSION | SIGNATURES | {"doctor", "threads"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}
 KNOW_THE_RAY_TRACER = {"channel"}

@@ -51,3 +51,17 @@ def test_importing_the_package_loads_no_ray_tracer():
     code = "import sys, invertwin; print(*{'drjit', 'mitsuba', 'torch'} & set(sys.modules))"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == ""
+
+
+def test_every_dependency_has_its_licence_in_the_notice(project, repository):
+    lines = (repository / "NOTICE").read_text().splitlines()
+    listed = {canonical(line[2:]) for line in lines if line.startswith("- ") and ": " in line}
+    assert {canonical(requirement) for requirement in project["dependencies"]} <= listed
+
+
+def test_every_bundled_file_is_in_the_notice(repository):
+    package = repository / "src" / "invertwin"
+    found = [f for f in package.rglob("*") if f.is_file() and "__pycache__" not in f.parts]
+    bundled = {f.name for f in found if f.suffix != ".py"} - {"py.typed"}
+    notice = (repository / "NOTICE").read_text()
+    assert {name for name in bundled if name not in notice} == set()

@@ -94,3 +94,11 @@ def test_two_noise_levels_are_refused():
         simulate(
             occluder(), device, device.grid(0.5, 2.5), seed=0, snr_db=9, impairments=Impairments()
         )
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_types_are_told_in_one_line():
+    import invertwin as iw
+
+    with pytest.raises(iw.InputError, match=r"expected a scene \(Scene\), got None; build one"):
+        iw.simulate(None, radar="x", grid=None, seed=1)  # type: ignore[arg-type]

@@ -11,12 +11,13 @@ import scipy.io
 
 from invertwin.capture import Capture, described_arrays
 from invertwin.capture.channels import ChannelCalibration
+from invertwin.capture.ti.mmwave_studio import read_studio
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.cli import build
 from invertwin.cli.run_file import load_run
 from invertwin.errors import InputError
 from invertwin.scene.files import load_mesh, load_scene_xml
-from invertwin.untrusted import read_arrays, read_npy, reading, try_apart
+from invertwin.untrusted import read_arrays, read_npy, reader, reading, try_apart
 
 DESCRIPTION = """
 [data]
@@ -122,6 +123,44 @@ def test_what_the_reader_itself_refuses_is_left_to_it(tmp_path):
     try_apart(tmp_path / "a.nc", "netcdf")
     with pytest.raises(InputError, match=r"expected a whole NetCDF file, got .*a\.nc"):
         Capture.load(tmp_path / "a.nc", trusted=True)
+
+
+def test_all_of_a_reader_is_wrapped():
+    @reader("a mesh", "export it")
+    def read(path, number=0):
+        return 1 / number
+
+    assert read("a.ply", number=4) == 0.25
+    for call in (lambda: read("a.ply"), lambda: read(path="a.ply")):
+        with pytest.raises(InputError, match=r"expected a mesh, got a\.ply \(ZeroDiv.*; export it"):
+            call()
+
+
+def test_warnings_that_are_errors_stay_warnings():
+    with pytest.raises(UserWarning, match="as it was"), reading("a.ply", "a mesh"):
+        raise UserWarning("as it was")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "read"),
+    [
+        # What `make fuzz` has found.
+        ("a.setup.json", '{"configUsed": "b.json", "DCA1000Config": "x"}', read_studio),
+        ("a.setup.json", json.dumps({"configUsed": "b" * 5_000}), read_studio),
+        (
+            "a.toml",
+            DESCRIPTION.format("q.npy").replace("[data]", "[data]\ndimensions = [[]]"),
+            None,
+        ),
+        ("a.toml", DESCRIPTION.format("q.npy") + "transmit_order = 3\n", None),
+    ],
+)
+def test_values_of_another_kind_are_one_line(tmp_path, name, text, read):
+    np.save(tmp_path / "q.npy", np.ones((2, 4, 2, 4, 16), np.complex64))
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match="expected ") as caught:
+        (read or described_arrays.read_chirps)(tmp_path / name)
+    assert "\n" not in str(caught.value)
 
 
 def test_errors_of_readers_name_the_file_and_pass_input_errors_on():

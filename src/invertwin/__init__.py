@@ -14,7 +14,7 @@ is quick, and ``invertwin doctor`` runs where no ray tracer can.
 from importlib import import_module
 from typing import Any
 
-from invertwin import doctor
+from invertwin import doctor, threads
 
 __version__ = "0.2.0"
 
@@ -39,6 +39,7 @@ _MENU = {
     "SurrogateMap": "models",
     "gradcheck": "inversion.gradcheck",
     "load_mesh": "scene.files",
+    "rcs": "signatures",
     "reconstruct": "inversion.reconstruction",
     "search": "inversion.minima",
     "simulate": "simulation",
@@ -62,5 +63,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
+# Libraries read how many threads to start while they are being loaded.
+threads.prepare()
 # Dr.Jit picks its libLLVM while it is being imported: before any module can do that.
 doctor.prepare()

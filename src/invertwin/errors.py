@@ -1,6 +1,13 @@
-"""The one exception type for bad input, raised at the public edge, and the one warning."""
+"""The one exception type for bad input, raised at the public edge, and the one warning.
 
-_LONGEST = 2_000  # characters of a line
+And what the command line says when it is interrupted.
+"""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_LONGEST = 8_000  # characters of a line
 
 
 class InputError(ValueError):
@@ -36,3 +43,13 @@ def one_line(text: str) -> str:
     if len(text) > _LONGEST:
         text = f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
     return text
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """End the program with one line and exit code 130 on Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("invertwin: interrupted", file=sys.stderr)
+        sys.exit(130)

@@ -13,8 +13,10 @@ from annotated_types import Ge, Gt, Le
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Share = Annotated[float, Ge(0), Le(1)]
-Count = Annotated[int, Ge(1)]
-Several = Annotated[int, Ge(2)]
+MOST = 2**31 - 1
+"""Larger counts are a mistake; the ray tracer numbers its rays by 32 bits."""
+Count = Annotated[int, Ge(1), Le(MOST)]
+Several = Annotated[int, Ge(2), Le(MOST)]
 
 RADIANS = "rad"
 """Marks a value in radians. Its key in a run file ends in `_deg` and is in degrees."""

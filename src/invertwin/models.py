@@ -30,6 +30,7 @@ from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spe
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derived_seed
+from invertwin.signatures import Signature
 from invertwin.simulation import simulate
 
 
@@ -41,10 +42,13 @@ class ForwardModel(ABC):
             whose random numbers belong to the scene.
         smooth: Whether the derivative of the mean is the mean of derivatives, visibility
             included. Gauss–Newton and gradient checks need that.
+        random: Whether maps depend on the seed. Of a model whose maps do not, gradient checks take
+            one derivative and one pair of differences.
     """
 
     redraws: ClassVar[bool] = True
     smooth: ClassVar[bool] = True
+    random: ClassVar[bool] = True
 
     @abstractmethod
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Float[Tensor, "frame *map"]:
@@ -102,6 +106,19 @@ class ForwardModel(ABC):
     def sampled_by(self, **changes: Any) -> "ForwardModel":
         """The model with other fields of its ``sampling``, where it has one."""
         return replace(self, sampling=replace(self.sampling, **changes))  # type: ignore
+
+    def ablations(self) -> "dict[str, ForwardModel]":
+        """Models whose derivatives leave something out, by the field that says so.
+
+        Gradient checks compare with them: ``boundary``, ``interior_edges``, ``contacts``.
+        """
+        sampling = getattr(self, "sampling", None)
+        if sampling is None or not sampling.boundary:
+            return {}
+        fields = ["boundary"]
+        fields += ["interior_edges"] if sampling.depth > 1 else []
+        fields += ["contacts"] if sampling.contacts else []
+        return {name: self.sampled_by(**{name: False}) for name in fields}
 
     @property
     def widened(self) -> bool:
@@ -412,6 +429,40 @@ class MotionMap(ForwardModel):
         start, count = float(self.grid.ranges[ranges[0]]), len(ranges)
         grid = replace(self.grid, range_start=start, range_count=count)
         return replace(self, grid=grid, rates=self.rates[rates])
+
+
+@dataclass(frozen=True)
+class SignatureMap(ForwardModel):
+    """Radar cross-sections σ = 4π|S|² [m²] of a scene, over frequency, aspect and polarisations.
+
+    No sensor is needed: give None.
+
+    Attributes:
+        signature: Takes a scene and ``boundary``: ``invertwin.rcs`` with everything else, such as
+            ``partial(rcs, directions=…, frequencies=…)``.
+        boundary: False leaves out of derivatives what moving edges of beams and shadows change,
+            for ablation.
+    """
+
+    signature: Callable[..., Signature]
+    boundary: bool = True
+
+    redraws: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+
+    def predict(
+        self, scene: Scene, sensor: Any, seed: int
+    ) -> Float64[Tensor, "frequency aspect 2 2"]:
+        """σ [m²], receive × transmit. See ``ForwardModel.predict``."""
+        return self.signature(scene, boundary=self.boundary).section
+
+    def observe(self, recording: Signature) -> Float64[Tensor, "frequency aspect 2 2"]:
+        """σ of a signature [m²]."""
+        return recording.section
+
+    def ablations(self) -> dict[str, ForwardModel]:
+        """The model at fixed visibility. See ``ForwardModel.ablations``."""
+        return {"boundary": replace(self, boundary=False)} if self.boundary else {}
 
 
 def surrogate_correlation(

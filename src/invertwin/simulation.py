@@ -14,7 +14,8 @@ from invertwin.radar.motion import Chirps, Places, Train, every_ramp, sample_int
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.spectrum import exact_spectrum
-from invertwin.scene.scene import Scene
+from invertwin.scene.checks import checked_type
+from invertwin.scene.scene import Scene, warn_of_mirrors
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.
 _STRAIGHT = 1e-6
@@ -65,12 +66,16 @@ def simulate(
     Raises:
         InputError: An object in motion: a frame is one instant. Two noise levels.
     """
+    checked_type(scene, Scene, "a scene", "build one with Scene({name: Object(...)})")
+    checked_type(radar, Radar, "a radar", "build one with Radar(...), or capture.radar()")
+    checked_type(grid, Grid, "a grid of bins", "make one with radar.grid(...)")
     moving = [name for name, item in scene.objects.items() if item.velocity is not None]
     if moving:
         raise InputError(
             f"expected objects at rest, got velocities on {', '.join(moving)}; a frame is one "
             "instant: use scene.at(time), or simulate_chirps for motion within a frame"
         )
+    warn_of_mirrors(scene, radar.waveform.center_frequency)
     noisy = snr_db is not None or noise_figure_db is not None
     if noisy and impairments is not None:
         raise InputError(
@@ -125,6 +130,8 @@ def simulate_chirps(
         InputError: See ``trace_field`` and ``moving_beat``; a function of time whose objects
             change their triangles; phase noise where rays are traced anew.
     """
+    checked_type(radar, Radar, "a radar", "build one with Radar(...)")
+    checked_type(chirps, Chirps, "the timing of chirps", "build it with Chirps(count, interval)")
     again = retrace or not isinstance(scene, Scene)
     if again and impairments is not None:
         impairments.check_applicable()

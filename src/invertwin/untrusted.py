@@ -9,10 +9,11 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
 from zipfile import ZipFile
 
 from invertwin.errors import InputError
@@ -20,6 +21,8 @@ from invertwin.errors import InputError
 if TYPE_CHECKING:  # the command line starts without NumPy
     import numpy as np
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 _DAMAGED = "it is damaged or of another kind; copy or export it again"
 _SECONDS, _BYTES_PER_SECOND = 8.0, 10e6  # of processor time, that of importing a reader with it
 _WAITING = 10.0  # times as long on a busy machine
@@ -53,7 +56,7 @@ except Exception:
 
 @contextmanager
 def reading(path: str | Path, expected: str, do: str = _DAMAGED) -> Iterator[None]:
-    """Tell whatever a reader raises as an InputError of one line.
+    """Tell whatever a reader raises as an InputError of one line; warnings stay warnings.
 
     Args:
         path: The file.
@@ -65,12 +68,32 @@ def reading(path: str | Path, expected: str, do: str = _DAMAGED) -> Iterator[Non
     """
     try:
         yield
-    except InputError:
+    except (InputError, Warning):
         raise
     # A damaged file can make readers fail in any way; every one means the same to the user.
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise InputError(f"expected {expected}, got {path} ({reason}); {do}") from None
+
+
+def reader(expected: str, do: str = _DAMAGED) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
+    """Decorate a function that reads the file it is given first: all of it is `reading`.
+
+    Args:
+        expected: What the file should be.
+        do: What the user can do.
+    """
+
+    def decorate(function: Callable[_P, _R]) -> Callable[_P, _R]:
+        @wraps(function)
+        def read(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+            path: Any = args[0] if args else next(iter(kwargs.values()))
+            with reading(path, expected, do):
+                return function(*args, **kwargs)
+
+        return read
+
+    return decorate
 
 
 def existing_file(path: str | Path, what: str = "an existing file") -> Path:

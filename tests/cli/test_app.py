@@ -1,5 +1,6 @@
 """The commands end to end, on scenes small enough for seconds."""
 
+import io
 import math
 import os
 import signal
@@ -10,9 +11,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from cli.small import BEHIND, GRADCHECK, MATERIAL, RUN, STARTS, call, read_metrics
-from invertwin.cli import app
+from invertwin.cli import app, running
 from invertwin.cli.run_file import load_run
 
 
@@ -277,3 +279,64 @@ def test_backend_option_is_in_force(monkeypatch, run_file):
     assert call(monkeypatch, "reconstruct", "none.toml", "--backend", "cpu") == 2
     assert os.environ["INVERTWIN_BACKEND"] == "cpu"
     assert call(monkeypatch, "reconstruct", "none.toml", "--backend", "tpu") == 2
+
+
+def test_a_resumed_run_is_complete_and_only_then_complete_already(run_file, monkeypatch, capsys):
+    from invertwin.cli import run_reconstruct
+
+    def interrupted(run, folder, console):
+        folder.write_text("checkpoint.pt", "state")
+        raise KeyboardInterrupt
+
+    def finished(run, folder, console):
+        folder.write_text("metrics.json", "{}")
+        return [], "found"
+
+    monkeypatch.setattr(run_reconstruct, "run_reconstruct", interrupted)
+    assert call(monkeypatch, "reconstruct", run_file) == 130
+    monkeypatch.setattr(run_reconstruct, "run_reconstruct", finished)
+    capsys.readouterr()
+    assert call(monkeypatch, "reconstruct", run_file, "--resume") == 0
+    assert capsys.readouterr().out.splitlines()[-1].startswith("complete: ")
+    assert call(monkeypatch, "reconstruct", run_file, "--resume") == 0
+    assert capsys.readouterr().out.startswith("was complete already: ")
+
+
+@pytest.mark.parametrize("place", ["load_runs", "_demo_file"])
+def test_an_interruption_before_a_run_has_a_folder_is_one_line(
+    run_file, monkeypatch, capsys, place
+):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(app, place, stopped)
+    assert (
+        call(monkeypatch, *(["demo"] if place == "_demo_file" else ["simulate", run_file])) == 130
+    )
+    assert capsys.readouterr().err == "invertwin: interrupted\n"
+
+
+def test_an_interruption_while_modules_are_imported_is_one_line(monkeypatch, capsys):
+    from invertwin import __main__ as start
+
+    def stopped():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(app, "main", stopped)
+    with pytest.raises(SystemExit) as ended:
+        start.main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "invertwin: interrupted\n"
+
+
+def test_a_log_tells_the_time_that_is_left(monkeypatch):
+    now = iter(range(0, 1000, 6))
+    monkeypatch.setattr(running.time, "monotonic", lambda: float(next(now)))
+    written = io.StringIO()
+    log = Console(file=written, width=100)
+    with running.counted(log, "landscape", 10) as advance:
+        for _ in range(10):
+            advance()
+    lines = written.getvalue().splitlines()
+    assert lines
+    assert all(line.startswith("landscape: ") and line.endswith(" left") for line in lines)

@@ -9,7 +9,8 @@ from invertwin.capture import Capture
 from invertwin.capture.files import write_dataset
 from invertwin.cli import build
 from invertwin.cli.run_file import load_run
-from invertwin.folders import MANIFEST, Manifest, save_manifest
+from invertwin.folders import MANIFEST
+from invertwin.runs import open_run
 from invertwin.scene import Mesh, plate
 from invertwin.scene.files import save_mesh
 
@@ -65,9 +66,8 @@ def folder(run_file, monkeypatch):
     spoiled = capture.dataset.copy(deep=True)
     spoiled["beat"].values[0, 0, 0, 0] = np.nan
     write_dataset(spoiled, folder / "nan.nc")
-    (folder / "full").mkdir()
-    (folder / "full" / "metrics.json").write_text("{}")
-    save_manifest(folder / "full", Manifest(files=["metrics.json"]))
+    with open_run(folder / "full", {"bad": "seed = 1"}) as done:
+        done.write_text("metrics.json", "{}")
     return folder
 
 
@@ -150,7 +150,8 @@ def test_one_line_code_2_and_results_untouched(folder, monkeypatch, capfd, text,
     assert error.startswith("invertwin: ")
     assert "expected" in error
     assert error.count("\n") == 1
-    assert {p.name for p in (folder / "full").iterdir()} == {"metrics.json", MANIFEST}
+    names = {path.name for path in (folder / "full").iterdir()}
+    assert names == {MANIFEST, "metrics.json", "run.toml"}
     assert (folder / "full" / "metrics.json").read_text() == "{}"
 
 

@@ -326,7 +326,7 @@ def test_loss_and_optimizer_pass_on_what_is_given():
     ("grid", "said"),
     [
         ({"range_min": 1, "range_max": 200}, r"grid\.range_max: .*4\.797 m, got 200"),
-        ({"range_min": 1, "range_max": 4, "oversample": 1e9}, r"grid: .*bins"),
+        ({"range_min": 1, "range_max": 4, "oversample": 1e9}, r"grid\.range_max: .*bins"),
     ],
 )
 def test_grid_that_only_a_wrong_unit_explains(grid, said):

@@ -1,9 +1,11 @@
 """Run files: what is accepted, and what the errors say."""
 
+import tomllib
 from pathlib import Path
 
 import pytest
 
+from cli.small import RUN
 from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
@@ -147,7 +149,7 @@ def test_further_errors_are_said_too_but_not_without_end():
     first, second = message.split(" — also ")
     assert first.startswith("radar.window: ")
     assert second.startswith("radar.array_window: ")
-    assert error_of(run(radar=radar(positions=[["x"] * 3] * 9))).count(" — also ") == 3
+    assert error_of(run(radar=radar(positions=[["x"] * 3] * 9))).count(" — also ") == 19
 
 
 @pytest.mark.parametrize(
@@ -217,3 +219,23 @@ def test_missing_file_folder_and_broken_toml_are_input_errors(tmp_path):
 )
 def test_every_run_file_of_the_repository_is_valid(path):
     assert isinstance(load_run(path), RunFile)
+
+
+def test_all_typos_are_told_at_once_beside_wrong_values(tmp_path):
+    text = RUN.replace("permittivity = 4.0", "permitivity = 4.0", 1)
+    text = text.replace("divisions = 3", "divisions = 0\nwidht = 1.0")
+    text = text.replace("steps = 8", "stepz = 8\nsamplez = 3").replace("range_max", "range_mx")
+    with pytest.raises(InputError) as found:
+        validate(tomllib.loads(text), tmp_path / "run.toml")
+    said = str(found.value).split(" — also ")
+    paths = {line.removeprefix(f"{tmp_path}/run.toml: ").split(":")[0] for line in said}
+    assert paths == {
+        "scene.plate.widht",
+        "scene.plate.divisions",
+        "scene.plate.material.permitivity",
+        "grid.range_mx",
+        "reconstruct.stepz",
+        "reconstruct.samplez",
+    }
+    # A key that is misspelt is not missing, too.
+    assert "got nothing" not in str(found.value)

@@ -43,6 +43,7 @@ from invertwin.scene.parameters import (
     Translation,
     Vertices,
 )
+from invertwin.signatures import rcs
 from scenes import float64, occluder, relative
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "limitations.md"
@@ -53,6 +54,7 @@ MECHANISMS = {
     "2+ bounces, boundary": "bounces boundary",
     "coherent field": "coherent",
     "rough field": "rough",
+    "signature": "signature",
 }
 ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
 METAL = PerfectConductor()
@@ -136,6 +138,7 @@ def soft() -> Move:
 
 CORNERS = float64([[1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.3]])
 ASIDE = {"translation": float64([0.9, 0.3, 0.1])}
+GEOMETRY = {"translation", "pose", "scale", "vertices"}
 MOVES: dict[str, Move] = {
     "translation": Move(Translation("occluder"), ASIDE),
     "pose": Move(Pose("occluder"), {"rotation": float64([0.2, 0.9, 0.6])}),
@@ -291,6 +294,25 @@ def rough_case(parameter: str) -> Found:
     return Found(found, found, (up - down) / 2e-4, 0.0)
 
 
+def section(scene: Scene) -> Tensor:
+    """Radar cross-sections from in front, a little to the side."""
+    sides = float64([[0.3, 0.1, -1.0], [0.05, -0.2, -1.0]])
+    return rcs(scene, sides, [1e9], edges=0).section
+
+
+def signature_case(parameter: str) -> Found:
+    """Without random numbers, differences are as smooth as the derivative."""
+    wall = METAL if parameter in GEOMETRY else COATED
+    scene, moves = occluder(wall=wall, occluder=METAL), MOVES[parameter]
+
+    def value(theta: Tensor) -> Tensor:
+        return section(moves(scene, power_radar(), theta)[0])
+
+    up, down = (value(torch.tensor(sign * 1e-5).double()) for sign in (1, -1))
+    found = pushed(value)
+    return Found(found, found, (up - down) / 2e-5, 0.0)
+
+
 _power: dict[str, Found] = {}
 
 
@@ -299,6 +321,8 @@ def case(parameter: str, mechanism: str) -> Found:
         return coherent_case(parameter)
     if mechanism == "rough":
         return rough_case(parameter)
+    if mechanism == "signature":
+        return signature_case(parameter)
     if parameter not in _power:
         _power[parameter] = bias_case() if parameter == "range bias" else power_case(parameter)
     return _power[parameter]
@@ -349,6 +373,9 @@ def test_zero(parameter, mechanism):
 
 def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     """Use a scene and a radar as the mechanism does."""
+    if mechanism == "signature":
+        section(scene)
+        return
     if mechanism.endswith(("interior", "boundary")):
         grid = radar.grid(0.4, 2.8, 0.6)
         drawn = Sampling(

@@ -1,5 +1,7 @@
 """The check of gradients, checked: it passes right ones and fails wrong ones."""
 
+import re
+
 import pytest
 import torch
 
@@ -48,7 +50,7 @@ def test_a_right_gradient_passes_and_reports():
     assert 4 <= report.pairs <= 6
     assert report.gradient.shape == report.value.shape == (1, *grid.shape)
     assert lines
-    assert "difference noise" in lines[-1]
+    assert re.search(r"difference noise 0\.\d+, about 0 s left", lines[-1])
 
 
 def test_a_wrong_gradient_fails():
@@ -119,7 +121,7 @@ def test_bad_tangents_are_named(module, tangent, message):
 def test_models_without_a_mean_derivative_are_refused():
     device = radar()
     model = ExactMap(device.grid(0.4, 2.8))
-    with pytest.raises(InputError, match="expected a smooth model such as SurrogateMap, got Exact"):
+    with pytest.raises(InputError, match="expected a smooth model, got ExactMap"):
         gradcheck(model, Translation("occluder"), SLIDE, scene=occluder(), sensor=device)
 
 

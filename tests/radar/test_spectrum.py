@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.radar import Radar, beamform, beat_signal, exact_spectrum, range_profile
+from invertwin.radar import FMCW, Radar, beamform, beat_signal, exact_spectrum, range_profile
+from invertwin.radar.range_profile import fft_bins
 from invertwin.radar.spectrum import aperture
 from invertwin.scene.antenna import AntennaArray, linear_array
 from invertwin.scene.pose import rotation_from_vector
@@ -145,3 +146,27 @@ def test_wrong_input(planar):
     count = len(few.receivers.positions)
     with pytest.raises(InputError, match="resolve both axes"):
         beamform(profile[:, :, :count], few, replace(grid, v_count=1))
+
+
+@pytest.mark.parametrize("count", [3, 8, 13])
+def test_directions_of_a_grid_end_at_one(count):
+    chirp = FMCW(start_frequency=77e9, bandwidth=2e9, duration=5e-5, samples=64)
+    row = linear_array(count, chirp.wavelength / 2)
+    radar = Radar(
+        linear_array(1, 0.002), row, chirp, positions=torch.zeros(1, 3, dtype=torch.float64)
+    )
+    u = radar.grid(0.5, 1.5).u
+    assert 1 - radar.beamwidth[0] < float(u.abs().max()) <= 1.0
+
+
+def test_ranges_beyond_the_unambiguous_one_show_the_period_before():
+    chirp = FMCW(start_frequency=77e9, bandwidth=2e9, duration=5e-5, samples=16)
+    one = linear_array(1, 0.002)
+    radar = Radar(one, one, chirp, positions=torch.zeros(1, 3, dtype=torch.float64))
+    grid = radar.grid(0.0, chirp.max_range)
+    beat = torch.randn(
+        1, 1, 1, 16, dtype=torch.complex128, generator=torch.Generator().manual_seed(1)
+    )
+    found = range_profile(beat, radar, grid)
+    assert fft_bins(chirp, grid) is not None
+    torch.testing.assert_close(found[..., -1], found[..., 0])

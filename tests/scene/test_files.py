@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (
     Mesh,
     Object,
@@ -20,6 +20,7 @@ from invertwin.scene import (
     Scene,
     box,
     load_mesh,
+    load_parts,
     load_scene_xml,
     plate,
     rigid,
@@ -142,7 +143,7 @@ def ply(vertex: str) -> str:
     ("name", "content", "message"),
     [
         ("missing.ply", None, "an existing file, got .*missing.ply"),
-        ("mesh.step", b"", r"mesh file \(.obj, .ply, .stl, .gltf, .glb\), got mesh.step"),
+        ("mesh.step", b"", r"mesh file \(.obj, .ply, .stl, .gltf, .glb, .inp\), got mesh.step"),
         ("empty.obj", b"", "empty.obj"),
         ("empty.stl", b"", "empty.stl"),
         ("empty.ply", b"", "empty.ply"),
@@ -373,3 +374,74 @@ def test_damaged_arrays_are_one_error(damage, tmp_path):
         InputError, match=r"expected plain arrays .*, got .*parts\.npz \(.*\); look$"
     ):
         read_arrays(file, "look")
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_units_parts_and_materials_of_a_file(tmp_path):
+    (tmp_path / "two.obj").write_text(
+        "v 0 0 0\nv 100 0 0\nv 0 200 0\nv 0 0 300\n"
+        "mtllib two.mtl\nusemtl steel\nf 1 2 3\nusemtl paint\nf 1 3 4\nf 1 4 2\n"
+    )
+    (tmp_path / "two.mtl").write_text("newmtl steel\nKd 1 0 0\nnewmtl paint\nKd 0 1 0\n")
+    whole = load_mesh(tmp_path / "two.obj", unit="mm")
+    found = whole.summary()
+    assert found.extent == pytest.approx((0.1, 0.2, 0.3))
+    assert (found.triangles, found.open_edges, found.nonmanifold_edges) == (3, 3, 0)
+    assert str(found) == "0.1 × 0.2 × 0.3 m, 3 triangles, 3 open and 0 non-manifold edges"
+    parts = load_parts(tmp_path / "two.obj", unit="mm")
+    assert {name: len(part.faces) for name, part in parts.items()} == {"steel": 1, "paint": 2}
+    assert parts["paint"].summary().extent == pytest.approx((0.1, 0.2, 0.3))
+    with pytest.raises(InputError, match="a unit among m, cm"):
+        load_mesh(tmp_path / "two.obj", unit="parsec")  # type: ignore[arg-type]
+    with pytest.warns(PhysicsWarning, match=r'300 m wide.*unit = "mm"'):
+        load_mesh(tmp_path / "two.obj")
+
+
+ABAQUS = """*HEADING
+a plate and a triangle, by hand
+**
+*PART, NAME=one
+*Node
+      1,  0.0, 0.0, 0.0
+      2,  1.0, 0.0, 0.0
+      7,  1.0, 1.0, 0.0
+      8,  0.0, 1.0, 0.0
+*Element, type=S4R, ELSET=all
+10, 1, 2, 7, 8
+*END PART
+*PART, NAME=two
+*NODE
+1, 0, 0, 1
+2, 1, 0, 1
+3, 0, 1, 1
+*ELEMENT, TYPE=STRI3
+1, 1, 2,
+3
+"""
+
+
+def test_shell_elements_of_an_abaqus_file(tmp_path):
+    file = tmp_path / "parts.inp"
+    file.write_text(ABAQUS)
+    mesh = load_mesh(file)
+    corners = mesh.vertices[mesh.faces]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert len(mesh.faces) == 3
+    assert torch.allclose(normals[:, 2], torch.ones(3, dtype=torch.float64))
+    assert corners[2, :, 2].tolist() == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("type=S4R", "type=C3D8"),
+        ("10, 1, 2, 7, 8", "10, 1, 2, 7, 9"),
+        ("1.0, 1.0, 0.0", "1.0, one, 0.0"),
+    ],
+)
+def test_other_abaqus_files_are_refused_in_one_line(tmp_path, old, new):
+    file = tmp_path / "parts.inp"
+    file.write_text(ABAQUS.replace(old, new))
+    with pytest.raises(InputError, match=r"expected a readable \.inp mesh") as caught:
+        load_mesh(file)
+    assert "\n" not in str(caught.value)

@@ -8,7 +8,7 @@ import pickle
 import pytest
 import torch
 
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (
     Mesh,
     Object,
@@ -154,8 +154,8 @@ def test_scene_can_be_copied_and_pickled():
         (lambda: Object(PLATE, METAL).at(math.nan), "time"),
         (lambda: Scene({}), "at least one named object, got none"),
         (lambda: Scene([Object(PLATE, METAL)]), "at least one named object, got list"),  # pyright: ignore[reportArgumentType]
-        (lambda: Scene({"": Object(PLATE, METAL)}), "names that are not empty .*, got ''"),
-        (lambda: Scene({3: Object(PLATE, METAL)}), "names that are not empty .*, got 3"),  # pyright: ignore[reportArgumentType]
+        (lambda: Scene({"": Object(PLATE, METAL)}), "names that are not empty.*, got ''"),
+        (lambda: Scene({3: Object(PLATE, METAL)}), "names that are not empty.*, got 3"),  # pyright: ignore[reportArgumentType]
         (lambda: Scene({"wall": PLATE}), "an Object for 'wall', got Mesh"),  # pyright: ignore[reportArgumentType]
         (lambda: scene()["floor"], r"\(wall, door\), got 'floor'"),
         (lambda: scene().replace("floor", pose=None), r"\(wall, door\), got 'floor'"),
@@ -166,3 +166,23 @@ def test_bad_scenes_are_refused_in_one_line(make, message):
     with pytest.raises(InputError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_scenes_of_mirrors_get_a_warning():
+    from invertwin.scene import Dielectric, RoughConductor, Slab
+    from invertwin.scene.scene import warn_of_mirrors
+
+    wall = plate(1.0, 1.0)
+    for material in (
+        RoughConductor(scattering=0.0),
+        RoughDielectric(4.0, diffuse=0.0, lobe_width=0.1),
+    ):
+        with pytest.warns(PhysicsWarning, match="no surface scatters"):
+            warn_of_mirrors(Scene({"wall": Object(wall, material)}), 77e9)
+    for material in (RoughConductor(), Dielectric(4.0), RoughDielectric(4.0), PerfectConductor()):
+        warn_of_mirrors(Scene({"wall": Object(wall, material)}), 77e9)
+    pair = {
+        "glass": Object(wall, Slab(6.0, thickness=0.01)),
+        "wall": Object(wall, RoughConductor()),
+    }
+    warn_of_mirrors(Scene(pair), 77e9)

@@ -86,6 +86,14 @@ def test_dihedral_is_a_right_angle_open_to_the_radar():
     assert mesh.vertices[:, 2].max() == 0.0
 
 
+def test_a_dihedral_opens():
+    mesh = dihedral(0.3, math.radians(120))
+    left, right = (mesh.vertices[i] - mesh.vertices[2] for i in (0, 4))
+    assert float(left.norm()) == pytest.approx(0.3)
+    assert float(left @ right) / 0.3**2 == pytest.approx(math.cos(math.radians(120)))
+    assert left[2] == right[2] < 0
+
+
 def test_trihedral_returns_to_where_it_came_from():
     mesh = trihedral(0.3)
     assert mesh.vertices[0].tolist() == [0.0, 0.0, 0.0]
@@ -149,6 +157,7 @@ def test_any_text_is_closed(string, characteristic):
         (lambda: sphere(math.inf), "sphere radius"),
         (lambda: sphere(1.0, -1), "subdivisions"),
         (lambda: dihedral(-0.1), "dihedral edge"),
+        (lambda: dihedral(0.1, 4.0), "opening"),
         (lambda: trihedral(0.0), "trihedral edge"),
         (lambda: text("  "), "one line of visible text"),
         (lambda: text(""), "one line of visible text"),

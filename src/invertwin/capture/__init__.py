@@ -12,4 +12,8 @@ from invertwin.capture.chirps import ChirpSettings as ChirpSettings
 from invertwin.capture.chirps import adc_counts as adc_counts
 from invertwin.capture.chirps import settings_of as settings_of
 from invertwin.capture.reading import read as read
+from invertwin.capture.signature_files import MeasuredSection as MeasuredSection
+from invertwin.capture.signature_files import Touchstone as Touchstone
+from invertwin.capture.signature_files import load_section as load_section
+from invertwin.capture.signature_files import load_touchstone as load_touchstone
 from invertwin.capture.track import Track as Track

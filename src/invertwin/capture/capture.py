@@ -19,6 +19,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.waveform import SampledWaveform
+from invertwin.untrusted import reading
 
 BEAT_DIMS = ("frame", "tx", "rx", "sample")
 PROFILE_DIMS = ("frame", "range")
@@ -138,7 +139,8 @@ class Capture:
         Raises:
             InputError: no such file, a truncated file, or one that holds no capture.
         """
-        return cls(read_dataset(Path(path), trusted=trusted))
+        with reading(path, "a capture", "record or save it again"):
+            return cls(read_dataset(Path(path), trusted=trusted))
 
     def save(self, path: str | Path) -> None:
         """Write NetCDF (HDF5), bit for bit; an interrupted write leaves an old file as it was.

@@ -119,9 +119,8 @@ class ChirpCapture:
         if chirp == "mean":
             if self.moving:
                 raise InputError(
-                    "expected a parameter of kind mover, since the recording has chirps and "
-                    "movers, which fade in the mean of the chirps; fit a mover, or choose one "
-                    "`chirp`"
+                    "expected one chirp of a recording with movers, got the mean, in which they "
+                    "fade; choose one `chirp`, or fit a parameter of kind mover"
                 )
             beat = self.beat.mean(dim=1)
         elif isinstance(chirp, bool) or not isinstance(chirp, int) or not 0 <= chirp < count:

@@ -17,7 +17,14 @@ from invertwin.folders import replacing
 from invertwin.radar.boards import Elements, Mounting
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import checked_tensor
-from invertwin.untrusted import existing_file, read_arrays, read_npy, reading, try_apart
+from invertwin.untrusted import (
+    existing_file,
+    read_arrays,
+    read_npy,
+    reader,
+    reading,
+    try_apart,
+)
 
 # The data tell these settings by their shape and kind.
 _TOLD = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
@@ -29,6 +36,7 @@ _KEYS = {
 _ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 
 
+@reader("a description of samples")
 def described_board(
     path: str | Path,
     board: str | None = None,
@@ -67,6 +75,7 @@ def described_board(
     )
 
 
+@reader("samples as their description says")
 def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     """Read every chirp of described samples.
 

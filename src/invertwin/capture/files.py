@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import xarray as xr
 
@@ -41,6 +42,9 @@ def read_dataset(path: Path, *, trusted: bool = False) -> xr.Dataset:
     if not trusted:
         try_apart(path, "netcdf")
     with reading(path, "a whole NetCDF file"):
+        # Where this fails, h5netcdf breaks off half made, and complains when it is thrown away.
+        with h5py.File(path) as file:
+            file.attrs.get("_nc3_strict")
         # Nothing is decoded: seconds stay numbers, and every bit stays what it was.
         return _joined(xr.load_dataset(path, engine="h5netcdf", decode_cf=False))
 

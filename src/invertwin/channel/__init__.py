@@ -1,6 +1,7 @@
 """From a scene to propagation paths: the only room that knows the ray tracer."""
 
 from invertwin.channel.field.field import trace_field as trace_field
+from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle
 from invertwin.channel.field.speckle import draw_speckle as draw_speckle
 from invertwin.channel.paths import Grid as Grid
@@ -15,5 +16,14 @@ from invertwin.channel.rays.backend import torch_threads as torch_threads
 from invertwin.channel.rays.backend import use_backend as use_backend
 from invertwin.channel.rays.geometry import differentiated as differentiated
 from invertwin.channel.rays.scene import visible_points as visible_points
+from invertwin.channel.reference.cross_sections import CrossSection as CrossSection
+from invertwin.channel.reference.cross_sections import DihedralByMoments as DihedralByMoments
+from invertwin.channel.reference.cross_sections import DihedralSection as DihedralSection
+from invertwin.channel.reference.cross_sections import PlateSection as PlateSection
+from invertwin.channel.reference.cross_sections import SphereSection as SphereSection
+from invertwin.channel.reference.cross_sections import (
+    SquareTrihedralSection as SquareTrihedralSection,
+)
+from invertwin.channel.reference.cross_sections import TrihedralSection as TrihedralSection
 from invertwin.channel.reference.power import trace_power as trace_power
 from invertwin.channel.sampling import Sampling as Sampling

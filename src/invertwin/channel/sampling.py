@@ -6,7 +6,7 @@ from typing import Annotated
 from annotated_types import Ge, Le
 
 from invertwin.errors import InputError
-from invertwin.limits import Count
+from invertwin.limits import MOST, Count
 
 _DEEPEST = 16
 
@@ -38,7 +38,7 @@ class Sampling:
 
     depth: Annotated[int, Ge(1), Le(_DEEPEST)] = 3
     samples: Count = 400_000
-    boundary_samples: Annotated[int, Ge(0)] = 50_000
+    boundary_samples: Annotated[int, Ge(0), Le(MOST)] = 50_000
     boundary: bool = True
     interior_edges: bool = True
     contacts: bool = True
@@ -53,10 +53,11 @@ class Sampling:
                 f"expected a depth from 1 to {_DEEPEST}, got {self.depth}; give the most bounces "
                 "of a path"
             )
-        if self.samples < 1 or self.boundary_samples < 0:
+        if not (1 <= self.samples <= MOST and 0 <= self.boundary_samples <= MOST):
             raise InputError(
-                f"expected samples >= 1 and boundary_samples >= 0, got {self.samples} and "
-                f"{self.boundary_samples}; give the number of rays over all frames"
+                f"expected samples from 1 and boundary_samples from 0 to {MOST}, got "
+                f"{self.samples} and {self.boundary_samples}; give the number of rays over all "
+                "frames"
             )
         if not self.points_per_m2 > 0 or self.rough_paths < 1:
             raise InputError(

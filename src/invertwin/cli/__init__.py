@@ -8,4 +8,5 @@ registry.built_in = (
     "invertwin.cli.shape_tables",
     "invertwin.cli.recordings",
     "invertwin.cli.fit_tables",
+    "invertwin.cli.cross_sections",
 )

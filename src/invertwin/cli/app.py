@@ -25,11 +25,19 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.run_file import about_file
 from invertwin.cli.running import load_runs, now_and_then, print_tables, run_folder
-from invertwin.errors import InputError, one_line
+from invertwin.errors import InputError, interruptible, one_line
 
 
 class _Commands(TyperGroup):
     """Our commands, and those of plugins, which are imported when ours do not answer."""
+
+    def make_context(self, *args: Any, **given: Any) -> Any:
+        with interruptible():
+            return super().make_context(*args, **given)
+
+    def invoke(self, ctx: Any) -> Any:
+        with interruptible():
+            return super().invoke(ctx)
 
     def list_commands(self, ctx: Any) -> list[str]:
         self._add_plugins()
@@ -114,6 +122,20 @@ def plan(options: Resumable, file: FileArgument) -> None:
 
 
 @app.command()
+def check(file: FileArgument, backend: BackendOption = None) -> None:
+    """Say what a run file needs, memory and time, and do nothing else."""
+    from invertwin.cli.run_file import load_run
+
+    run = load_run(file)
+    from invertwin.cli.run_check import run_check
+
+    with about_file(file):
+        tables, line = run_check(run)
+    print_tables(tables)
+    console.print(line, markup=False, soft_wrap=True)
+
+
+@app.command()
 @with_options(Resumable)
 def demo(options: Resumable) -> None:
     """Find a hidden letter from its radar echoes."""
@@ -137,7 +159,7 @@ def look(options: Look) -> None:
 @with_options(Resumable)
 def gradcheck(options: Resumable, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
-    runs = load_runs(files, options, "gradcheck", ("gradcheck", "radar", "grid"))
+    runs = load_runs(files, options, "gradcheck", _needs_of_gradcheck)
     default = Path("out", files[0].stem if len(files) == 1 else "gradcheck")
     with run_folder(options, default, runs) as folder:
         if folder.complete:
@@ -147,6 +169,27 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
         with console.status("tracing") as status:
             say = status.update if console.is_terminal else now_and_then()
             tables = run_gradcheck(runs, {file.stem: file for file in files}, folder, say)
+        print_tables(tables)
+
+
+def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
+    return ("gradcheck",) if run.rcs is not None else ("gradcheck", "radar", "grid")
+
+
+@app.command()
+@with_options(Resumable)
+def rcs(options: Resumable, files: FilesArgument) -> None:
+    """Compute radar signatures: cross-sections, range profiles, images."""
+    runs = load_runs(files, options, "rcs", ("rcs",))
+    default = Path("out", files[0].stem if len(files) == 1 else "rcs")
+    with run_folder(options, default, runs) as folder:
+        if folder.complete:
+            return
+        from invertwin.cli.run_rcs import run_rcs
+
+        with console.status("tracing") as status:
+            say = status.update if console.is_terminal else now_and_then()
+            tables = run_rcs(runs, {file.stem: file for file in files}, folder, say)
         print_tables(tables)
 
 

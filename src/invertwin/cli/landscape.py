@@ -1,17 +1,19 @@
 """Why the surrogate: the exact signal's loss beside the surrogate's, along a line."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from rich.console import Console
 
 from invertwin import plotting
 from invertwin.cli import build
 from invertwin.cli.fits.problem import Problem, models_of
 from invertwin.cli.run_file import need
+from invertwin.cli.running import counted
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion import Observation
 from invertwin.inversion.lines import Line, line_of, losses_along
@@ -20,7 +22,7 @@ from invertwin.models import BeatMap
 from invertwin.scene import Scene, Translation
 
 
-def landscape(problem: Problem) -> tuple[Figure, dict[str, Any]]:
+def landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str, Any]]:
     """The figure of the `[landscape]` table, and the local minima of every curve.
 
     For the exact signal one channel of one frame is enough to show the shape.
@@ -32,12 +34,14 @@ def landscape(problem: Problem) -> tuple[Figure, dict[str, Any]]:
     wide = np.linspace(-table.span, table.span, table.points)
     model, first = BeatMap(sight.grid, channels=(slice(1), slice(1))), sight.radar.frames([0])
     beat = Observation(model, first, sight.capture.beat[:1, :1, :1], loss=relative_error)
-    exact = exact_losses(run, line, fine, beat)
+    with counted(console, "loss landscape, exact signal", len(fine)) as advance:
+        exact = exact_losses(run, line, fine, beat, advance)
     model, loss = models_of(problem)[0], build.made(run, "loss")
     smooth = {}
     for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
         seen = Observation(model.narrowed(share), sight.radar, sight.capture, loss=loss)
-        losses = losses_along(line, wide, seen, seed=run.seed).numpy()
+        with counted(console, f"loss landscape, {name}", len(wide)) as advance:
+            losses = losses_along(line, told(wide, advance), seen, seed=run.seed).numpy()
         smooth[f"surrogate, {name}"] = wide, losses
     minima = {"exact": exact, **{name: losses for name, (_, losses) in smooth.items()}}
     counts = {name: plotting.count_minima(losses) for name, losses in minima.items()}
@@ -53,11 +57,24 @@ def line_through(truth: Scene, name: str, axis: Sequence[float]) -> tuple[Line, 
     return line_of(Translation(name), unit / unit.norm(), truth), along
 
 
-def exact_losses(run: RunFile, line: Line, offsets: np.ndarray, seen: Observation) -> np.ndarray:
+def told(offsets: Iterable[float], advance: Callable[[], None]) -> Iterator[float]:
+    """The offsets of a line, and a call whenever one is done."""
+    for offset in offsets:
+        yield offset
+        advance()
+
+
+def exact_losses(
+    run: RunFile,
+    line: Line,
+    offsets: np.ndarray,
+    seen: Observation,
+    advance: Callable[[], None] = lambda: None,
+) -> np.ndarray:
     """Losses of exact signals along a line, with the rough points of the simulated data."""
     data = need(run, "data", "the loss landscape")
     assert isinstance(data, SimulatedData)
     drawn = {"samples": data.samples, "points_per_m2": data.points_per_m2, "boundary": False}
     seen = replace(seen, model=seen.model.sampled_by(depth=1, **drawn))
     seed = run.seed if data.seed is None else data.seed
-    return losses_along(line, offsets, seen, seed=seed).numpy()
+    return losses_along(line, told(offsets, advance), seen, seed=seed).numpy()

@@ -21,7 +21,7 @@ from invertwin.registry.section import TAG_MARK
 from invertwin.registry.section import about as about
 from invertwin.untrusted import reading
 
-_MOST_ERRORS = 4  # in one line
+_MOST_ERRORS = 20  # in one line
 # Sections and kinds of the package in experiments/studies.
 _STUDIES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
 _BELONG = {

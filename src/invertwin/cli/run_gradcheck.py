@@ -12,18 +12,21 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
+from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.report import Picture, Table, finish, picture, texts
-from invertwin.cli.run_file import about_file, need
+from invertwin.cli.run_file import about, about_file, need
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.schema.signature import swept
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
-from invertwin.models import SurrogateMap
+from invertwin.models import ForwardModel, SignatureMap, SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene
+from invertwin.signatures import Signature
 
 _COLUMNS = (
     *("scene", "L1 full", "L1 interior", "L1 no interior edges", "L1 no contact", "ratio"),
@@ -127,28 +130,73 @@ def run_gradcheck(
     return finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
 
 
-def _check(
-    name: str, run: RunFile, folder: RunFolder, say: Callable[[str], None]
-) -> dict[str, Any]:
-    begin = time.perf_counter()
-    settings = need(run, "gradcheck", "gradcheck")
+@dataclass(frozen=True)
+class _Seen:
+    """What is differentiated."""
+
+    model: ForwardModel
+    device: tuple[Radar, Grid] | None
+    draw: Callable[[GradientReport], Figure]
+
+
+def _signature(run: RunFile, settings: Gradcheck) -> _Seen:
+    """The signature of `[rcs]`."""
+    table = need(run, "rcs", "gradcheck")
+
+    def signature(scene: Scene, **more: Any) -> Signature:
+        with about("rcs"):
+            return table.build({Scene: scene}, **more)
+
+    def draw(report: GradientReport) -> Figure:
+        angles, label = table.angles
+        size = report.difference.abs().sum((0, 1))
+        i, j = max(table.channels.values(), key=lambda at: float(size[at]))
+        curves = {n: values[:, :, i, j] for n, values in _derivatives(report).items()}
+        if len(angles) > 1:
+            places = (angles, label)
+            curves = {name: values[0] for name, values in curves.items()}
+        else:
+            places = (swept(table.frequencies) / 1e9, "frequency [GHz]")
+            curves = {name: values[:, 0] for name, values in curves.items()}
+        return plotting.slopes(curves, *places, f"∂σ, σ in m² [{_unit(settings)}]")
+
+    return _Seen(SignatureMap(signature), None, draw)
+
+
+def _map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+    """The smooth map of `[radar]`, `[grid]` and `[surrogate]`."""
     if run.surrogate.exact:
         raise InputError(
             "surrogate.exact: expected a smooth map to differentiate, got exact signals; remove "
             "it: silhouettes of single rough points have no derivative"
         )
-    scene = build.scene(run)
     radar = build.radar(need(run, "radar", "gradcheck"))
     grid = build.grid(need(run, "grid", "gradcheck"), radar)
-    module, tangent = build.tangent(run, scene)
-    for key in _studies(run) if settings.parameter.kind not in _MOVES else ():
-        raise InputError(
-            f"{key}: expected a parameter that moves something, got one of a shape; remove it"
-        )
+    require_room(run, scene, {"": Sensor(run, radar, grid)})
     drawn = {key: getattr(settings, key) for key in ("depth", "samples", "boundary_samples")}
+    model = SurrogateMap(grid, build.made(run, "surrogate"), Sampling(**drawn))
+    return _Seen(model, (radar, grid), lambda report: _maps(report, grid, settings))
+
+
+def _check(
+    name: str, run: RunFile, folder: RunFolder, say: Callable[[str], None]
+) -> dict[str, Any]:
+    begin = time.perf_counter()
+    settings = need(run, "gradcheck", "gradcheck")
+    scene = build.scene(run)
+    seen = _map(run, settings, scene) if run.rcs is None else _signature(run, settings)
+    module, tangent = build.tangent(run, scene)
+    for key in _studies(run):
+        if seen.device is None:
+            raise InputError(f"{key}: expected [radar] and [grid] with it, got [rcs]; remove it")
+        if settings.parameter.kind not in _MOVES:
+            raise InputError(
+                f"{key}: expected a parameter that moves something, got one of a shape; remove it"
+            )
     check = settings.build()
+    radar = seen.device[0] if seen.device else None
     report = gradcheck(
-        SurrogateMap(grid, build.made(run, "surrogate"), Sampling(**drawn)),
+        seen.model,
         module,
         tangent,
         scene=scene,
@@ -158,15 +206,16 @@ def _check(
         seed=run.seed,
         progress=say,
     )
-    picture(folder, f"{name}", _maps(report, grid, settings))
+    picture(folder, f"{name}", seen.draw(report))
     moved = filter(None, [getattr(settings.parameter, "object", None)])
     picture(folder, f"{name}_scene", plotting.scene(scene, radar, highlight=[*moved]))
     kept = {key: value for key in _KEPT if (value := getattr(report, key)) is not None}
     found = {k: asdict(v) if isinstance(v, Agreement) else v for k, v in kept.items()}
-    checked = Checked(run, scene, radar, grid, check.step, report, say)
-    for key, study in _studies(run).items():
-        found[key], figure = study.compare(checked)
-        picture(folder, f"{name}_{key}", figure)
+    if seen.device is not None:
+        checked = Checked(run, scene, *seen.device, check.step, report, say)
+        for key, study in _studies(run).items():
+            found[key], figure = study.compare(checked)
+            picture(folder, f"{name}_{key}", figure)
     return found | {"seconds": time.perf_counter() - begin}
 
 
@@ -177,16 +226,23 @@ def _studies(run: RunFile) -> dict[str, GradcheckStudy]:
 
 
 def _maps(report: GradientReport, grid: Grid, settings: Gradcheck) -> Figure:
-    maps = {
+    error = {"full − differences, own scale": report.gradient - report.difference}
+    label = f"∂ power (received/sent) [{_unit(settings)}]"
+    return plotting.gradient(_derivatives(report), grid, label=label, own_scale=error)
+
+
+def _derivatives(report: GradientReport) -> dict[str, Tensor]:
+    return {
         "differences": report.difference,
         "full": report.gradient,
         "interior only": report.interior_gradient,
     }
-    error = {"full − differences, own scale": report.gradient - report.difference}
+
+
+def _unit(settings: Gradcheck) -> str:
+    """Of a derivative of a number by θ."""
     name = next(iter(settings.tangent))
-    unit = "1/rad" if settings.turns else _UNITS.get(name, f"per unit of {name}")
-    label = f"∂ power (received/sent) [{unit}]"
-    return plotting.gradient(maps, grid, label=label, own_scale=error)
+    return "1/rad" if settings.turns else _UNITS.get(name, f"per unit of {name}")
 
 
 def _row(name: str, found: Mapping[str, Any]) -> list[Any]:

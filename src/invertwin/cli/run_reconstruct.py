@@ -100,8 +100,7 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         own = [key for key in same if is_shape_key(key) and not key.startswith("true_")]
         metrics |= {f"{key}_{mode}": same[key] for key in own}
     if run.landscape is not None and isinstance(run.data, SimulatedData):
-        console.print("computing the loss landscape")
-        figure, minima = landscape(problem)
+        figure, minima = landscape(problem, console)
         picture(folder, "landscape", figure)
         metrics["landscape"] = minima
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)

@@ -13,6 +13,7 @@ from invertwin import plotting
 from invertwin.capture import Capture, ChirpData, described_arrays
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build, sensors
+from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.raw_files import settings_of_run, write_raw
 from invertwin.cli.report import Table, finish, picture, quantities
 from invertwin.cli.run_file import about, need
@@ -75,6 +76,7 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
     grid = build.grid(need(run, "grid", "simulate"), radar)
     if run.raw is not None:
         settings_of_run(run, radar)  # its errors come before any work
+    require_room(run, scene, {"": Sensor(run, radar, grid)})
     simulated = _frames if run.chirps is None else _chirps
     beat, found, figure, note = simulated(run, folder, scene, radar, grid)
     metrics = {

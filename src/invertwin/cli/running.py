@@ -1,5 +1,6 @@
 """What commands do before and after their work: run files in, folder, tables on the terminal."""
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -7,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -47,11 +50,20 @@ def run_folder(
 
 
 def load_runs(
-    files: Sequence[Path], options: Options, command: str, sections: Sequence[str]
+    files: Sequence[Path],
+    options: Options,
+    command: str,
+    sections: Sequence[str] | Callable[[Any], Sequence[str]],
 ) -> dict[str, Any]:
     """Run files by stem, with the sections that the command cannot do without.
 
     A seed of the options replaces theirs. Run files of another task than the command's are refused.
+
+    Args:
+        files: Where they are.
+        options: What the user has chosen.
+        command: Whose task they must have.
+        sections: What it needs, or what it needs of a run file.
     """
     runs: dict[str, Any] = {}
     for file in files:
@@ -65,22 +77,63 @@ def load_runs(
         if other != command:
             cure = f"its task is {run.task}: use `invertwin {other} {file}`"
         with about_file(file):
-            for section in sections:
+            for section in sections(run) if callable(sections) else sections:
                 need(run, section, command, cure)
         seeded = {} if options.seed is None else {"seed": options.seed}
         runs[file.stem] = run.model_copy(update=seeded)
     return runs
 
 
-def now_and_then() -> Callable[[str], None]:
-    """A function that prints a line of progress, unless one was printed just now."""
-    last = -_LOG_SECONDS
+@contextmanager
+def counted(shown: Console, name: str, total: int) -> Iterator[Callable[[], None]]:
+    """Progress with the time that is left: a bar, or a line now and then where no terminal is.
+
+    Args:
+        shown: Where.
+        name: Of what is counted.
+        total: How many there are.
+
+    Yields:
+        A function to be called after each of them.
+    """
+    begin, done = time.monotonic(), 0
+    say = now_and_then(shown, begin)
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=shown, disable=not shown.is_terminal) as bar:
+        task = bar.add_task("", total=total)
+
+        def advance() -> None:
+            nonlocal done
+            done += 1
+            bar.update(task, completed=done)
+            if not shown.is_terminal:
+                left = time_left((time.monotonic() - begin) / done * (total - done))
+                say(f"{name}: {done} of {total}, {left} left")
+
+        yield advance
+
+
+def time_left(seconds: float) -> str:
+    """A time as people say it."""
+    for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def now_and_then(shown: Console = console, last: float = -math.inf) -> Callable[[str], None]:
+    """A function that prints a line of progress, unless one was printed just now.
+
+    Args:
+        shown: Where.
+        last: When the last one was printed.
+    """
 
     def say(line: str) -> None:
         nonlocal last
         if time.monotonic() - last >= _LOG_SECONDS:
             last = time.monotonic()
-            console.print(line, markup=False, soft_wrap=True)
+            shown.print(line, markup=False, soft_wrap=True)
 
     return say
 

@@ -1,6 +1,5 @@
 """Radars of run files: waveforms, antennas, boards, tracks, poses, grids."""
 
-import math
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -11,7 +10,6 @@ from torch import Tensor
 
 from invertwin.capture.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
-from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar import boards, tracks
 from invertwin.radar.impairments import Impairments
@@ -32,7 +30,6 @@ from invertwin.scene import (
 )
 from invertwin.scene import Table as PatternTable
 
-_MOST_BINS = 1e9  # 4 GB a map
 Numbers = Annotated[list[Count], MinLen(1)]
 
 
@@ -210,18 +207,10 @@ def grid(table: Any, radar: Radar) -> Grid:
     """The bins of a `[grid]` table for a radar.
 
     Raises:
-        InputError: Limits that the radar refuses or does not reach, or a map of a size that only
-            a wrong unit explains.
+        InputError: Limits that the radar refuses or does not reach.
     """
     with about("grid"):
-        found = table.build(self=radar)
-        bins = math.prod(found.shape) * radar.frame_count
-        if bins > _MOST_BINS:
-            raise InputError(
-                f"expected a map of at most {_MOST_BINS:g} bins over all frames, got {bins:.3g}; "
-                "give limits in metres and direction cosines, or less oversampling"
-            )
-    return found
+        return table.build(self=radar)
 
 
 def impairments(table: Any, data: Any) -> Impairments:

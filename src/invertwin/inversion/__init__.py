@@ -41,6 +41,7 @@ from invertwin.inversion.regularization import Laplacian as Laplacian
 from invertwin.inversion.regularization import LatentNorm as LatentNorm
 from invertwin.inversion.regularization import Regularizer as Regularizer
 from invertwin.inversion.remeshing import remeshed as remeshed
+from invertwin.inversion.remeshing import require_edge as require_edge
 from invertwin.inversion.schedule import Schedule as Schedule
 from invertwin.inversion.schedule import Stage as Stage
 from invertwin.inversion.starts import displaced as displaced

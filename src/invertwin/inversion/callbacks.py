@@ -16,6 +16,7 @@ from invertwin.errors import InputError
 from invertwin.folders import replacing
 from invertwin.inversion.fit import Callback, Fit
 from invertwin.scene.scene import Scene
+from invertwin.untrusted import reading
 
 
 @dataclass(frozen=True)
@@ -85,14 +86,10 @@ class Checkpoint(Callback):
         path = self._path(fit)
         if not (self.resume and path.exists()):
             return
-        try:
+        with reading(path, "a whole checkpoint", "delete it or start without resume"):
             state = torch.load(path, weights_only=True)
-        except Exception as error:
-            raise InputError(
-                f"expected a checkpoint in {path}, got a file that cannot be read "
-                f"({type(error).__name__}); delete it or start without resume"
-            ) from None
-        if not isinstance(state, dict) or not fit.restore(state):
+            restored = isinstance(state, dict) and fit.restore(state)
+        if not restored:
             raise InputError(
                 f"expected a checkpoint of this fit in {path}, got one of another (schedule, "
                 "seed, model, loss, optimizer, regularizers, parameters, scene or data differ); "

@@ -84,7 +84,10 @@ class FirstPose:
         for name in ("low", "high"):
             if (getattr(self, name) is None) != (self.pose == "known"):
                 no, do = ("no ", "remove it") if self.pose == "known" else ("", "add it")
-                raise InputError(f'expected {no}`{name}` with pose = "{self.pose}"; {do}')
+                got = "one" if self.pose == "known" else "none"
+                raise InputError(
+                    f'expected {no}`{name}` with pose = "{self.pose}", got {got}; {do}'
+                )
 
     def find(
         self,

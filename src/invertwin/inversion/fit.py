@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from pydantic import ConfigDict, TypeAdapter
 from torch import Tensor, nn
 
 from invertwin.channel import torch_threads
@@ -30,6 +31,11 @@ _DIVERGED = 1e3  # times the first loss
 _WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
 _WINDOW = 20  # steps over which convergence is judged
 _SUBSETS = 2**16  # keys of the seeds that choose frames, beyond those of observations
+# What optimisers remember of a parameter.
+_REMEMBERED: dict[type[torch.optim.Optimizer], set[str]] = {
+    torch.optim.Adam: {"step", "exp_avg", "exp_avg_sq"},
+    torch.optim.SGD: {"momentum_buffer"},
+}
 _SHARP, _LOOKS = 2**17, 2**17 + 1  # keys of seeds, beyond those of stages
 
 
@@ -45,11 +51,16 @@ class Progress:
         ended: The status, once the fit has ended.
     """
 
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
+
     first: dict[str, Tensor]
     step: int = 0
     history: list[dict[str, Any]] = field(default_factory=list)
     best: tuple[int, float, dict[str, Tensor]] | None = None
     ended: Status | None = None
+
+
+_PROGRESS = TypeAdapter(Progress)
 
 
 class Callback:
@@ -282,12 +293,22 @@ class Fit:
         }
 
     def restore(self, state: dict[str, Any]) -> bool:
-        """Go on from a ``state`` of this fit; of another fit, change nothing and return False."""
+        """Go on from a ``state`` of this fit; of another fit, change nothing and return False.
+
+        A state whose fingerprint fits and whose content does not raises what comes of it.
+        """
         if not self.fingerprint.matches(state.get("fingerprint")):
             return False
+        progress = _PROGRESS.validate_python(state["progress"])
+        kept = [state["modules"], progress.first, *(progress.best or ())[2:]]
+        own = {name: value.shape for name, value in self.parameters().items()}
+        if any({name: v.shape for name, v in values.items()} != own for values in kept):
+            raise ValueError("parameters of another fit")
+        if not all({"step", "stage", "loss", "values"} <= row.keys() for row in progress.history):
+            raise ValueError("rows of another fit")
         self.modules.load_state_dict(state["modules"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.progress = Progress(**state["progress"])
+        _restore(self.optimizer, state["optimizer"])
+        self.progress = progress
         return True
 
     def annealed(self, step: int) -> bool:
@@ -405,6 +426,19 @@ class Settings:
     optimizer: Optimizer  # of stages without one of their own
     regularizers: tuple[Regularizer, ...]  # of the scene, beside those of its unknowns
     seed: int  # of all random numbers
+
+
+def _restore(optimizer: torch.optim.Optimizer | GaussNewton, state: dict[str, Any]) -> None:
+    """Give an optimiser back what it knew of every parameter; its settings are those of the fit."""
+    if isinstance(optimizer, GaussNewton):
+        optimizer.load_state_dict(state)
+        return
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": state["state"]})
+    names = _REMEMBERED[type(optimizer)]
+    for parameter, known in optimizer.state.items():
+        shapes = [value.shape for value in known.values()]
+        if known.keys() != names or not {*shapes} <= {parameter.shape, torch.Size([])}:
+            raise ValueError("an optimiser of another fit")
 
 
 def _require_all_used(modules: nn.ModuleList) -> None:

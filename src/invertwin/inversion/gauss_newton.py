@@ -161,7 +161,12 @@ class GaussNewton:
         """Restore what `state_dict` gave."""
         self.damping = float(state["damping"])
         self._age = int(state.get("age", 0))
-        self._known = (state["curvature"], state["free"]) if "curvature" in state else None
+        self._known = None
+        if "curvature" in state:
+            curvature, free = state["curvature"], state["free"]
+            if curvature.shape != (int(free.sum()),) * 2 or free.shape != self.reach.shape:
+                raise ValueError("a curvature of other parameters")
+            self._known = curvature, free
 
     def zero_grad(self) -> None:
         """Do nothing: gradients are not kept in the parameters."""

@@ -1,6 +1,7 @@
 """Is the gradient right? Automatic derivatives of a whole map against central differences."""
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, overload
@@ -73,7 +74,7 @@ class GradientReport:
             cast on each other; None for paths of one bounce, which have none.
         no_contact: With boundary paths, but without those of the curves in which surfaces cross or
             touch; None where surfaces do not meet.
-        difference_noise: ‖standard error‖₁ / ‖g_FD‖₁.
+        difference_noise: ‖standard error‖₁ / ‖g_FD‖₁; 0 where maps do not depend on the seed.
         step_agreement: ‖FD(ε) − FD(ε/2)‖₁ / ‖FD(ε)‖₁ (holds the noise of both).
         pairs: Number of independent difference pairs.
         value, gradient, interior_gradient, difference: The map and its derivatives.
@@ -109,7 +110,7 @@ def gradcheck(
     The parameters of the module move along the tangent: p + θ · tangent. The differences use
     common random numbers: both ends of a pair draw the same numbers, with probabilities fixed at
     θ = 0, and every pair draws others. Pairs are added until the standard error of their mean is
-    small enough.
+    small enough. One pair serves where maps do not depend on the seed.
 
     Args:
         model: What predicts the map; its ``sampling`` is that of one derivative.
@@ -130,11 +131,12 @@ def gradcheck(
     check = check or Check()
     if not model.smooth:
         raise InputError(
-            f"expected a smooth model such as SurrogateMap, got {type(model).__name__}: "
-            "silhouettes of single rough points have no derivative"
+            f"expected a smooth model, got {type(model).__name__}, whose silhouettes of single "
+            "rough points have no derivative; use one such as SurrogateMap"
         )
     target = scene if of == "scene" else sensor
     line = line_of(module, tangent, target)
+    least, repeats = (_LEAST_PAIRS, check.repeats) if model.random else (1, 1)
 
     def seen(moved: Any) -> tuple[Scene, Any]:
         return (moved, sensor) if of == "scene" else (scene, moved)
@@ -145,7 +147,7 @@ def gradcheck(
 
     def derivative(chosen: ForwardModel) -> tuple[Tensor, Tensor]:
         primals, tangents = [], []
-        for number in range(check.repeats):
+        for number in range(repeats):
             with alone, forward_ad.dual_level():
                 zero = torch.zeros((), dtype=torch.float64)
                 theta = forward_ad.make_dual(zero, torch.ones_like(zero))
@@ -164,17 +166,17 @@ def gradcheck(
 
     with torch.no_grad():
         value, gradient = derivative(model)
-        sampling = getattr(model, "sampling", None)
-        interior_gradient, outer_gradient, apart_gradient = gradient, None, None
-        if sampling is not None and sampling.boundary:
-            interior_gradient = derivative(model.sampled_by(boundary=False))[1]
-            if sampling.depth > 1:
-                outer_gradient = derivative(model.sampled_by(interior_edges=False))[1]
-            if sampling.contacts:
-                apart = derivative(model.sampled_by(contacts=False))[1]
-                changed = (apart - gradient).abs().sum() > _ROUNDING * gradient.abs().sum()
-                apart_gradient = apart if changed else None
-        pairs, reached = _converged(lambda n: difference(check.step, n), check, progress)
+        less = {name: derivative(other)[1] for name, other in model.ablations().items()}
+        apart_gradient = less.get("contacts")
+        if apart_gradient is not None:
+            changed = (apart_gradient - gradient).abs().sum()
+            if not changed > _ROUNDING * gradient.abs().sum():
+                apart_gradient = None
+        interior_gradient = less.get("boundary", gradient)
+        if model.random:
+            pairs, reached = _converged(lambda n: difference(check.step, n), check, progress)
+        else:
+            pairs, reached = difference(check.step, 0)[None], 0.0
         truth = pairs.mean(0)
         if not truth.abs().sum() > 0:
             raise InputError(
@@ -182,14 +184,14 @@ def gradcheck(
                 "check the grid and what the parameter moves"
             )
         half, far, farther = (
-            torch.stack([difference(factor * check.step, n) for n in range(_LEAST_PAIRS)]).mean(0)
+            torch.stack([difference(factor * check.step, n) for n in range(least)]).mean(0)
             for factor in (0.5, 4.0, 8.0)
         )
-        same = pairs[:_LEAST_PAIRS].mean(0)
+        same = pairs[:least].mean(0)
     return GradientReport(
         full=_agreement(gradient, truth, far, farther),
         interior=_agreement(interior_gradient, truth, far, farther),
-        no_interior_edges=_agreement(outer_gradient, truth, far, farther),
+        no_interior_edges=_agreement(less.get("interior_edges"), truth, far, farther),
         no_contact=_agreement(apart_gradient, truth, far, farther),
         difference_noise=reached,
         step_agreement=float((same - half).abs().sum() / same.abs().sum()),
@@ -206,13 +208,18 @@ def _converged(
 ) -> tuple[Tensor, float]:
     """Difference pairs, as many as the noise asks for, and the noise of their mean."""
     pairs: list[Tensor] = []
-    reached = math.inf
+    reached, begin = math.inf, time.monotonic()
     while len(pairs) < check.max_pairs and (len(pairs) < _LEAST_PAIRS or reached > check.noise):
         pairs.append(difference(len(pairs)))
         if len(pairs) >= 2:
             reached = _noise(torch.stack(pairs))
             if progress:
-                progress(f"{len(pairs)} pairs, difference noise {reached:.4f}")
+                # Noise falls with the root of the number of pairs.
+                enough = len(pairs) * (reached / max(check.noise, 1e-9)) ** 2
+                count = min(check.max_pairs, max(_LEAST_PAIRS, math.ceil(enough)))
+                left = (time.monotonic() - begin) / len(pairs) * max(count - len(pairs), 0)
+                noise = f"difference noise {reached:.4f}, about {left:.0f} s left"
+                progress(f"{len(pairs)} pairs, {noise}")
     return torch.stack(pairs), reached
 
 

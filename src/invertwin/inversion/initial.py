@@ -20,6 +20,7 @@ from invertwin.capture.backprojection import backproject
 from invertwin.capture.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
+from invertwin.memory import require_at_most
 from invertwin.radar.detection import ordered_statistics_cfar, peaks
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
@@ -29,6 +30,7 @@ from invertwin.scene.geometry.lattice import Lattice
 
 _TURNS = 91  # yaws that a rectangle is tried at, over a quarter turn
 _EDGE = 0.02  # share of the points beyond a side of a rectangle
+_MOST_NODES = 1e6  # along a side of an image; the lattice has its own limits
 _RANK = 0.25  # of the training cells: most of them may hold the target itself
 _CHUNK = 20_000  # points of an image at a time
 
@@ -161,6 +163,10 @@ def image_points(
     """
     size = torch.as_tensor(high, dtype=torch.float64) - torch.as_tensor(low, dtype=torch.float64)
     width = checked_number(step, "step of the image [m]", 0.0, open_low=True)
+    most = float(size.max()) / width
+    require_at_most(
+        most, _MOST_NODES, "nodes along a side", "give metres, or a larger step", "step"
+    )
     counts = [max(2, round(float(side) / width) + 1) for side in size]
     nodes = Lattice.between(low, high, counts).nodes
     if (height := _unresolved_height(capture.radar(), grid)) is not None:

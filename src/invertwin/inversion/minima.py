@@ -23,11 +23,13 @@ from invertwin.inversion.rivals import REJECTED, same, score, turns, way
 from invertwin.inversion.schedule import Schedule
 from invertwin.inversion.starts import displaced
 from invertwin.limits import Count, Positive
+from invertwin.memory import require_at_most
 from invertwin.models import ForwardModel
 from invertwin.scene.checks import Point
 from invertwin.scene.scene import Object, Scene
 from invertwin.seeds import derived_seed
 
+_MOST_POSES = 1e4
 _FITS = 4  # full fits of the best starts
 _FEWER = 8  # samples of a screened start: a share of those of a fit
 _NEAR_PLACE, _NEAR_TURN = 0.1, 0.35  # m and rad: of starts as near one is enough
@@ -82,6 +84,14 @@ def pose_grid(
         turns: about the axis at every place, evenly spread over a whole one
         axis: of the turns, in the world
     """
+    if not all(a <= b for a, b in zip(low, high, strict=True)):
+        raise InputError(
+            f"expected a box with low <= high, got {list(low)} and {list(high)}; exchange them"
+        )
+    places = math.prod(1 + float(b - a) / step for a, b in zip(low, high, strict=True)) * turns
+    require_at_most(
+        places, _MOST_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
+    )
     axes = [
         torch.linspace(a, b, 1 + math.ceil((b - a) / step - 1e-9), dtype=torch.float64)
         for a, b in zip(low, high, strict=True)

@@ -14,9 +14,11 @@ import numpy as np
 import torch
 
 from invertwin.errors import InputError
+from invertwin.memory import require_at_most
 from invertwin.scene.checks import checked_number
 from invertwin.scene.mesh import Mesh
 
+_MOST_TRIANGLES = 1e6  # each is moved by itself
 _ROUNDS = 5  # of split, collapse, flip, relax; the lengths settle within these
 _LONG, _SHORT = 4 / 3, 4 / 5  # of the target: edges that are split, edges that are collapsed
 _FLAT = 0.5  # least cosine between two triangles whose edge is flipped: corners stay
@@ -37,12 +39,9 @@ def remeshed(mesh: Mesh, edge: float) -> Mesh:
         edge: target length [m].
 
     Raises:
-        InputError: a length that is not positive, or a surface without area.
+        InputError: a length that is not positive or too small, or a surface without area.
     """
-    length = checked_number(edge, "edge length [m]", 0.0, open_low=True)
-    a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
-    if not bool((torch.linalg.cross(b - a, c - a) != 0).any()):
-        raise InputError("expected a surface with area, got none; check the mesh")
+    length = require_edge(mesh, edge)
     surface = _Surface(mesh)
     for _ in range(_ROUNDS):
         surface.split(_LONG * length)
@@ -50,6 +49,26 @@ def remeshed(mesh: Mesh, edge: float) -> Mesh:
         surface.flip()
         surface.relax(mesh)
     return surface.mesh()
+
+
+def require_edge(mesh: Mesh, edge: float) -> float:
+    """Return an edge length, if a surface can be remeshed with it.
+
+    Args:
+        mesh: the surface.
+        edge: target length [m].
+
+    Raises:
+        InputError: what `remeshed` refuses.
+    """
+    length = checked_number(edge, "edge length [m]", 0.0, open_low=True)
+    a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
+    area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+    if not area > 0:
+        raise InputError("expected a surface with area, got none; check the mesh")
+    do = "give metres, or a longer edge"
+    require_at_most(2 * area / length / length, _MOST_TRIANGLES, "triangles", do)
+    return length
 
 
 def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:

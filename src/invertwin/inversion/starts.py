@@ -11,10 +11,12 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Axes, Count, NonNegative
+from invertwin.memory import require_at_most
 from invertwin.scene.checks import Point
 from invertwin.scene.pose import rigid, rotation_from_vector
 from invertwin.scene.scene import Object
 
+_MOST_COPIES = 1e4
 Interval = tuple[NonNegative, NonNegative]
 
 
@@ -39,6 +41,7 @@ def nearby(
         rotation_axis: without it any axis
         generator: Of the random numbers. They are drawn copy by copy.
     """
+    require_at_most(count, _MOST_COPIES, "poses", "lower count", "count")
 
     def uniform(low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))

@@ -22,4 +22,8 @@ from invertwin.plotting.maps import range_doppler as range_doppler
 from invertwin.plotting.maps import residuals as residuals
 from invertwin.plotting.maps import spectrum as spectrum
 from invertwin.plotting.scenes import scene as scene
+from invertwin.plotting.signatures import focused as focused
+from invertwin.plotting.signatures import profile as profile
+from invertwin.plotting.signatures import sections as sections
+from invertwin.plotting.signatures import slopes as slopes
 from invertwin.plotting.turntable import turntable as turntable

@@ -254,7 +254,8 @@ def _training_cells(
         )
     if min(*guard, *training) < 0:
         raise InputError(
-            f"expected guard and training cells of at least 0, got {guard} and {training}"
+            f"expected guard and training cells of at least 0, got {guard} and {training}; give "
+            "numbers of cells"
         )
     reach = [g + t for g, t in zip(guard, training, strict=True)]
     sizes = [2 * r + 1 for r in reach]

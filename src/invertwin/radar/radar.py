@@ -14,7 +14,8 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Link, differentiated
 from invertwin.errors import InputError
-from invertwin.limits import Among, NonNegative, Positive
+from invertwin.limits import MOST, Among, NonNegative, Positive
+from invertwin.memory import require_at_most
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import check_fields, check_shape, checked_tensor
@@ -25,6 +26,7 @@ Cosine = Annotated[float, Gt(0), Le(1)]
 _SHARED_VISIBILITY_DISTANCE = 0.1
 # Arrays are built for λ/2 at some frequency of the band, not exactly at its centre.
 _SPACING_TOLERANCE = 1.05
+_MOST_CHANNELS = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +80,13 @@ class Radar:
                 f"expected one transmitter when TX and RX see separately, got {self.shape[1]}; "
                 "set shared_visibility=True or use one transmitter"
             )
+        require_at_most(
+            self.shape[1] * self.shape[2],
+            _MOST_CHANNELS,
+            "pairs of a transmitter and a receiver",
+            "use fewer elements",
+            "receivers",
+        )
         self._warn_about_spacing()
 
     @property
@@ -173,8 +182,8 @@ class Radar:
 
         Ranges fall on the bins of a zero-padded FFT and are spaced by one range cell over
         ``oversample`` (2 = Nyquist of the power profile). Direction cosines are spaced by
-        λ/(2·oversample·D), D the virtual aperture (1 = Nyquist of the power pattern). An axis
-        along which the virtual array has no extent is not resolved.
+        λ/(2·oversample·D), D the virtual aperture (1 = Nyquist of the power pattern), and end at
+        ±1. An axis along which the virtual array has no extent is not resolved.
 
         Args:
             range_min: First range to cover [m].
@@ -206,6 +215,8 @@ class Radar:
                     "range_max",
                 )
             step = self.waveform.max_range / round(oversample * self.waveform.samples)
+        do = "give metres, and direction cosines, or less oversampling"
+        require_at_most(range_max / step, MOST, "bins of range", do, "range_max")
         first = math.floor(range_min / step + 1e-9)
         last = math.ceil(range_max / step - 1e-9)
         axes = {}
@@ -214,7 +225,8 @@ class Radar:
             if size < 1.001 * half:
                 continue
             spacing = self.waveform.wavelength / (2 * oversample * size)
-            side = math.ceil(limit / spacing - 1e-9)
+            require_at_most(limit / spacing, MOST / 2 - 1, f"bins of {name}", do, f"{name}_max")
+            side = min(math.ceil(limit / spacing - 1e-9), math.floor(1 / spacing + 1e-9))
             axes |= {
                 f"{name}_start": -side * spacing,
                 f"{name}_step": spacing,

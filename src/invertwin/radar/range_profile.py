@@ -145,11 +145,13 @@ def range_profile(
     waveform = sampled(radar)
     window = unit_window(radar.window, waveform.samples)
     tapered = checked_beat(beat, radar) * window.to(beat.device, beat.real.dtype)
-    bins = _fft_bins(waveform, grid)
+    bins = fft_bins(waveform, grid)
     if bins is None:
         return tapered @ _range_matrix(waveform, grid).to(beat.device, beat.dtype)
     length, first = bins
-    return torch.fft.fft(tapered, length)[..., first : first + grid.range_count]
+    # A range beyond the unambiguous one shows what is one period nearer.
+    wanted = (first + torch.arange(grid.range_count, device=beat.device)) % length
+    return torch.fft.fft(tapered, length)[..., wanted]
 
 
 def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
@@ -188,13 +190,17 @@ def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
         )
 
 
-def _fft_bins(waveform: SampledWaveform, grid: Grid) -> tuple[int, int] | None:
-    """FFT length and first bin when all ranges are FFT bins, else None."""
+def fft_bins(waveform: SampledWaveform, grid: Grid) -> tuple[int, int] | None:
+    """FFT length and first bin when all ranges are FFT bins, else None.
+
+    Args:
+        waveform: What is sampled.
+        grid: Bins, of which the ranges count.
+    """
     length = waveform.max_range / grid.range_step
     first = grid.range_start / grid.range_step
     on_bins = max(abs(length - round(length)), abs(first - round(first))) < 1e-6
-    inside = round(first) >= 0 and round(first) + grid.range_count <= round(length)
-    if on_bins and inside and round(length) >= waveform.samples:
+    if on_bins and round(first) >= 0 and round(length) >= waveform.samples:
         return round(length), round(first)
     return None
 

@@ -5,7 +5,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.limits import Angle, Count, NonNegative, Positive
+from invertwin.memory import require_at_most
 from invertwin.scene.checks import Point, checked_tensor
+
+_MOST_POSITIONS = 1e6
 
 
 def line(start: Point, stop: Point, count: Count) -> Float64[Tensor, "frame 3"]:
@@ -45,6 +48,7 @@ def grid(
         size: m along x, y.
         count: positions along x, y.
     """
+    _require_positions(count[0] * count[1])
     x, y = (
         (_linspace(-0.5, 0.5, n) if n > 1 else torch.zeros(1, dtype=torch.float64)) * length
         for n, length in zip(count, size, strict=True)
@@ -57,5 +61,10 @@ def _point(value: Point) -> Tensor:
     return checked_tensor(value, (3,), "a point [m]", "give x, y and z")
 
 
+def _require_positions(count: int) -> None:
+    require_at_most(count, _MOST_POSITIONS, "positions of a radar", "lower count", "count")
+
+
 def _linspace(first: float, last: float, count: int) -> Tensor:
+    _require_positions(count)
     return torch.linspace(first, last, count, dtype=torch.float64)

@@ -3,15 +3,25 @@
 Nothing here imports torch, so that the command line can say what it offers without it.
 """
 
+import difflib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, get_args
 
 from annotated_types import Ge, Le, Len, Lt, MinLen
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from pydantic_core.core_schema import ErrorType
 
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative
@@ -23,6 +33,7 @@ Counts = Annotated[list[Annotated[int, Ge(2)]], Len(3, 3)]
 Interval = Annotated[list[NonNegative], Len(2, 2)]
 WorldAxes = Annotated[list[Literal["x", "y", "z"]], MinLen(1)]
 
+_OWN = frozenset(get_args(ErrorType))  # kinds of errors that pydantic itself knows
 # Pydantic puts the tag of a union into an error's location; the mark tells it from a key.
 TAG_MARK = "→"
 
@@ -94,15 +105,47 @@ class Section(BaseModel):
         extra="forbid", strict=True, frozen=True, allow_inf_nan=False, defer_build=True
     )
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _known_keys_only(cls, data: Any) -> Any:
+    def _known_keys_only(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+        """Tell all unknown keys, beside what is wrong with the known ones."""
+        names = list(cls.model_fields)
+        unknown = [name for name in data if name not in names] if isinstance(data, dict) else []
+        if not unknown:
+            return handler(data)
         # Pydantic's own error for an extra key does not carry the keys that are allowed.
-        for name in data if isinstance(data, dict) else ():
-            if name not in cls.model_fields:
-                allowed = {"key": name, "allowed": list(cls.model_fields)}
-                raise PydanticCustomError("unknown_key", "unknown key", allowed)
-        return data
+        found = [
+            InitErrorDetails(
+                type=PydanticCustomError(
+                    "unknown_key", "unknown key", {"key": n, "allowed": names}
+                ),
+                loc=(),
+                input=data,
+            )
+            for n in unknown
+        ]
+        meant = {m for n in unknown for m in difflib.get_close_matches(str(n), names, cutoff=0.5)}
+        try:
+            handler({name: value for name, value in data.items() if name in names})
+        except ValidationError as error:
+            for row in error.errors(include_url=False):
+                # A key that is misspelt is not missing, too.
+                if row["type"] == "missing" and row["loc"] and row["loc"][0] in meant:
+                    continue
+                found.append(_again(row))
+        raise ValidationError.from_exception_data(cls.__name__, found)
+
+
+def _again(row: ErrorDetails) -> InitErrorDetails:
+    """An error of pydantic as one that can be raised again."""
+    kind, context = row["type"], row.get("ctx", {})
+    if kind not in _OWN:
+        return InitErrorDetails(
+            type=PydanticCustomError(kind, "{text}", {**context, "text": row["msg"]}),  # type: ignore[arg-type]
+            loc=row["loc"],
+            input=row["input"],
+        )
+    return InitErrorDetails(type=kind, loc=row["loc"], input=row["input"], ctx=context)
 
 
 def tag_by(keys: tuple[str, ...], default: str | None = None) -> Discriminator:
@@ -136,8 +179,8 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
     """
     for name, needed in wanted.items():
         if needed != (getattr(section, name) is not None):
-            verb, do = ("", "add it") if needed else ("no ", "remove it")
-            fail(f"expected {verb}`{name}` {when}; {do}")
+            verb, got, do = ("", "none", "add it") if needed else ("no ", "one", "remove it")
+            fail(f"expected {verb}`{name}` {when}, got {got}; {do}")
 
 
 def fail(text: str, path: str = "") -> NoReturn:

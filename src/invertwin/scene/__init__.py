@@ -9,6 +9,7 @@ from invertwin.scene.antenna import linear_array as linear_array
 from invertwin.scene.antenna import planar_array as planar_array
 from invertwin.scene.cloud import Cloud as Cloud
 from invertwin.scene.files import load_mesh as load_mesh
+from invertwin.scene.files import load_parts as load_parts
 from invertwin.scene.files import load_scene_xml as load_scene_xml
 from invertwin.scene.files import save_mesh as save_mesh
 from invertwin.scene.geometry.anny_body import load_anny as load_anny
@@ -54,6 +55,7 @@ from invertwin.scene.material.surface import Material as Material
 from invertwin.scene.material.surface import Surface as Surface
 from invertwin.scene.material.values import Texture as Texture
 from invertwin.scene.mesh import Mesh as Mesh
+from invertwin.scene.mesh import MeshSummary as MeshSummary
 from invertwin.scene.mesh import joined as joined
 from invertwin.scene.parameters import Compose as Compose
 from invertwin.scene.parameters import MaterialValues as MaterialValues

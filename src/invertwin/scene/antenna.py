@@ -17,8 +17,10 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Count, NonNegative, Positive
+from invertwin.memory import require_at_most
 from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 
+_MOST_ELEMENTS = 1e5
 COSINE_COUNT = 2049
 """Nodes of a pattern table over cosθ, at linspace(−1, 1, 2049)."""
 
@@ -248,6 +250,8 @@ def planar_array(
     Raises:
         InputError: no elements, or a spacing that is not positive.
     """
+    elements = count[0] * count[1]
+    require_at_most(elements, _MOST_ELEMENTS, "antenna elements", "lower count", "count")
     x = _centred(count[0], spacing[0], "elements along x")
     y = _centred(count[1], spacing[1], "elements along y")
     plane = torch.cartesian_prod(x, y)

@@ -52,6 +52,22 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
     return tensor
 
 
+def checked_type(value: object, kind: type, what: str, do: str) -> None:
+    """Raise unless a value is of a type.
+
+    Args:
+        value: the value.
+        kind: the type.
+        what: what it is, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: another type.
+    """
+    if not isinstance(value, kind):
+        raise InputError(f"expected {what} ({kind.__name__}), got {value!r:.80}; {do}")
+
+
 def refuse_batch(value: Tensor) -> Tensor:
     """Return a tensor, unless it is a batch of `torch.func.vmap`.
 
@@ -203,7 +219,8 @@ def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]
         if type(mark) in _LIMITS:
             field, words, holds = _LIMITS[type(mark)]
             limit = getattr(mark, field)
-            if not (math.isfinite(number) and holds(number, limit)):
+            finite = isinstance(number, int) or math.isfinite(number)
+            if not (finite and holds(number, limit)):
                 raise InputError(f"expected {name} {words} {limit:g}, got {number}; {do}")
     if usual and not usual.low <= number <= usual.high:
         meant = usual.meant(float(number))

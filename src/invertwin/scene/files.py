@@ -1,9 +1,11 @@
 """Read meshes and scene geometry from files, and write meshes to files."""
 
 import math
+import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,7 +14,7 @@ from torch import Tensor
 from trimesh import transformations
 from trimesh.exchange.gltf import export_glb
 
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.folders import replacing
 from invertwin.scene import shapes
 from invertwin.scene.checks import checked_tensor
@@ -20,41 +22,104 @@ from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
-from invertwin.untrusted import existing_file, reading
+from invertwin.untrusted import existing_file, reader, reading
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb")
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
+_CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # of shell elements, by the digit in their type
+Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+_LARGE = 100.0  # m
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
 
 
-def load_mesh(file: str | Path) -> Mesh:
-    """A triangle mesh from an OBJ, PLY, STL or glTF file.
+def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
+    """A triangle mesh from a file; `Mesh.summary` says what came.
 
     Vertices at equal positions are merged, vertices of no triangle are left out, the rest keep
-    their order. All parts of the file become one mesh; units are taken as metres and axes as they
-    are.
+    their order. All parts of the file become one mesh (`load_parts` keeps them apart); axes are
+    taken as they are. A mesh of more than 100 m gets a warning: it may be in millimetres.
+    Of an Abaqus file (.inp) shell elements are read by their corners, in the coordinates in which
+    they are defined; quadrilaterals are split.
+
+    Args:
+        file: OBJ, PLY, STL, glTF or Abaqus; its suffix tells the format.
+        unit: of the file's numbers
+
+    Raises:
+        InputError: no such file, another format, a broken file, no triangles, NaN, or another
+            unit.
+    """
+    return _loaded(file, unit, lambda scene: {"": scene.to_mesh()})[""]
+
+
+def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
+    """The parts of an OBJ, PLY, STL or glTF file, one for each name and material.
+
+    Their names are those of the file, of its objects or, as in OBJ, of its materials; a further
+    part of the same name has a number. All are in the frame of the file.
 
     Args:
         file: OBJ, PLY, STL or glTF; its suffix tells the format.
+        unit: of the file's numbers
 
     Raises:
-        InputError: no such file, another format, a broken file, no triangles, or NaN.
+        InputError: what `load_mesh` refuses.
     """
+
+    whole = Path(file).name  # how nodes without a name of their own are called
+
+    def apart(scene: trimesh.Scene) -> dict[str, trimesh.Trimesh]:
+        found: dict[str, trimesh.Trimesh] = {}
+        for node in scene.graph.nodes_geometry:
+            transform, name = scene.graph[node]
+            mesh = scene.geometry[name].copy()
+            if isinstance(mesh, trimesh.Trimesh):
+                mesh.apply_transform(transform)
+                # In glTF a node has a name, and every part of it a material.
+                material = getattr(getattr(mesh.visual, "material", None), "name", None)
+                named = "" if str(node).startswith(whole) else str(node)
+                label = ", ".join(dict.fromkeys(filter(None, (named, material)))) or str(node)
+                found[f"{label} {len(found)}" if label in found else label] = mesh
+        return found
+
+    return _loaded(file, unit, apart)
+
+
+@reader("a readable mesh")
+def _loaded(
+    file: str | Path, unit: Unit, split: Callable[[trimesh.Scene], Mapping[str, trimesh.Trimesh]]
+) -> dict[str, Mesh]:
     path = existing_file(file)
+    if unit not in _METRES:
+        raise InputError(f"expected a unit among {', '.join(_METRES)}, got {unit!r}; choose one")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
             f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {path.name}; convert it first"
         )
+    found = {}
     with reading(path, f"a readable {path.suffix} mesh"):
-        loaded = trimesh.load_scene(path, process=False).to_mesh()
-        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
+        for name, part in split(_scene_in(path)).items():
+            vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
+            faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
+            found[name] = vertices * _METRES[unit], faces
     try:
         # The first check sees the file as it is: merging would hide what is wrong with it.
-        Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
-        return _merged(vertices, faces)
+        for vertices, faces in found.values():
+            Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
+        meshes = {name: _merged(*part) for name, part in found.items()}
+        if not meshes:
+            raise InputError("expected triangles, got none; export the mesh again")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    extent = max(float(np.ptp(vertices, axis=0).max()) for vertices, _ in found.values())
+    if extent > _LARGE:
+        warnings.warn(
+            f'{path}: a mesh {extent:.4g} m wide; if its numbers are millimetres, say unit = "mm"',
+            PhysicsWarning,
+            stacklevel=3,
+        )
+    return meshes
 
 
 def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
@@ -91,6 +156,7 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         part.write_bytes(export_glb(written) if glb else _ply(written.to_mesh()))
 
 
+@reader("a readable scene")
 def load_scene_xml(
     path: str | Path, materials: Mapping[str, Material] | None = None, default: Material = CONCRETE
 ) -> Scene:
@@ -115,6 +181,52 @@ def load_scene_xml(
         return _scene_of(root, file.parent, dict(materials or {}), default)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
+
+
+def _scene_in(path: Path) -> trimesh.Scene:
+    if path.suffix.lower() != ".inp":
+        return trimesh.load_scene(path, process=False)
+    vertices, faces = _abaqus(path.read_text(encoding="utf-8-sig"))
+    return trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False))
+
+
+def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of the nodes and shell elements of an Abaqus file."""
+    nodes: dict[str, int] = {}
+    places: list[list[float]] = []
+    faces: list[list[int]] = []
+    keyword, corners, words = "", 0, []
+    for line in text.splitlines():
+        if line.startswith("**") or not line.strip():
+            continue
+        if line.startswith("*"):
+            keyword, *options = line[1:].upper().replace(" ", "").split(",")
+            if keyword == "PART":
+                nodes = {}  # every part numbers its own
+            kind = next((o[5:] for o in options if o.startswith("TYPE=")), "")
+            corners, words = _corners_of(kind) if keyword == "ELEMENT" else 0, []
+        elif keyword == "NODE":
+            number, *place = line.split(",")[:4]
+            nodes[number.strip()] = len(places)
+            places.append([float(value) for value in place])
+        elif keyword == "ELEMENT":
+            words += [word.strip() for word in line.split(",") if word.strip()]
+            if line.rstrip().endswith(","):
+                continue  # the element goes on
+            used = [nodes[word] for word in words[1 : 1 + corners]]
+            faces += [[used[0], used[k], used[k + 1]] for k in range(1, len(used) - 1)]
+            words = []
+    if not faces:
+        raise ValueError("no shell elements")
+    return np.array(places, dtype=np.float64), np.array(faces, dtype=np.int64)
+
+
+def _corners_of(kind: str) -> int:
+    """Corners of an element type such as S3, STRI65, S4R, R3D3; 0 of other than shells."""
+    if not kind.startswith(("S", "R3D", "M3D", "CPS", "CPE", "DS", "SFM3D")):
+        raise ValueError(f"elements of type {kind}, no shells")
+    digits = [c for c in kind.replace("R3D", "").replace("M3D", "") if c.isdigit()]
+    return _CORNERS[digits[0]]
 
 
 def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:

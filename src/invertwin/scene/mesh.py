@@ -13,6 +13,30 @@ from invertwin.errors import InputError
 from invertwin.scene.checks import checked_tensor
 
 
+@dataclass(frozen=True)
+class MeshSummary:
+    """What one wants to know of a mesh that one has loaded.
+
+    Attributes:
+        extent: size of the bounding box along x, y and z [m].
+        triangles: their number.
+        open_edges: edges of one triangle only; a closed mesh has none.
+        nonmanifold_edges: edges of more than two triangles.
+    """
+
+    extent: tuple[float, float, float]
+    triangles: int
+    open_edges: int
+    nonmanifold_edges: int
+
+    def __str__(self) -> str:
+        size = " × ".join(f"{length:.4g}" for length in self.extent)
+        return (
+            f"{size} m, {self.triangles} triangles, {self.open_edges} open and "
+            f"{self.nonmanifold_edges} non-manifold edges"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh; its normals are (v1 − v0) × (v2 − v0).
@@ -37,6 +61,14 @@ class Mesh:
         )
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", checked_faces(self.faces, len(vertices)))
+
+    def summary(self) -> "MeshSummary":
+        """Its size, and whether it is closed."""
+        places, faces = self.vertices.detach(), self.faces
+        pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        _, counts = pairs.sort(dim=1).values.unique(dim=0, return_counts=True)
+        x, y, z = (places.amax(0) - places.amin(0)).tolist()
+        return MeshSummary((x, y, z), len(faces), int((counts == 1).sum()), int((counts > 2).sum()))
 
     @property
     def center(self) -> Float64[Tensor, "3"]:

@@ -1,5 +1,6 @@
 """Scenes: named objects, each a mesh with a material, a pose and a motion."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -9,9 +10,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene.checks import checked_number, checked_tensor
 from invertwin.scene.cloud import Cloud
+from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import compose, rigid
@@ -182,6 +184,35 @@ class Scene:
     def at(self, time: float) -> "Scene":
         """The scene after all objects moved with their velocities for `time` [s]."""
         return Scene({name: value.at(time) for name, value in self.objects.items()})
+
+
+def warn_of_mirrors(scene: Scene, frequency: float) -> None:
+    """Warn where no surface scatters: a radar sees a mirror only where it stands upright to it.
+
+    Scenes of perfect conductors and clouds alone are meant to be what they are.
+
+    Args:
+        scene: What is seen.
+        frequency: [Hz].
+    """
+    bodies = [item for item in scene.objects.values() if item.cloud is None]
+    rough = [item for item in bodies if not item.material.coherent]
+    with torch.no_grad():
+        if rough and not any(_scatters(item.material, frequency) for item in rough):
+            kinds = ", ".join(sorted({type(item.material).__name__ for item in rough}))
+            warnings.warn(
+                f"no surface scatters ({kinds}): all are mirrors, which a radar sees only where "
+                "they face it; give them scattering, or RoughDielectric a diffuse share",
+                PhysicsWarning,
+                stacklevel=3,
+            )
+
+
+def _scatters(material: Material, frequency: float) -> bool:
+    surface = material.surface(frequency)
+    wide = surface.exponents[..., 0] <= 1.01 * lobe_exponent(ROUGH_LOBE_WIDTH)
+    others = surface.lobes[..., 1:] > 0
+    return bool(((surface.diffuse > 0) | wide | others.any(dim=-1)).any())
 
 
 def _checked_pose(pose: object) -> Tensor:

@@ -12,9 +12,13 @@ import trimesh
 from annotated_types import Ge, Le, MinLen
 
 from invertwin.errors import InputError
-from invertwin.limits import Count, Positive
+from invertwin.limits import Angle, Count, Positive
+from invertwin.memory import require_at_most
 from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh
+
+_MOST_TRIANGLES = 1e7  # of one shape
+_MOST_LETTERS = 100  # whose outlines are joined one by one
 
 
 def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
@@ -30,6 +34,7 @@ def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
     """
     size = [_length(width, "plate width [m]"), _length(height, "plate height [m]")]
     n = checked_count(divisions, "divisions", 1)
+    _require_triangles(2 * n**2, "divisions")
     points, faces = _lattice(n)
     # The lattice faces +z; turning every triangle makes it face −z.
     plane = (points / n - 0.5) * size
@@ -51,6 +56,7 @@ def box(size: Positive | Sequence[Positive], divisions: Count = 1) -> Mesh:
     for length in extent:
         _length(float(length), "box size [m]")
     n = checked_count(divisions, "divisions", 1)
+    _require_triangles(12 * n**2, "divisions")
     points, faces = _lattice(n)
     corners, triangles = [], []
     for axis in range(3):
@@ -79,25 +85,30 @@ def sphere(radius: Positive, subdivisions: Annotated[int, Ge(0), Le(8)] = 4) -> 
     """
     length = _length(radius, "sphere radius [m]")
     count = checked_count(subdivisions, "subdivisions", 0)
+    _require_triangles(20 * 4.0 ** min(count, 100), "subdivisions")
     ball = trimesh.creation.icosphere(subdivisions=count, radius=1.0)
     unit = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
     return _mesh(unit * length, ball.faces)
 
 
-def dihedral(edge: Positive) -> Mesh:
-    """Two square plates at a right angle that meet on the y axis and open to −z.
+def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
+    """Two square plates that meet on the y axis and open to −z, at a right angle or another.
 
-    Its boresight is −z, and every wave it returns has the range of the y axis.
+    Its boresight is −z. At a right angle every wave it returns after two bounces has the range of
+    the y axis.
 
     Args:
         edge: edge length of the plates [m].
+        opening: angle between the plates.
 
     Raises:
-        InputError: a length that is not positive.
+        InputError: a length that is not positive, or an angle beyond π.
     """
     length = _length(edge, "dihedral edge [m]")
-    reach = length / math.sqrt(2)
-    vertices = [(x, y * length / 2, -abs(x)) for x in (-reach, 0.0, reach) for y in (-1, 1)]
+    half = checked_number(opening, "opening [rad]", 0.0, math.pi, open_low=True) / 2
+    tips = [(s * length * math.sin(half), -length * math.cos(half)) for s in (-1, 1)]
+    places = (tips[0], (0.0, 0.0), tips[1])
+    vertices = [(x, y * length / 2, z) for x, z in places for y in (-1, 1)]
     return _mesh(np.array(vertices), np.array([(0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4)]))
 
 
@@ -142,7 +153,7 @@ def text(
     height = _length(size, "text size [m]")
     thickness = _length(depth, "text depth [m]")
     longest = _length(max_edge, "longest edge [m]")
-    plane, cap = _triangulated_outline(text, height, longest)
+    plane, cap = _triangulated_outline(text, height, thickness, longest)
     count = len(plane)
     front = np.column_stack([plane, np.full(count, -thickness / 2)])
     back = np.column_stack([plane, np.full(count, thickness / 2)])
@@ -157,6 +168,11 @@ def text(
 
 def _length(value: object, what: str) -> float:
     return checked_number(value, what, 0.0, open_low=True)
+
+
+def _require_triangles(count: float, at: str, do: str = "") -> None:
+    do = do or f"lower {at}"
+    require_at_most(count, _MOST_TRIANGLES, "triangles of a shape", do, at)
 
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
@@ -180,9 +196,10 @@ def _lattice(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _triangulated_outline(
-    string: str, height: float, longest: float
+    string: str, height: float, thickness: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points [p, 2] and counter-clockwise triangles that fill the outline of a text."""
+    require_at_most(len(string), _MOST_LETTERS, "letters", "give a shorter text", "text")
     # Imported here: only text needs these two, and matplotlib alone takes half a second.
     import matplotlib
     import shapely
@@ -210,6 +227,11 @@ def _triangulated_outline(
     scale = height / (top - bottom)
     center = np.array([left + right, bottom + top]) / 2
     outline = shapely.transform(outline, lambda points: (points - center) * scale)
+    # Thin triangles across the walls, and across the strokes of letters, a quarter as wide as they
+    # are high, are halved along their long sides again and again: three for one at every halving.
+    thin = sum(max(1.0, min(s / longest, 1e9)) ** 1.585 for s in (thickness, height / 4))
+    pieces = 2 * (outline.length / longest + len(loops)) * thin
+    _require_triangles(pieces, "max_edge", "give sizes in metres, or larger edges")
     fine = shapely.segmentize(outline, longest)
     # The triangulation wants one polygon at a time, and returns rings of four points.
     triangles = np.concatenate(

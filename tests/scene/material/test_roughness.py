@@ -208,7 +208,7 @@ def test_the_lobe_of_small_slopes_is_that_of_their_distribution():
 
 
 def test_gradients_of_the_weights():
-    names = tuple(EffectiveRoughness.__dataclass_fields__)
+    names = [n for n in EffectiveRoughness.__dataclass_fields__ if n != "rms_height"]  # of fields
 
     def weights(*values):
         return tuple(EffectiveRoughness(**dict(zip(names, values, strict=True))).weights())

@@ -11,6 +11,7 @@ from torch import Tensor
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
+from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.landscape import exact_losses, line_through
 from invertwin.cli.report import Table, finish, picture
 from invertwin.cli.run_file import need
@@ -66,6 +67,7 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
         )
     if depth > 1:
         raise InputError(f"data.depth: expected 1 for loss-scan, got {depth}; set depth = 1")
+    require_room(run, truth, {"": Sensor(run, radar, grid)})
     found = exact(run, truth, radar, grid)
     line, along = line_through(truth, settings.object, settings.axis)
     near, wide = _losses(run, settings, line, radar, grid, found.beat)

@@ -20,12 +20,13 @@ from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.errors import InputError
 from invertwin.folders import replacing
 from invertwin.radar.waveform import PhysicsWarning
-from invertwin.untrusted import existing_file
+from invertwin.untrusted import existing_file, reader
 
 _WORD = np.dtype("<i2")
 _LANE_COUNT = 4
 
 
+@reader("samples as their settings say")
 def read_recording(
     path: str | Path, settings: str | Path | ChirpSettings | None = None, lanes: int | None = None
 ) -> ChirpData:

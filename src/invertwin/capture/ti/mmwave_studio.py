@@ -19,7 +19,7 @@ from invertwin.capture.ti.chirp_table import (
 )
 from invertwin.errors import InputError
 from invertwin.folders import replacing
-from invertwin.untrusted import existing_file, read_text, reading
+from invertwin.untrusted import existing_file, read_text, reader, reading
 
 # Names of the numbers of a profile, and of the frame.
 _PROFILE = (
@@ -40,6 +40,7 @@ _VARIATIONS = (
 )
 
 
+@reader("settings of mmWave Studio", "save them again with mmWave Studio")
 def read_studio(path: str | Path) -> ChirpSettings:
     """Read the settings of a `.mmwave.json` file, or of the one that a `.setup.json` file names.
 
@@ -72,6 +73,7 @@ def read_studio(path: str | Path) -> ChirpSettings:
         ) from error
 
 
+@reader("a setup of mmWave Studio", "save it again with mmWave Studio")
 def setup_files(path: str | Path) -> list[Path]:
     """Find the raw files that a `.setup.json` file names, in the order of recording.
 

@@ -16,7 +16,7 @@ from invertwin.capture.ti.chirp_table import (
 )
 from invertwin.errors import InputError
 from invertwin.folders import replacing
-from invertwin.untrusted import read_text
+from invertwin.untrusted import read_text, reader
 
 # Fewest arguments of the commands that are read.
 _ARGUMENTS = {
@@ -33,6 +33,7 @@ _ONCE = ("channelCfg", "adcCfg", "frameCfg")
 _PROFILE = (1, 2, 3, 4, 7, 9, 10)
 
 
+@reader("settings of the mmWave SDK", "compare with the SDK's user guide")
 def read_cfg(path: str | Path) -> ChirpSettings:
     """Read `channelCfg`, `adcCfg`, `profileCfg`, `chirpCfg` and `frameCfg` of a `.cfg` file.
 

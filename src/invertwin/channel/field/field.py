@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from invertwin.channel.field.mirrors import mirrored_paths, spread_points
 from invertwin.channel.field.speckle import Speckle, draw_speckle
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.rays.backend import tracing
@@ -23,7 +23,6 @@ from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
-_GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
 _ROWS_AT_ONCE = 1 << 18  # frames × paths
 
 
@@ -35,8 +34,9 @@ def trace_field(
     Args:
         scene: What is seen.
         link: Antennas, per frame.
-        sampling: How many paths are drawn. From the second bounce on, every surface scatters as a
-            rough one does: a fixed phase for every ordered path, conductors by their lobe.
+        sampling: How many paths are drawn. From conductor to conductor they are mirrored, every
+            bounce in phase; between other surfaces every ordered path has a fixed phase, and
+            conductors scatter by their lobe.
         seed: Places and phases.
         speckle: The rough points and paths to use, so that they stay while the scene moves; None
             draws them from the seed.
@@ -71,15 +71,19 @@ def trace_field(
             )
         if depth > 1:
             geometry.require_rest(depth)
+            parts += mirrored_paths(rays, sampling, seed) if any(geometry.coherent) else []
+        if all(geometry.coherent):
+            return joined(parts)
         fixed = speckle or draw_speckle(scene, link, sampling, seed)
         if len(fixed.paths) < depth - 1:
             raise InputError(
                 f"expected speckle of paths of up to {depth} bounces, got "
                 f"{len(fixed.paths) + 1}; draw it with this sampling"
             )
-        points = () if all(geometry.coherent) else (fixed.points,)
-        for paths in (*points, *fixed.paths[: depth - 1]):
-            parts += _fields(rays, paths, "rough", _rough_field)
+        smooth = torch.tensor(geometry.coherent)[geometry.face_object]
+        for paths in (fixed.points, *fixed.paths[: depth - 1]):
+            mixed = paths.keep(~smooth[paths.face].all(1))
+            parts += _fields(rays, mixed, "rough", _rough_field)
         return joined(parts)
 
 
@@ -120,24 +124,8 @@ def _conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
         coefficient = (amount - amount.detach()) * coherent[edge.face]
         return echo.paths("coherent", coefficient=coefficient, boundary=True)
 
-    points = _spread(face_areas(rays.geometry) * coherent, sampling.samples, seed)
+    points = spread_points(face_areas(rays.geometry) * coherent, sampling.samples, seed)
     parts = _fields(rays, points, "coherent", field)
     if sampling.boundary:
         parts += boundary_rows(rays, sampling.boundary_samples, seed, row)
     return parts
-
-
-def _spread(areas: Tensor, count: int, seed: int) -> SurfacePaths:
-    """Low-discrepancy points over triangles of these areas (error of an integral: 1/count)."""
-    rng = np.random.default_rng(seed)
-    shift = rng.random(2)
-    index = np.arange(count)
-    edges = np.cumsum(areas.numpy())
-    # Jittered, not evenly spaced: even steps would beat with the order of a subdivided mesh.
-    place = (index + rng.random(count)) / count * edges[-1]
-    face = np.minimum(np.searchsorted(edges, place, side="right"), len(edges) - 1)
-    b = (shift[:, None] + index * np.array(_GOLDEN)[:, None]) % 1.0
-    b = np.where(b.sum(0) > 1, 1 - b, b)
-    b1, b2 = torch.from_numpy(b)[..., None]
-    weight = torch.full((count,), float(edges[-1]) / count, dtype=torch.float64)
-    return SurfacePaths(torch.from_numpy(face)[:, None], b1, b2, weight, torch.zeros_like(weight))

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from invertwin import doctor
+from invertwin import doctor, threads
 from invertwin.errors import InputError
 
 VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
@@ -127,7 +127,14 @@ def torch_threads(count: int) -> Iterator[None]:
 @cache
 def _loaded(module: str, name: str) -> Any:
     doctor.require(name)
-    return importlib.import_module(module)
+    found, drjit = importlib.import_module(module), importlib.import_module("drjit")
+    count = threads.available()
+    if drjit.thread_count() != count:
+        drjit.set_thread_count(count)
+    # It has read the environment, unless it was imported before this package.
+    if torch.get_num_threads() > count:
+        torch.set_num_threads(count)
+    return found
 
 
 class _Mitsuba:

@@ -178,6 +178,8 @@ def next_surface(
         rays: What may be in the way.
         start, end: Points.
     """
+    if not len(start):
+        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
     origin = rays.located(start)
     offset = rays.located(end) - origin
     ray = mi.Ray3f(origin + offset * NEAR, mi.Vector3f(offset), 1 - 2 * NEAR, 0.0, [])

@@ -43,7 +43,8 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
         if boundary and not simple and silhouettes_move(geometry, link):
             raise InputError(
                 "expected explicit paths of one bounce without sheets for derivatives in which "
-                "silhouettes move; use deposit_power, or boundary=False for fixed visibility"
+                f"silhouettes move, got {depth} bounces or sheets; use deposit_power, or "
+                "boundary=False for fixed visibility"
             )
         if boundary and simple:
             require_edges(geometry, link, edges)

@@ -181,9 +181,21 @@ def mirror_field(link: Link, echo: Echo) -> Complex128[Tensor, " n"]:
         (point.normal * normalize(antenna[echo.frame] - point.position, dim=1)).sum(1)
         for antenna in (link.tx, link.rx)
     ]
-    lit = (cosines[0] * cosines[1] > 0).to(point.position)
-    facing = 0.5 * (cosines[0] + cosines[1]).abs() * point.jacobian
-    return -1j / (4 * torch.pi) * (echo.spread.sqrt() * lit * facing)
+    return conductor_field(echo.spread, *cosines) * point.jacobian
+
+
+def conductor_field(
+    spread: Float64[Tensor, " n"], incoming: Float64[Tensor, " n"], outgoing: Float64[Tensor, " n"]
+) -> Complex128[Tensor, " n"]:
+    """Field coefficient per m² of a lit conductor: ``−(j/4π) √spread (cosθ + cosθ')/2``.
+
+    Args:
+        spread: gains and 1/R² of both ways, without scattering.
+        incoming, outgoing: cosines to where the wave comes from and goes to; zero where they
+            are on different sides.
+    """
+    lit = (incoming * outgoing > 0).to(spread)
+    return -1j / (4 * torch.pi) * (spread.sqrt() * lit * 0.5 * (incoming + outgoing).abs())
 
 
 def _scattered(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Tensor:

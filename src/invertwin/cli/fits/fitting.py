@@ -30,6 +30,7 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
+from invertwin.cli.running import time_left
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import (
@@ -201,6 +202,7 @@ def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
     words, lines = TextColumn("{task.description}"), not console.is_terminal
     bar = Progress(*columns, words, console=console, disable=lines)
     task = bar.add_task("", total=steps)
+    begin = time.monotonic()
     with bar, interrupted_between_steps() as heed:
 
         def show(row: dict[str, Any]) -> None:
@@ -212,7 +214,8 @@ def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
             text, done = f"loss {row['loss']:.4f} {values}", row["step"] + 1
             bar.update(task, completed=done, description=text)
             if lines and done * 10 // steps > row["step"] * 10 // steps:
-                line = f"{name}: step {done} of {steps}, {text}"
+                left = time_left((time.monotonic() - begin) / done * (steps - done))
+                line = f"{name}: step {done} of {steps}, {left} left, {text}"
                 console.print(line, markup=False, soft_wrap=True)
             heed()
 

@@ -14,6 +14,7 @@ from invertwin import plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
 from invertwin.cli import build
+from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.fits.fitting import watched
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
@@ -122,7 +123,9 @@ def _recorded(run: RunFile) -> ChirpCapture:
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
         chirps = need(run, "chirps", "a mover in simulated data").build()
-        beat = chirp_train(run, build.true_scene(run), radar, chirps)
+        truth, grid = build.true_scene(run), build.grid(need(run, "grid", "reconstruct"), radar)
+        require_room(run, truth, {"": Sensor(run, radar, grid)})
+        beat = chirp_train(run, truth, radar, chirps)
         recording = ChirpCapture(beat, radar, chirps)
     else:
         recording = chirp_capture(data)

@@ -1,6 +1,7 @@
 """What is to be fitted: scene, observations, unknowns and stages of a run file."""
 
 import math
+import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -14,13 +15,14 @@ from torch import nn
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
+from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.recordings import measured
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import exact
 from invertwin.cli.schema import SAMPLED, Measures, Reconstruct, RunFile, SimulatedData
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.cli.shape_tables import shape_terms
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
 from invertwin.models import ExactMap, ForwardModel, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
@@ -93,11 +95,29 @@ def problem_of(run: RunFile, console: Console) -> Problem:
     for name, variant in run.variants.items():
         with about(f"variants.{name}"):
             build.parameters(variant.parameters or [], scene, run.scene)
-    sights = _sights(run, truth, console)
+    sensors = sensors_of(run)
+    _warn_of_depths(run, sensors)
+    require_room(run, truth, sensors)
+    sights = _sights(run, sensors, truth, console)
     simulated = all(isinstance(own.data, SimulatedData) for own in observed_runs(run).values())
     known = frozenset(truth.names if simulated else run.truth)
     target = run.starts.object if run.starts else next(iter(fitted_objects(run)), None)
     return Problem(run, scene, truth, known, sights, target)
+
+
+def _warn_of_depths(run: RunFile, sensors: Mapping[str, Sensor]) -> None:
+    if run.reconstruct is None:
+        return
+    for name, sensor in sensors.items():
+        data, depth = sensor.run.data, run.reconstruct.depth
+        if isinstance(data, SimulatedData) and data.depth != depth and run.chirps is None:
+            at = f"observations.{name}." if name else ""
+            warnings.warn(
+                f"reconstruct.depth is {depth}, {at}data.depth is {data.depth}: the fit explains "
+                "echoes of other numbers of bounces than its data have; make them equal",
+                PhysicsWarning,
+                stacklevel=3,
+            )
 
 
 def recorded_anew(run: RunFile) -> bool:
@@ -116,15 +136,31 @@ def another(problem: Problem, number: int, console: Console) -> Problem:
     assert isinstance(data, SimulatedData)
     seed = derived_seed(run.seed if data.seed is None else data.seed, _RECORDINGS, number)
     run = run.model_copy(update={"data": data.model_copy(update={"seed": seed})})
-    return replace(problem, run=run, sights=_sights(run, problem.truth, console))
+    return replace(problem, run=run, sights=_sights(run, sensors_of(run), problem.truth, console))
 
 
-def _sights(run: RunFile, truth: Scene, console: Console) -> dict[str, Sight]:
-    sights = {}
+def sensors_of(run: RunFile) -> dict[str, Sensor]:
+    """What the tables of every sensor make; recordings are read, nothing is simulated."""
+    found = {}
     for name, own in observed_runs(run).items():
         with about(f"observations.{name}") if name else nullcontext():
-            weight = run.observations[name].weight if name else 1.0
-            sights[name] = Sight(*_recorded(own, truth, console), weight)
+            found[name] = _sensor(own)
+    return found
+
+
+def _sights(
+    run: RunFile, sensors: Mapping[str, Sensor], truth: Scene, console: Console
+) -> dict[str, Sight]:
+    sights = {}
+    for name, own in sensors.items():
+        capture = own.capture
+        if capture is None:
+            console.print("simulating the exact signals of the true scene")
+            with about(f"observations.{name}") if name else nullcontext():
+                beat = exact(own.run, truth, own.radar, own.grid).beat
+            capture = Capture.from_beat(beat, own.radar)
+        weight = run.observations[name].weight if name else 1.0
+        sights[name] = Sight(capture, own.radar, own.grid, weight)
     return sights
 
 
@@ -146,21 +182,19 @@ def observed_runs(run: RunFile) -> dict[str, RunFile]:
     return found
 
 
-def _recorded(run: RunFile, truth: Scene, console: Console) -> tuple[Capture, Radar, Grid]:
+def _sensor(run: RunFile) -> Sensor:
     data, table = need(run, "data", "reconstruct"), need(run, "grid", "reconstruct")
     if isinstance(data, SimulatedData):
         radar = build.radar(need(run, "radar", "simulated data"))
-        grid = build.grid(table, radar)
-        console.print("simulating the exact signals of the true scene")
-        capture = Capture.from_beat(exact(run, truth, radar, grid).beat, radar)
-        return capture, radar, grid
+        return Sensor(run, radar, build.grid(table, radar))
     if run.radar is not None:
         raise InputError(
             f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
             "remove it: a capture brings its radar along"
         )
     capture = measured(data)
-    return capture, capture.radar(), build.grid(table, capture.radar())
+    radar = capture.radar()
+    return Sensor(run, radar, build.grid(table, radar), capture)
 
 
 def fitted_objects(run: RunFile) -> list[str]:

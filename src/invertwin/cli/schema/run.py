@@ -23,6 +23,7 @@ from invertwin.cli.schema.fits import (
     Variant,
 )
 from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.shape_tables import LearnedTable
 from invertwin.errors import InputError
@@ -31,9 +32,16 @@ from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
 from invertwin.registry.section import InputPath, Section, Seed, Vector, Words, fail, key
+from invertwin.signatures import rcs
 
 # How a run calls its own fits, and how names of its metrics end.
 _TAKEN = ("full", "whole", "seen", "count", "m", "number", "consistency")
+
+# Keys of a gradient check that say how paths are drawn.
+_DRAWN = (
+    *("depth", "samples", "boundary_samples", "repeats", "difference_samples", "noise"),
+    *("max_pairs", "scheme"),
+)
 
 _AS_GIVEN: dict[str, Any] = {"exclude_unset": True, "exclude_none": True}
 
@@ -42,6 +50,15 @@ AnyModel = Annotated[Any, OneOf("model")]
 AnyData = Annotated[Any, OneOf("data")]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
 AnyGradcheck = Annotated[Any, TableOf(Check, Gradcheck)]
+AnyRcs = Annotated[
+    Any,
+    TableOf(
+        rcs,
+        Rcs,
+        ("directions", "frequencies", "receivers", "polarisation", "boundary"),
+        checked=False,
+    ),
+]
 
 
 class SceneFile(Section):
@@ -140,6 +157,7 @@ class _RunFile(Section):
     calibration: Calibration | None = key("calibration before the fit", None)
     landscape: Landscape | None = key("losses along a line", None)
     gradcheck: AnyGradcheck | None = key("the gradient check", None)
+    rcs: AnyRcs | None = key("the radar signature; with [gradcheck] what is differentiated", None)
 
     @model_validator(mode="after")
     def _names_exist(self) -> "_RunFile":
@@ -152,6 +170,21 @@ class _RunFile(Section):
                     raise PydanticCustomError(
                         "unknown_object", "unknown object", {"path": path, "name": name}
                     )
+        return self
+
+    @model_validator(mode="after")
+    def _a_signature_is_differentiated_alone(self) -> "_RunFile":
+        if self.gradcheck is None or self.rcs is None:
+            return self
+        if self.gradcheck.of == "sensor":
+            fail(
+                "expected a parameter of the scene with [rcs], got radar_pose; turn the scene",
+                "gradcheck.parameter.kind",
+            )
+        given = [name for name in ("radar", "grid") if getattr(self, name) is not None]
+        given += [f"gradcheck.{n}" for n in _DRAWN if n in self.gradcheck.model_fields_set]
+        for path in given:
+            fail("expected nothing with [rcs], which draws no paths, got a value; remove it", path)
         return self
 
     @model_validator(mode="after")

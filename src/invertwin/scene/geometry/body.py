@@ -15,7 +15,7 @@ from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.scene.mesh import Mesh, joined
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
 from invertwin.scene.pose import rotation_angle, rotation_from_vector
-from invertwin.untrusted import read_arrays
+from invertwin.untrusted import read_arrays, reader
 
 _DO = "give arrays of one template"
 _ALONE = 0.95  # share of a vertex that a joint moves nearly alone
@@ -384,6 +384,7 @@ def articulated_template(
     )
 
 
+@reader("a body model")
 def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
     """A body in the layout of SMPL's ``.npz`` files, which users obtain under its own licence.
 

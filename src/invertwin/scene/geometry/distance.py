@@ -4,14 +4,16 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
+from typing import Annotated
 
 import igl
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.limits import Count, NonNegative, Positive
+from invertwin.limits import NonNegative, Positive
 from invertwin.scene.checks import (
     ArrayLike,
     Counts,
@@ -225,8 +227,8 @@ class NeuralDistance(_Distance):
         counts: Counts,
         *,
         radius: Positive,
-        width: Count = 32,
-        depth: Count = 2,
+        width: Annotated[int, Ge(1), Le(4096)] = 32,
+        depth: Annotated[int, Ge(1), Le(64)] = 2,
         frequency: Positive = 8.0,
         seed: int = 0,
     ) -> None:

@@ -8,8 +8,10 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.memory import require_at_most
 from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 
+_MOST_NODES, _MOST_ALONG = 2e7, 2000
 _DO = "give x, y, z of the box's corners"
 
 
@@ -27,12 +29,15 @@ class Lattice:
     counts: tuple[int, int, int]
 
     @classmethod
-    def between(cls, low: ArrayLike, high: ArrayLike, counts: Sequence[int]) -> "Lattice":
+    def between(
+        cls, low: ArrayLike, high: ArrayLike, counts: Sequence[int], *, sliced: bool = False
+    ) -> "Lattice":
         """The lattice between two corners, given as any numbers.
 
         Args:
             low, high: opposite corners of the box [m].
             counts: nodes along x, y and z.
+            sliced: whether nodes are visited in slices, so that any number of them has room.
 
         Raises:
             InputError: a box without volume, fewer than two nodes along an axis, wrong shapes, or
@@ -49,6 +54,13 @@ class Lattice:
                 f"expected a box with low < high, got {first.tolist()} and {last.tolist()}; {_DO}"
             )
         x, y, z = (checked_count(count, "nodes along an axis", 2) for count in counts)
+        for count, most, where in (
+            (max(x, y, z), _MOST_ALONG, " along an axis"),
+            (0 if sliced else x * y * z, _MOST_NODES, ""),
+        ):
+            require_at_most(
+                count, most, f"nodes of a grid{where}", "take fewer, wider apart", "counts"
+            )
         return cls(first, last, (x, y, z))
 
     @property

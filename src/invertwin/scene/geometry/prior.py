@@ -16,7 +16,7 @@ from invertwin.scene.geometry.iso_surface import follow, surface_of
 from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
-from invertwin.untrusted import read_arrays
+from invertwin.untrusted import read_arrays, reader
 
 _MODEL = "vehicle_prior.npz"
 _FORMAT = "invertwin shape prior 1"
@@ -87,15 +87,19 @@ class ShapePrior:
         self.low, self.high = lattice.low, lattice.high
         self._last: tuple[tuple[int, ...], Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
-    def nodes(self, counts: Sequence[int] | None = None) -> Lattice:
+    def nodes(self, counts: Sequence[int] | None = None, *, sliced: bool = False) -> Lattice:
         """Nodes in the box, so many along x, y and z; None makes them about 0.1 m apart.
+
+        Args:
+            counts: Of nodes.
+            sliced: See `Lattice.between`.
 
         Raises:
             InputError: fewer than two nodes along an axis.
         """
         if counts is None:
             counts = (((self.high - self.low) / _SPACING - 1e-9).ceil().int() + 1).tolist()
-        return Lattice.between(self.low, self.high, counts)
+        return Lattice.between(self.low, self.high, counts, sliced=sliced)
 
     def values(self, latent: Float64[Tensor, " k"]) -> Float64[Tensor, "x y z"]:
         """Signed distances at the decoder's nodes [m], negative inside.
@@ -132,7 +136,7 @@ class ShapePrior:
         Raises:
             InputError: what `values` refuses, or fewer than two nodes along an axis.
         """
-        return cubic_slices(self.values(latent), self.lattice, self.nodes(counts))
+        return cubic_slices(self.values(latent), self.lattice, self.nodes(counts, sliced=True))
 
     def decode(
         self, latent: Float64[Tensor, " k"], counts: Sequence[int]
@@ -263,6 +267,7 @@ def _loaded() -> ShapePrior:
         return _read(file)
 
 
+@reader("a shape prior")
 def _read(path: Path) -> ShapePrior:
     do = "give a file of invertwin train-prior"
     found = read_arrays(path, do)

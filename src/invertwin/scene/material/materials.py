@@ -28,13 +28,14 @@ from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.roughness import (
     MIRROR_LOBE_WIDTH,
     ROUGH_LOBE_WIDTH,
+    ROUGH_SCATTERING,
     EffectiveRoughness,
     Weights,
     lobe_exponent,
     specular_weights,
 )
 from invertwin.scene.material.slab import Sheet, slab_tables
-from invertwin.scene.material.surface import ANGLE_COUNT, Material, Surface
+from invertwin.scene.material.surface import ANGLE_COUNT, Material, Skin, Surface
 from invertwin.scene.material.values import RANGES, Value, checked_value, evaluated, row_count
 
 AnyMedium = TypeVar("AnyMedium", bound="Medium")
@@ -45,6 +46,19 @@ _MIRROR = torch.ones_like(_COSINES)
 
 class _Values:
     """Checks the fields of a dataclass by name, and knows for how many triangles they are."""
+
+    def __new__(cls, *values: object, **named: object) -> Any:
+        """Refuse values that the material does not have, before Python does so in its own words."""
+        names = {entry.name: entry.kw_only for entry in fields(cls)}  # type: ignore[arg-type]
+        bare = [name for name, by_name in names.items() if not by_name]
+        others = [repr(value) for value in values[len(bare) :]]
+        others += [name for name in named if name not in names]
+        if others:
+            raise InputError(
+                f"expected values of {cls.__name__} by name ({', '.join(names)}), got "
+                f"{others[0]}; such as {cls.__name__}({next(reversed(names))}=...)"
+            )
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         for name in _value_names(self):
@@ -158,13 +172,20 @@ class PerfectConductor(_Values, Material):
 class RoughConductor(_Values, EffectiveRoughness, Material):
     """A perfect conductor with a rough surface: all power comes back, spread by the roughness.
 
-    Its fields are those of `EffectiveRoughness`.
+    Its fields are those of `EffectiveRoughness`; a rough surface scatters by default.
     """
+
+    scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         return Surface(_MIRROR, *self.weights())
+
+    def skin(self, frequency: float) -> Skin | None:
+        """What the surface does to fields at `frequency` [Hz]."""
+        checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+        return self.skin_of(None)
 
 
 @dataclass(frozen=True)
@@ -195,13 +216,19 @@ class Dielectric(Medium, EffectiveRoughness, Material):
 
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
-            `EffectiveRoughness`.
+            `EffectiveRoughness`; it scatters by default.
     """
+
+    scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
         return Surface(fresnel_amplitude(epsilon[..., None], _COSINES), *self.weights())
+
+    def skin(self, frequency: float) -> Skin | None:
+        """What the surface does to fields at `frequency` [Hz]."""
+        return self.skin_of(self.complex_permittivity(frequency))
 
 
 @dataclass(frozen=True)
@@ -226,6 +253,10 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
             index=refractive_index(epsilon),
             attenuation=attenuation(epsilon, frequency),
         )
+
+    def skin(self, frequency: float) -> Skin | None:
+        """What the outer face does to fields at `frequency` [Hz]."""
+        return self.skin_of(self.complex_permittivity(frequency))
 
 
 @dataclass(frozen=True)
@@ -262,6 +293,10 @@ class Slab(Layer, EffectiveRoughness, Material):
     def surface(self, frequency: float) -> Surface:
         """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
         return _slab_surface([self], self.weights(), frequency)
+
+    def skin(self, frequency: float) -> Skin | None:
+        """What the sheet does to fields at `frequency` [Hz]."""
+        return self.skin_of(self.complex_permittivity(frequency), self.thickness)
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.scene.material.surface import LOBE_COUNT
+from invertwin.scene.material.surface import LOBE_COUNT, Skin
 from invertwin.scene.material.values import Value, checked_value, evaluated
 
 MIRROR_LOBE_WIDTH = math.radians(5.0)
 ROUGH_LOBE_WIDTH = math.radians(20.0)
+ROUGH_SCATTERING = 0.4
+"""S of building walls, as measured (Degli-Esposti et al. 2007)."""
 
 
 class Weights(NamedTuple):
@@ -100,6 +102,8 @@ class EffectiveRoughness:
             what is left goes back towards the source. In [0, 1].
         directive_exponent: α_R of the directive lobe, ((1 + cosψ)/2)^α_R.
         backscatter_exponent: α_i of the backscattering lobe.
+        rms_height: of the roughness [m]: takes exp(−½(2kσ cosθ)²) off coherent fields (`skin`).
+            Power maps do not see it.
     """
 
     scattering: Value = 0.0
@@ -108,6 +112,17 @@ class EffectiveRoughness:
     directive: Value = 1.0
     directive_exponent: Value = 4.0
     backscatter_exponent: Value = 4.0
+    rms_height: Value = 0.0
+
+    def skin_of(self, permittivity: Tensor | None, thickness: Value = math.inf) -> Skin:
+        """What the surface does to fields: the share 1 − S² of the power stays coherent.
+
+        Args:
+            permittivity: complex and relative; None of a conductor.
+            thickness: of a sheet [m].
+        """
+        coherent = (1 - evaluated(self.scattering) ** 2).sqrt()
+        return Skin(permittivity, evaluated(thickness), coherent, evaluated(self.rms_height))
 
     def weights(self) -> Weights:
         """Weights and exponents of the Lambertian part and the three lobes."""

@@ -21,7 +21,7 @@ average and R exactly where both angles agree.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float64
@@ -37,6 +37,7 @@ _SCALARS = ("diffuse", "index", "attenuation")  # the other fields are tables
 _NONE = torch.zeros(LOBE_COUNT, dtype=torch.float64)
 _DARK = torch.zeros(ANGLE_COUNT, dtype=torch.float64)
 _ZERO, _ONE = _DARK[0], torch.ones((), dtype=torch.float64)
+_INFINITE = torch.full((), torch.inf, dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +84,22 @@ class Surface:
             object.__setattr__(self, name, values.expand((*row, *widths[name])))
 
 
+class Skin(NamedTuple):
+    """What a smooth surface does to fields, with one value or one per triangle each.
+
+    Attributes:
+        permittivity: complex relative permittivity; None of a perfect conductor.
+        thickness: of a sheet about the surface [m]; infinite for a body.
+        coherent: share of the reflected field that stays in the mirror direction, in [0, 1].
+        rms_height: of the roughness [m].
+    """
+
+    permittivity: Tensor | None
+    thickness: Tensor
+    coherent: Tensor
+    rms_height: Tensor
+
+
 class Material(ABC):
     """What an object's surface does to the waves.
 
@@ -96,6 +113,13 @@ class Material(ABC):
     def faces(self) -> int | None:
         """The number of triangles that its values are for; None if they hold for any."""
         return None
+
+    def skin(self, frequency: float) -> Skin | None:
+        """What the surface does to fields at `frequency` [Hz]; None if it is only rough.
+
+        A coherent material is a perfect conductor, unless it says otherwise.
+        """
+        return Skin(None, _INFINITE, _ONE, _ZERO) if self.coherent else None
 
     @abstractmethod
     def surface(self, frequency: float) -> Surface:

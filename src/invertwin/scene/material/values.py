@@ -123,6 +123,7 @@ RANGES: Mapping[str, Range] = {
     "lobe_width": Range("lobe width [rad]", 3.4e-4, math.pi),
     "scattering": Range("scattering coefficient", 0.0, 1.0),
     "rms_slope": Range("rms slope", 1e-4, 1.0),
+    "rms_height": Range("rms height [m]", 0.0),
     "lambertian": Range("Lambertian share", 0.0, 1.0),
     "directive": Range("directive share", 0.0, 1.0),
     "directive_exponent": Range("exponent of the directive lobe", 0.0, 1e8),

@@ -1,0 +1,197 @@
+"""Range profile of a car at 77 GHz by ray tubes: error against the converged one, and speed.
+
+    python benchmarks/signatures.py [-o DIR]
+
+A car of conducting metal (`experiments/car.ply`, each triangle in four) at an oblique aspect,
+77 GHz, 1 GHz of bandwidth, three bounces, no edges. The error is ‖p − q‖/‖q‖ over all ranges and
+polarisations, of the complex profile p with one tube per wavelength and the profile q with
+`CONVERGED`. Prints a table and writes `metrics.json` into DIR (default `out/signatures`):
+
+- `profile_error_db`, `seconds`, `tubes` (rays that start): of one tube per wavelength. Its first
+  run compiles kernels and is not counted.
+- `converging_db.<tubes per wavelength>`: the errors of other numbers of tubes.
+- `order_error_db.order <n>`: the error of the n-th bounce alone, over the whole profile.
+- `rays_per_second`: rays of all bounces over the time; `tracing_share`: the share of the time in
+  which rays are traced, those for shadows of the first bounce among them.
+"""
+
+import argparse
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from report import MetricTable, Required, write
+from rich.table import Table
+from torch import Tensor
+
+from invertwin import Object, Scene, rcs
+from invertwin.channel import backend
+from invertwin.channel.field import signature, tubes
+from invertwin.errors import PhysicsWarning
+from invertwin.scene import Mesh, PerfectConductor, load_mesh
+from invertwin.signatures import Signature, aspects
+
+CAR = Path(__file__).parents[1] / "experiments" / "car.ply"
+ASPECT = (85.0, 20.0)  # θ, φ [°]; the car points along x
+FREQUENCIES = (76.5e9, 77.5e9, 64)
+DEPTH = 3
+DENSITY, OTHERS, CONVERGED = 1.0, (0.5, 2.0), 4.0  # tubes per wavelength
+REQUIRED: Required = {
+    "triangles": (">=", 25_000),
+    "profile_error_db": ("<=", -20.0),
+    "tubes": ("<=", 3e5),
+    "seconds": ("<=", 20.0),
+}
+
+
+class Rays:
+    """Counts the rays that are traced, and the time that it takes."""
+
+    def __init__(self) -> None:
+        self.counts: list[int] = []
+        self.shadows = 0
+        self.seconds = 0.0
+
+    def next_surface(self, trace: Callable[..., Any]) -> Callable[..., Any]:
+        """A tracer of tubes, with a count for each bounce."""
+
+        def counted(occluders: Any, start: Tensor, end: Tensor) -> Any:
+            self.counts.append(len(start))
+            return self._timed(trace, occluders, start, end)
+
+        return counted
+
+    def visible(self, trace: Callable[..., Any]) -> Callable[..., Any]:
+        """A tracer of shadows, with a count."""
+
+        def counted(occluders: Any, start: Tensor, end: Tensor) -> Any:
+            self.shadows += len(start)
+            return self._timed(trace, occluders, start, end)
+
+        return counted
+
+    def _timed(self, trace: Callable[..., Any], *arguments: Any) -> Any:
+        start = perf_counter()
+        found = trace(*arguments)
+        self.seconds += perf_counter() - start
+        return found
+
+
+def car() -> Scene:
+    """The car, of at least 25 000 triangles."""
+    mesh = load_mesh(CAR)
+    corners = mesh.vertices[mesh.faces]
+    middles = (corners + corners.roll(-1, 1)) / 2
+    a, b, c = corners.unbind(1)
+    ab, bc, ca = middles.unbind(1)
+    parts = torch.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 1).reshape(-1, 3)
+    points, index = parts.unique(dim=0, return_inverse=True)
+    return Scene({"car": Object(Mesh(points, index.reshape(-1, 3)), PerfectConductor())})
+
+
+def signed(scene: Scene, density: float, frequencies: tuple[float, float, int]) -> Signature:
+    """The signature with so many tubes per wavelength."""
+    theta, phi = torch.deg2rad(torch.tensor(ASPECT, dtype=torch.float64))
+    swept = torch.linspace(*frequencies, dtype=torch.float64)
+    with warnings.catch_warnings():
+        # Facets of this car are what is simulated, however coarse they are.
+        warnings.simplefilter("ignore", PhysicsWarning)
+        return rcs(
+            scene,
+            aspects(theta, phi),
+            swept,
+            depth=DEPTH,
+            edges=0,
+            tubes_per_wavelength=density,
+        )
+
+
+def error_db(found: Signature, truth: Signature, whole: Signature | None = None) -> float:
+    """Of a range profile, relative to that of ``whole`` (default: the truth)."""
+    difference = found.range_profile()[1] - truth.range_profile()[1]
+    scale = (whole or truth).range_profile()[1].norm()
+    return float(20 * torch.log10(difference.norm() / scale))
+
+
+def measure(
+    frequencies: tuple[float, float, int] = FREQUENCIES,
+    others: tuple[float, ...] = OTHERS,
+    converged: float = CONVERGED,
+) -> dict[str, Any]:
+    """All metrics; fewer frequencies in tests only."""
+    load, scene = os.getloadavg()[0], car()
+    signed(scene, 0.25, (*frequencies[:2], 2))
+    rays = Rays()
+    with (
+        patch.object(tubes, "next_surface", rays.next_surface(tubes.next_surface)),
+        patch.object(signature, "visible", rays.visible(signature.visible)),
+    ):
+        start = perf_counter()
+        found = signed(scene, DENSITY, frequencies)
+        seconds = perf_counter() - start
+    truth = signed(scene, converged, frequencies)
+    orders = {
+        name: error_db(
+            replace(found, parts={name: part}),
+            replace(truth, parts={name: truth.parts[name]}),
+            truth,
+        )
+        for name, part in found.parts.items()
+    }
+    return {
+        "triangles": len(scene["car"].mesh.faces),
+        "profile_error_db": error_db(found, truth),
+        "order_error_db": orders,
+        "converging_db": {
+            f"{density:g}": error_db(signed(scene, density, frequencies), truth)
+            for density in others
+        },
+        "tubes": rays.counts[0],
+        "seconds": seconds,
+        "rays_per_second": (sum(rays.counts) + rays.shadows) / seconds,
+        "tracing_share": rays.seconds / seconds,
+        "frequencies": frequencies[2],
+        "backend": backend(),
+        "load_average": load,
+    }
+
+
+def table(metrics: dict[str, Any]) -> Table:
+    """What was counted, and what must hold."""
+    page = MetricTable(
+        f"A car at 77 GHz, three bounces: {metrics['frequencies']} frequencies, backend "
+        f"{metrics['backend']}, load average {metrics['load_average']:.1f} at the start",
+        REQUIRED,
+    )
+    page.row("triangles", metrics["triangles"], ".0f")
+    page.row("tubes", metrics["tubes"], ".0f", "rays that start, one a wavelength apart")
+    page.row(
+        "profile_error_db", metrics["profile_error_db"], ".1f", "of the range profile, complex"
+    )
+    for name, value in metrics["order_error_db"].items():
+        page.row(f"order_error_db.{name}", value, ".1f", "over the whole profile")
+    for density, value in metrics["converging_db"].items():
+        page.row(f"converging_db.{density}", value, ".1f", f"with {density} tubes per wavelength")
+    page.row("seconds", metrics["seconds"], ".1f", "all frequencies, both polarisations")
+    page.row("rays_per_second", metrics["rays_per_second"], ".3g", "tubes' and shadows' rays")
+    page.row("tracing_share", metrics["tracing_share"], ".2f", "of the time")
+    return page.grid
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/signatures"))
+    arguments = parser.parse_args()
+    metrics = measure()
+    write(metrics, table(metrics), arguments.out)
+
+
+if __name__ == "__main__":
+    main()

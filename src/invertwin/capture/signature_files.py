@@ -1,0 +1,128 @@
+"""Measured signatures: tables of radar cross-sections, and Touchstone files of analysers."""
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.untrusted import read_text, reading
+
+_UNITS = {"HZ": 1.0, "KHZ": 1e3, "MHZ": 1e6, "GHZ": 1e9}
+_FORMATS = ("MA", "DB", "RI")
+_PORTS = re.compile(r"\.s(\d+)p", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSection:
+    """A radar cross-section over aspect, one row a value.
+
+    Attributes:
+        frequency: [Hz].
+        theta, phi: direction to the radar [rad].
+        dbsm: σ over 1 m², in decibels.
+    """
+
+    frequency: Float64[Tensor, " row"]
+    theta: Float64[Tensor, " row"]
+    phi: Float64[Tensor, " row"]
+    dbsm: Float64[Tensor, " row"]
+
+
+@dataclass(frozen=True, eq=False)
+class Touchstone:
+    """Scattering parameters of a network analyser.
+
+    Attributes:
+        frequencies: [Hz].
+        parameters: S of every frequency, [frequency, port out, port in].
+        resistance: reference resistance [Ω].
+    """
+
+    frequencies: Float64[Tensor, " frequency"]
+    parameters: Complex128[Tensor, "frequency port port"]
+    resistance: float
+
+
+def load_section(file: str | Path) -> MeasuredSection:
+    """Read a text file of rows of frequency [Hz], θ [°], φ [°] and RCS [dBsm].
+
+    Args:
+        file: as the Austin RCS Benchmark Suite has them.
+
+    Raises:
+        InputError: no such file, other columns, or numbers that are not finite.
+    """
+    what = "rows of frequency, theta, phi and RCS"
+    text = read_text(file, what)
+    with reading(file, what):
+        rows = np.array([[float(cell) for cell in line.split()] for line in text.splitlines()])
+        if rows.ndim != 2 or rows.shape[1] != 4 or not np.isfinite(rows).all():
+            raise ValueError("other than four finite numbers a row")
+    frequency, theta, phi, level = torch.from_numpy(rows.T.copy())
+    return MeasuredSection(frequency, theta.deg2rad(), phi.deg2rad(), level)
+
+
+def load_touchstone(file: str | Path) -> Touchstone:
+    """Read a Touchstone file of version 1 (.s1p, .s2p and so on); noise data are left out.
+
+    Args:
+        file: its suffix tells the number of ports.
+
+    Raises:
+        InputError: no such file, another suffix, parameters other than S, or a damaged file.
+    """
+    path = Path(file)
+    ports = _PORTS.fullmatch(path.suffix)
+    if ports is None or not 1 <= int(ports[1]) <= 99:
+        raise InputError(f"expected a Touchstone file such as .s1p or .s2p, got {path.name}")
+    count = int(ports[1])
+    what = f"a Touchstone file of {count} ports"
+    text = read_text(path, what)
+    with reading(path, what):
+        lines = [line.split("!")[0].strip() for line in text.splitlines()]
+        options = next((line[1:].upper().split() for line in lines if line.startswith("#")), [])
+        unit, kind, resistance = _options(options)
+        numbers = [float(word) for line in lines if line[:1] not in "#[" for word in line.split()]
+        width = 1 + 2 * count**2
+        if len(numbers) % width and count != 2:
+            raise ValueError(f"{len(numbers)} numbers, no multiple of {width}")
+        rows = np.array(numbers[: len(numbers) // width * width]).reshape(-1, width)
+        # Noise data of two ports follow; their frequencies begin anew.
+        falls = np.nonzero(np.diff(rows[:, 0]) <= 0)[0]
+        rows = rows[: falls[0] + 1] if len(falls) else rows
+        if not len(rows) or not np.isfinite(rows).all():
+            raise ValueError("no finite numbers")
+        matrix = _complex(rows[:, 1::2], rows[:, 2::2], kind).reshape(-1, count, count)
+    # Two ports are listed as S11, S21, S12, S22; others row by row.
+    ordered = matrix.transpose(0, 2, 1) if count == 2 else matrix
+    return Touchstone(
+        torch.from_numpy(rows[:, 0] * unit), torch.from_numpy(ordered.copy()), resistance
+    )
+
+
+def _options(words: list[str]) -> tuple[float, str, float]:
+    """Unit, format and resistance of the option line; without one GHz, MA and 50 Ω."""
+    unit, kind, resistance = 1e9, "MA", 50.0
+    for number, word in enumerate(words):
+        if word in _UNITS:
+            unit = _UNITS[word]
+        elif word in _FORMATS:
+            kind = word
+        elif word == "R":
+            resistance = float(words[number + 1])
+        elif word != "S" and words[number - 1] != "R":
+            raise ValueError(f"the option {word}")
+    return unit, kind, resistance
+
+
+def _complex(first: np.ndarray, second: np.ndarray, kind: str) -> np.ndarray:
+    if kind == "RI":
+        return first + 1j * second
+    size = first if kind == "MA" else 10 ** (first / 20)
+    return size * np.exp(1j * math.pi / 180 * second)

@@ -1,0 +1,159 @@
+"""Several bounces between conductors: mirrored paths, all in phase.
+
+A ray from the antenna is mirrored by conductor after conductor. Wherever it ends, the current that
+its field induces there sends to the other antenna: physical optics of every order, as in
+``signature``, for antennas near by. The way unfolds to a straight line from an image of the
+antenna, so that delays are exact for every element of an array.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invertwin.channel.field.waves import dot, mirrored
+from invertwin.channel.paths import Paths
+from invertwin.channel.rays.geometry import silhouettes_move
+from invertwin.channel.rays.scene import NEAR, RayScene, face_areas, next_surface
+from invertwin.channel.reference.radar_equation import SurfacePaths, conductor_field, passed
+from invertwin.channel.sampling import Sampling
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+
+_GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
+_ROWS_AT_ONCE = 1 << 18  # frames × rays
+
+
+def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
+    """Field paths of two bounces and more that only conductors mirror; detached.
+
+    ``a = −(j/4π) (−1)^(m−1) √(G_t G_r)/(R r) (cosθ + cosθ')/2 dA`` after m bounces, R the unfolded
+    way to the last one. Rays begin at both antennas, each way with half of the field, which keeps
+    reciprocity. The sign is that of E along the creases between the mirrors.
+
+    Args:
+        rays: The scene and its antennas.
+        sampling: Number of rays per frame, most bounces.
+        seed: Where rays meet the first conductor.
+
+    Source: derivations §13.
+
+    Raises:
+        InputError: There are some, and a derivative flows through the scene or the antennas.
+    """
+    geometry = rays.geometry
+    smooth = torch.tensor(geometry.coherent)[geometry.face_object]
+    points = spread_points(face_areas(geometry) * smooth, sampling.samples, seed)
+    same = torch.equal(rays.link.tx, rays.link.rx)
+    found: list[Paths] = []
+    frames = torch.arange(rays.link.frame_count)
+    with torch.no_grad():
+        for some in frames.split(max(1, _ROWS_AT_ONCE // len(points.weight))):
+            row = torch.arange(len(points.weight)).repeat(len(some))
+            frame = some.repeat_interleave(len(points.weight))
+            for from_receiver in (False,) if same else (False, True):
+                share = 1.0 if same else 0.5
+                chain = _chain(rays, sampling.depth, smooth, frame, points.keep(row), from_receiver)
+                found += [path for paths in chain if len(path := _weighted(paths, share))]
+    if found and silhouettes_move(geometry, rays.link):
+        raise InputError(
+            "expected depth 1 for derivatives of fields between conductors, got "
+            f"{sampling.depth}: mirrored paths have none; use depth=1, power paths, or rcs"
+        )
+    return found
+
+
+def _weighted(paths: Paths, share: float) -> Paths:
+    rows = paths.chosen(paths.coefficient != 0)
+    return replace(rows, coefficient=rows.coefficient * share)
+
+
+def _chain(
+    rays: RayScene,
+    depth: int,
+    smooth: Tensor,
+    frame: Tensor,
+    points: SurfacePaths,
+    from_receiver: bool,
+) -> Iterator[Paths]:
+    """Follow rays from one antenna by way of their first points."""
+    link, geometry = rays.link, rays.geometry
+    here, there = (link.rx, link.tx) if from_receiver else (link.tx, link.rx)
+    patterns = link.tx_pattern, link.rx_pattern
+    own, other = patterns[::-1] if from_receiver else patterns
+    (place,) = points.places(geometry)
+    antenna, position = here[frame], place.position
+    seen, extra = passed(rays, antenna, position)
+    keep = torch.nonzero(seen > 0)[:, 0]
+    frame, position, antenna = frame[keep], position[keep], antenna[keep]
+    normal, through, extra = place.normal[keep], seen[keep], extra[keep]
+    length = (position - antenna).norm(dim=1)
+    start = (position - antenna) / length[:, None]
+    gain = own.gain(torch.einsum("nij,ni->nj", link.rotations[frame], start)) * through
+    # The solid angle of a ray, from the area that its first point stands for.
+    angle = points.weight[keep] * dot(normal, start).abs() / length**2
+    direction = start
+    extent = geometry.vertices.detach()
+    reach = float((extent.amax(0) - extent.amin(0)).norm()) * 1.01
+    for bounce in range(2, depth + 1):
+        # Rays begin a little above the mirror: the ray tracer rounds places far from the antennas.
+        above = -dot(normal, direction).sign() * NEAR * (position - rays.origin).norm(dim=1)
+        direction = mirrored(direction, normal)
+        begin = position + above[:, None] * normal
+        face, _ = next_surface(rays, begin, begin + reach * direction)
+        hit = (face >= 0) & smooth[face.clamp_min(0)]
+        columns = (face, frame, position, length, start, gain, angle, direction, extra)
+        face, frame, position, length, start, gain, angle, direction, extra = (
+            column[hit] for column in columns
+        )
+        p0, p1, p2 = (corner.detach() for corner in geometry.corners(face))
+        normal = normalize(torch.linalg.cross(p1 - p0, p2 - p0), dim=1)
+        facing = dot(normal, direction)
+        way = dot(normal, p0 - position) / torch.where(facing == 0, torch.ones_like(facing), facing)
+        position, length = position + way[:, None] * direction, length + way
+        offset = there[frame] - position
+        distance = offset.norm(dim=1)
+        onwards = offset / distance[:, None]
+        leaving = torch.einsum("nij,ni->nj", link.rotations[frame], -onwards)
+        open_, more = passed(rays, position, there[frame])
+        spread = gain * other.gain(leaving) * open_ / (length * distance) ** 2
+        area = angle * length**2 / facing.abs().clamp_min(1e-9)
+        field = conductor_field(spread, -facing, dot(normal, onwards)) * area
+        image = here[frame] + length[:, None] * start  # the last point, unfolded
+        first, last = (position, image) if from_receiver else (image, position)
+        yield Paths(
+            frame=frame,
+            delay=(length + distance + extra + more) / SPEED_OF_LIGHT,
+            coefficient=field * (-1.0) ** (bounce - 1),
+            power=torch.zeros_like(length),
+            first=first,
+            last=last,
+            kind="coherent",
+            boundary=torch.zeros(len(frame), dtype=torch.bool),
+        )
+
+
+def spread_points(areas: Float64[Tensor, " f"], count: int, seed: int) -> SurfacePaths:
+    """Low-discrepancy points over triangles (error of an integral: 1/count).
+
+    Args:
+        areas: of the triangles; those of none get no point.
+        count: of the points.
+        seed: of their places.
+    """
+    rng = np.random.default_rng(seed)
+    shift = rng.random(2)
+    index = np.arange(count)
+    edges = np.cumsum(areas.numpy())
+    # Jittered, not evenly spaced: even steps would beat with the order of a subdivided mesh.
+    place = (index + rng.random(count)) / count * edges[-1]
+    face = np.minimum(np.searchsorted(edges, place, side="right"), len(edges) - 1)
+    b = (shift[:, None] + index * np.array(_GOLDEN)[:, None]) % 1.0
+    b = np.where(b.sum(0) > 1, 1 - b, b)
+    b1, b2 = torch.from_numpy(b)[..., None]
+    weight = torch.full((count,), float(edges[-1]) / count, dtype=torch.float64)
+    return SurfacePaths(torch.from_numpy(face)[:, None], b1, b2, weight, torch.zeros_like(weight))

@@ -1,0 +1,380 @@
+"""The far field that a smooth scene scatters: every bounce, edges, both polarisations, coherent.
+
+Each order is physical optics of its own incident field; all add in one field. In scenes of few flat
+facets light is clipped beams, in others ray tubes: the same integral over the same lit surface.
+
+Differs from the source: physical optics of separate antennas is not reciprocal. The result is the
+mean of both ways, which is. In one place it is the mean of both cross-polar terms.
+"""
+
+import math
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invertwin.channel.field.beams import Bounce, Facets, beams
+from invertwin.channel.field.patches import lit_triangles
+from invertwin.channel.field.plates import plates_of, several_diffractions
+from invertwin.channel.field.tubes import TubeBounce, tubes
+from invertwin.channel.field.waves import (
+    Skins,
+    dot,
+    parallelogram_integral,
+    polarisations,
+    radiated,
+    reflected,
+)
+from invertwin.channel.field.wedges import (
+    LEAST_ANGLE,
+    Wedges,
+    find_wedges,
+    fringe_field,
+    grazes,
+    outside,
+)
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.geometry import differentiated
+from invertwin.channel.rays.scene import Occluders, visible
+from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError, PhysicsWarning
+from invertwin.scene.scene import Scene
+
+FEW = 24
+"""Triangles of a scene up to which beams are clipped exactly; more are shot with tubes."""
+_SAGITTA = 1 / 50  # wavelengths that a facet may be off the curved surface
+_SMOOTH = (1e-6, 0.35)  # rad that normals turn from facet to facet where a surface is curved
+_SEGMENTS = 2.0  # of an edge per wavelength; each is seen or not
+_OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
+_ROWS_AT_ONCE = 1 << 18
+_Lit = Bounce | TubeBounce
+
+
+@dataclass(frozen=True)
+class _Body:
+    """A scene as the laws of waves see it.
+
+    Attributes:
+        facets: its triangles.
+        topology: its edges.
+        vertices: [m].
+        occluders: what rays meet.
+        skins: of the triangles, for each frequency.
+        wave_numbers: k of the frequencies [1/m].
+        up: direction of V.
+    """
+
+    facets: Facets
+    topology: Topology
+    vertices: Float64[Tensor, "v 3"]
+    occluders: Occluders
+    skins: Sequence[Skins]
+    wave_numbers: Sequence[float]
+    up: Float64[Tensor, "3"]
+
+    @property
+    def wavelength(self) -> float:
+        """The shortest [m]."""
+        return 2 * math.pi / max(self.wave_numbers)
+
+    @property
+    def plain(self) -> bool:
+        """Whether all is smooth metal, of which fields do not depend on the frequency."""
+        first = self.skins[0]
+        smooth = (first.coherent == 1) & (first.rms_height == 0)
+        return bool((first.conducting & smooth).all())
+
+    def clear(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Whether nothing lies between points and the far end of directions."""
+        return visible(self.occluders, points, points + 3 * self.facets.size * directions)
+
+
+def trace_signature(
+    scene: Scene,
+    transmitters: Float64[Tensor, "aspect 3"],
+    receivers: Float64[Tensor, "aspect 3"] | None,
+    frequencies: Float64[Tensor, " frequency"],
+    *,
+    depth: int,
+    edges: int,
+    tubes_per_wavelength: float,
+    up: Float64[Tensor, "3"],
+    boundary: bool = True,
+) -> dict[str, Complex128[Tensor, "frequency aspect 2 2"]]:
+    """Scattering amplitudes S of every part of the field, about the world's origin; σ = 4π|S|².
+
+    Rows are the receiving, columns the transmitting polarisation, V and H of ``polarisations``. The
+    parts are ``order 1``, ``order 2`` and so on, and ``edges 1``, ``edges 2``.
+
+    Args:
+        scene: conductors and smooth dielectrics.
+        transmitters: unit vectors from the scene to the antenna.
+        receivers: the same; None = the transmitter receives.
+        frequencies: [Hz].
+        depth: most bounces.
+        edges: most diffractions of a wave by sharp edges of conductors; 0 leaves them out.
+        tubes_per_wavelength: at the highest frequency, where the scene has many triangles.
+        up: V lies in a plane with this unit vector.
+        boundary: False leaves out of derivatives what moving edges of beams change.
+
+    Raises:
+        InputError: a cloud, a rough surface, derivatives of a scene of many triangles.
+    """
+    with tracing():
+        body = _body(scene, frequencies, up)
+        count = len(body.facets.normal)
+        if count > FEW and differentiated(body.vertices):
+            raise InputError(
+                f"expected at most {FEW} triangles for derivatives of a signature, got {count}: "
+                "ray tubes jump at edges; detach the scene, or fit with power paths"
+            )
+        spacing = None if count <= FEW else body.wavelength / tubes_per_wavelength
+        _warn(scene, body, tubes_per_wavelength, spacing)
+        ways = [(transmitters, transmitters if receivers is None else receivers)]
+        if receivers is not None:
+            ways.append((receivers, transmitters))
+        found = [_View(body, *way).parts(depth, edges, spacing, boundary) for way in ways]
+        # The mean of both ways between two antennas, or between polarisations of one.
+        return {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
+
+
+@dataclass(frozen=True)
+class _View:
+    """Waves from one set of directions, received in another."""
+
+    body: _Body
+    transmitters: Tensor
+    receivers: Tensor
+
+    def parts(
+        self, depth: int, edges: int, spacing: float | None, boundary: bool
+    ) -> dict[str, Tensor]:
+        """All parts of the field."""
+        found = self._bounces(depth, spacing, boundary)
+        return found | self._diffracted(edges) if edges else found
+
+    @property
+    def _sent(self) -> Tensor:
+        """Incident fields of 1 V/m, V and H, of every aspect."""
+        return polarisations(self.transmitters, self.body.up)
+
+    def _none(self) -> Tensor:
+        shape = (len(self.body.wave_numbers), len(self.transmitters), 2, 2)
+        return torch.zeros(shape, dtype=torch.complex128)
+
+    def _received(self, total: Tensor, aspect: Tensor, sent: Tensor) -> Tensor:
+        """A total with the parts of F that the receiving polarisations see added."""
+        seen = polarisations(self.receivers, self.body.up)[aspect]
+        return total.index_add(0, aspect, dot(seen[:, :, None], sent[:, None]))
+
+    def _bounces(self, depth: int, spacing: float | None, boundary: bool) -> dict[str, Tensor]:
+        """Physical optics of every order: of beams, or of tubes where a spacing is given."""
+        body, orders = self.body, [list(self._none()) for _ in range(depth)]
+        chains: Iterable[tuple[int, Sequence[_Lit]]]
+        if spacing is None:
+            lit = beams(body.facets, -self.transmitters, depth, boundary=boundary)
+            chains = [(0, list(lit))]
+        else:
+            chains = self._sampled(depth, spacing)
+        for first, chain in chains:
+            currents: list[Tensor] = []
+            integrals = [bounce.integral(self.receivers[bounce.aspect]) for bounce in chain]
+            for f, k in enumerate(body.wave_numbers):
+                if not (body.plain and currents):
+                    currents = self._currents(chain, body.skins[f], 1.0 if body.plain else k)
+                rows = zip(orders, chain, integrals, currents, strict=False)
+                for order, bounce, integral, current in islice(rows, first, None):
+                    strength = integral(k) * (k if body.plain else 1.0)
+                    sent = current * strength[:, None, None]
+                    order[f] = order[f].index_add(0, bounce.aspect, sent)
+        return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
+
+    def _sampled(self, depth: int, spacing: float) -> Iterator[tuple[int, Sequence[_Lit]]]:
+        """Many facets: the first order triangle by triangle, the others by tubes."""
+        body, incident = self.body, -self.transmitters
+        for lit in lit_triangles(body.facets, body.clear, incident, spacing):
+            yield 0, [lit]
+        if depth > 1:
+            corners = body.facets.corners.detach()
+            for chain in tubes(body.occluders, corners, incident, spacing, depth):
+                yield 1, chain
+
+    def _currents(self, chain: Sequence[_Lit], skins: Skins, k: float) -> list[Tensor]:
+        """S per m² of all patches, order by order: [row, receive, transmit] each."""
+        found: list[Tensor] = []
+        again = torch.zeros(0)
+        for bounce in chain:
+            first = not found
+            field = (
+                self._sent.to(torch.complex128)[bounce.aspect] if first else again[bounce.before]
+            )
+            surface = (skins.rows(bounce.facet), k, bounce.normal, bounce.direction, field)
+            sent = radiated(*surface, self.receivers[bounce.aspect])
+            seen = polarisations(self.receivers, self.body.up)[bounce.aspect]
+            found.append(dot(seen[:, :, None], sent[:, None]))
+            again = reflected(*surface)
+        return found
+
+    def _diffracted(self, most: int) -> dict[str, Tensor]:
+        """What sharp edges of conductors add to physical optics."""
+        body = self.body
+        topology = body.topology
+        ends = body.vertices[topology.edges]
+        wedges = find_wedges(body.facets.corners, ends, topology.beside)
+        wedges = wedges.rows(body.skins[0].conducting[wedges.face])
+        found = {"edges 1": self._once(wedges)}
+        plates = plates_of(wedges) if most > 1 else []
+        totals = [list(self._none()) for _ in range(2, most + 1)]
+        every = torch.arange(len(self.transmitters))
+        for f, k in enumerate(body.wave_numbers if plates else ()):
+            several = several_diffractions(
+                plates, k, -self.transmitters, self._sent, self.receivers, most, body.clear
+            )
+            for total, sent in zip(totals, several, strict=True):
+                total[f] = self._received(total[f], every, sent)
+        return found | {f"edges {n}": torch.stack(t) for n, t in enumerate(totals, start=2)}
+
+    def _once(self, wedges: Wedges) -> Tensor:
+        """First-order fringe currents of the parts of edges that both antennas see."""
+        body, total = self.body, list(self._none())
+        wedges = _segments(wedges, body.wavelength / _SEGMENTS)
+        count = len(wedges.start)
+        left_out = 0
+        some = torch.arange(len(self.transmitters))
+        for aspects in some.split(max(1, _ROWS_AT_ONCE // max(1, count))) if count else ():
+            aspect = aspects.repeat_interleave(count)
+            row = torch.arange(count).repeat(len(aspects))
+            for way in (self.transmitters, self.receivers):
+                direction = way[aspect]
+                at = wedges.rows(row)
+                keep = outside(at, direction)
+                flat = keep & grazes(at, direction)
+                left_out += int(flat.sum())
+                aspect, row = aspect[keep & ~flat], row[keep & ~flat]
+            for way in (self.transmitters, self.receivers):
+                at = wedges.rows(row)
+                aside = (at.normals - at.inwards).sum(1)
+                middle = (at.start + at.end) / 2
+                middle = middle + _OFF * body.facets.size * normalize(aside, dim=1)
+                seen = body.clear(middle, way[aspect])
+                aspect, row = aspect[seen], row[seen]
+                if way is self.receivers:
+                    break
+            at = wedges.rows(row)
+            d, s = -self.transmitters[aspect], self.receivers[aspect]
+            middle, side = (at.start + at.end) / 2, at.end - at.start
+            for f, k in enumerate(body.wave_numbers):
+                sent = fringe_field(at, k, d, self._sent[aspect], s)
+                wave = k * (s - d)
+                width = parallelogram_integral(wave, side, torch.zeros_like(side))
+                turn = dot(wave, middle)
+                scale = torch.polar(torch.ones_like(turn), turn) * width * side.norm(dim=1)
+                total[f] = self._received(total[f], aspect, sent * scale[:, None, None])
+        if left_out:
+            warnings.warn(
+                f"edges of sheets within {math.degrees(LEAST_ANGLE):.0f}° of grazing are left out: "
+                "their fringe currents are not valid there, and physical optics is not either",
+                PhysicsWarning,
+                stacklevel=2,
+            )
+        return torch.stack(total)
+
+
+def _segments(wedges: Wedges, longest: float) -> Wedges:
+    """Edges in equal pieces no longer than a length."""
+    side = wedges.end - wedges.start
+    pieces = (side.detach().norm(dim=1) / longest).ceil().long().clamp_min(1)
+    row = torch.repeat_interleave(pieces)
+    number = torch.arange(len(row)) - (pieces.cumsum(0) - pieces)[row]
+    cut = wedges.rows(row)
+    low, high = (number / pieces[row])[:, None], ((number + 1) / pieces[row])[:, None]
+    columns = vars(cut) | {
+        "start": cut.start + low * side[row],
+        "end": cut.start + high * side[row],
+    }
+    return Wedges(**columns)
+
+
+def _body(scene: Scene, frequencies: Tensor, up: Tensor) -> _Body:
+    objects = scene.objects
+    clouds = [name for name, item in objects.items() if item.cloud is not None]
+    if clouds:
+        raise InputError(
+            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
+        )
+    vertices = torch.cat([item.vertices for item in objects.values()])
+    topology = topology_of([item.mesh for item in objects.values()])
+    corners = vertices[topology.faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    volume = dot(corners.detach()[:, 0], area.detach()) / 6
+    solid = torch.zeros(len(corners), dtype=torch.bool)
+    for number in range(len(objects)):
+        own = topology.face_object == number
+        solid[own] = number not in topology.open_objects and bool(volume[own].sum() > 0)
+    extent = vertices.detach().amax(0) - vertices.detach().amin(0)
+    facets = Facets(corners, normalize(area, dim=1), solid, float(extent.norm()))
+    occluders = Occluders(vertices, topology, vertices.detach().mean(0))
+    skins = [_skins(scene, topology, frequency) for frequency in frequencies.tolist()]
+    wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
+    return _Body(facets, topology, vertices, occluders, skins, wave_numbers, up)
+
+
+def _skins(scene: Scene, topology: Topology, frequency: float) -> Skins:
+    """The skins of all triangles."""
+    columns: list[list[Tensor]] = [[] for _ in Skins._fields]
+    for name, item in scene.objects.items():
+        skin = item.material.skin(frequency)
+        if skin is None:
+            raise InputError(
+                f"expected smooth surfaces in a signature, got {type(item.material).__name__} for "
+                f"{name}; give a PerfectConductor, RoughConductor, Dielectric, RefractingBody or "
+                "Slab"
+            )
+        metal = torch.tensor(skin.permittivity is None)
+        epsilon = torch.ones(()) if skin.permittivity is None else skin.permittivity
+        values = (metal, epsilon.to(torch.complex128), *skin[1:])
+        for column, value in zip(columns, values, strict=True):
+            column.append(value.expand(len(item.mesh.faces)))
+    return Skins(*map(torch.cat, columns))
+
+
+def _warn(scene: Scene, body: _Body, density: float, spacing: float | None) -> None:
+    """Say where the physics ends."""
+    found: list[str] = []
+    if spacing is not None and density < 1:
+        found.append(f"{density:g} tubes per wavelength are too few: use 1 or more, better 4")
+    faces = body.topology.face_object
+    both = torch.nn.functional.pad(body.topology.beside, (0, 1), value=-1)[:, :2]
+    both = torch.where(both >= 0, both, both[:, :1])  # an open edge does not turn
+    normal = body.facets.normal.detach()
+    turn = 2 * torch.asin(
+        (0.5 * (normal[both[:, 0]] - normal[both[:, 1]]).norm(dim=1)).clamp_max(1)
+    )
+    ends = body.vertices.detach()[body.topology.edges]
+    # A triangle of side ℓ whose neighbours turn by α is ℓα/√12 off the curved surface.
+    off = (ends[:, 1] - ends[:, 0]).norm(dim=1) * turn / math.sqrt(12)
+    curved = (turn > _SMOOTH[0]) & (turn < _SMOOTH[1])
+    for number, name in enumerate(scene.objects):
+        own = faces == number
+        points = body.facets.corners.detach()[own].reshape(-1, 3)
+        size = float((points.amax(0) - points.amin(0)).norm())
+        if size < body.wavelength:
+            found.append(
+                f"{name} is {size / body.wavelength:.2g} wavelengths large: physical optics is for "
+                "objects of several"
+            )
+        mine = curved & own[both[:, 0]]
+        sagitta = float(off[mine].median()) / body.wavelength if bool(mine.any()) else 0.0
+        if sagitta > _SAGITTA:
+            found.append(
+                f"the facets of {name} are {sagitta:.2g} wavelengths off the curved surface, more "
+                "than 1/50: use a finer mesh"
+            )
+    for text in found:
+        warnings.warn(text, PhysicsWarning, stacklevel=3)

@@ -1,0 +1,255 @@
+"""Radar cross-sections that are known otherwise: closed forms, a series, a method of moments.
+
+Each is of a conductor as the built-in shape of its name stands, unturned, and serves as an oracle.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from numpy.typing import NDArray
+from scipy.special import hankel2, roots_legendre, spherical_jn, spherical_yn
+from torch import Tensor
+
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.limits import Positive
+from invertwin.scene.shapes import trihedral
+
+_PER_WAVELENGTH = 24  # segments of the method of moments
+_POINTS = 4  # of its quadrature on a segment
+_EULER = math.exp(np.euler_gamma)
+
+
+class CrossSection(ABC):
+    """σ over frequency and direction."""
+
+    @abstractmethod
+    def section(
+        self, frequencies: Float64[Tensor, " frequency"], directions: Float64[Tensor, "aspect 3"]
+    ) -> Float64[Tensor, "frequency aspect"]:
+        """Monostatic σ [m²].
+
+        Args:
+            frequencies: [Hz].
+            directions: unit vectors to the radar.
+        """
+
+
+def _wavelengths(frequencies: Tensor) -> Tensor:
+    return (SPEED_OF_LIGHT / frequencies)[:, None]
+
+
+@dataclass(frozen=True)
+class PlateSection(CrossSection):
+    """Physical optics of a rectangle: 4πA²/λ² cos²θ with a sin(x)/x along each side.
+
+    Attributes:
+        width: along x [m].
+        height: along y [m].
+    """
+
+    width: Positive
+    height: Positive
+
+    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
+        """σ [m²]."""
+        wavelength = _wavelengths(frequencies)
+        x, y, z = directions.T
+        lobes = [
+            torch.sinc(2 * side * part / wavelength)
+            for side, part in ((self.width, x), (self.height, y))
+        ]
+        peak = 4 * math.pi * (self.width * self.height / wavelength) ** 2
+        return peak * (z * lobes[0] * lobes[1]) ** 2
+
+
+@dataclass(frozen=True)
+class DihedralSection(CrossSection):
+    """Peak of two square plates at a right angle, two bounces at boresight: 8πa⁴/λ².
+
+    Attributes:
+        edge: of the plates [m].
+    """
+
+    edge: Positive
+
+    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
+        """σ [m²], that of boresight in all directions."""
+        peak = 8 * math.pi * self.edge**4 / _wavelengths(frequencies) ** 2
+        return peak.expand(-1, len(directions))
+
+
+@dataclass(frozen=True)
+class TrihedralSection(CrossSection):
+    """Triple bounces of a triangular corner: 4πA²/λ², A the area that comes back (Siegel).
+
+    With direction cosines l ≤ m ≤ n to the inner edges, A = a²·4lm/(l+m+n) where l + m ≤ n, else
+    a²(l + m + n − 2/(l + m + n)): 4πa⁴/3λ² at boresight.
+
+    Attributes:
+        edge: the three inner edges [m].
+    """
+
+    edge: Positive
+
+    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
+        """σ [m²]."""
+        tips = trihedral(self.edge).vertices[1:] / self.edge
+        low, middle, high = (directions @ tips.T).sort(dim=1).values.T
+        total = low + middle + high
+        narrow = 4 * low * middle / total
+        area = torch.where(low + middle <= high, narrow, total - 2 / total) * self.edge**2
+        return 4 * math.pi * (area / _wavelengths(frequencies)) ** 2
+
+
+@dataclass(frozen=True)
+class SquareTrihedralSection(CrossSection):
+    """Peak of a corner of three squares, three bounces at boresight: 12πa⁴/λ².
+
+    Attributes:
+        edge: of the squares [m].
+    """
+
+    edge: Positive
+
+    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
+        """σ [m²], that of boresight in all directions."""
+        peak = 12 * math.pi * self.edge**4 / _wavelengths(frequencies) ** 2
+        return peak.expand(-1, len(directions))
+
+
+@dataclass(frozen=True)
+class SphereSection(CrossSection):
+    """The Mie series of a conducting sphere.
+
+    ``S = (1/k) Σ (−1)ⁿ (n + ½) (b_n − a_n)``, a_n = j_n/h_n and b_n = (x j_n)′/(x h_n)′ at x = ka.
+
+    Attributes:
+        radius: [m].
+    """
+
+    radius: Positive
+
+    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
+        """σ [m²], the same in all directions."""
+        found = [self._of(2 * math.pi * f / SPEED_OF_LIGHT) for f in frequencies.tolist()]
+        return torch.tensor(found, dtype=torch.float64)[:, None].expand(-1, len(directions))
+
+    def _of(self, k: float) -> float:
+        x = k * self.radius
+        n = np.arange(1, int(x + 4 * x ** (1 / 3) + 12))
+        j, h = spherical_jn(n, x), spherical_jn(n, x) - 1j * spherical_yn(n, x)
+        dj = spherical_jn(n, x, derivative=True)
+        dh = dj - 1j * spherical_yn(n, x, derivative=True)
+        terms = (-1.0) ** n * (n + 0.5) * ((j + x * dj) / (h + x * dh) - j / h)
+        return float(4 * math.pi * abs(terms.sum() / k) ** 2)
+
+
+@dataclass(frozen=True)
+class DihedralByMoments(CrossSection):
+    """A square dihedral from the exact field of an endless one: a method of moments in the plane.
+
+    σ = (2a²/λ) σ_2D, for directions across the y axis. The ends of the plates along y, which the
+    plane does not have, are left out.
+
+    Attributes:
+        edge: of the plates [m].
+        polarisation: "V" = E along y, "H" = H along y.
+    """
+
+    edge: Positive
+    polarisation: Literal["V", "H"] = "V"
+
+    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
+        """σ [m²]."""
+        rows = []
+        flat = directions[:, [0, 2]].numpy()
+        for frequency in frequencies.tolist():
+            wavelength = SPEED_OF_LIGHT / frequency
+            nodes = self._nodes(wavelength)
+            solve = strip_along if self.polarisation == "V" else strip_across
+            width = solve(nodes, 2 * math.pi / wavelength, flat)
+            rows.append(torch.from_numpy(2 * self.edge**2 / wavelength * width))
+        return torch.stack(rows)
+
+    def _nodes(self, wavelength: float) -> NDArray[np.float64]:
+        """Corners of the segments, from one free edge by the crease to the other."""
+        count = math.ceil(self.edge / wavelength * _PER_WAVELENGTH)
+        along = np.linspace(-1, 1, 2 * count + 1) * self.edge / math.sqrt(2)
+        return np.column_stack([along, -np.abs(along)])
+
+
+def strip_along(
+    nodes: NDArray[np.float64], k: float, directions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """σ_2D [m] of a thin conductor, E along its axis: ∫ηJ k/4 H₀(k|r − r′|) dl′ = E, pulses.
+
+    Args:
+        nodes: corners of the segments in the plane [m].
+        k: wave number [1/m].
+        directions: to the radar, unit vectors in the plane.
+
+    Source: Harrington, Field Computation by Moment Methods, §3.2.
+    """
+    middle, length, _ = _segments(nodes)
+    current = np.linalg.inv(1j * k * _potentials(nodes, k))
+    wave = np.exp(1j * k * directions @ middle.T)
+    sent = np.einsum("ai,ij,aj,i->a", wave, current, wave, length)
+    return k / 4 * np.abs(sent) ** 2
+
+
+def strip_across(
+    nodes: NDArray[np.float64], k: float, directions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """σ_2D [m] of a thin conductor, H along its axis: mixed potentials, triangles about each node.
+
+    Args:
+        nodes, k, directions: as in ``strip_along``.
+
+    Source: Harrington, Field Computation by Moment Methods, §3.3.
+    """
+    middle, length, tangent = _segments(nodes)
+    green = _potentials(nodes, k)
+    # A triangle is half a pulse on either segment; its charge is +1/l on one, −1/l on the other.
+    count = len(length) - 1
+    pulse = np.zeros((count, len(length)))
+    charge = np.zeros((count, len(length)))
+    inner = np.arange(count)
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        pulse[inner, inner + side] = 0.5
+        charge[inner, inner + side] = sign
+    vector = (pulse * length) @ ((tangent @ tangent.T) * green) @ pulse.T
+    scalar = charge @ (green / length) @ charge.T
+    impedance = 1j * k * vector + scalar / (1j * k)
+    across = np.stack([-directions[:, 1], directions[:, 0]], 1)
+    wave = np.exp(1j * k * directions @ middle.T) * (across @ tangent.T) * length
+    driven = wave @ pulse.T
+    sent = np.einsum("ai,ij,aj->a", driven, np.linalg.inv(impedance), driven)
+    return k / 4 * np.abs(sent) ** 2
+
+
+def _segments(
+    nodes: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Middles, lengths and tangents."""
+    step = np.diff(nodes, axis=0)
+    length = np.linalg.norm(step, axis=1)
+    return (nodes[:-1] + nodes[1:]) / 2, length, step / length[:, None]
+
+
+def _potentials(nodes: NDArray[np.float64], k: float) -> NDArray[np.complex128]:
+    """∫ H₀(k|r_p − r′|)/4j dr′ over segment q at the middle of p; its own by the small argument."""
+    middle, length, tangent = _segments(nodes)
+    found = np.zeros((len(length), len(length)), dtype=np.complex128)
+    for at, weight in zip(*roots_legendre(_POINTS), strict=True):
+        place = middle + tangent * (length * at / 2)[:, None]
+        distance = np.linalg.norm(middle[:, None] - place, axis=2)
+        np.fill_diagonal(distance, 1.0)
+        found += weight / 2 * length * hankel2(0, k * distance) / 4j
+    own = 1 - 2j / np.pi * (np.log(_EULER * k * length / 4) - 1)
+    np.fill_diagonal(found, length / 4j * own)
+    return found

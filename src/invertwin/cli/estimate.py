@@ -1,0 +1,315 @@
+"""What a run needs, before it begins: memory by part, and how much there is to trace."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from invertwin.capture import Capture
+from invertwin.channel import Grid
+from invertwin.cli.run_file import about
+from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.errors import InputError
+from invertwin.inversion import require_edge
+from invertwin.memory import free_memory, gigabytes
+from invertwin.radar import SampledWaveform
+from invertwin.radar.radar import Radar
+from invertwin.radar.range_profile import fft_bins
+from invertwin.scene import Mesh, Object, Scene
+from invertwin.scene.scene import warn_of_mirrors
+
+# Bytes, measured as peaks of whole runs (benchmarks are in docs/limitations.md).
+_PROGRAM = 0.8e9  # the library, compiled kernels and the rays that are alive at a time
+_TRIANGLE = 700
+_POINT, _ROW = 250, 300  # of a rough surface; of a path in one frame
+_SAMPLE = 64  # of a beat signal
+_BIN, _FITTED_BIN = 60, 100  # of a recorded spectrum; of a map with its derivative
+_PHASOR = 32
+_COPY = 10_000  # of an object at another place
+_SIMULATED_RAYS = 2e6  # of the smooth map beside a simulation
+_MOST_RAYS = 1e13  # twelve days at 10⁷ a second
+_SIZES = ("max_edge", "divisions", "subdivisions", "spacing", "file", "parts", "shape")
+
+
+@dataclass(frozen=True)
+class Part:
+    """One thing that a run needs memory for.
+
+    Attributes:
+        name: What it is.
+        count: How many of them.
+        memory: Bytes.
+        key: Of the run file, to be lowered.
+    """
+
+    name: str
+    count: float
+    memory: float
+    key: str
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a run needs.
+
+    Attributes:
+        parts: What takes memory, the largest first.
+        maps: Smooth maps that are predicted.
+        rays: Samples of all of them.
+        rays_key: Key of the run file that has most to do with their number.
+        recordings: Exact signals that are simulated.
+        rows: Paths of all of them, times frames.
+    """
+
+    parts: tuple[Part, ...]
+    maps: float
+    rays: float
+    rays_key: str
+    recordings: float
+    rows: float
+
+    @property
+    def memory(self) -> float:
+        """Bytes at the peak."""
+        return _PROGRAM + sum(part.memory for part in self.parts)
+
+    def require(self) -> None:
+        """Refuse a run that this machine cannot do.
+
+        Raises:
+            InputError: More memory than is free, or more rays than anybody can trace.
+        """
+        free = free_memory()
+        if not self.memory <= free:
+            most = self.parts[0]
+            raise InputError(
+                f"{most.key}: expected a run within the {gigabytes(free)} of memory that are free, "
+                f"got an estimate of {gigabytes(self.memory)}, most of it for "
+                f"{min(most.count, 1e300):.3g} {most.name}; lower {most.key}, or give metres if "
+                "these are millimetres"
+            )
+        if not self.rays <= _MOST_RAYS:
+            raise InputError(
+                f"{self.rays_key}: expected at most {_MOST_RAYS:g} rays in all, got "
+                f"{min(self.rays, 1e300):.3g}; lower {self.rays_key}"
+            )
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What measures.
+
+    Attributes:
+        run: The run file as it is for this sensor.
+        radar, grid: What its tables make.
+        capture: What it has recorded; None where that is simulated.
+    """
+
+    run: RunFile
+    radar: Radar
+    grid: Grid
+    capture: Capture | None = None
+
+
+def estimate_of(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> Estimate:
+    """What a run needs, from its tables and what they make: nothing is traced.
+
+    Args:
+        run: The run file.
+        truth: Its true scene.
+        sensors: By name; a run without `[observations]` has one without a name.
+
+    Raises:
+        InputError: Too many starts, or a stage that makes too many triangles.
+    """
+    _require_stated(run, truth)
+    parts, rows, one_channel = [_triangles(run, truth)], 0.0, 0.0
+    for name, sensor in sensors.items():
+        found, traced = of_sensor(sensor, truth)
+        parts += [_at(f"observations.{name}.", part) if name else part for part in found]
+        rows += traced
+        one_channel += traced / math.prod(sensor.radar.shape)
+    parts += _of_fits(run, sensors)
+    again = _recordings(run)
+    recordings, rows = again * len(sensors), rows * again
+    if run.landscape is not None:
+        rows += run.landscape.exact_points * one_channel
+    ordered = sorted(parts, key=lambda part: -part.memory)
+    kept = tuple(part for part in ordered if part.memory)
+    return Estimate(kept, *_rays(run), recordings, rows)
+
+
+def require_room(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> None:
+    """Refuse a run that this machine cannot do; arguments and errors as of `estimate_of`."""
+    for sensor in sensors.values():
+        warn_of_mirrors(truth, sensor.radar.waveform.center_frequency)
+    estimate_of(run, truth, sensors).require()
+
+
+def _at(path: str, part: Part) -> Part:
+    return replace(part, key=f"{path}{part.key}")
+
+
+def _triangles(run: RunFile, scene: Scene) -> Part:
+    counts = {name: len(item.mesh.faces) for name, item in scene.objects.items()}
+    name = max(counts, key=lambda name: counts[name])
+    key, total = "scene_file.file", sum(counts.values())
+    if name in run.scene:
+        size = next(size for size in _SIZES if hasattr(run.scene[name], size))
+        key = f"scene.{name}.{size}"
+    return Part("triangles", total, total * _TRIANGLE, key)
+
+
+def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
+    """What the data of one sensor need, and how many paths they have over all frames.
+
+    Args:
+        sensor: What measures.
+        scene: What it measures.
+    """
+    run, radar, grid = sensor.run, sensor.radar, sensor.grid
+    frames, senders, receivers = radar.shape
+    channels, chirps = senders * receivers, run.chirps.count if run.chirps else 1
+    across, bins = grid.u_count + grid.v_count, math.prod(grid.shape)
+    beams = bins // grid.range_count if not _separable(radar) else across
+    counts = {"radar.positions": frames, "grid.range_max": grid.range_count}
+    counts |= {"grid.u_max": grid.u_count, "grid.v_max": grid.v_count}
+    largest = max(counts, key=lambda name: counts[name])
+    parts = [
+        Part("bins of a map over all frames", bins * frames, bins * frames * _BIN, largest),
+        Part(
+            "phases of beams and antennas",
+            beams * channels,
+            beams * channels * _PHASOR,
+            "grid.u_max",
+        ),
+    ]
+    rows = 0.0
+    if isinstance(radar.waveform, SampledWaveform):
+        samples = radar.waveform.samples
+        taken = {"chirps.count": chirps, "radar.positions": frames, "radar.receivers": channels}
+        taken["radar.waveform"] = samples
+        beat = math.prod(taken.values())
+        most = max(taken, key=lambda name: taken[name])
+        parts.append(Part("samples of beat signals", beat, beat * _SAMPLE, most))
+        if fft_bins(radar.waveform, grid) is None:
+            count = samples * grid.range_count
+            parts.append(
+                Part("phases of samples and ranges", count, count * _PHASOR, "grid.range_max")
+            )
+    if isinstance(run.data, SimulatedData):
+        for part, traced in _of_simulation(run.data, scene, frames):
+            parts.append(part)
+            again = chirps if run.chirps is not None and run.chirps.retrace else 1
+            rows += traced * again
+    return parts, rows
+
+
+def _of_simulation(data: SimulatedData, scene: Scene, frames: int) -> Iterator[tuple[Part, float]]:
+    """Paths of exact signals, and how many there are over all frames."""
+    rough = [item for item in scene.objects.values() if not item.material.coherent]
+    area = sum(_area(Mesh(item.vertices.detach(), item.mesh.faces)) for item in rough)
+    points = area * data.points_per_m2
+    each = _POINT + frames * _ROW
+    name = f"points on {area:.3g} m² of rough surfaces"
+    yield Part(name, points, points * each, "data.points_per_m2"), points * frames
+    if len(rough) < len(scene.objects):
+        rows = data.samples * frames
+        yield Part("points on conductors", data.samples, rows * _ROW, "data.samples"), rows
+    if data.depth > 1:
+        drawn = data.rough_paths * (data.depth - 1)
+        kept = drawn / 4 * frames
+        memory = drawn * _POINT + kept * _ROW
+        yield Part("paths of several bounces", drawn, memory, "data.rough_paths"), drawn + kept
+
+
+def _of_fits(run: RunFile, sensors: Mapping[str, Sensor]) -> Iterator[Part]:
+    """What fits and checks of derivatives keep, beside the data."""
+    copies = (run.starts.count if run.starts else 1) * (1 + len(run.variants))
+    key = "starts.count" if run.starts else "variants"
+    yield Part("starts", copies, copies * _COPY, key)
+    if run.landscape is not None:
+        points = run.landscape.points + run.landscape.exact_points
+        yield Part("points of a landscape", points, points * 100, "landscape.exact_points")
+    for name, sensor in sensors.items():
+        bins, frames = math.prod(sensor.grid.shape), sensor.radar.frame_count
+        path = f"observations.{name}." if name else ""
+        if run.gradcheck is not None:
+            maps = 4 * run.gradcheck.repeats + run.gradcheck.max_pairs
+            count = maps * bins * frames
+            most = max(("repeats", "max_pairs"), key=lambda key: getattr(run.gradcheck, key))
+            yield Part("bins of maps to compare", count, count * 8, f"gradcheck.{most}")
+        if run.reconstruct is not None:
+            used = max(min(own.frames_per_step or frames, frames) for own in _budgets(run))
+            count = bins * used
+            yield Part("bins of a fitted map", count, count * _FITTED_BIN, f"{path}grid.range_max")
+
+
+def _rays(run: RunFile) -> tuple[float, float, str]:
+    """Smooth maps, samples of all of them, and the key that says most of these."""
+    if run.task == "gradcheck" and run.gradcheck is not None:
+        table = run.gradcheck
+        ends, slopes = 4 * table.max_pairs, 4 * table.repeats
+        far = ends * table.difference_samples
+        near = slopes * (table.samples + table.boundary_samples)
+        key = "difference_samples" if far > near else "samples"
+        return ends + slopes, far + near, f"gradcheck.{key}"
+    own = run.reconstruct
+    if run.task == "simulate" or own is None:
+        return 1, _SIMULATED_RAYS, "data.samples"
+    each = (run.starts.count if run.starts else 1) * max(1, len(run.observations))
+    maps = each * sum(part.steps for part in _budgets(run))
+    rays = each * sum(part.steps * (part.samples + part.boundary_samples) for part in _budgets(run))
+    if run.landscape is not None:
+        maps += 2 * run.landscape.points
+        rays += 2 * run.landscape.points * own.samples
+    counts = {"starts.count": each, "reconstruct.steps": own.steps}
+    counts |= {"reconstruct.samples": own.samples / 1000}  # a thousand rays are no step
+    return maps, rays, max(counts, key=lambda name: counts[name])
+
+
+def _budgets(run: RunFile) -> list[Any]:
+    """The `[reconstruct]` of every stage of every way to fit."""
+    ways = [run, *(run.varied(variant) for variant in run.variants.values())]
+    runs = [own for way in ways for own in [run.varied(stage) for stage in way.stages] or [way]]
+    return [own.reconstruct for own in runs if own.reconstruct is not None]
+
+
+def _recordings(run: RunFile) -> int:
+    """How often data are simulated."""
+    if not isinstance(run.data, SimulatedData):
+        return 1
+    anew = run.starts.count if run.data.every_start and run.starts is not None else 1
+    return anew + (run.plan.fits if run.plan is not None else 0)
+
+
+def _require_stated(run: RunFile, scene: Scene) -> None:
+    """Refuse starts and stages beyond the limits of what makes them, before any of them begins."""
+    chance = torch.Generator()
+    for section, more in (("starts", {"generator": chance}), ("search", {})):
+        table = getattr(run, section)
+        if table is not None:
+            given = {Object: scene[table.object], torch.Generator: chance}
+            with about(section):
+                next(iter(table.build(given, **more)), None)
+    free = [table.object for table in run.parameters if table.kind == "vertices"]
+    for i, stage in enumerate(run.stages):
+        for name in free if stage.remesh else ():
+            with about(f"stages[{i}].remesh"):
+                require_edge(scene[name].mesh, stage.remesh or 0.0)
+
+
+def _separable(radar: Radar) -> bool:
+    """Whether the virtual array is a product of a row and a column."""
+    places = radar.virtual_positions / (1e-3 * radar.waveform.wavelength)
+    x, y, both = (
+        len(part.round().unique(dim=0)) for part in (places[:, :1], places[:, 1:2], places)
+    )
+    return x * y == both
+
+
+def _area(mesh: Mesh) -> float:
+    a, b, c = mesh.vertices[mesh.faces].unbind(1)
+    return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())

@@ -1,0 +1,132 @@
+"""`invertwin check`: what a run file needs, memory and time, before anything is done."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import torch
+
+from invertwin.channel import Sampling
+from invertwin.cli import build
+from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor
+from invertwin.cli.fits.problem import sensors_of
+from invertwin.cli.recordings import chirp_capture
+from invertwin.cli.report import Table, texts
+from invertwin.cli.run_file import need
+from invertwin.cli.run_simulate import chirp_train, exact
+from invertwin.cli.running import time_left
+from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.shape_tables import Mover
+from invertwin.memory import free_memory, gigabytes
+from invertwin.models import SurrogateMap
+from invertwin.scene import Scene, Translation
+
+_FRAMES = 4  # of the radar, in the probe
+_FEW, _MANY = 10_000, 100_000  # rays or paths that are timed: less than a second of work
+_FITS = ("reconstruct", "demo")
+
+
+def run_check(run: RunFile) -> tuple[list[Table], str]:
+    """Tables of what a run needs and of its meshes, and a line with its time.
+
+    Raises:
+        InputError: What the run's own command refuses before it begins.
+    """
+    truth, sensors = build.true_scene(run), _sensors(run)
+    build.parameters(
+        [table for table in run.parameters if not isinstance(table, Mover)],
+        build.scene(run),
+        run.scene,
+    )
+    found = estimate_of(run, truth, sensors)
+    found.require()
+    seconds = _seconds(run, found, truth, sensors)
+    rows = [[part.name, part.count, part.memory / 1e9, part.key] for part in found.parts]
+    heads = ("needs", "how many", "GB", "key")
+    line = (
+        f"about {gigabytes(found.memory)} of {gigabytes(free_memory())} free, and "
+        f"{time_left(seconds)} for {found.rays:.2g} rays and {found.rows:.2g} paths"
+    )
+    return [Table("Estimate", heads, rows, texts("notes")["estimate"]), _meshes(truth)], line
+
+
+def _meshes(scene: Scene) -> Table:
+    heads = ("object", "size [m]", "triangles", "open edges", "non-manifold edges")
+    rows = []
+    for name, item in scene.objects.items():
+        found = item.mesh.summary()
+        edges = found.open_edges, found.nonmanifold_edges
+        rows.append([name, list(found.extent), found.triangles, *edges])
+    return Table("Meshes", heads, rows)
+
+
+def _sensors(run: RunFile) -> Mapping[str, Sensor]:
+    mover = isinstance(next(iter(run.parameters), None), Mover)
+    measured = run.data is not None and not isinstance(run.data, SimulatedData)
+    if run.task in _FITS and not mover:
+        return sensors_of(run)
+    table = need(run, "grid", run.task)
+    radar = (
+        chirp_capture(run.data).device if measured else build.radar(need(run, "radar", run.task))
+    )
+    return {"": Sensor(run, radar, build.grid(table, radar))}
+
+
+def _seconds(run: RunFile, found: Estimate, truth: Scene, sensors: Mapping[str, Sensor]) -> float:
+    """Time of the run, from the time of a few rays and a few paths on this machine."""
+    whole, settings = next(iter(sensors.values())), run.gradcheck or run.reconstruct
+    depth = settings.depth if settings else run.data.depth if run.data else 1
+    frames = whole.radar.frame_count
+    sensor = replace(whole, radar=whole.radar.frames(range(min(_FRAMES, frames))))
+    still = Scene({name: replace(item, velocity=None) for name, item in truth.objects.items()})
+    each, ray = _line(lambda count: _map(sensor, still, depth, count, run.task != "simulate"))
+    used = min(getattr(settings, "frames_per_step", None) or frames, frames)
+    seconds = found.maps * each * used / sensor.radar.frame_count + found.rays * ray
+    if found.rows:
+        each, row = _line(lambda count: _signals(sensor, truth, count))
+        each *= frames / sensor.radar.frame_count
+        seconds += found.recordings * each + found.rows * row
+    return seconds
+
+
+def _line(work: Callable[[int], float]) -> tuple[float, float]:
+    """Seconds that work takes at least, and more of them for each ray or path."""
+    work(_FEW)  # compiled now
+    times, counts = [time.perf_counter()], []
+    for count in (_FEW, _MANY):
+        counts.append(work(count))
+        times.append(time.perf_counter())
+    first, last = times[1] - times[0], times[2] - times[1]
+    slope = max(0.0, last - first) / max(1.0, counts[1] - counts[0])
+    return max(0.0, first - slope * counts[0]), slope
+
+
+def _map(sensor: Sensor, truth: Scene, depth: int, count: int, fitted: bool) -> float:
+    """Predict a smooth map, with its derivative where it is fitted; return the number of rays."""
+    rays, edges = round(0.8 * count), round(0.2 * count)
+    sampling = Sampling(depth=depth, samples=rays, boundary_samples=edges, boundary=fitted)
+    model = SurrogateMap(sensor.grid, build.made(sensor.run, "surrogate"), sampling)
+    module = Translation(truth.names[0])
+    with torch.set_grad_enabled(fitted):
+        found = model.predict(module(truth) if fitted else truth, sensor.radar, 0)
+        if found.requires_grad:
+            found.sum().backward()
+    return count
+
+
+def _signals(sensor: Sensor, truth: Scene, count: int) -> float:
+    """Simulate exact signals of about so many paths; return their number."""
+    data, whole = need(sensor.run, "data", "a simulation"), of_sensor(sensor, truth)[1]
+    share = min(1.0, count / whole)
+    fewer = {
+        "points_per_m2": data.points_per_m2 * share,
+        "samples": max(1, round(data.samples * share)),
+        "rough_paths": max(1, round(data.rough_paths * share)),
+        "every_start": False,
+    }
+    run = sensor.run.model_copy(update={"data": data.model_copy(update=fewer)})
+    if run.chirps is None:
+        exact(run, truth, sensor.radar, sensor.grid)
+    else:
+        chirp_train(run, truth, sensor.radar, run.chirps.build())
+    return whole * share

@@ -1,0 +1,81 @@
+"""One setting of threads for the whole process: how many there are, and how they wait.
+
+Dr.Jit, torch, OpenMP and BLAS each start a thread for every core of the machine. A thread without
+work spins for a while, so that the next piece begins sooner. On a machine that others use too, that
+takes the cores from the threads that have work. So threads sleep while they wait, and none of the
+libraries starts more of them than this process may use cores.
+"""
+
+import math
+import os
+from pathlib import Path
+
+#: What tells libraries how their threads wait, read when they are loaded.
+_WAITING = {
+    "OMP_WAIT_POLICY": "PASSIVE",
+    "GOMP_SPINCOUNT": "0",  # GNU OpenMP: of torch and finufft
+    "KMP_BLOCKTIME": "0",  # OpenMP of Intel and LLVM
+    "OPENBLAS_THREAD_TIMEOUT": "4",  # its least: 2⁴ turns
+}
+_COUNTS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+_GROUPS = Path("/sys/fs/cgroup")
+
+
+def prepare() -> None:
+    """Set the environment that libraries read while they are loaded; what is set already stays.
+
+    ``import invertwin`` calls it. Libraries that were imported earlier keep their own ways.
+    """
+    count = str(available())
+    for name, value in (_WAITING | dict.fromkeys(_COUNTS, count)).items():
+        os.environ.setdefault(name, value)
+
+
+def available() -> int:
+    """Threads that work at once here: cores that the process may use, or ``OMP_NUM_THREADS``.
+
+    Counted are the affinity mask and the quota of the control group.
+    """
+    asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
+    if asked.isdecimal() and int(asked) > 0:
+        return int(asked)
+    found = getattr(os, "sched_getaffinity", None)
+    cores = len(found(0)) if found else os.cpu_count() or 1
+    return max(1, math.ceil(min(cores, quota())))
+
+
+def quota(listing: Path = Path("/proc/self/cgroup"), root: Path = _GROUPS) -> float:
+    """Cores that the control groups of this process grant it, infinite where they do not say.
+
+    Args:
+        listing: Names the groups of the process.
+        root: Where their files are.
+    """
+    least = math.inf
+    for line in _text(listing).splitlines():
+        _, kinds, name = line.split(":", 2)
+        if kinds and "cpu" not in kinds.split(","):
+            continue
+        top = root / kinds if kinds else root
+        inside = top / name.lstrip("/")
+        # A container sees its own group as the root, whatever name it has outside.
+        for folder in (inside, *inside.parents, root / "cpu", root):
+            if folder == root or root in folder.parents:
+                least = min(least, _granted(folder))
+    return least
+
+
+def _granted(folder: Path) -> float:
+    words = _text(folder / "cpu.max").split()  # version 2
+    if not words:
+        words = [_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
+    if len(words) == 2 and all(word.isdecimal() for word in words) and int(words[1]) > 0:
+        return int(words[0]) / int(words[1])
+    return math.inf
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text()
+    except OSError:
+        return ""

@@ -1,0 +1,518 @@
+"""Signatures: laws of waves first, then targets that are known."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invertwin.channel import SphereSection, trace_signature
+from invertwin.channel.field import signature
+from invertwin.channel.field.beams import clip
+from invertwin.channel.field.waves import (
+    Skins,
+    area_vector,
+    dot,
+    mirrored,
+    polarisations,
+    polygon_integral,
+    radiated,
+    reflected,
+)
+from invertwin.channel.field.wedges import Wedges, fringe_field
+from invertwin.channel.reference.cross_sections import strip_across, strip_along
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError, PhysicsWarning
+from invertwin.scene import (
+    Cloud,
+    Dielectric,
+    Mesh,
+    Object,
+    PerfectConductor,
+    RoughDielectric,
+    Scene,
+    Slab,
+    box,
+    dihedral,
+    plate,
+    rigid,
+    rotation_from_vector,
+    sphere,
+    trihedral,
+)
+from invertwin.scene.material.fresnel import fresnel_coefficients
+from invertwin.scene.material.slab import slab_coefficients
+from scenes import float64
+
+METAL = PerfectConductor()
+WAVELENGTH = 0.01
+FREQUENCY = SPEED_OF_LIGHT / WAVELENGTH
+K = 2 * math.pi / WAVELENGTH
+UP = float64([0.0, 1.0, 0.0])
+
+
+def traced(scene: Scene, directions: object, receivers: Tensor | None = None, **options) -> dict:
+    """All parts of S at one frequency, [aspect, 2, 2] each."""
+    given: dict[str, Any] = {
+        "depth": 3,
+        "edges": 0,
+        "tubes_per_wavelength": 8.0,
+        "up": UP,
+    } | options
+    frequencies = float64([given.pop("frequency", FREQUENCY)])
+    toward = normalize(torch.as_tensor(directions, dtype=torch.float64), dim=1)
+    found = trace_signature(scene, toward, receivers, frequencies, **given)
+    return {name: part[0] for name, part in found.items()}
+
+
+def total(*arguments, **options) -> Tensor:
+    return torch.stack([*traced(*arguments, **options).values()]).sum(0)
+
+
+def metal(mesh: Mesh, pose: Tensor | None = None) -> Scene:
+    return Scene({"target": Object(mesh, METAL, pose)})
+
+
+def turned(x: float, y: float, z: float, place: object = (0.0, 0.0, 0.0)) -> Tensor:
+    return rigid(rotation_from_vector(float64([x, y, z])), float64(place))
+
+
+def random_directions(count: int, seed: int = 0) -> Tensor:
+    return normalize(torch.from_numpy(np.random.default_rng(seed).normal(size=(count, 3))), dim=1)
+
+
+def dbsm(amplitude: Tensor) -> Tensor:
+    return 10 * torch.log10(4 * math.pi * amplitude.abs() ** 2)
+
+
+def crowd(kind: str) -> Scene:
+    """Small scenes with shadows and several bounces."""
+    leaf = turned(0.3, 0.2, 0.1, (0.02, 0.01, -0.06))
+    if kind == "metal":
+        return Scene(
+            {
+                "corner": Object(trihedral(0.05), METAL),
+                "leaf": Object(plate(0.02, 0.03), METAL, leaf),
+            }
+        )
+    if kind == "solid":
+        return Scene(
+            {"floor": Object(plate(0.08, 0.08), METAL), "box": Object(box(0.03), METAL, leaf)}
+        )
+    return Scene(
+        {
+            "corner": Object(dihedral(0.04), Dielectric(4.0, 0.1, rms_height=3e-4)),
+            "leaf": Object(plate(0.02, 0.03), Slab(3.0, thickness=2e-3), leaf),
+        }
+    )
+
+
+# Integrals and clipping.
+
+
+def test_polygon_integral_agrees_with_a_fine_sum():
+    corners = float64([[0, 0, 0], [1, 0.2, 0.1], [1.2, 1.1, 0.5], [0.1, 0.9, 0.4]])
+    middle, u, v = corners[0], corners[1], corners[3]
+    quad = torch.stack([middle, u, u + v, v])[None]  # a flat parallelogram
+    steps = (torch.arange(400, dtype=torch.float64) + 0.5) / 400
+    s, t = torch.meshgrid(steps, steps, indexing="ij")
+    points = s[..., None] * u + t[..., None] * v
+    for wave in ([3.0, -2.0, 1.0], [0.0, 0.0, 0.0], [40.0, 10.0, -5.0]):
+        w = float64([wave])
+        sum_ = torch.exp(1j * (points @ w[0])).mean() * torch.linalg.cross(u, v).norm()
+        assert abs(complex(polygon_integral(quad, w)(1.0)[0] - sum_)) < 2e-4
+
+
+def test_polygon_integral_is_smooth_where_the_wave_is_broadside():
+    triangle = float64([[[0, 0, 0], [1, 0, 0], [0, 2, 0]]])
+    values = [
+        complex(polygon_integral(triangle, float64([[x, 0.4 * x, 7.0]]))(1.0)[0])
+        for x in (9.0e-4, 9.6e-4, 1e-3)
+    ]
+    slope = (values[2] - values[0]) / 1e-4
+    assert abs(values[1] - values[0] - 0.6e-4 * slope) < 1e-9
+
+
+def test_clipping_keeps_what_is_in_front():
+    square = float64([[[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]]).repeat(3, 1, 1)
+    normal = float64([[1, 0, 0]]).repeat(3, 1)
+    part = clip(square, normal, float64([0.25, -1.0, 2.0]))
+    assert torch.allclose(area_vector(part).norm(dim=1), float64([0.75, 1.0, 0.0]))
+
+
+# The laws at a surface.
+
+
+def skins(**values: object) -> Skins:
+    given = {
+        "conducting": False,
+        "permittivity": 1 + 0j,
+        "thickness": math.inf,
+        "coherent": 1.0,
+        "rms_height": 0.0,
+    } | values
+    kinds = [torch.bool, torch.complex128, *[torch.float64] * 3]
+    columns = zip(given.values(), kinds, strict=True)
+    return Skins(*(torch.tensor([value], dtype=kind) for value, kind in columns))
+
+
+def incident(angle: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Normal, direction, and the fields across and in the plane of incidence."""
+    direction = float64([[math.sin(angle), 0, -math.cos(angle)]])
+    fields = torch.stack([float64([0, 1, 0]), float64([math.cos(angle), 0, math.sin(angle)])])
+    return float64([[0, 0, 1]]), direction, fields[None].to(torch.complex128)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.2])
+@pytest.mark.parametrize("kind", ["metal", "body", "sheet"])
+def test_what_a_surface_sends_to_its_mirror_direction_is_its_reflection(kind, angle):
+    """(jk/2π) cosθ per m² of the reflected field: a patch in the far field of an endless plane."""
+    normal, direction, field = incident(angle)
+    own = {
+        "metal": skins(conducting=True),
+        "body": skins(permittivity=4 - 0.5j),
+        "sheet": skins(permittivity=3 - 0.1j, thickness=2.3e-3),
+    }[kind]
+    onwards = mirrored(direction, normal)
+    sent = radiated(own, K, normal, direction, field, onwards)
+    back = reflected(own, K, normal, direction, field)
+    expected = 1j * K / (2 * math.pi) * math.cos(angle) * back
+    assert torch.allclose(sent, expected, atol=1e-9 * K)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.2])
+def test_reflection_coefficients_are_those_of_the_materials(angle):
+    normal, direction, field = incident(angle)
+    cosine = float64([math.cos(angle)])
+    half = fresnel_coefficients(torch.tensor([4 - 0.5j], dtype=torch.complex128), cosine)
+    layer = Slab(3.0, 0.05, thickness=2.3e-3)
+    sheet = slab_coefficients([layer.sheet(FREQUENCY)], cosine, FREQUENCY)
+    epsilon = complex(layer.complex_permittivity(FREQUENCY))
+    front = np.exp(1j * K * math.cos(angle) * 2.3e-3)  # from the middle to the face
+    for own, found, turn in (
+        (skins(permittivity=4 - 0.5j), half, 1.0),
+        (skins(permittivity=epsilon, thickness=2.3e-3), sheet, front),
+    ):
+        back = reflected(own, K, normal, direction, field)
+        assert abs(complex(back[0, 0, 1]) - complex(found.reflection_s) * turn) < 1e-9
+        # A conductor has r_p = 1, which turns the part along the surface over.
+        after = float64([-math.cos(angle), 0, math.sin(angle)])
+        assert abs(complex(dot(back[0, 1], after)) - complex(found.reflection_p) * turn) < 1e-9
+
+
+def test_a_sheet_takes_from_the_wave_behind_it_what_does_not_pass():
+    """Forward, the polarisation current sends (jk/2π) cosθ (T − 1): an endless sheet's shadow."""
+    angle, thickness = 0.5, 2.3e-3
+    normal, direction, field = incident(angle)
+    layer = Slab(3.0, 0.05, thickness=thickness)
+    passed = slab_coefficients([layer.sheet(FREQUENCY)], float64([math.cos(angle)]), FREQUENCY)
+    epsilon = complex(layer.complex_permittivity(FREQUENCY))
+    own = skins(permittivity=epsilon, thickness=thickness)
+    sent = radiated(own, K, normal, direction, field, direction)
+    through = np.exp(1j * K * math.cos(angle) * thickness)
+    for number, t in enumerate((passed.transmission_s, passed.transmission_p)):
+        lost = complex(t) * through - 1
+        expected = 1j * K / (2 * math.pi) * math.cos(angle) * lost * field[0, number]
+        assert torch.allclose(sent[0, number], expected, atol=1e-9 * K)
+
+
+def test_a_thin_sheet_of_high_permittivity_reflects_like_its_impedance():
+    """h → 0 with (ε−1)h fixed: r_s = −x/(cosθ + x), x = jk(ε−1)h/2."""
+    normal, direction, field = incident(0.6)
+    load, thickness = 0.8j, 1e-9
+    own = skins(permittivity=1 + load / (0.5j * K * thickness), thickness=thickness)
+    back = reflected(own, K, normal, direction, field)
+    assert abs(complex(back[0, 0, 1]) + load / (math.cos(0.6) + load)) < 1e-4
+
+
+def test_roughness_takes_its_share_of_the_coherent_power():
+    normal, direction, field = incident(0.5)
+    own = skins(conducting=True, rms_height=5e-4, coherent=0.8)
+    power = reflected(own, K, normal, direction, field).abs().square().sum(2) / 0.64
+    expected = math.exp(-((2 * K * 5e-4 * math.cos(0.5)) ** 2))
+    assert torch.allclose(power, torch.full_like(power, expected))
+
+
+@pytest.mark.parametrize("kind", ["metal", "sheet"])
+def test_roughness_leaves_the_shadow_and_takes_from_the_flash(kind):
+    normal, direction, field = incident(0.5)
+    own = {"conducting": True} if kind == "metal" else {"permittivity": 3, "thickness": 2e-3}
+    smooth, rough = skins(**own), skins(**own, rms_height=5e-4)
+    lost = math.exp(-0.5 * (2 * K * 5e-4 * math.cos(0.5)) ** 2)
+    for towards, expected in ((direction, 1.0), (mirrored(direction, normal), lost)):
+        sent = [radiated(s, K, normal, direction, field, towards) for s in (smooth, rough)]
+        assert torch.allclose(sent[1], sent[0] * expected)
+
+
+def test_polarisations_are_right_handed_and_of_unit_length():
+    directions = torch.cat([random_directions(20), UP[None], -UP[None]])
+    v, h = polarisations(directions, UP).unbind(1)
+    assert torch.allclose(torch.linalg.cross(v, h), directions)
+    assert torch.allclose(dot(h, UP.expand_as(h)), torch.zeros(22, dtype=torch.float64))
+
+
+# Edges.
+
+
+def half_plane(angle: float) -> tuple[Wedges, Tensor, Tensor, Tensor]:
+    """A metre of edge along y of the half plane z = 0, x > 0, seen from an angle off the plane."""
+    ends = float64([[0, -0.5, 0]]), float64([[0, 0.5, 0]])
+    inwards = float64([[[1, 0, 0], [1, 0, 0]]])
+    normals = float64([[[0, 0, 1], [0, 0, -1]]])
+    wedge = Wedges(*ends, inwards, normals, float64([2.0]), torch.tensor([0]))
+    towards = float64([[math.cos(angle), 0, math.sin(angle)]])
+    fields = torch.stack([float64([0, 1, 0]), torch.linalg.cross(float64([0, 1, 0]), towards[0])])
+    return wedge, -towards, fields[None], towards
+
+
+@pytest.mark.parametrize("angle", [math.pi / 2, math.pi / 4, 2.0, 2.8])
+def test_fringe_of_a_half_plane_is_keller_less_physical_optics(angle):
+    """Back to the source, f = ½(1/cosφ − 1) and g = ½(−1/cosφ − 1), optics ±½ tanφ (Ufimtsev)."""
+    wedge, direction, fields, towards = half_plane(angle)
+    sent = fringe_field(wedge, K, direction, fields, towards)
+    soft, hard = (complex(dot(sent[0, i], fields[0, i])) * 2 * math.pi for i in (0, 1))
+    # E of the hard wave turns over on its way back.
+    assert soft - hard == pytest.approx(-1, abs=1e-5)
+    if angle != math.pi / 2:
+        expected = 0.5 * (1 / math.cos(angle) - 1 - math.tan(angle))
+        assert soft == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_wave_along_the_face_of_a_wedge_is_no_pole():
+    wedge, _, fields, _ = half_plane(math.pi / 2)
+    for angle in (math.pi / 2 - 1e-7, math.pi / 2, math.pi / 2 + 1e-7):
+        towards = half_plane(angle)[3]
+        sent = fringe_field(wedge, K, -towards, fields, towards)
+        assert torch.isfinite(sent).all()
+        assert sent.abs().max() < 1.0
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+def test_edges_bring_a_plate_to_the_method_of_moments(channel):
+    """A strip of 4 wavelengths, 15 long, 20° to 60° off its flash: with E and H along it."""
+    width, height = 4 * WAVELENGTH, 15 * WAVELENGTH
+    angles = torch.deg2rad(torch.linspace(20, 60, 41, dtype=torch.float64))
+    directions = torch.stack([angles.sin(), torch.zeros_like(angles), -angles.cos()], 1)
+    line = np.linspace(-0.5, 0.5, 97)[:, None] * [width, 0.0]
+    solve = (strip_along, strip_across)[channel]
+    exact = torch.from_numpy(solve(line, K, directions[:, [0, 2]].numpy()))
+    exact = 10 * torch.log10(2 * height**2 / WAVELENGTH * exact)
+    parts = traced(metal(plate(width, height)), directions, depth=1, edges=2)
+    strength = [parts["order 1"], parts["order 1"] + parts["edges 1"]]
+    strength.append(torch.stack([*parts.values()]).sum(0))
+    errors = [float((dbsm(s[:, channel, channel]) - exact).abs().mean()) for s in strength]
+    assert errors[0] > 3
+    assert errors[1] < (0.6, 2.5)[channel]
+    assert errors[2] < (0.6, 1.0)[channel]
+
+
+def test_creases_between_facets_of_a_flat_or_smooth_surface_are_no_edges():
+    ball = traced(metal(sphere(0.03, 4)), random_directions(3), depth=1, edges=1)
+    assert float(ball["edges 1"].abs().max()) == 0
+    fine, coarse = (
+        total(metal(plate(0.05, 0.05, divisions=n)), [[0.3, 0.1, -1.0]], depth=1, edges=2)
+        for n in (1, 3)
+    )
+    assert torch.allclose(fine, coarse, rtol=1e-6)
+
+
+# Every bounce.
+
+
+def test_closed_forms_at_boresight():
+    ahead = [[0.0, 0.0, -1.0]]
+    a = 0.1
+    for scene, expected, tolerance in (
+        (metal(plate(a, a)), 4 * math.pi * a**4 / WAVELENGTH**2, 1e-6),
+        (metal(dihedral(a)), 8 * math.pi * a**4 / WAVELENGTH**2, 0.1),
+        (metal(trihedral(a)), 4 * math.pi * a**4 / 3 / WAVELENGTH**2, 0.13),
+    ):
+        found = dbsm(total(scene, ahead)[0].diagonal())
+        assert float((found - 10 * math.log10(expected)).abs().max()) < tolerance
+
+
+def test_a_rolled_dihedral_turns_the_polarisation():
+    found = total(metal(dihedral(0.1), turned(0, 0, math.pi / 4)), [[0.0, 0.0, -1.0]])[0]
+    expected = 10 * math.log10(8 * math.pi * 0.1**4 / WAVELENGTH**2)
+    assert float(dbsm(found[0, 1])) == pytest.approx(expected, abs=0.01)
+    assert float(dbsm(found[0, 0])) < expected - 35
+
+
+def test_sphere_is_that_of_mie():
+    ka, radius = 10.0, 0.05
+    frequency = ka / radius * SPEED_OF_LIGHT / (2 * math.pi)
+    direction = random_directions(1)
+    found = total(metal(sphere(radius, 5)), direction, depth=1, frequency=frequency)[0]
+    exact = SphereSection(radius).section(float64([frequency]), direction)
+    error = dbsm(found.diagonal()) - 10 * torch.log10(exact[0])
+    assert float(error.abs().max()) < 0.1
+    assert float(found[0, 1].abs() / found[0, 0].abs()) < 1e-3
+
+
+@pytest.mark.parametrize("kind", ["metal", "solid", "dielectric"])
+def test_tubes_agree_with_beams(kind, monkeypatch):
+    """One meaning, two ways, in shadows and with separate antennas."""
+    sent, received = random_directions(8, 1), random_directions(8, 2)
+    exact = traced(crowd(kind), sent, received)
+    monkeypatch.setattr(signature, "FEW", 0)
+    found = traced(crowd(kind), sent, received, tubes_per_wavelength=24.0)
+    # At random angles the fields of later orders are sidelobes, small beside what cancels.
+    for name, tolerance in (("order 1", 0.01), ("order 2", 0.1), ("order 3", 0.15)):
+        error = (found[name] - exact[name]).norm() / exact[name].norm().clamp_min(1e-12)
+        assert float(error) < tolerance, name
+
+
+@pytest.mark.filterwarnings("ignore:edges of sheets")
+@pytest.mark.parametrize("kind", ["metal", "solid", "dielectric"])
+@pytest.mark.parametrize("few", [24, 0])
+def test_reciprocity(kind, few, monkeypatch):
+    monkeypatch.setattr(signature, "FEW", few)
+    sent, received = random_directions(6, 3), random_directions(6, 4)
+    there = total(crowd(kind), sent, received, edges=2)
+    back = total(crowd(kind), received, sent, edges=2)
+    assert torch.allclose(there, back.mT, rtol=1e-6, atol=1e-9 * float(there.abs().max()))
+
+
+def test_one_antenna_sees_equal_cross_polar_terms():
+    found = total(crowd("metal"), random_directions(6, 5))
+    assert torch.allclose(found, found.mT)
+
+
+def test_two_runs_are_equal():
+    for kind, few in (("metal", 24), ("solid", 0)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(signature, "FEW", few)
+            runs = [total(crowd(kind), random_directions(4)) for _ in range(2)]
+        assert torch.equal(*runs)
+
+
+def test_a_large_plate_scatters_twice_what_it_meets():
+    """Its mirror image and its shadow: ∫|S|² dω over all directions is 2A cosθ."""
+    side, towards = 8 * WAVELENGTH, float64([[0.3, 0.1, -1.0]])
+    towards = towards / towards.norm()
+    n = 160
+    z = (torch.arange(n, dtype=torch.float64) + 0.5) / n * 2 - 1
+    phi = (torch.arange(2 * n, dtype=torch.float64) + 0.5) / n * math.pi
+    zz, pp = torch.meshgrid(z, phi, indexing="ij")
+    rho = (1 - zz**2).sqrt()
+    out = torch.stack([rho * pp.cos(), rho * pp.sin(), zz], -1).reshape(-1, 3)
+    found = total(metal(plate(side, side)), towards.expand(len(out), 3), out, depth=1)
+    power = float(found[:, :, 0].abs().square().sum(1).mean() * 4 * math.pi)
+    assert power == pytest.approx(2 * side**2 * abs(float(towards[0, 2])), rel=0.05)
+
+
+def test_triple_bounces_of_a_corner_grow_with_the_square_of_the_frequency():
+    direction = float64([[0.1, 0.15, -1.0]])
+    found = [
+        traced(metal(trihedral(0.1)), direction, frequency=f * FREQUENCY)["order 3"][0, 0, 0]
+        for f in (1.0, 2.0)
+    ]
+    assert abs(complex(found[1] / found[0]) - 2) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("mesh", "order"), [(plate(0.1, 0.1), 1), (dihedral(0.1), 2), (trihedral(0.1), 3)]
+)
+def test_each_order_has_the_delay_of_its_vertex(mesh, order):
+    """The phase of plate, crease and apex, moved by 0.3 m: exp(−2jk·0.3) at every frequency."""
+    for place, scale in (((0, 0, 0.3), 2 * 0.3), ((0.0, 0.0, -0.2), -2 * 0.2)):
+        for frequency in (FREQUENCY, 1.13 * FREQUENCY):
+            here, there = (
+                traced(metal(mesh, pose), [[0.0, 0.0, -1.0]], frequency=frequency)[f"order {order}"]
+                for pose in (None, turned(0, 0, 0, place))
+            )
+            k = 2 * math.pi * frequency / SPEED_OF_LIGHT
+            assert torch.allclose(there, here * np.exp(-1j * k * scale), atol=1e-9)
+
+
+def test_a_large_mirror_turns_the_field_over():
+    """Γ = −1: S = −jA/λ, of which the image source sends −1."""
+    found = total(metal(plate(0.1, 0.1)), [[0.0, 0.0, -1.0]])[0]
+    assert torch.allclose(found.diagonal(), torch.full_like(found[0], -1j * 0.01 / WAVELENGTH))
+
+
+def test_what_is_behind_does_not_count():
+    front = Object(plate(0.1, 0.1), METAL)
+    small = Object(plate(0.03, 0.03), METAL, turned(0.2, 0.1, 0, (0, 0, 0.05)))
+    alone = total(Scene({"front": front}), [[0.0, 0.0, -1.0]])
+    both = total(Scene({"front": front, "behind": small}), [[0.0, 0.0, -1.0]])
+    assert torch.allclose(both, alone, atol=1e-12)
+
+
+def test_an_array_of_few_facets_is_differentiable():
+    """d|S|² by the opening of a dihedral, by where a plate stands before another, by size."""
+
+    def power(theta: Tensor) -> Tensor:
+        angle = math.pi / 4 + theta[0]
+        first = torch.stack([angle.sin(), angle.new_zeros(()), -angle.cos()]) * (0.05 + theta[2])
+        second = float64([-(0.5**0.5), 0.0, -(0.5**0.5)]) * 0.05
+        up = float64([0.0, 0.05, 0.0])
+        corners = torch.stack([0 * up, up, second, second + up, first, first + up])
+        mesh = Mesh(corners, torch.tensor([(0, 2, 3), (0, 3, 1), (0, 1, 5), (0, 5, 4)]))
+        shift = torch.stack([theta[1] + 0.01, theta[1], theta[1] * 0 - 0.08])
+        leaf = plate(0.02, 0.02)
+        scene = Scene(
+            {
+                "dihedral": Object(mesh, METAL),
+                "leaf": Object(Mesh(leaf.vertices + shift, leaf.faces), METAL),
+            }
+        )
+        return total(scene, [[0.08, 0.1, -1.0]])[0, 0, 0].abs().square()
+
+    start = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(power(start), start)
+    for i in range(3):
+        step = torch.zeros(3, dtype=torch.float64)
+        step[i] = 1e-6
+        difference = float(power(step) - power(-step)) / 2e-6
+        assert float(gradient[i]) == pytest.approx(difference, rel=1e-5)
+
+
+# Where the physics ends, and what is refused.
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "text"),
+    [
+        (metal(sphere(0.05, 2)), {}, "facets of target are .* wavelengths off"),
+        (metal(plate(0.002, 0.002)), {}, "target is 0.28 wavelengths large"),
+        (metal(box(0.05, divisions=3)), {"tubes_per_wavelength": 0.5}, "0.5 tubes per wavelength"),
+        (metal(plate(0.1, 0.1)), {"edges": 1}, "within 10° of grazing are left out"),
+    ],
+)
+def test_warnings_where_the_physics_ends(scene, options, text):
+    with pytest.warns(PhysicsWarning, match=text):
+        total(scene, [[1.0, 0.0, -0.1]], depth=1, **options)
+
+
+def test_rough_surfaces_and_clouds_are_refused():
+    with pytest.raises(
+        InputError, match="smooth surfaces in a signature, got RoughDielectric for a"
+    ):
+        total(Scene({"a": Object(plate(1, 1), RoughDielectric(4.0))}), [[0.0, 0.0, -1.0]])
+    cloud = Cloud(float64([-1, -1, -1]), float64([1, 1, 1]), torch.ones(2, 2, 2).double())
+    with pytest.raises(InputError, match="got clouds for a"):
+        total(Scene({"a": Object(box(1.0), METAL, cloud=cloud)}), [[0.0, 0.0, -1.0]])
+
+
+def test_derivatives_of_many_facets_are_refused():
+    ball = sphere(0.05, 3)
+    mesh = Mesh(ball.vertices.clone().requires_grad_(), ball.faces)
+    with pytest.raises(InputError, match="at most 24 triangles for derivatives of a signature"):
+        total(metal(mesh), [[0.0, 0.0, -1.0]])
+
+
+def test_triangles_without_area_and_empty_views_give_zeros():
+    flat = Mesh(
+        float64([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.05, 0, 0]]),
+        torch.tensor([[0, 2, 1], [0, 1, 3]]),
+    )
+    lone = Mesh(flat.vertices[:3], flat.faces[:1])
+    found = [total(metal(mesh), [[0.1, 0.2, -1.0]], edges=0) for mesh in (flat, lone)]
+    assert torch.allclose(found[0], found[1])
+    assert torch.isfinite(total(metal(flat), [[0.1, 0.2, -1.0]], edges=2)).all()
+    edge_on = total(metal(lone), [[1.0, 0.0, 0.0]])
+    assert float(edge_on.abs().max()) == 0

@@ -1,0 +1,75 @@
+"""The oracles of signatures against each other, limits and a published table."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from invertwin.capture import load_section
+from invertwin.channel import (
+    DihedralByMoments,
+    DihedralSection,
+    PlateSection,
+    SphereSection,
+    SquareTrihedralSection,
+    TrihedralSection,
+)
+from invertwin.channel.reference.cross_sections import strip_across, strip_along
+from invertwin.constants import SPEED_OF_LIGHT
+from scenes import float64
+
+AHEAD = float64([[0.0, 0.0, -1.0]])
+WAVELENGTH = 0.01
+BAND = float64([SPEED_OF_LIGHT / WAVELENGTH])
+
+
+@pytest.mark.parametrize(
+    ("oracle", "expected"),
+    [
+        (PlateSection(0.1, 0.2), 4 * math.pi * 0.02**2 / WAVELENGTH**2),
+        (DihedralSection(0.1), 8 * math.pi * 0.1**4 / WAVELENGTH**2),
+        (TrihedralSection(0.1), 4 * math.pi * 0.1**4 / (3 * WAVELENGTH**2)),
+        (SquareTrihedralSection(0.1), 12 * math.pi * 0.1**4 / WAVELENGTH**2),
+    ],
+)
+def test_peaks(oracle, expected):
+    assert float(oracle.section(BAND, AHEAD)) == pytest.approx(expected)
+
+
+def test_a_corner_returns_less_off_its_axis_and_nothing_along_its_plates():
+    angles = float64([0.0, 0.2, 0.4])
+    directions = torch.stack([angles.sin(), 0 * angles, -angles.cos()], 1)
+    levels = TrihedralSection(0.1).section(BAND, directions)[0]
+    assert bool((levels.diff() < 0).all())
+
+
+def test_small_and_large_spheres():
+    k = float64([2 * math.pi * f / SPEED_OF_LIGHT for f in (1e6, 3e11)])
+    found = SphereSection(0.1).section(float64([1e6, 3e11]), AHEAD)[:, 0]
+    area = math.pi * 0.1**2
+    assert float(found[0]) == pytest.approx(9 * area * float(k[0] * 0.1) ** 4, rel=1e-3)  # Rayleigh
+    assert float(found[1]) == pytest.approx(area, rel=2e-3)
+
+
+@pytest.mark.parametrize(("name", "radius"), [("s2", 0.3), ("s7", 9.6)])
+def test_spheres_are_those_of_the_published_table(data_folder, name, radius):
+    for band in ("f1", "f6"):
+        data = load_section(data_folder / "austin_rcs" / "IA" / f"ref_rcs.I.A.{name}.{band}.V.txt")
+        found = SphereSection(radius).section(data.frequency[:1], AHEAD)
+        assert 10 * math.log10(float(found)) == pytest.approx(float(data.dbsm[0]), abs=1e-5)
+
+
+@pytest.mark.parametrize("solve", [strip_along, strip_across])
+def test_a_wide_strip_has_the_flash_of_physical_optics(solve):
+    line = np.linspace(-0.5, 0.5, 241)[:, None] * [10 * WAVELENGTH, 0.0]
+    k = 2 * math.pi / WAVELENGTH
+    found = solve(line, k, np.array([[0.0, 1.0]]))
+    assert 10 * math.log10(found[0] / (k * (10 * WAVELENGTH) ** 2)) == pytest.approx(0, abs=0.3)
+
+
+def test_moments_of_a_dihedral_peak_like_two_bounces():
+    for polarisation in ("V", "H"):
+        found = DihedralByMoments(0.1, polarisation).section(BAND, AHEAD)
+        peak = DihedralSection(0.1).section(BAND, AHEAD)
+        assert abs(10 * math.log10(float(found / peak))) < 1  # its free edges make the rest

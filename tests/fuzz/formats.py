@@ -1,0 +1,425 @@
+"""Every format that invertwin reads: small valid files, and what reads them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from torch import nn
+
+from cli.small import GRADCHECK, RUN, STARTS
+from fuzz.damage import SOUND, Files
+from invertwin.capture import Capture, ChannelCalibration, ChirpData, ChirpSettings, read, ti
+from invertwin.capture.described_arrays import write_chirps
+from invertwin.cli import build
+from invertwin.cli.run_file import load_run, to_toml
+from invertwin.inversion.callbacks import Checkpoint
+from invertwin.inversion.fingerprint import Fingerprint
+from invertwin.inversion.fit import Fit, Progress
+from invertwin.radar.boards import Mounting
+from invertwin.radar.radar import Radar
+from invertwin.radar.waveform import FMCW
+from invertwin.runs import open_run
+from invertwin.scene import linear_array, plate
+from invertwin.scene.files import load_mesh, load_scene_xml, save_mesh
+from invertwin.scene.geometry.body import load_smpl
+from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.geometry.prior import Decoder, ShapePrior, load_prior
+from invertwin.scene.parameters import Translation
+
+ALL = ("bytes", "words", "values")
+
+
+@dataclass(frozen=True)
+class Format:
+    """What is read, and how it is damaged.
+
+    Attributes:
+        samples: Makes valid files; the one that is read comes first.
+        read: What a user's call does with that file.
+        levels: Of damage; those that are named twice are drawn twice as often.
+        intact: Names of files that no damage may change or remove.
+        short: Cases of the short test.
+    """
+
+    samples: Callable[[], list[Files]]
+    read: Callable[[Path], Any]
+    levels: tuple[str, ...] = ALL
+    intact: tuple[str, ...] = ()
+    short: int = 100
+
+
+def _written(*writers: Callable[[Path], Any]) -> list[Files]:
+    """The files that functions write, each into a folder of its own."""
+    found = []
+    for write in writers:
+        with TemporaryDirectory() as name:
+            first = write(Path(name))
+            files = {path.name: path.read_bytes() for path in sorted(Path(name).iterdir())}
+            found.append({first: files.pop(first), **files} if first else files)
+    return found
+
+
+# Run files
+
+
+def _read_run(path: Path) -> None:
+    run = load_run(path)
+    to_toml(run)
+    scene = build.true_scene(run)
+    if run.radar is not None and run.grid is not None:
+        build.grid(run.grid, build.radar(run.radar))
+    build.parameters(run.parameters, scene, run.scene)
+
+
+def _runs() -> list[Files]:
+    plain = RUN.replace("task", 'title = "small"\ntask', 1)
+    checked = RUN.replace("reconstruct", "gradcheck", 1) + GRADCHECK
+    mesh = _written(lambda folder: save_mesh(folder / "part.ply", plate(1.0, 1.0)))[0]["part.ply"]
+    file = RUN.replace('shape = "plate"\nwidth = 2.0\nheight = 2.0', 'file = "part.ply"')
+    return [
+        {"run.toml": plain.encode()},
+        {"run.toml": (RUN + STARTS).encode()},
+        {"run.toml": checked.encode()},
+        {"run.toml": file.encode(), "part.ply": mesh},
+    ]
+
+
+# Meshes
+
+_OBJ = b"""# a tetrahedron
+mtllib part.mtl
+o part
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+vn 0 0 1
+vt 0 0
+usemtl paint
+f 1/1/1 3/1/1 2/1/1
+f 1//1 2//1 4//1
+f 2 3 4
+f -4 -1 -2
+"""
+_MTL = b"newmtl paint\nKd 0.5 0.5 0.5\nmap_Kd paint.png\n"
+_XML = b"""<?xml version="1.0"?>
+<scene version="3.0.0">
+  <bsdf type="diffuse" id="paint"/>
+  <shape type="ply" id="part"><string name="filename" value="part.ply"/>
+    <transform name="to_world"><translate x="1" y="2" z="3"/>
+      <rotate x="0" y="1" z="0" angle="30"/><scale value="2"/></transform>
+    <ref id="paint"/></shape>
+  <shape type="sphere" id="ball"><float name="radius" value="0.5"/>
+    <point name="center" x="0" y="0" z="2"/></shape>
+  <shape type="cube"><transform name="to_world">
+    <matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/></transform></shape>
+</scene>
+"""
+
+
+def _meshes() -> list[Files]:
+    import trimesh
+    from trimesh.exchange import gltf
+
+    box = trimesh.creation.box()
+
+    def exported(name: str, **how: Any) -> Callable[[Path], str]:
+        def write(folder: Path) -> str:
+            box.export(folder / name, **how)
+            return name
+
+        return write
+
+    def parts(name: str) -> Callable[[Path], str]:
+        scene = trimesh.Scene({"a": box, "b": trimesh.creation.icosphere(0)})
+
+        def write(folder: Path) -> str:
+            files = gltf.export_gltf(scene)
+            for file, data in files.items():
+                (folder / file).write_bytes(data)
+            return "model.gltf"
+
+        def write_glb(folder: Path) -> str:
+            (folder / name).write_bytes(gltf.export_glb(scene))
+            return name
+
+        return write if name.endswith("gltf") else write_glb
+
+    def own(folder: Path) -> str:
+        save_mesh(folder / "own.ply", plate(1.0, 1.0, 2))
+        return "own.ply"
+
+    def xml(folder: Path) -> str:
+        (folder / "scene.xml").write_bytes(_XML)
+        save_mesh(folder / "part.ply", plate(1.0, 1.0, 1))
+        return "scene.xml"
+
+    return [
+        {"part.obj": _OBJ, "part.mtl": _MTL},
+        *_written(
+            exported("box.stl"),
+            exported("text.stl", file_type="stl_ascii"),
+            exported("box.ply"),
+            exported("text.ply", encoding="ascii"),
+            parts("model.gltf"),
+            parts("model.glb"),
+            own,
+            xml,
+        ),
+    ]
+
+
+def _read_mesh(path: Path) -> None:
+    (load_scene_xml if path.suffix == ".xml" else load_mesh)(path)
+
+
+# Captures and described arrays
+
+_SETTINGS = ChirpSettings(
+    start_frequency=77e9,
+    slope=60e12,
+    sample_rate=5e6,
+    samples=8,
+    transmit_order=(1, 2),
+    receivers=(1, 2, 3, 4),
+    loops=2,
+    frames=2,
+    frame_period=0.1,
+    lanes=2,
+)
+
+
+def _captures() -> list[Files]:
+    waveform = FMCW(77e9, 2e9, 5e-5, 8)
+    places = torch.tensor([[0.0, 0, 0], [0.1, 0, 0]], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+
+    def beat(folder: Path) -> str:
+        radar = Radar(linear_array(1, 1e-3), linear_array(2, 2e-3), waveform, positions=places)
+        samples = torch.randn(2, 1, 2, 8, dtype=torch.complex128, generator=generator)
+        Capture.from_beat(samples, radar, torch.arange(2.0).double()).save(folder / "beat.nc")
+        return "beat.nc"
+
+    def profile(folder: Path) -> str:
+        radar = Radar(linear_array(1, 1e-3), linear_array(1, 1e-3), waveform, positions=places)
+        samples = torch.randn(2, 9, dtype=torch.complex128, generator=generator)
+        ranges = torch.linspace(1, 2, 9, dtype=torch.float64)
+        Capture.from_range_profile(samples, ranges, radar, survey=places).save(folder / "p.nc")
+        return "p.nc"
+
+    return _written(beat, profile)
+
+
+def _read_capture(path: Path) -> None:
+    found = Capture.load(path, trusted=_sound(path))
+    found.radar().elements()
+    _ = found.max_range, found.track, found.survey, found.clock_offset, found.range_bias
+
+
+def _sound(path: Path) -> bool:
+    """Whether the libraries wrote the file: a child process would take most of the time."""
+    return path.with_name(SOUND).exists()
+
+
+def _arrays(*endings: str) -> Callable[[], list[Files]]:
+    def write(ending: str) -> Callable[[Path], str]:
+        def written(folder: Path) -> str:
+            write_chirps(folder / "adc.toml", _chirps(), f"adc.{ending}")
+            return "adc.toml"
+
+        return written
+
+    return lambda: _written(*map(write, endings))
+
+
+def _chirps() -> ChirpData:
+    counts = torch.arange(2 * 2 * 2 * 4 * 8).reshape(2, 2, 2, 4, 8) % 1000
+    return ChirpData(torch.complex(counts.float(), -counts.float()), _SETTINGS)
+
+
+def _mats() -> list[Files]:
+    def seven(folder: Path) -> str:
+        write_chirps(folder / "adc.toml", _chirps(), "adc.h5")
+        text = (folder / "adc.toml").read_text().replace("adc.h5", "adc.mat")
+        (folder / "adc.toml").write_text(text)
+        with h5py.File(folder / "adc.h5") as old, h5py.File(folder / "adc.mat", "w") as new:
+            new["adc"] = np.asarray(old["adc"]).T
+        (folder / "adc.h5").unlink()
+        return "adc.toml"
+
+    return [*_arrays("mat")(), *_written(seven)]
+
+
+def _read_arrays(path: Path) -> None:
+    found = read(path, board=Mounting("xWR1843", 1), trusted=_sound(path))
+    _ = found.max_range, found.frame_count
+
+
+# Arrays by name
+
+
+def _npz() -> list[Files]:
+    rng = np.random.default_rng(1)
+
+    def body(folder: Path) -> str:
+        count, joints = 12, 3
+        regressor, weights = rng.random((joints, count)), rng.random((count, joints))
+        np.savez(
+            folder / "body.npz",
+            v_template=rng.normal(size=(count, 3)),
+            f=rng.integers(0, count, (8, 3)).astype(np.uint32),
+            weights=weights / weights.sum(1, keepdims=True),
+            kintree_table=np.array([[2**32 - 1, 0, 1], [0, 1, 2]], dtype=np.uint32),
+            J_regressor=regressor / regressor.sum(1, keepdims=True),
+            shapedirs=rng.normal(size=(count, 3, 4)) * 0.01,
+            posedirs=rng.normal(size=(count, 3, 18)) * 0.01,
+        )
+        return "body.npz"
+
+    def prior(folder: Path) -> str:
+        torch.manual_seed(1)
+        decoder = Decoder(2, 3, 4, 5 * 3 * 5).double()
+        lattice = Lattice.between([-1.0, -1, -1], [1.0, 1, 1], [5, 5, 5])
+        ShapePrior(decoder, lattice).save(folder / "prior.npz")
+        return "prior.npz"
+
+    return [*_written(body, prior), *_arrays("npz", "npy")()]
+
+
+def _read_npz(path: Path) -> None:
+    if path.suffix == ".toml":
+        _read_arrays(path)
+    elif path.stem == "body":
+        load_smpl(path)
+    else:
+        load_prior(path).values(torch.zeros(2).double())
+
+
+# Boards, calibrations
+
+
+def _boards() -> list[Files]:
+    def cfg(folder: Path) -> str:
+        ti.write_samples(folder / "adc.bin", _chirps())
+        ti.write_cfg(folder / "adc.cfg", _SETTINGS)
+        return "adc.cfg"
+
+    def studio(folder: Path) -> str:
+        ti.write_samples(folder / "adc.bin", _chirps())
+        ti.write_studio(folder / "adc.mmwave.json", _SETTINGS)
+        ti.write_setup(folder / "a.setup.json", folder / "adc.mmwave.json", [folder / "adc.bin"])
+        return "a.setup.json"
+
+    return _written(cfg, studio)
+
+
+def _read_board(path: Path) -> None:
+    cfg = path.suffix == ".cfg"
+    found = read(
+        path.with_name("adc.bin") if cfg else path,
+        path if cfg else None,
+        board=Mounting("xWR1843", 1),
+    )
+    _ = found.max_range, found.frame_count
+
+
+def _channels() -> list[Files]:
+    gains = torch.tensor([[1 + 1j, 0.5], [0.9j, 1.0]], dtype=torch.complex128)
+    return _written(
+        lambda folder: ChannelCalibration(gains).save(folder / "channels.json") or "channels.json"
+    )
+
+
+# What a run leaves
+
+
+def _fit() -> Fit:
+    """What of a fit a checkpoint knows, without rays."""
+    fit = object.__new__(Fit)
+    fit.modules, fit.number, fit.last = nn.ModuleList([Translation("ball")]), 0, True
+    fit.fingerprint = Fingerprint("a fit", torch.arange(3.0))
+    fit.optimizer = optimizer = torch.optim.Adam(fit.modules.parameters(), lr=0.1)
+    fit.modules[0].translation.grad = torch.ones(3, dtype=torch.float64)  # type: ignore[union-attr]
+    optimizer.step()
+    first = {name: value.clone() for name, value in fit.modules.state_dict().items()}
+    row = {"step": 0, "stage": 0, "loss": 1.5, "values": {"ball.translation": [0.0, 0.0, 0.0]}}
+    fit.progress = Progress(first, 1, [row], (0, 1.5, first))
+    return fit
+
+
+def _checkpoints() -> list[Files]:
+    def write(folder: Path) -> str:
+        Checkpoint(folder / "checkpoint.pt").end(_fit())
+        return "checkpoint.pt"
+
+    return _written(write)
+
+
+def _read_checkpoint(path: Path) -> None:
+    fit = _fit()
+    Checkpoint(path, resume=True).begin(fit)
+    assert isinstance(fit.optimizer, torch.optim.Adam)
+    fit.optimizer.step()
+    torch.save(fit.state(), path.with_name("again"))
+
+
+_TEXTS = {"run": "seed = 1\n"}
+
+
+def _manifests() -> list[Files]:
+    def whole(folder: Path) -> str:
+        with open_run(folder / "out", _TEXTS) as run:
+            run.write_text("metrics.json", "{}")
+        return ".invertwin.json"
+
+    def interrupted(folder: Path) -> str:
+        try:
+            with open_run(folder / "out", _TEXTS) as run:
+                run.write_text("parts/start0.json", "{}")
+                raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            return ".invertwin.json"
+
+    found = []
+    for write in (whole, interrupted):
+        with TemporaryDirectory() as name:
+            write(Path(name))
+            data = (Path(name) / "out" / ".invertwin.json").read_bytes()
+        found.append({"manifest.json": data, "victim": b"mine", "notes.txt": b"mine"})
+    return found
+
+
+def _read_manifest(path: Path) -> None:
+    for number, how in enumerate(({"resume": True}, {"overwrite": True}, {})):
+        out = path.with_name(f"out{number}")
+        (out / "unfinished" / "parts").mkdir(parents=True)
+        for name in ("metrics.json", "run.toml", "unfinished/parts/start0.json"):
+            (out / name).write_text("{}")
+        (out / "link").symlink_to(path.parent)
+        (out / ".invertwin.json").write_bytes(path.read_bytes())
+        try:
+            with open_run(out, _TEXTS, **how) as run:
+                if not run.complete:
+                    run.write_text("metrics.json", "new")
+                    _ = run.run_files
+        except ValueError:
+            if number == 2:
+                raise
+
+
+FORMATS: dict[str, Format] = {
+    "run_file": Format(_runs, _read_run, ("words", "values", "values")),
+    "mesh": Format(_meshes, _read_mesh),
+    "capture": Format(_captures, _read_capture, ("bytes", "values", "values", "values"), short=30),
+    "npz": Format(_npz, _read_npz, ("bytes", "values")),
+    "mat": Format(_mats, _read_arrays, ("bytes", "values", "values", "values"), short=30),
+    "dca1000": Format(_boards, _read_board),
+    "channels": Format(_channels, ChannelCalibration.load),
+    "checkpoint": Format(_checkpoints, _read_checkpoint, ("bytes", "values", "values")),
+    "manifest": Format(_manifests, _read_manifest, intact=("victim", "notes.txt")),
+}

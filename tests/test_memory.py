@@ -1,0 +1,41 @@
+"""What is free, and what is refused before any of it is taken."""
+
+import math
+
+import pytest
+
+from invertwin import memory
+from invertwin.errors import InputError
+
+
+def test_limits_of_groups_and_processes_count(monkeypatch, tmp_path):
+    inner = tmp_path / "a" / "b"
+    inner.mkdir(parents=True)
+    (inner / "memory.max").write_text("max\n")
+    group = inner.parent
+    (group / "memory.max").write_text("3000000000\n")
+    (group / "memory.current").write_text("2500000000\n")
+    (group / "memory.stat").write_text("anon 5\ninactive_file 400000000\n")
+    names = "memory.max", "memory.current", "inactive_file"
+    assert list(memory._of_group(inner, *names)) == []
+    assert list(memory._of_group(group, *names)) == [0.9e9]
+    monkeypatch.setattr(memory, "_of_groups", lambda: iter([0.9e9]))
+    assert memory.free_memory() <= 0.9e9
+    monkeypatch.setattr(memory, "_of_process", lambda: iter([-5.0]))
+    assert memory.free_memory() == 0.0
+
+
+def test_memory_is_refused_in_one_line_that_names_the_key(monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda: 2e9)
+    memory.require_memory(2e9, "a map", "lower it")
+    for needed in (3e9, math.inf, math.nan, 10**400):
+        with pytest.raises(InputError, match=r"within the 2 GB of memory that are free") as found:
+            memory.require_memory(needed, "a map", "lower it", "range_max")
+        assert found.value.at == "range_max"
+
+
+def test_counts_beyond_a_stated_number_are_refused():
+    memory.require_at_most(5, 5, "bins", "lower it")
+    for count in (6, math.inf, math.nan, 10**400):
+        with pytest.raises(InputError, match="at most 5 bins"):
+            memory.require_at_most(count, 5, "bins", "lower it")
