@@ -9,7 +9,17 @@ from torch import Tensor
 import invertwin as iw
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, PerfectConductor, Slab, dihedral, joined, plate, rigid, sphere
+from invertwin.scene import (
+    Mesh,
+    PerfectConductor,
+    Slab,
+    dihedral,
+    joined,
+    plate,
+    rigid,
+    sphere,
+    trihedral,
+)
 from invertwin.signatures import aspects, decibels
 from scenes import float64
 
@@ -29,6 +39,21 @@ def test_sigma_of_a_plate():
     assert found.dbsm.shape == (1, 1, 2, 2)
     assert float(found.dbsm[0, 0, 0, 0]) == pytest.approx(expected, abs=0.05)
     assert float(found.dbsm[0, 0, 1, 0]) < -200
+
+
+def test_a_target_that_is_moved_returns_no_more_and_no_less():
+    """Sides of its beams lie in the planes of its mirrors; rounding there has no derivative."""
+    directions = aspects(torch.deg2rad(float64([172.0, 180.0, 186.0])), math.pi / 2)
+
+    def power(place: Tensor) -> Tensor:
+        moved = iw.Object(trihedral(0.05), METAL, rigid(translation=place))
+        found = iw.rcs(iw.Scene({"target": moved}), directions, 77e9, edges=0)
+        return found.matrix.abs().square().sum((0, 2, 3))
+
+    place = float64([0.0, 0.0, 0.0])
+    change = torch.autograd.functional.jacobian(power, place)
+    wave_number = 2 * math.pi * 77e9 / SPEED_OF_LIGHT
+    assert (change.abs() < 1e-12 * wave_number * power(place)[:, None]).all()  # it was 7e-5
 
 
 @pytest.mark.parametrize(("mesh", "kept"), [(plate(0.1, 0.1), 1), (dihedral(0.1), 0)])

@@ -16,6 +16,7 @@ from torch import Tensor
 from invertwin.channel.field.waves import area_vector, cross, dot, mirrored, polygon_integral
 
 _EMPTY = 1e-12  # of the scene's size squared: a polygon of less area is none
+_FLAT = 1e-12  # of a polygon's size: a side between less different heights lies in the plane
 _BEFORE = 1e-9  # of the scene's size: what rises less above a facet hides nothing of it
 
 
@@ -217,10 +218,12 @@ def clip(
     crossed = inside != inside.roll(-1, 1)
     if bool(inside.all()):
         return polygon
-    share = height / torch.where(crossed, height - after, torch.ones_like(height))
-    between = polygon + torch.where(crossed, share, 0.0)[..., None] * (
-        polygon.roll(-1, 1) - polygon
-    )
+    # A side that lies in the plane, or one of no length, is crossed by rounding alone: where it is
+    # crossed would have any derivative.
+    extent = (polygon - polygon[:, :1]).detach().norm(dim=2).amax(1, keepdim=True)
+    steep = crossed & ((height - after).detach().abs() > _FLAT * extent)
+    share = height / torch.where(steep, height - after, torch.ones_like(height))
+    between = polygon + torch.where(steep, share, 0.0)[..., None] * (polygon.roll(-1, 1) - polygon)
     points = torch.stack([polygon, between], 2).flatten(1, 2)
     kept = torch.stack([inside, crossed], 2).flatten(1, 2)
     order = torch.argsort((~kept).to(torch.int8), dim=1, stable=True)
