@@ -31,7 +31,16 @@ def test_a_dihedral_across_its_crease(full_wave):
     for polarisation in "VH":
         assert metrics["rms_db"][f"dihedral_across_{polarisation}"] < 2.0
         assert metrics["phase_deg"][f"dihedral_across_{polarisation}"] < 20.0
+    assert metrics["unsolved"] == []
     json.dumps(metrics)
     console = Console(width=160, record=True)
     console.print(full_wave.table(metrics))
     assert "yes" in console.export_text()
+
+
+def test_a_cube_whose_faces_are_grazed_exactly(full_wave):
+    metrics = full_wave.measure(["cube"])
+    assert max(metrics["phase_deg"].values()) < 5.0
+    for polarisation in "VH":
+        assert metrics["rms_db"][f"cube_face_{polarisation}"] < 2.0
+        assert metrics["rms_db"][f"cube_oblique_{polarisation}"] < 2.0

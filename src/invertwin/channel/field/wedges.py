@@ -131,6 +131,13 @@ def _azimuth(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
     ) % (2 * math.pi)
 
 
+def _azimuth_outside(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
+    """The same of a direction outside: one that grazes a face is not taken for one inside."""
+    angle, last = _azimuth(wedges, direction, face), wedges.opening * math.pi
+    grazed = torch.where(angle > last / 2 + math.pi, 0.0 * angle, last)
+    return torch.where(angle > last, grazed, angle)
+
+
 def fringe_field(
     wedges: Wedges,
     wave_number: float,
@@ -155,8 +162,8 @@ def fringe_field(
         along = cross(wedges.inwards[:, face], wedges.normals[:, face])
         cos_in, cos_out = dot(along, direction), dot(along, towards)
         sin_in, sin_out = (1 - cos_in**2).sqrt(), (1 - cos_out**2).sqrt()
-        phi_in = _azimuth(wedges, -direction, face)
-        phi_out = _azimuth(wedges, towards, face)
+        phi_in = _azimuth_outside(wedges, -direction, face)
+        phi_out = _azimuth_outside(wedges, towards, face)
         mu = sin_out * torch.cos(phi_out) / sin_in
         electric, magnetic = _strengths(wedges.opening, phi_in, mu)
         across = cross(towards, along)
