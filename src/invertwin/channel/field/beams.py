@@ -20,6 +20,7 @@ from invertwin.channel.rays.topology import Topology
 FEW = 24
 """Triangles of a scene up to which beams are clipped exactly."""
 _EMPTY = 1e-12  # of the scene's size squared: a polygon of less area is none
+_FLAT = 1e-12  # of a polygon's size: a side between less different heights lies in the plane
 _BEFORE = 1e-9  # of the scene's size: what rises less above a facet hides nothing of it
 
 
@@ -223,8 +224,12 @@ def clip(
     crossed = inside != inside.roll(-1, 1)
     if bool(inside.all()):
         return polygon
-    share = height / torch.where(crossed, height - after, torch.ones_like(height))
-    between = polygon + torch.where(crossed, share, 0.0)[..., None] * (
+    # A side that lies in the plane, or one of no length, is crossed by rounding alone: where it is
+    # crossed would have any derivative.
+    extent = (polygon - polygon[:, :1]).detach().norm(dim=2).amax(1, keepdim=True)
+    steep = crossed & ((height - after).detach().abs() > _FLAT * extent)
+    share = height / torch.where(steep, height - after, torch.ones_like(height))
+    between = polygon + torch.where(steep, share, 0.0)[..., None] * (
         polygon.roll(-1, 1) - polygon
     )
     points = torch.stack([polygon, between], 2).flatten(1, 2)
