@@ -53,7 +53,7 @@ def transition(s: Float64[Tensor, "*row"]) -> Complex128[Tensor, "*row"]:
 def end_transition(
     s: Float64[Tensor, "*#row"], t: Float64[Tensor, "*#row"]
 ) -> Complex128[Tensor, "*row"]:
-    """What of g(s) comes from the part of an edge beyond t: 1/√π exp(jπ/4) ∫ s exp(−jτ²)/(s² + τ²) dτ.
+    """The part of g(s) that an edge beyond t sends: exp(jπ/4)/√π ∫ s exp(−jτ²)/(s² + τ²) dτ.
 
     An edge whose ends are t₁ and t₂ away from the point of diffraction, counted outwards, sends
     g(s) less the part beyond either end; t < 0 where that point lies beyond the end. Sums over the
@@ -65,6 +65,41 @@ def end_transition(
     """
     beyond = _Beyond.apply(s, t.abs())
     return torch.where(t < 0, transition(s) - beyond, beyond)  # type: ignore[operator]
+
+
+def edge_transition(
+    s: Float64[Tensor, "*#row"], ends: Float64[Tensor, "*#row 2"] | None
+) -> Complex128[Tensor, "*row"]:
+    """g(s) of an edge with two ends.
+
+    Args:
+        s: as in ``transition``.
+        ends: t of both ends, as in ``end_transition``; None of an endless edge.
+    """
+    sent = transition(s)
+    if ends is None:
+        return sent
+    return sent - end_transition(s, ends[..., 0]) - end_transition(s, ends[..., 1])
+
+
+def edge_transition_slope(
+    s: Float64[Tensor, "*#row"],
+    ends: Float64[Tensor, "*#row 2"] | None,
+    sent: Complex128[Tensor, "*row"],
+) -> Complex128[Tensor, "*row"]:
+    """Derivative of ``edge_transition`` by s.
+
+    Args:
+        s, ends: as there.
+        sent: its value.
+    """
+    slope = 2j * s * sent - 2j
+    for t in () if ends is None else ends.unbind(-1):
+        size = _half(t.abs())
+        share = torch.where(t < 0, 1 - size, size)
+        square = (s * s + t * t).clamp_min(1e-300)
+        slope = slope + 2j * share - _TURN / _ROOT * _wave(-t * t) / square * t
+    return slope
 
 
 def _scaled_erfc(x: Tensor) -> Tensor:
@@ -143,7 +178,7 @@ class _Beyond(torch.autograd.Function):
 
 
 def _slopes(s: Tensor, t: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of the part beyond t by s and by t; at s = t = 0, where there are none, by none."""
+    """Derivatives of the part beyond t by s and by t; finite at s = t = 0, where there are none."""
     square = (s * s + t * t).clamp_min(1e-300)
     front = _TURN / _ROOT * _wave(-t * t) / square
     return 2j * s * found - 2j * _half(t) + front * t, -front * s

@@ -131,8 +131,16 @@ def _azimuth(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
     ) % (2 * math.pi)
 
 
-def _azimuth_outside(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
-    """The same of a direction outside: one that grazes a face is not taken for one inside."""
+def azimuth_outside(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
+    """Angle about the edge from a face, of a direction outside, in [0, opening · π].
+
+    One that grazes a face is not taken for one inside.
+
+    Args:
+        wedges: one row each.
+        direction: unit vectors from the edge.
+        face: 0 or 1, the face from which the angle is counted.
+    """
     angle, last = _azimuth(wedges, direction, face), wedges.opening * math.pi
     grazed = torch.where(angle > last / 2 + math.pi, 0.0 * angle, last)
     return torch.where(angle > last, grazed, angle)
@@ -162,8 +170,8 @@ def fringe_field(
         along = cross(wedges.inwards[:, face], wedges.normals[:, face])
         cos_in, cos_out = dot(along, direction), dot(along, towards)
         sin_in, sin_out = (1 - cos_in**2).sqrt(), (1 - cos_out**2).sqrt()
-        phi_in = _azimuth_outside(wedges, -direction, face)
-        phi_out = _azimuth_outside(wedges, towards, face)
+        phi_in = azimuth_outside(wedges, -direction, face)
+        phi_out = azimuth_outside(wedges, towards, face)
         mu = sin_out * torch.cos(phi_out) / sin_in
         electric, magnetic = _strengths(wedges.opening, phi_in, mu)
         across = cross(towards, along)
