@@ -28,11 +28,11 @@ from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel.field.diffraction import Faces, Turn, conductor, diffraction_dyad, edge_axis
+from invertwin.channel.field.diffraction import Faces, Turn, conductor, diffraction_dyad
 from invertwin.channel.field.edge_paths import Edge, over_edges, slope_transfer
 from invertwin.channel.field.transition import transition
 from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
-from invertwin.channel.field.wedges import Wedges, azimuth_outside
+from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
 from invertwin.channel.reference.wedges import (
     half_plane_of_plane_wave,
     half_plane_of_point_source,
@@ -78,7 +78,7 @@ class Bend:
         normals = torch.stack([y, math.sin(angle) * x - math.cos(angle) * y])
         columns = (-z, z, inwards, normals, torch.tensor(self.opening, dtype=torch.float64))
         rows = [column.expand(count, *column.shape) for column in columns]
-        return Wedges(*rows, face=torch.zeros(count, dtype=torch.int64))
+        return Wedges(*rows, faces=torch.zeros(count, 2, dtype=torch.int64))
 
     def place(self, distance: Any, azimuth: Tensor, height: float) -> Float64[Tensor, "row 3"]:
         """Points about it."""
@@ -209,7 +209,11 @@ def plane_wave_error(opening: float, distance: float, truth: Callable[..., Any])
         total = sent.numpy() * np.exp(-1j * reach) / math.sqrt(distance)
         angle = azimuth.numpy()
         mirror = 2 * opening * math.pi - angle - azimuth_in
-        for beta, strength in ((angle - azimuth_in, 1.0), (angle + azimuth_in, sign), (mirror, sign)):
+        for beta, strength in (
+            (angle - azimuth_in, 1.0),
+            (angle + azimuth_in, sign),
+            (mirror, sign),
+        ):
             total = total + strength * (np.abs(beta) < math.pi) * np.exp(1j * reach * np.cos(beta))
         exact = truth(WAVE_NUMBER, azimuth_in, distance, angle, polarisation)
         worst = max(worst, float(np.abs(total - exact).max() / np.abs(exact).max()))
@@ -355,7 +359,9 @@ def measure() -> dict[str, Any]:
     cases = bends()
     return {
         "transition": transition_error(),
-        "half_plane": max(plane_wave_error(2.0, x, sommerfeld) for x in (0.5, 1.0, 3.0, 10.0, 30.0)),
+        "half_plane": max(
+            plane_wave_error(2.0, x, sommerfeld) for x in (0.5, 1.0, 3.0, 10.0, 30.0)
+        ),
         "wedge": {f"{x:g}": plane_wave_error(1.5, x, series) for x in (0.5, 1.0, 3.0, 10.0)},
         "point_source": {f"{x:g}": point_source_error(x) for x in (1.0, 3.0, 10.0)},
         "jump": {name: max(map(jump, some)) for name, some in cases.items()},

@@ -26,7 +26,7 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.field.transition import edge_transition, edge_transition_slope
 from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
-from invertwin.channel.field.wedges import Wedges
+from invertwin.channel.field.wedges import Wedges, edge_axis
 from invertwin.scene.material.fresnel import FieldCoefficients
 
 _TURN = complex(math.sqrt(0.5), -math.sqrt(0.5))  # exp(−jπ/4)
@@ -161,11 +161,6 @@ def _cotangent(
     by_s = edge_transition_slope(s, turn.ends, sent)
     by_half = -root * (past * sent + quotient * by_s * root * torch.cos(half))
     return value, by_half * (-sign / 2)
-
-
-def edge_axis(wedges: Wedges) -> Float64[Tensor, "row 3"]:
-    """Unit vectors along the edges, about which azimuths are counted from the face 0."""
-    return cross(wedges.inwards[:, 0], wedges.normals[:, 0])
 
 
 def _basis(along: Tensor, direction: Tensor) -> Float64[Tensor, "row 2 3"]:

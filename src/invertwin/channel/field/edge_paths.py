@@ -2,9 +2,9 @@
 
 A path over edges is as short as paths that touch these edges can be. Its amplitude spreads with the
 second derivatives H of its length by the places on the edges: over N edges
-``A = Π sinβ_i / (Π s_j √det H)``, of the unit of 1/length that a free path has. Distance parameters
-are those of the whole path, ``L_i = a_i b_i sin²β_i/(a_i + b_i)``, a_i and b_i the lengths before
-and after the edge.
+``A = Π sinβ_i / (Π s_j √det H)``, of the unit of 1/length that a free path has. The distance
+parameter of an edge is that by which its field's step at a boundary is the whole field of the path
+that leaves this edge out: ``L = s s′ sin²β/(s + s′)`` of one edge or of parallel ones.
 
 Source: derivations §9; Tiberio, Manara, Pelosi and Kouyoumjian, "High-frequency electromagnetic
 scattering of plane waves from double wedges", IEEE TAP 37, 1989 (slopes between edges of a face).
@@ -22,10 +22,9 @@ from invertwin.channel.field.diffraction import (
     Turn,
     conductor,
     diffraction_dyad,
-    edge_axis,
 )
 from invertwin.channel.field.waves import cross, dot
-from invertwin.channel.field.wedges import Wedges, azimuth_outside
+from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
 
 _STEPS = 40  # of the search for the shortest path over two edges
 _LEAST = 1e-9  # of a path's length: edges that touch there have no path between them
@@ -159,21 +158,32 @@ class _Route:
         found, legs = [], self.legs
         way = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
         for number, edge in enumerate(self.edges):
-            before, after = legs[:, : number + 1].sum(1), legs[:, number + 1 :].sum(1)
             direction, towards = way[:, number], way[:, number + 1]
-            square = cross(edge_axis(edge.wedges), direction).square().sum(1)
             turn = Turn(
                 edge.wedges,
                 direction,
                 towards,
                 _azimuth(edge.wedges, -direction, edge.azimuth_in),
                 _azimuth(edge.wedges, towards, edge.azimuth),
-                before * after / (before + after) * square,
+                self._parameter(number, legs, way),
                 edge.faces,
                 None if edge.endless else self.ends(number, wave_number),
             )
             found.append(turn)
         return found
+
+    def _parameter(self, number: int, legs: Tensor, way: Tensor) -> Tensor:
+        """L of an edge: (s s′/(s + s′))² det H over that of the path without it."""
+        before, after = legs[:, number], legs[:, number + 1]
+        share = before * after / (before + after)
+        stiff = self.spread**2
+        if len(self.edges) == 2:
+            other = 1 - number
+            outer = legs[:, 2] if other else legs[:, 0]
+            axis = edge_axis(self.edges[other].wedges)
+            square = cross(axis, way[:, 2 * other]).square().sum(1)
+            stiff = stiff / (square * (1 / outer + 1 / (before + after)))
+        return share**2 * stiff
 
     def ends(self, number: int, wave_number: float) -> Float64[Tensor, "row 2"]:
         """√phase by which paths over the ends of an edge are longer, < 0 past the end.
@@ -316,8 +326,8 @@ def _shortest(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
 def _second(route: _Route, turns: Sequence[Turn], wave_number: float, first: Tensor) -> Tensor:
     """Both dyads one after the other; along a face with half the field, and its slope.
 
-    Edges that meet would send without bound into their corner: there the field is taken off over
-    the first radian of phase.
+    Two edges closer than half a wavelength are one thing, which the product of dyads is not: it
+    grows without bound into the corner where they meet. There it is taken off, by x³/(1 + x³).
     """
     legs = route.legs
     total = diffraction_dyad(turns[1], wave_number) @ first
@@ -331,5 +341,5 @@ def _second(route: _Route, turns: Sequence[Turn], wave_number: float, first: Ten
             turns[0], wave_number, "out"
         )
         total = torch.where(along, (total + scale[:, None, None] * slope) / 2, total)
-    phase = wave_number * legs[:, 1]
-    return total * (phase / torch.sqrt(1 + phase**2))[:, None, None]
+    apart = (wave_number * legs[:, 1] / torch.pi) ** 3
+    return total * (apart / (1 + apart))[:, None, None]

@@ -227,7 +227,7 @@ class _View:
         topology = body.topology
         ends = body.vertices[topology.edges]
         wedges = find_wedges(body.facets.corners, ends, topology.beside)
-        wedges = wedges.rows(body.skins[0].conducting[wedges.face])
+        wedges = wedges.rows(body.skins[0].conducting[wedges.faces[:, 0]])
         found = {"edges 1": self._once(wedges)}
         plates = plates_of(wedges) if most > 1 else []
         totals = [list(self._none()) for _ in range(2, most + 1)]
