@@ -210,7 +210,7 @@ def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
 def _of_simulation(data: SimulatedData, scene: Scene, frames: int) -> Iterator[tuple[Part, float]]:
     """Paths of exact signals, and how many there are over all frames."""
     rough = [item for item in scene.objects.values() if not item.material.coherent]
-    area = sum(_area(Mesh(item.vertices.detach(), item.mesh.faces)) for item in rough)
+    area = sum(Mesh(item.vertices, item.mesh.faces).area for item in rough)
     points = area * data.points_per_m2
     each = _POINT + frames * _ROW
     name = f"points on {area:.3g} m² of rough surfaces"
@@ -308,8 +308,3 @@ def _separable(radar: Radar) -> bool:
         len(part.round().unique(dim=0)) for part in (places[:, :1], places[:, 1:2], places)
     )
     return x * y == both
-
-
-def _area(mesh: Mesh) -> float:
-    a, b, c = mesh.vertices[mesh.faces].unbind(1)
-    return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())

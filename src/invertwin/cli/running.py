@@ -17,6 +17,7 @@ from invertwin.cli.options import Options, Where, console
 from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.run_file import about_file, load_run, need, to_toml
 from invertwin.errors import InputError
+from invertwin.folders import PARTS
 from invertwin.runs import RunFolder, open_run
 
 _LOG_SECONDS = 10.0  # between lines of progress in a log
@@ -82,6 +83,33 @@ def load_runs(
         seeded = {} if options.seed is None else {"seed": options.seed}
         runs[file.stem] = run.model_copy(update=seeded)
     return runs
+
+
+def in_parts(
+    runs: Mapping[str, Any],
+    files: Mapping[str, Path],
+    folder: RunFolder,
+    compute: Callable[[str, Any], dict[str, Any]],
+) -> Iterator[tuple[str, Any, dict[str, Any]]]:
+    """What every run file gives, kept as it comes: an interrupted run does not compute it again.
+
+    Args:
+        runs: Run files by stem.
+        files: Where they are.
+        folder: Keeps what is done.
+        compute: Takes a stem and its run file.
+
+    Yields:
+        Stem, run file and what was computed.
+    """
+    for name, run in runs.items():
+        part = f"{PARTS}/{name}.json"
+        found = folder.read_json(part)
+        if found is None:
+            with about_file(files[name]):
+                found = compute(name, run)
+            folder.write_json(part, found)
+        yield name, run, found
 
 
 @contextmanager
