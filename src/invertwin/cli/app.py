@@ -25,7 +25,7 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.report import Table
 from invertwin.cli.run_file import about_file
-from invertwin.cli.running import load_runs, now_and_then, print_tables, run_folder
+from invertwin.cli.running import load_runs, now_and_then, print_tables, progress, run_folder
 from invertwin.errors import InputError, interruptible, one_line
 
 
@@ -95,7 +95,7 @@ def simulate(options: Options, file: FileArgument) -> None:
     with run_folder(options, Path("out", file.stem), runs) as folder:
         from invertwin.cli.run_simulate import run_simulate
 
-        with about_file(file):
+        with about_file(file), progress(console):
             tables = run_simulate(runs[file.stem], folder)
         print_tables(tables)
 
@@ -153,7 +153,9 @@ def look(options: Look) -> None:
 
     default = Path("out") / options.recording.name.split(".")[0]
     with run_folder(options, default) as folder:
-        print_tables(run_look(options, folder))
+        with progress(console):
+            tables = run_look(options, folder)
+        print_tables(tables)
 
 
 @app.command()

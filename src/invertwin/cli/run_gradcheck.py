@@ -12,7 +12,7 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.estimate import Sensor, of_signature, require_room
 from invertwin.cli.report import Picture, Table, finish, picture, texts
 from invertwin.cli.run_file import about, need
 from invertwin.cli.running import in_parts
@@ -134,9 +134,10 @@ class _Seen:
     draw: Callable[[GradientReport], Figure]
 
 
-def _signature(run: RunFile, settings: Gradcheck) -> _Seen:
+def _signature(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
     """The signature of `[rcs]`."""
     table = need(run, "rcs", "gradcheck")
+    of_signature(run, scene).require()
 
     def signature(scene: Scene, **more: Any) -> Signature:
         with about("rcs"):
@@ -179,7 +180,7 @@ def _check(
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
     scene = build.scene(run)
-    seen = _map(run, settings, scene) if run.rcs is None else _signature(run, settings)
+    seen = _map(run, settings, scene) if run.rcs is None else _signature(run, settings, scene)
     module, tangent = build.tangent(run, scene)
     for key in _studies(run):
         if seen.device is None:

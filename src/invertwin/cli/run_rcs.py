@@ -12,6 +12,7 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.capture import load_section
 from invertwin.cli import build
+from invertwin.cli.estimate import of_signature
 from invertwin.cli.report import Picture, Table, finish, picture, texts
 from invertwin.cli.run_file import about, need
 from invertwin.cli.running import in_parts
@@ -71,8 +72,10 @@ def run_rcs(
 def _signature(name: str, run: RunFile, folder: RunFolder) -> _Found:
     begin = time.perf_counter()
     table: Rcs = need(run, "rcs", "rcs")
+    scene = build.scene(run)
+    of_signature(run, scene).require()
     with about("rcs"):
-        found = table.build({Scene: build.scene(run)})
+        found = table.build({Scene: scene})
     kept: _Found = {
         "peak_dbsm": {
             channel: _level(found.dbsm[:, :, i, j]) for channel, (i, j) in table.channels.items()

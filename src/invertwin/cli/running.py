@@ -18,6 +18,7 @@ from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.run_file import about_file, load_run, need, to_toml
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
+from invertwin.progress import listening
 from invertwin.runs import RunFolder, open_run
 
 _LOG_SECONDS = 10.0  # between lines of progress in a log
@@ -139,6 +140,23 @@ def counted(shown: Console, name: str, total: int) -> Iterator[Callable[[], None
                 say(f"{name}: {done} of {total}, {left} left")
 
         yield advance
+
+
+@contextmanager
+def progress(shown: Console) -> Iterator[None]:
+    """Show how far long loops have come: on one line, or a line now and then in a log.
+
+    Args:
+        shown: Where.
+    """
+    with shown.status("working") as status:
+        say = status.update if shown.is_terminal else now_and_then(shown, time.monotonic())
+
+        def hear(name: str, done: int, total: int, left: float) -> None:
+            say(f"{name}: {done} of {total}, {time_left(left)} left")
+
+        with listening(hear):
+            yield
 
 
 def time_left(seconds: float) -> str:
