@@ -10,7 +10,6 @@ from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-
 from invertwin import __version__
 
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
