@@ -17,7 +17,16 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field, trace_power
+from invertwin.channel import (
+    Grid,
+    Paths,
+    Sampling,
+    Speckle,
+    draw_speckle,
+    trace_chains,
+    trace_field,
+    trace_power,
+)
 from invertwin.errors import InputError
 from invertwin.radar.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.looks import Looks
@@ -215,43 +224,92 @@ class SurrogateMap(ForwardModel):
             return None
         fields = replace(self.sampling, boundary=False)
         looks = Looks(trace_field(scene, sensor.link(), sampling=fields, seed=seed), sensor)
-        white = torch.randn(
-            *sensor.shape,
-            sensor.waveform.samples,
-            dtype=torch.complex64,
-            generator=torch.Generator().manual_seed(seed),
-        )
-        share = float(exact_spectrum(white, sensor, self.grid).mean())
-
-        def look(number: int, noise: float) -> Tensor:
-            beat = looks.beat(derived_seed(number, 0))
-            generator = torch.Generator().manual_seed(derived_seed(number, 1))
-            white = torch.randn(beat.shape, dtype=beat.dtype, generator=generator)
-            beat += (noise / share) ** 0.5 * white
-            return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
-
-        return look
+        return _noisy(lambda number: looks.beat(derived_seed(number, 0)), sensor, self.grid, seed)
 
     @property
     def widened(self) -> bool:
         """Whether the surrogate has extra widths."""
-        return self.kernels.range_width > 0 or self.kernels.angle_width > 0
+        return self.kernels.widened
 
     def narrowed(self, share: float) -> "SurrogateMap":
         """The surrogate with this share of its extra widths."""
-        kernels = self.kernels
-        return replace(
-            self,
-            surrogate=replace(
-                kernels,
-                range_width=kernels.range_width * share,
-                angle_width=kernels.angle_width * share,
-            ),
-        )
+        return replace(self, surrogate=self.kernels.narrowed(share))
 
     def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
         """A measured spectrum with the extra widths."""
         return self.kernels.blur(observed, sensor, self.grid)
+
+
+def _noisy(
+    beat_of: Callable[[int], Tensor], sensor: Radar, grid: Grid, seed: int
+) -> Callable[[int, float], Tensor]:
+    """Looks with noise, from a function of their number that gives the beat signals."""
+    assert isinstance(sensor.waveform, SampledWaveform)
+    shape = (*sensor.shape, sensor.waveform.samples)
+
+    def white(key: int) -> Tensor:
+        generator = torch.Generator().manual_seed(key)
+        return torch.randn(shape, dtype=torch.complex64, generator=generator)
+
+    share = float(exact_spectrum(white(seed), sensor, grid).mean())
+
+    def look(number: int, noise: float) -> Tensor:
+        beat = beat_of(number) + (noise / share) ** 0.5 * white(derived_seed(number, 1))
+        return exact_spectrum(beat, sensor, grid).to(torch.float32)
+
+    return look
+
+
+@dataclass(frozen=True)
+class ChainMap(ForwardModel):
+    """The power spectrum of a few flat conductors that mirror one another: |sum of fields|².
+
+    Chains of a corner reflector add in phase, where a ``SurrogateMap`` adds their powers and is
+    up to 8 dB too low. There are no samples and no speckle: the map is smooth in the pose, corners
+    and beams' edges included, as long as one chain or one corner dominates each cell; echoes of
+    several targets in one cell interfere, with a minimum every half wavelength.
+
+    Attributes:
+        grid: Bins, see ``Radar.grid``.
+        surrogate: Extra widths, which are zero at the end of a fit; its kernels do not count.
+        sampling: Most bounces; nothing else counts.
+    """
+
+    grid: Grid
+    surrogate: Surrogate = Surrogate()
+    sampling: Sampling = Sampling()
+
+    redraws: ClassVar[bool] = False
+
+    def _beat(self, scene: Scene, sensor: Radar) -> Tensor:
+        return beat_signal(trace_chains(scene, sensor.link(), self.sampling.depth), sensor)
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """The spectrum of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
+        spectrum = exact_spectrum(self._beat(scene, sensor), sensor, self.grid)
+        return self.blurred(spectrum.to(torch.float32), sensor)
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
+        """The measured power spectrum of a capture."""
+        return recording.spectrum(self.grid).to(torch.float32)
+
+    def looks(self, scene: Scene, sensor: Radar, seed: int) -> Callable[[int, float], Tensor]:
+        """The spectrum with other noise each time."""
+        beat = self._beat(scene, sensor).to(torch.complex64)
+        return _noisy(lambda _: beat, sensor, self.grid, seed)
+
+    @property
+    def widened(self) -> bool:
+        """Whether there are extra widths."""
+        return self.surrogate.widened
+
+    def narrowed(self, share: float) -> "ChainMap":
+        """The model with this share of its extra widths."""
+        return replace(self, surrogate=self.surrogate.narrowed(share))
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
+        """A map with the extra widths."""
+        return self.surrogate.blur(observed, sensor, self.grid)
 
 
 @dataclass(frozen=True)
