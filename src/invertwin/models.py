@@ -33,7 +33,7 @@ from invertwin.radar.looks import Looks
 from invertwin.radar.motion import Chirps
 from invertwin.radar.moving_power import moving_power
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import beat_signal
+from invertwin.radar.range_profile import beat_signal, range_profile
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
 from invertwin.radar.waveform import SampledWaveform
@@ -276,7 +276,7 @@ class ChainMap(ForwardModel):
     """
 
     grid: Grid
-    surrogate: Surrogate = Surrogate()
+    surrogate: Surrogate = field(default_factory=Surrogate)
     sampling: Sampling = Sampling()
 
     redraws: ClassVar[bool] = False
@@ -293,8 +293,12 @@ class ChainMap(ForwardModel):
         """The measured power spectrum of a capture."""
         return recording.spectrum(self.grid).to(torch.float32)
 
-    def looks(self, scene: Scene, sensor: Radar, seed: int) -> Callable[[int, float], Tensor]:
-        """The spectrum with other noise each time."""
+    def looks(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Callable[[int, float], Tensor] | None:
+        """The spectrum with other noise each time; None for waveforms without samples."""
+        if not isinstance(sensor.waveform, SampledWaveform):
+            return None
         beat = self._beat(scene, sensor).to(torch.complex64)
         return _noisy(lambda _: beat, sensor, self.grid, seed)
 
@@ -310,6 +314,45 @@ class ChainMap(ForwardModel):
     def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
         """A map with the extra widths."""
         return self.surrogate.blur(observed, sensor, self.grid)
+
+
+@dataclass(frozen=True)
+class ChainField(ChainMap):
+    """The complex range profiles of a few flat conductors that mirror one another.
+
+    The phase tells the range to parts of a wavelength. So its loss has a minimum every half
+    wavelength: it refines what a ``ChainMap`` has found to a tenth of a wavelength in range, in a
+    later stage of a fit. Maps hold real and imaginary parts; compare them by a ``SpectrumLoss`` of
+    kind ``mse`` with one level. The radar's phase is calibrated. Error bars come from the scatter
+    of the frames.
+    """
+
+    def predict(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Float[Tensor, "frame range channel part"]:
+        """The range profiles of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
+        return self._profile(self._beat(scene, sensor), sensor)
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range channel part"]:
+        """The measured range profiles of a capture."""
+        return self._profile(recording.beat, recording.radar())
+
+    def _profile(self, beat: Tensor, radar: Radar) -> Tensor:
+        profile = range_profile(beat.to(torch.complex128), radar, self.grid)
+        return torch.view_as_real(profile.flatten(1, 2).mT).contiguous()
+
+    def looks(self, scene: Scene, sensor: Radar, seed: int) -> None:
+        """None: how noise is drawn is known for power only."""
+        return
+
+    @property
+    def widened(self) -> bool:
+        """Fields have no extra widths."""
+        return False
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Tensor:
+        """A map as it is."""
+        return observed
 
 
 @dataclass(frozen=True)
