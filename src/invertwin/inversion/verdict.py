@@ -68,7 +68,7 @@ def verdict(end: End) -> Verdict:
     """
     fit = end.fit
     explained = [
-        gain * float(a.mean()) / max(float(b.mean()), 1e-300)
+        gain * float(a.abs().mean()) / max(float(b.abs().mean()), 1e-300)
         for gain, (a, b) in zip(end.gains, end.maps, strict=True)
     ]
     if min(explained) < _EMPTY:
