@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
 from invertwin.channel.field.waves import area_vector, dot, polygon_integral
 from invertwin.channel.paths import Link, Paths, joined
-from invertwin.channel.rays.topology import topology_of
+from invertwin.channel.rays.geometry import flatten
 from invertwin.channel.reference.radar_equation import conductor_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -42,7 +42,7 @@ def trace_chains(scene: Scene, link: Link, depth: int) -> Paths:
     Raises:
         InputError: Too many triangles, or another material.
     """
-    facets = _facets(scene)
+    facets = _facets(scene, link)
     middle = facets.corners.mean((0, 1))
     parts: list[Paths] = []
     last: Bounce | None = None
@@ -63,21 +63,19 @@ class _Unfolding(NamedTuple):
     shift: Float64[Tensor, "row 3"]
 
 
-def _facets(scene: Scene) -> Facets:
-    items = [*scene.objects.values()]
-    if any(item.cloud is not None or not item.material.coherent for item in items):
+def _facets(scene: Scene, link: Link) -> Facets:
+    geometry = flatten(scene, link.wavelength)
+    if not all(geometry.coherent):
         raise InputError(
             "expected smooth conductors alone for mirrored chains, got others; give a "
             "PerfectConductor, or use power paths"
         )
-    count = sum(len(item.mesh.faces) for item in items)
-    if count > FEW:
+    if len(geometry.faces) > FEW:
         raise InputError(
-            f"expected at most {FEW} triangles for mirrored chains, got {count}; use "
+            f"expected at most {FEW} triangles for mirrored chains, got {len(geometry.faces)}; use "
             "power paths, or simulate"
         )
-    topology = topology_of([item.mesh for item in items])
-    return facets_of(torch.cat([item.vertices for item in items]), topology)
+    return facets_of(geometry.vertices, geometry.topology)
 
 
 def _unfolded(bounce: Bounce, last: Bounce | None, before: _Unfolding | None) -> _Unfolding:
@@ -107,10 +105,10 @@ def _paths(bounce: Bounce, unfolding: _Unfolding, link: Link, order: int) -> Pat
     arriving = torch.einsum("nij,ni->nj", unfolding.turn, start)
     gain = link.tx_pattern.gain(torch.einsum("nij,ni->nj", rotation, start))
     gain = gain * link.rx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -onwards))
-    wave = 2 * torch.pi / link.wavelength * (onwards - arriving)
-    area = polygon_integral(bounce.polygon - place[:, None], wave)
+    area = polygon_integral(bounce.polygon - place[:, None], onwards - arriving)
     cosines = -dot(bounce.normal, arriving), dot(bounce.normal, onwards)
-    field = conductor_field(gain / (length * distance) ** 2, *cosines) * area
+    field = conductor_field(gain / (length * distance) ** 2, *cosines)
+    field = field * area(2 * torch.pi / link.wavelength)
     return Paths(
         frame=frame,
         delay=(length + distance) / SPEED_OF_LIGHT,
