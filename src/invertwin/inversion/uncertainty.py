@@ -163,26 +163,29 @@ class Evidence:
         )
 
     def _widened(self, covariance: Tensor, spans: Tensor) -> Tensor:
-        """The covariance, in units of the spans, with what the loss says far along weak directions."""
+        """The covariance, in units of the spans, with what the loss says far off in weak ways."""
         fit, known = self._end.fit, torch.tensor([math.isfinite(c.span) for c in self._found])
-        if bool(_penalty(fit, self._found).any()):
+        pairs = zip(*_eigen(covariance[known][:, known]), strict=True)
+        weak = [(float(error), axis) for error, axis in pairs if _WEAK < error < 1]
+        if not weak or bool(_penalty(fit, self._found).any()):
             return covariance
         with torch.no_grad():
             target = [predicted for predicted, _ in fit.sharp_maps(0)]
         own = fit.objective.curvature([(a, a) for a in target], self._rows[0])
-        own = own * spans * spans[:, None]
-        for error, axis in zip(*_eigen(covariance[known][:, known]), strict=True):
-            if _WEAK < error < 1:
-                way = torch.zeros(len(spans), dtype=torch.float64)
-                way[known] = axis
-                said = 0.5 * _FAR**2 / float(way @ torch.linalg.pinv(own, hermitian=True) @ way)
-                rise = min(self._risen(far * way, spans, target) for far in (_FAR, -_FAR))
-                more = float(error) * (said / max(rise, _LEAST * said) - 1)
-                covariance = covariance + max(more, 0.0) * way * way[:, None]
+        inverse = torch.linalg.pinv(own * spans * spans[:, None], hermitian=True)
+        for error, axis in weak:
+            way = torch.zeros(len(spans), dtype=torch.float64)
+            way[known] = axis
+            said = 0.5 * _FAR**2 / float(way @ inverse @ way)
+            rise = min(self._risen(far * way, spans, target) for far in (_FAR, -_FAR))
+            more = error * (said / max(rise, _LEAST * said) - 1)
+            covariance = covariance + max(more, 0.0) * way * way[:, None]
         return covariance
 
     def _risen(self, move: Tensor, spans: Tensor, target: list[Tensor]) -> float:
         """The loss where the twin is moved and all other coordinates make the best of it.
+
+        It is infinite where the scene refuses the move.
 
         Args:
             move: In units of the spans.
@@ -190,19 +193,25 @@ class Evidence:
             target: What stands for the data: the twin's own maps.
         """
         fit, least = self._end.fit.copied(), math.inf
-        across = torch.linalg.svd(move[None])[2][1:]
+
+        def here() -> list[Coordinate]:
+            every = list(coordinates(fit.modules))
+            return [every[k] for k in self._kept]
+
+        across = torch.linalg.svd(move[None])[2][1:]  # the ways that are perpendicular to the move
         for step in range(_REFITS + 1):
-            found = [list(coordinates(fit.modules))[k] for k in self._kept]
             with torch.no_grad():
-                for change, coordinate in zip((move * spans).tolist(), found, strict=True):
+                for change, coordinate in zip((move * spans).tolist(), here(), strict=True):
                     for name, tangent in coordinate.tangents.items():
                         fit.modules.get_parameter(name).add_(tangent, alpha=change)
-                maps = [(a, b) for (a, _), b in zip(fit.sharp_maps(0), target, strict=True)]
+                try:
+                    maps = [(a, b) for (a, _), b in zip(fit.sharp_maps(0), target, strict=True)]
+                except InputError:
+                    return least
             loss, slopes = self._end.slopes(maps)
             least = min(least, loss)
             if step < _REFITS:
-                found = [list(coordinates(fit.modules))[k] for k in self._kept]
-                rows = _derivatives(fit, found, 0)
+                rows = _derivatives(fit, here(), 0)
                 parts = zip(rows, slopes, strict=True)
                 slope = torch.stack([a.flatten(1) @ b.flatten() for a, b in parts]).sum(0)
                 own = fit.objective.curvature(maps, rows) * spans * spans[:, None]
