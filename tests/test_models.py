@@ -250,3 +250,16 @@ def test_chain_fields_are_the_range_profiles_of_a_recording():
     assert relative(found, truth) < 0.2
     away = corner().replace("corner", pose=thing(plate(1, 1), (0.02, 0.0, 1.001)).pose)
     assert relative(model.predict(away, device, 0), truth) > 1.0
+
+
+def test_looks_at_chain_fields_have_the_noise_that_is_asked_for():
+    device = radar()
+    model = ChainField(device.grid(0.7, 1.3), sampling=Sampling(depth=3))
+    flat = model.predict(corner(), device, 0)
+    look = model.looks(corner(), device, 0)
+    assert look is not None
+    assert torch.allclose(look(0, 0.0), flat)
+    noise = 0.01 * float(flat.square().max())
+    found = look(1, noise) - flat
+    assert float(found.square().mean()) == pytest.approx(noise, rel=0.2)
+    assert abs(float(found.mean())) < 0.1 * noise**0.5

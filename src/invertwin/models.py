@@ -53,11 +53,13 @@ class ForwardModel(ABC):
             included. Gauss–Newton and gradient checks need that.
         random: Whether maps depend on the seed. Of a model whose maps do not, gradient checks take
             one derivative and one pair of differences.
+        fields: Whether maps hold parts of fields, of either sign, not power.
     """
 
     redraws: ClassVar[bool] = True
     smooth: ClassVar[bool] = True
     random: ClassVar[bool] = True
+    fields: ClassVar[bool] = False
 
     @abstractmethod
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Float[Tensor, "frame *map"]:
@@ -107,8 +109,8 @@ class ForwardModel(ABC):
             seed: Of the points on rough surfaces.
 
         Returns:
-            A function of a seed and of the mean noise in a bin that returns a map, as ``observe``
-            would show it. None where the model cannot say.
+            A function of a seed and of the mean noise in a bin, of ``fields`` its mean square, that
+            returns a map, as ``observe`` would show it. None where the model cannot say.
         """
         return None
 
@@ -224,7 +226,12 @@ class SurrogateMap(ForwardModel):
             return None
         fields = replace(self.sampling, boundary=False)
         looks = Looks(trace_field(scene, sensor.link(), sampling=fields, seed=seed), sensor)
-        return _noisy(lambda number: looks.beat(derived_seed(number, 0)), sensor, self.grid, seed)
+        return _noisy(
+            lambda number: looks.beat(derived_seed(number, 0)),
+            lambda beat: exact_spectrum(beat, sensor, self.grid).to(torch.float32),
+            sensor,
+            seed,
+        )
 
     @property
     def widened(self) -> bool:
@@ -241,9 +248,14 @@ class SurrogateMap(ForwardModel):
 
 
 def _noisy(
-    beat_of: Callable[[int], Tensor], sensor: Radar, grid: Grid, seed: int
+    beat_of: Callable[[int], Tensor],
+    shown: Callable[[Tensor], Tensor],
+    sensor: Radar,
+    seed: int,
+    *,
+    fields: bool = False,
 ) -> Callable[[int, float], Tensor]:
-    """Looks with noise, from a function of their number that gives the beat signals."""
+    """Looks with noise: a function of their number gives beat signals, another shows them."""
     assert isinstance(sensor.waveform, SampledWaveform)
     shape = (*sensor.shape, sensor.waveform.samples)
 
@@ -251,11 +263,11 @@ def _noisy(
         generator = torch.Generator().manual_seed(key)
         return torch.randn(shape, dtype=torch.complex64, generator=generator)
 
-    share = float(exact_spectrum(white(seed), sensor, grid).mean())
+    whole = shown(white(seed))
+    share = float((whole.square() if fields else whole).mean())
 
     def look(number: int, noise: float) -> Tensor:
-        beat = beat_of(number) + (noise / share) ** 0.5 * white(derived_seed(number, 1))
-        return exact_spectrum(beat, sensor, grid).to(torch.float32)
+        return shown(beat_of(number) + (noise / share) ** 0.5 * white(derived_seed(number, 1)))
 
     return look
 
@@ -284,10 +296,12 @@ class ChainMap(ForwardModel):
     def _beat(self, scene: Scene, sensor: Radar) -> Tensor:
         return beat_signal(trace_chains(scene, sensor.link(), self.sampling.depth), sensor)
 
+    def _shown(self, beat: Tensor, sensor: Radar) -> Tensor:
+        return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
+
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
         """The spectrum of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
-        spectrum = exact_spectrum(self._beat(scene, sensor), sensor, self.grid)
-        return self.blurred(spectrum.to(torch.float32), sensor)
+        return self.blurred(self._shown(self._beat(scene, sensor), sensor), sensor)
 
     def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
         """The measured power spectrum of a capture."""
@@ -296,11 +310,17 @@ class ChainMap(ForwardModel):
     def looks(
         self, scene: Scene, sensor: Radar, seed: int
     ) -> Callable[[int, float], Tensor] | None:
-        """The spectrum with other noise each time; None for waveforms without samples."""
+        """The map with other noise each time; None for waveforms without samples."""
         if not isinstance(sensor.waveform, SampledWaveform):
             return None
-        beat = self._beat(scene, sensor).to(torch.complex64)
-        return _noisy(lambda _: beat, sensor, self.grid, seed)
+        beat = self._beat(scene, sensor)
+        return _noisy(
+            lambda _: beat,
+            lambda signal: self._shown(signal, sensor),
+            sensor,
+            seed,
+            fields=self.fields,
+        )
 
     @property
     def widened(self) -> bool:
@@ -323,27 +343,24 @@ class ChainField(ChainMap):
     The phase tells the range to parts of a wavelength. So its loss has a minimum every half
     wavelength: it refines what a ``ChainMap`` has found to a tenth of a wavelength in range, in a
     later stage of a fit. Maps hold real and imaginary parts; compare them by a ``SpectrumLoss`` of
-    kind ``mse`` with one level. The radar's phase is calibrated. Error bars come from the scatter
-    of the frames.
+    kind ``mse`` with one level. The radar's phase is calibrated.
     """
+
+    fields: ClassVar[bool] = True
+
+    def _shown(self, beat: Tensor, sensor: Radar) -> Tensor:
+        profile = range_profile(beat.to(torch.complex128), sensor, self.grid)
+        return torch.view_as_real(profile.flatten(1, 2).mT).contiguous()
 
     def predict(
         self, scene: Scene, sensor: Radar, seed: int
     ) -> Float[Tensor, "frame range channel part"]:
         """The range profiles of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
-        return self._profile(self._beat(scene, sensor), sensor)
+        return super().predict(scene, sensor, seed)
 
     def observe(self, recording: Capture) -> Float[Tensor, "frame range channel part"]:
         """The measured range profiles of a capture."""
-        return self._profile(recording.beat, recording.radar())
-
-    def _profile(self, beat: Tensor, radar: Radar) -> Tensor:
-        profile = range_profile(beat.to(torch.complex128), radar, self.grid)
-        return torch.view_as_real(profile.flatten(1, 2).mT).contiguous()
-
-    def looks(self, scene: Scene, sensor: Radar, seed: int) -> None:
-        """None: how noise is drawn is known for power only."""
-        return
+        return self._shown(recording.beat, recording.radar())
 
     @property
     def widened(self) -> bool:

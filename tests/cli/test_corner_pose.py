@@ -16,8 +16,10 @@ def test_a_corner_is_found_but_for_its_roll(repository, tmp_path, monkeypatch):
     assert metrics["success"]
     assert metrics["position_error_m"] < 1e-4
     assert metrics["rotation_error_deg"] < 0.5
+    assert metrics["verdict"] == "consistent"
     # The whole turn is another matter: its roll is not observed.
-    assert metrics["turn_error_deg"] > metrics["rotation_error_deg"]
+    (row,) = metrics["starts"]
+    assert row["turn_error_deg"] > metrics["rotation_error_deg"]
     (told,) = metrics["unobserved"]
     assert told.startswith("corner.roll: not observed")
 

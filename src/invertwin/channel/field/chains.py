@@ -28,9 +28,9 @@ def trace_chains(scene: Scene, link: Link, depth: int) -> Paths:
 
     ``a = −(j/4π) (−1)^(m−1) √(G_t G_r)/(R r) (cosθ + cosθ')/2 ∫ exp(−jk(d − s)·x) dA`` after m
     bounces, R the unfolded way to the centroid of the lit polygon. Beams are clipped as those of a
-    plane wave from the antenna to the middle of the scene, and phases are plane over a polygon: the
-    antennas are further than 2D²/λ from a target of size D. Only other facets hide a facet from the
-    transmitter, nothing hides it from the receiver.
+    plane wave from the antenna to the middle of the scene, and phases are plane over a polygon, so
+    that antennas should be in its far field. Only other facets hide a facet from the transmitter;
+    nothing hides it from the receiver.
 
     Args:
         scene: Smooth conductors of at most 24 triangles together.
