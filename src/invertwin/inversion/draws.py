@@ -11,6 +11,7 @@ from torch import Tensor
 
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.loss import Maps, SpectrumLoss, pooled
+from invertwin.progress import told
 from invertwin.seeds import derived_seed
 
 _LOOKS = 64  # they tell a standard deviation to 9 %
@@ -99,7 +100,7 @@ class End:
         models = [observation.model for observation in self.fit.observations]
         every = zip(self.maps, self.gains, models, strict=True)
         noises = [_noise(*pair, gain, model.fields) for pair, gain, model in every]
-        for number in range(_LOOKS):
+        for number in told(range(_LOOKS), "looks at the twin"):
             yield [
                 look(derived_seed(number, k), noise)
                 for k, (look, noise) in enumerate(zip(looks, noises, strict=True))
