@@ -260,6 +260,7 @@ def test_looks_at_chain_fields_have_the_noise_that_is_asked_for():
     assert look is not None
     assert torch.allclose(look(0, 0.0), flat)
     noise = 0.01 * float(flat.square().max())
-    found = look(1, noise) - flat
-    assert float(found.square().mean()) == pytest.approx(noise, rel=0.2)
+    found = torch.stack([look(number, noise) - flat for number in range(20)])
+    # How strong noise is in a map is known from one draw of it.
+    assert float(found.square().mean()) == pytest.approx(noise, rel=0.3)
     assert abs(float(found.mean())) < 0.1 * noise**0.5

@@ -12,10 +12,10 @@ from invertwin.errors import InputError
 from invertwin.scene import (
     PerfectConductor,
     Scene,
+    box,
     plate,
     rigid,
     rotation_from_vector,
-    sphere,
     trihedral,
 )
 from scenes import float64, link, thing
@@ -99,6 +99,9 @@ def test_turned_about_its_axis_a_corner_looks_the_same_from_its_central_zone():
 def test_only_few_flat_conductors_have_chains():
     with pytest.raises(InputError, match="expected smooth conductors alone"):
         trace_chains(Scene({"wall": thing(plate(1, 1))}), antennas(), 1)
-    ball = thing(sphere(0.1, 1), material=PerfectConductor())
+    boxes = {
+        name: thing(box((0.1, 0.1, 0.1)), (x, 0.0, 0.0), material=PerfectConductor())
+        for name, x in (("left", -1.0), ("middle", 0.0), ("right", 1.0))
+    }
     with pytest.raises(InputError, match="expected at most 24 triangles"):
-        trace_chains(Scene({"ball": ball}), antennas(), 1)
+        trace_chains(Scene(boxes), antennas(), 1)
