@@ -10,9 +10,17 @@ from rich.console import Console
 
 from invertwin.cli import build
 from invertwin.cli.fits.certainty import certainty_table
-from invertwin.cli.fits.problem import Problem, another, observations_of, problem_of, unknowns_of
+from invertwin.cli.fits.problem import (
+    Problem,
+    another,
+    observations_of,
+    problem_of,
+    stages_of,
+    unknowns_of,
+)
 from invertwin.cli.report import Table, finish, texts
 from invertwin.cli.run_file import need
+from invertwin.cli.running import progress
 from invertwin.cli.schema import Plan, RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
@@ -47,7 +55,8 @@ def run_plan(
         wide = run.model_copy(update={"radar": radar.model_copy(update={"positions": every})})
     own = problem_of(wide, console)
     console.print("error bars")
-    found, added = planned(_at_truth(own), len(places))
+    with progress(console):
+        found, added = planned(_at_truth(own), len(places))
     metrics: dict[str, Any] = {"task": "plan", **bars(found), "verdict_reasons": []}
     first = len(own.first.radar.positions) - len(places)
     metrics["candidates"] = [
@@ -71,9 +80,11 @@ def run_plan(
 
 
 def _at_truth(problem: Problem) -> Any:
+    # Error bars are those of the last stage, which may have another model.
+    last = replace(problem, run=stages_of(problem.run)[-1][1])
     return fit_at(
         problem.truth,
-        observations_of(problem),
+        observations_of(last),
         unknowns_of(problem.run),
         loss=build.made(problem.run, "loss"),
         seed=problem.run.seed,
