@@ -40,7 +40,7 @@ from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel.field.diffracted import Surroundings, diffracted_paths
+from invertwin.channel.field.diffracted import EdgedScene, diffracted_paths
 from invertwin.channel.field.diffraction import Faces, Turn, conductor, diffraction_dyad
 from invertwin.channel.field.edge_paths import Edge, over_edges, slope_transfer
 from invertwin.channel.field.transition import transition
@@ -386,7 +386,7 @@ class Cube:
         topology = topology_of([mesh])
         rays = Occluders(mesh.vertices, topology, torch.zeros(3, dtype=torch.float64))
         self.half = side / 2
-        self.around = Surroundings(
+        self.around = EdgedScene(
             mesh.vertices, topology, rays, lambda _, cosine: conductor(0, cosine)
         )
 

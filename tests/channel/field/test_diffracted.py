@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from invertwin.channel.field.diffracted import Surroundings, diffracted_paths
+from invertwin.channel.field.diffracted import EdgedScene, diffracted_paths
 from invertwin.channel.field.diffraction import conductor
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene import Occluders, visible
@@ -21,7 +21,7 @@ def surroundings(*meshes, scale=1.0):
     vertices = torch.cat([mesh.vertices for mesh in meshes]) * scale
     topology = topology_of(list(meshes))
     rays = Occluders(vertices, topology, torch.zeros(3, dtype=torch.float64))
-    return Surroundings(vertices, topology, rays, lambda _, cosine: conductor(0, cosine))
+    return EdgedScene(vertices, topology, rays, lambda _, cosine: conductor(0, cosine))
 
 
 def behind(around, rx):

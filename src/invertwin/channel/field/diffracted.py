@@ -41,7 +41,7 @@ _ONE_PLANE = 1e-6
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class EdgedScene:
     """A scene as diffraction sees it.
 
     Attributes:
@@ -105,7 +105,7 @@ class DiffractedPaths:
 
 
 def diffracted_paths(
-    around: Surroundings,
+    around: EdgedScene,
     tx: Float64[Tensor, "link 3"],
     rx: Float64[Tensor, "link 3"],
     wave_number: float,
@@ -157,7 +157,7 @@ def exterior(wedges: Wedges, places: Float64[Tensor, "row 3"]) -> Bool[Tensor, "
 
 
 def _once(
-    around: Surroundings, tx: Tensor, rx: Tensor, wave_number: float
+    around: EdgedScene, tx: Tensor, rx: Tensor, wave_number: float
 ) -> Iterator[DiffractedPaths]:
     """Paths over one edge."""
     count = len(around.wedges.start)
@@ -171,7 +171,7 @@ def _once(
 
 
 def _twice(
-    around: Surroundings, tx: Tensor, rx: Tensor, wave_number: float
+    around: EdgedScene, tx: Tensor, rx: Tensor, wave_number: float
 ) -> Iterator[DiffractedPaths]:
     """Paths over two edges."""
     pairs, between = _pairs(around)
@@ -196,7 +196,7 @@ def _twice(
         yield from _seen(around, wave_number, link, row, (tx, rx), sent)
 
 
-def _sees(around: Surroundings, places: Tensor) -> Bool[Tensor, "place edge"]:
+def _sees(around: EdgedScene, places: Tensor) -> Bool[Tensor, "place edge"]:
     """Which wedges places are outside of."""
     count, edges = len(places), len(around.wedges.start)
     row = torch.arange(edges).repeat(count)
@@ -204,7 +204,7 @@ def _sees(around: Surroundings, places: Tensor) -> Bool[Tensor, "place edge"]:
     return outside.reshape(count, edges)
 
 
-def _pairs(around: Surroundings) -> tuple[Int64[Tensor, "pair 2"], Int64[Tensor, "pair 2"]]:
+def _pairs(around: EdgedScene) -> tuple[Int64[Tensor, "pair 2"], Int64[Tensor, "pair 2"]]:
     """Edges that may follow one another, and which of their faces lies between them (−1: none).
 
     Two edges with a face between them have one path along each side that both have in common.
@@ -236,7 +236,7 @@ def _pairs(around: Surroundings) -> tuple[Int64[Tensor, "pair 2"], Int64[Tensor,
 
 
 def _seen(
-    around: Surroundings,
+    around: EdgedScene,
     wave_number: float,
     link: Tensor,
     edge: Tensor,
