@@ -21,7 +21,7 @@ from invertwin.memory import require_at_most
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.scene.polarisation import JonesTable, Polarisation
 
-Polarised = Literal["V", "H", "circular"] | Sequence[float | Sequence[float]] | JonesTable | Tensor
+Polarised = str | ArrayLike | JonesTable
 _MOST_ELEMENTS = 1e5
 COSINE_COUNT = 2049
 """Nodes of a pattern table over cosθ, at linspace(−1, 1, 2049)."""

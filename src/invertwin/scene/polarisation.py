@@ -6,10 +6,9 @@ takes p · E of a field E, without a conjugate, so that an antenna has one vecto
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
 
 import torch
 from jaxtyping import Complex128, Float64
@@ -28,7 +27,7 @@ _DETACHED = "polarisations cannot be fitted: detach them"
 
 
 def jones_basis(
-    polarisation: str | Sequence[complex] | ArrayLike,
+    polarisation: str | ArrayLike,
 ) -> Complex128[Tensor, "2 2"]:
     """The polarisation and the one orthogonal to it, of unit length, as columns over (V, H).
 
@@ -150,7 +149,7 @@ class Polarisation:
 
     @staticmethod
     def of(
-        polarisation: Literal["V", "H", "circular"] | ArrayLike | JonesTable,
+        polarisation: str | ArrayLike | JonesTable,
         leakage: complex | ArrayLike,
         elements: int,
     ) -> "Polarisation":

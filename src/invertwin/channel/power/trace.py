@@ -47,7 +47,9 @@ def without_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, Link]
         link: Antennas.
     """
     tables = dict(zip(DIFFERENTIABLE, map(plain, tables_of(geometry, link)), strict=True))
-    rows = replace(geometry.surfaces, **{name: tables.pop(name) for name in SURFACE})
+    rows = {name: tables.pop(name) for name in SURFACE}
+    rows["depolarisation"] = plain(geometry.surfaces.depolarisation)
+    rows = replace(geometry.surfaces, **rows)
     return replace(geometry, vertices=tables.pop("vertices"), surfaces=rows), replace(
         link, **tables
     )
