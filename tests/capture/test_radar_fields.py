@@ -1,6 +1,7 @@
 """Every waveform survives the way into a file and back."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -44,12 +45,13 @@ def test_polarisations(tmp_path):
     vectors = torch.tensor([[[1, 0]], [[0.6, 0.8j]]], dtype=torch.complex128)
     table = JonesTable(torch.tensor([0.0, 1.0]).double(), torch.zeros(1).double(), vectors)
     there = torch.tensor([[0.3, 0.2, 0.9]], dtype=torch.float64)
-    for options in (
+    cases: list[dict[str, Any]] = [
         {"polarisation": "H", "leakage": [0.0, 0.3]},
         {"polarisation": "circular"},
         {"polarisation": table},
         {"polarisation": table, "leakage": 0.2},
-    ):
+    ]
+    for options in cases:
         arrays = linear_array(1, 1.0), linear_array(2, 1e-3, **options)
         radar = Radar(*arrays, FMCW(76e9, 1e9, 40e-6, 16), torch.zeros(1, 3, dtype=torch.float64))
         beat = torch.ones(1, 1, 2, 16, dtype=torch.complex128)
