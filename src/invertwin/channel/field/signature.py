@@ -21,14 +21,6 @@ from torch.nn.functional import normalize
 from invertwin.channel.field.beams import Bounce, Facets, beams
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
-from invertwin.channel.field.routes import (
-    Mirrors,
-    Route,
-    is_open,
-    mirrors_of,
-    routed,
-    sequences,
-)
 from invertwin.channel.field.tubes import TubeBounce, tubes
 from invertwin.channel.field.waves import (
     Skins,
@@ -60,8 +52,7 @@ FEW = 24
 _SAGITTA = 1 / 50  # wavelengths that a facet may be off the curved surface
 _SMOOTH = (1e-6, 0.35)  # rad that normals turn from facet to facet where a surface is curved
 _SEGMENTS = 2.0  # of an edge per wavelength; each is seen or not
-_MOST_MIRRORS = 2  # between an edge and an antenna
-_LEAST_LINE = 0.5  # wavelengths that an edge which ends in a smooth surface runs on at least
+_LEAST_LINE = 2.0  # wavelengths that an edge which ends in a smooth surface runs on at least
 _OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
 _ROWS_AT_ONCE = 1 << 18
 _Lit = Bounce | TubeBounce
@@ -168,7 +159,7 @@ class _View:
     ) -> dict[str, Tensor]:
         """All parts of the field."""
         found = self._bounces(depth, spacing, boundary)
-        return found | self._diffracted(edges, depth) if edges else found
+        return found | self._diffracted(edges) if edges else found
 
     @property
     def _sent(self) -> Tensor:
@@ -232,7 +223,7 @@ class _View:
             again = reflected(*surface)
         return found
 
-    def _diffracted(self, most: int, depth: int) -> dict[str, Tensor]:
+    def _diffracted(self, most: int) -> dict[str, Tensor]:
         """What sharp edges of conductors add to physical optics."""
         body = self.body
         topology = body.topology
@@ -240,14 +231,7 @@ class _View:
         wedges = find_wedges(body.facets.corners, ends, topology.beside)
         wedges = wedges.rows(body.skins[0].conducting[wedges.face])
         wedges = wedges.rows(run_on(wedges, body.wavelength * _LEAST_LINE))
-        mirrors = mirrors_of(
-            body.facets.corners,
-            body.facets.normal,
-            body.skins[0].conducting & body.plain,
-            body.facets.solid,
-            body.facets.size,
-        )
-        found = {"edges 1": self._once(wedges, mirrors, min(depth - 1, _MOST_MIRRORS))}
+        found = {"edges 1": self._once(wedges)}
         plates = plates_of(wedges) if most > 1 else []
         totals = [list(self._none()) for _ in range(2, most + 1)]
         every = torch.arange(len(self.transmitters))
@@ -259,29 +243,42 @@ class _View:
                 total[f] = self._received(total[f], every, sent)
         return found | {f"edges {n}": torch.stack(t) for n, t in enumerate(totals, start=2)}
 
-    def _once(self, wedges: Wedges, mirrors: Mirrors, most: int) -> Tensor:
+    def _once(self, wedges: Wedges) -> Tensor:
         """First-order fringe currents of the parts of edges that both antennas see."""
         body, total = self.body, list(self._none())
         wedges = _segments(wedges, body.wavelength / _SEGMENTS)
-        count, left_out = len(wedges.start), 0
-        every = torch.arange(len(self.transmitters))
-        for aspects in every.split(max(1, _ROWS_AT_ONCE // max(1, count))) if count else ():
-            sent, flat = self._routes(self.transmitters, wedges, aspects, mirrors, most)
-            received, also = sent, 0
-            if not torch.equal(self.transmitters, self.receivers):
-                received, also = self._routes(self.receivers, wedges, aspects, mirrors, most)
-            left_out += flat + also
-            key = torch.full((len(aspects) * count,), -1)
-            for there in sent:
-                key.fill_(-1)
-                key[(there.aspect - aspects[0]) * count + there.edge] = torch.arange(
-                    len(there.edge)
-                )
-                for back in received:
-                    row = key[(back.aspect - aspects[0]) * count + back.edge]
-                    both = row >= 0
-                    if bool(both.any()):
-                        self._add(total, wedges, there.rows(row[both]), back.rows(both))
+        count = len(wedges.start)
+        left_out = 0
+        some = torch.arange(len(self.transmitters))
+        for aspects in some.split(max(1, _ROWS_AT_ONCE // max(1, count))) if count else ():
+            aspect = aspects.repeat_interleave(count)
+            row = torch.arange(count).repeat(len(aspects))
+            for way in (self.transmitters, self.receivers):
+                direction = way[aspect]
+                at = wedges.rows(row)
+                keep = outside(at, direction)
+                flat = keep & grazes(at, direction)
+                left_out += int(flat.sum())
+                aspect, row = aspect[keep & ~flat], row[keep & ~flat]
+            for way in (self.transmitters, self.receivers):
+                at = wedges.rows(row)
+                aside = (at.normals - at.inwards).sum(1)
+                middle = (at.start + at.end) / 2
+                middle = middle + _OFF * body.facets.size * normalize(aside, dim=1)
+                seen = body.clear(middle, way[aspect])
+                aspect, row = aspect[seen], row[seen]
+                if way is self.receivers:
+                    break
+            at = wedges.rows(row)
+            d, s = -self.transmitters[aspect], self.receivers[aspect]
+            middle, side = (at.start + at.end) / 2, at.end - at.start
+            for f, k in enumerate(body.wave_numbers):
+                sent = fringe_field(at, k, d, self._sent[aspect], s)
+                wave = k * (s - d)
+                width = parallelogram_integral(wave, side, torch.zeros_like(side))
+                turn = dot(wave, middle)
+                scale = torch.polar(torch.ones_like(turn), turn) * width * side.norm(dim=1)
+                total[f] = self._received(total[f], aspect, sent * scale[:, None, None])
         if left_out:
             warnings.warn(
                 f"edges of sheets within {math.degrees(LEAST_ANGLE):.0f}° of grazing are left out: "
@@ -290,46 +287,6 @@ class _View:
                 stacklevel=2,
             )
         return torch.stack(total)
-
-    def _routes(
-        self, way: Tensor, wedges: Wedges, aspects: Tensor, mirrors: Mirrors, most: int
-    ) -> tuple[list[Route], int]:
-        """How antennas see edges, straight and in mirrors; and how many are grazed."""
-        body, count = self.body, len(wedges.start)
-        aspect = aspects.repeat_interleave(count)
-        edge = torch.arange(count).repeat(len(aspects))
-        fields = polarisations(way[aspect], body.up)
-        straight = Route(aspect, edge, way[aspect], fields, torch.zeros_like(way[aspect, 0]))
-        ends = torch.stack([wedges.start, wedges.end], 1)
-        aside = (wedges.normals - wedges.inwards).sum(1)
-        beside = ends.mean(1) + _OFF * body.facets.size * normalize(aside, dim=1)
-        found, left_out = [], 0
-        for sequence in sequences(mirrors, most):
-            route = routed(straight, mirrors, sequence, ends)
-            at = wedges.rows(route.edge)
-            keep = outside(at, route.towards)
-            flat = keep & grazes(at, route.towards)
-            left_out += 0 if sequence else int(flat.sum())
-            route = route.rows(keep & ~flat)
-            start, far = beside[route.edge], 3 * body.facets.size
-            route = route.rows(
-                is_open(body.occluders, mirrors, sequence, start, route.towards, far)
-            )
-            found += [route] if len(route.edge) else []
-        return found, left_out
-
-    def _add(self, total: list[Tensor], wedges: Wedges, there: Route, back: Route) -> None:
-        """Add what edges send that are lit by one route and seen by another."""
-        at = wedges.rows(there.edge)
-        middle, side = (at.start + at.end) / 2, at.end - at.start
-        for f, k in enumerate(self.body.wave_numbers):
-            sent = fringe_field(at, k, -there.towards, there.fields, back.towards)
-            wave = k * (back.towards + there.towards)
-            width = parallelogram_integral(wave, side, torch.zeros_like(side))
-            turn = dot(wave, middle) + k * (there.length + back.length)
-            scale = torch.polar(torch.ones_like(turn), turn) * width * side.norm(dim=1)
-            seen = dot(back.fields[:, :, None], sent[:, None]) * scale[:, None, None]
-            total[f] = total[f].index_add(0, there.aspect, seen)
 
 
 def _segments(wedges: Wedges, longest: float) -> Wedges:

@@ -110,7 +110,7 @@ def run_on(wedges: Wedges, least: float) -> Bool[Tensor, " row"]:
 
     Edges run on into others of like opening. About a tip, smooth facets turn sharply, but where the
     rings have more of them they do not: such lines are short and end in a smooth surface. Lines of
-    the body are long, or join long ones at both ends.
+    the body end at others, or are long.
 
     Args:
         wedges: sharp edges.
@@ -143,12 +143,15 @@ def run_on(wedges: Wedges, least: float) -> Bool[Tensor, " row"]:
         )
         for reduce in ("amin", "amax")
     )
-    long = (high - low).norm(dim=1) >= least
-    met = torch.zeros(len(number), dtype=torch.bool)
-    met[vertex[long[line.repeat(2)]]] = True
-    touching = torch.unique(torch.stack([line.repeat(2), vertex], 1)[met[vertex]], dim=0)
-    held = torch.bincount(touching[:, 0], minlength=lines) > 1
-    return (long | held)[line]
+    short = (high - low).norm(dim=1) < least
+    kept, left = torch.ones(lines, dtype=torch.bool), -1
+    # Taking one away may leave the next with a loose end.
+    while left != int(kept.sum()):
+        left = int(kept.sum())
+        there = kept[line.repeat(2)]
+        loose = there & (torch.bincount(vertex[there], minlength=len(number))[vertex] == 1)
+        kept[line.repeat(2)[loose]] &= ~short[line.repeat(2)[loose]]
+    return kept[line]
 
 
 def outside(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
