@@ -15,7 +15,7 @@ from torch.func import functional_call
 
 from invertwin.capture import Capture
 from invertwin.capture.track import Track
-from invertwin.channel import Sampling, deposit_power, trace_field
+from invertwin.channel import Link, Paths, Sampling, deposit_power, trace_chains, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check, gradcheck
@@ -55,6 +55,7 @@ MECHANISMS = {
     "coherent field": "coherent",
     "rough field": "rough",
     "signature": "signature",
+    "chains": "chains",
 }
 ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
 METAL = PerfectConductor()
@@ -248,7 +249,11 @@ def pushed(function: Callable[[Tensor], Tensor]) -> Tensor:
 def response(scene: Scene, radar: Radar, sampling: Sampling, seed: int) -> Tensor:
     """Real and imaginary parts of the channel at the carrier, per frame."""
     antennas = radar.link()
-    paths = trace_field(scene, antennas, sampling=sampling, seed=seed)
+    return at_carrier(trace_field(scene, antennas, sampling=sampling, seed=seed), antennas)
+
+
+def at_carrier(paths: Paths, antennas: Link) -> Tensor:
+    """Real and imaginary parts of the sum of field paths, per frame."""
     phase = 2 * math.pi / antennas.wavelength * SPEED_OF_LIGHT * paths.delay
     field = paths.coefficient * torch.polar(torch.ones_like(phase), -phase)
     total = torch.zeros(antennas.frame_count, dtype=torch.complex128)
@@ -314,6 +319,19 @@ def signature_case(parameter: str) -> Found:
     return Found(found, found, (up - down) / 2e-5, 0.0)
 
 
+def chain_case(parameter: str) -> Found:
+    """Chains between two plates, one of which hides the other; no random numbers."""
+    scene, radar, moves = occluder(wall=METAL, occluder=METAL), field_radar(0.3), MOVES[parameter]
+
+    def value(theta: Tensor) -> Tensor:
+        moved, device = moves(scene, radar, theta)
+        return at_carrier(trace_chains(moved, device.link(), 2), device.link())
+
+    up, down = (value(torch.tensor(sign * 1e-6).double()) for sign in (1, -1))
+    found = pushed(value)
+    return Found(found, found, (up - down) / 2e-6, 0.0)
+
+
 _power: dict[str, Found] = {}
 
 
@@ -324,6 +342,8 @@ def case(parameter: str, mechanism: str) -> Found:
         return rough_case(parameter)
     if mechanism == "signature":
         return signature_case(parameter)
+    if mechanism == "chains":
+        return chain_case(parameter)
     if parameter not in _power:
         _power[parameter] = bias_case() if parameter == "range bias" else power_case(parameter)
     return _power[parameter]
@@ -376,6 +396,11 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     """Use a scene and a radar as the mechanism does."""
     if mechanism == "signature":
         section(scene)
+        return
+    if mechanism == "chains":
+        exact_spectrum(
+            beat_signal(trace_chains(scene, radar.link(), 2), radar), radar, radar.grid(0.4, 2.8)
+        )
         return
     if mechanism.endswith(("interior", "boundary")):
         grid = radar.grid(0.4, 2.8, 0.6)
@@ -440,7 +465,7 @@ REFUSED = [cell for cell, said in CELLS.items() if said == "refused"]
 
 @pytest.mark.parametrize(("parameter", "mechanism"), REFUSED)
 def test_refused(parameter, mechanism):
-    surface = METAL if mechanism == "coherent" else ROUGH
+    surface = METAL if mechanism in ("coherent", "chains") else ROUGH
     scene, radar = occluder(wall=surface, occluder=surface), power_radar()
     message = NAMES.get(parameter, "expected no geometry derivative of rough field paths")
     theta = torch.zeros((), dtype=torch.float64, requires_grad=True)

@@ -11,17 +11,16 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.beams import Bounce, Facets, beams
+from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
-from invertwin.channel.field.tubes import TubeBounce, tubes
+from invertwin.channel.field.tubes import tubes
 from invertwin.channel.field.waves import (
     Skins,
     dot,
@@ -47,15 +46,12 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene.scene import Scene
 
-FEW = 24
-"""Triangles of a scene up to which beams are clipped exactly; more are shot with tubes."""
 _SAGITTA = 1 / 50  # wavelengths that a facet may be off the curved surface
 _SMOOTH = (1e-6, 0.35)  # rad that normals turn from facet to facet where a surface is curved
 _SEGMENTS = 2.0  # of an edge per wavelength; each is seen or not
 _LEAST_LINE = 2.0  # wavelengths that an edge which ends in a smooth surface runs on at least
 _OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
 _ROWS_AT_ONCE = 1 << 18
-_Lit = Bounce | TubeBounce
 
 
 @dataclass(frozen=True)
@@ -178,36 +174,31 @@ class _View:
     def _bounces(self, depth: int, spacing: float | None, boundary: bool) -> dict[str, Tensor]:
         """Physical optics of every order: of beams, or of tubes where a spacing is given."""
         body, orders = self.body, [list(self._none()) for _ in range(depth)]
-        chains: Iterable[tuple[int, Sequence[_Lit]]]
+        chains: Iterable[Sequence[Bounce]]
         if spacing is None:
-            lit = beams(body.facets, -self.transmitters, depth, boundary=boundary)
-            chains = [(0, list(lit))]
+            chains = [list(beams(body.facets, -self.transmitters, depth, boundary=boundary))]
         else:
             chains = self._sampled(depth, spacing)
-        for first, chain in chains:
+        for chain in chains:
             currents: list[Tensor] = []
             integrals = [bounce.integral(self.receivers[bounce.aspect]) for bounce in chain]
             for f, k in enumerate(body.wave_numbers):
                 if not (body.plain and currents):
                     currents = self._currents(chain, body.skins[f], 1.0 if body.plain else k)
                 rows = zip(orders, chain, integrals, currents, strict=False)
-                for order, bounce, integral, current in islice(rows, first, None):
+                for order, bounce, integral, current in rows:
                     strength = integral(k) * (k if body.plain else 1.0)
                     sent = current * strength[:, None, None]
                     order[f] = order[f].index_add(0, bounce.aspect, sent)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
-    def _sampled(self, depth: int, spacing: float) -> Iterator[tuple[int, Sequence[_Lit]]]:
-        """Many facets: the first order triangle by triangle, the others by tubes."""
-        body, incident = self.body, -self.transmitters
-        for lit in lit_triangles(body.facets, body.clear, incident, spacing):
-            yield 0, [lit]
-        if depth > 1:
-            corners = body.facets.corners.detach()
-            for chain in tubes(body.occluders, corners, incident, spacing, depth):
-                yield 1, chain
+    def _sampled(self, depth: int, spacing: float) -> Iterator[Sequence[Bounce]]:
+        """Many facets: tubes that begin as lit triangles."""
+        facets = self.body.facets
+        for lit in lit_triangles(facets, self.body.clear, -self.transmitters, spacing):
+            yield [lit, *tubes(facets, self.body.occluders, lit, spacing, depth)]
 
-    def _currents(self, chain: Sequence[_Lit], skins: Skins, k: float) -> list[Tensor]:
+    def _currents(self, chain: Sequence[Bounce], skins: Skins, k: float) -> list[Tensor]:
         """S per m² of all patches, order by order: [row, receive, transmit] each."""
         found: list[Tensor] = []
         again = torch.zeros(0)
@@ -229,7 +220,7 @@ class _View:
         topology = body.topology
         ends = body.vertices[topology.edges]
         wedges = find_wedges(body.facets.corners, ends, topology.beside)
-        wedges = wedges.rows(body.skins[0].conducting[wedges.face])
+        wedges = wedges.rows(body.skins[0].conducting[wedges.faces[:, 0]])
         wedges = wedges.rows(run_on(wedges, body.wavelength * _LEAST_LINE))
         found = {"edges 1": self._once(wedges)}
         plates = plates_of(wedges) if most > 1 else []
@@ -313,15 +304,7 @@ def _body(scene: Scene, frequencies: Tensor, up: Tensor) -> _Body:
         )
     vertices = torch.cat([item.vertices for item in objects.values()])
     topology = topology_of([item.mesh for item in objects.values()])
-    corners = vertices[topology.faces]
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    volume = dot(corners.detach()[:, 0], area.detach()) / 6
-    solid = torch.zeros(len(corners), dtype=torch.bool)
-    for number in range(len(objects)):
-        own = topology.face_object == number
-        solid[own] = number not in topology.open_objects and bool(volume[own].sum() > 0)
-    extent = vertices.detach().amax(0) - vertices.detach().amin(0)
-    facets = Facets(corners, normalize(area, dim=1), solid, float(extent.norm()))
+    facets = facets_of(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
     skins = [_skins(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
