@@ -166,8 +166,8 @@ def _array_from_fields(end: str, dataset: xr.Dataset) -> AntennaArray:
         return replace(array, polarisation=_complex(dataset, f"{end}_jones"))
     if f"{end}_jones_table" not in dataset.variables:
         return array
-    angles = (tensor(dataset, f"{end}_jones_{name}") for name in ("theta", "phi"))
-    table = JonesTable(*angles, _complex(dataset, f"{end}_jones_table"))
+    theta, phi = (tensor(dataset, f"{end}_jones_{name}") for name in ("theta", "phi"))
+    table = JonesTable(theta, phi, _complex(dataset, f"{end}_jones_table"))
     mixtures = _complex(dataset, f"{end}_mixture")
     return replace(array, polarisation=table, leakage=mixtures[:, 1] / mixtures[:, 0])
 
