@@ -45,14 +45,15 @@ def fields(paths, wavelength: float = WAVELENGTH) -> Tensor:
 
 @pytest.mark.parametrize("turn", [(0.03, -0.05, 0.02), (-0.1, 0.12, 0.5)])
 def test_polygons_agree_with_sampled_rays(turn):
-    """Within 0.3 dB and 0.1 rad at 2 m: beams are those of plane waves."""
+    """Within 0.2 dB and 0.03 rad at 4 m, half as well at 2 m: beams are those of plane waves."""
     scene = corner(rigid(rotation_from_vector(float64(turn)), float64([0.004, -0.003, 0.002])))
+    far = link(2 * PLACES, wavelength=WAVELENGTH)
     sampled = trace_field(
-        scene, antennas(), sampling=Sampling(depth=3, samples=60_000, boundary=False), seed=1
+        scene, far, sampling=Sampling(depth=3, samples=60_000, boundary=False), seed=1
     )
-    ratio = fields(trace_chains(scene, antennas(), 3)) / fields(sampled)
-    assert (20 * ratio.abs().log10()).abs().max() < 0.3
-    assert ratio.angle().abs().max() < 0.1
+    ratio = fields(trace_chains(scene, far, 3)) / fields(sampled)
+    assert (20 * ratio.abs().log10()).abs().max() < 0.2
+    assert ratio.angle().abs().max() < 0.03
 
 
 def test_chains_of_three_bounces_have_the_range_of_the_apex():
