@@ -1,6 +1,7 @@
 """Mirrored chains as exact polygons: against sampled rays, delays, gradients, refusals."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,14 +11,17 @@ from invertwin.channel import Link, Sampling, trace_chains, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import (
+    Object,
     PerfectConductor,
     Scene,
     box,
+    dihedral,
     plate,
     rigid,
     rotation_from_vector,
     trihedral,
 )
+from invertwin.scene.polarisation import Polarisation
 from scenes import float64, link, thing
 
 WAVELENGTH = SPEED_OF_LIGHT / 77e9
@@ -45,14 +49,15 @@ def fields(paths, wavelength: float = WAVELENGTH) -> Tensor:
 
 @pytest.mark.parametrize("turn", [(0.03, -0.05, 0.02), (-0.1, 0.12, 0.5)])
 def test_polygons_agree_with_sampled_rays(turn):
-    """Within 0.3 dB and 0.1 rad at 2 m: beams are those of plane waves."""
+    """Within 0.2 dB and 0.03 rad at 4 m, half as well at 2 m: beams are those of plane waves."""
     scene = corner(rigid(rotation_from_vector(float64(turn)), float64([0.004, -0.003, 0.002])))
+    far = link(2 * PLACES, wavelength=WAVELENGTH)
     sampled = trace_field(
-        scene, antennas(), sampling=Sampling(depth=3, samples=60_000, boundary=False), seed=1
+        scene, far, sampling=Sampling(depth=3, samples=60_000, boundary=False), seed=1
     )
-    ratio = fields(trace_chains(scene, antennas(), 3)) / fields(sampled)
-    assert (20 * ratio.abs().log10()).abs().max() < 0.3
-    assert ratio.angle().abs().max() < 0.1
+    ratio = fields(trace_chains(scene, far, 3)) / fields(sampled)
+    assert (20 * ratio.abs().log10()).abs().max() < 0.2
+    assert ratio.angle().abs().max() < 0.03
 
 
 def test_chains_of_three_bounces_have_the_range_of_the_apex():
@@ -105,3 +110,17 @@ def test_only_few_flat_conductors_have_chains():
     }
     with pytest.raises(InputError, match="expected at most 24 triangles"):
         trace_chains(Scene(boxes), antennas(), 1)
+
+
+@pytest.mark.parametrize("pair", ["VV", "HH", "VH"])
+def test_chains_are_polarised(pair):
+    """A rolled dihedral at 4 m, as sampled rays have it."""
+    jones = [Polarisation.of(name, 0.0, 1) for name in pair]
+    far = replace(link(2 * PLACES, wavelength=WAVELENGTH), tx_jones=jones[0], rx_jones=jones[1])
+    pose = rigid(rotation_from_vector(float64([0.0, 0.0, 0.3])), float64([0.0, 0.0, 0.0]))
+    scene = Scene({"a": Object(dihedral(0.05), PerfectConductor(), pose)})
+    sampled = trace_field(
+        scene, far, sampling=Sampling(depth=2, samples=60_000, boundary=False), seed=1
+    )
+    ratio = fields(trace_chains(scene, far, 2)) / fields(sampled)
+    assert float((ratio[0] - 1).abs()) < 0.05  # the other places are off its lobe
