@@ -44,6 +44,7 @@ _MENU = {
     "search": "inversion.minima",
     "simulate": "simulation",
     "simulate_chirps": "simulation",
+    "trace_paths": "channel",
 }
 
 __all__ = ["__version__", *_MENU, *_ROOMS]  # pyright: ignore[reportUnsupportedDunderAll]

@@ -168,15 +168,20 @@ def _mirrored_field(
     whole = 2 * dot(n, field)[..., None] * n - field
     if bool(skins.conducting.all()):
         return whole
-    across, before, after = _frame(normal, direction)
+    across, before, after = plane_of_incidence(normal, direction)
     r_s, r_p = _coefficients(skins, wave_number, -dot(normal, direction))
     part = r_s[:, None, None] * dot(across, field)[..., None] * across
     part = part + r_p[:, None, None] * dot(before, field)[..., None] * after
     return torch.where(skins.conducting[:, None, None], whole, part)
 
 
-def _frame(normal: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit vectors across the plane of incidence, and in it before and after the mirror."""
+def plane_of_incidence(normal: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit vectors of E across the plane of incidence (s), and in it (p) before and after a mirror.
+
+    Args:
+        normal: of the surface, towards either side.
+        direction: d of the incident wave.
+    """
     across = cross(direction, normal)
     # At normal incidence any axis serves.
     spare = cross(normal, torch.eye(3, dtype=normal.dtype)[normal.detach().abs().argmin(-1)])
@@ -232,7 +237,7 @@ def _sheet_radiated(
     k, cosine = wave_number, -dot(normal, direction)
     epsilon, root, cosine = _media(skins, cosine)
     thickness = torch.where(torch.isfinite(skins.thickness), skins.thickness, 0.0)
-    across, before, _ = _frame(normal, direction)
+    across, before, _ = plane_of_incidence(normal, direction)
     once = torch.exp(-1j * k * root * thickness)
     along = direction + cosine[:, None] * normal  # sinθ times its unit vector
     total = torch.zeros_like(field)
