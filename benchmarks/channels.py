@@ -21,11 +21,11 @@ of two polarisations at 3.5 GHz, and 200 000 rays. Then both find the paths from
 """
 
 import argparse
-import json
 import os
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -39,7 +39,7 @@ import invertwin as iw
 from invertwin.channel import KINDS, backend
 from invertwin.scene import Mesh, Scene, load_scene_xml
 
-FREQUENCY, DEPTH, RAYS, RECEIVERS, CALLS = 3.5e9, 3, 200_000, 1000, 3
+FREQUENCY, DEPTH, RAYS, RECEIVERS, CALLS = 3.5e9, 3, 200_000, 1000, 1
 LEAST = 1e-6  # of the strongest amplitude
 SAME_DELAY = 2e-11  # s: beyond, two paths are different ones
 KIND_OF = {0: 0, 1: KINDS.index("reflection"), 4: KINDS.index("transmission")}
@@ -49,7 +49,9 @@ REQUIRED = {
     "box.amplitude": ("<=", 1e-5),
     "amplitude": ("<=", 2e-3),
     **{f"links_ratio_sionna.{name}": (">=", 3.0) for name in ("box", "box_one_screen", "canyon")},
-    **{f"gradient_ratio_sionna.{name}": (">=", 1.0) for name in ("box", "box_one_screen", "canyon")},
+    **{
+        f"gradient_ratio_sionna.{name}": (">=", 1.0) for name in ("box", "box_one_screen", "canyon")
+    },
 }
 
 
@@ -108,9 +110,7 @@ class Sionna:
     """A case as Sionna RT takes it."""
 
     def __init__(self, case: Case, receivers: np.ndarray) -> None:
-        import mitsuba as mi
-        from sionna import rt
-
+        mi, rt = import_module("mitsuba"), import_module("sionna.rt")
         self.case = case
         scene = rt.load_scene(getattr(rt.scene, case.scene), merge_shapes=False)
         scene.frequency = FREQUENCY
@@ -149,8 +149,7 @@ class Ours:
     """A case as invertwin takes it, from the same file."""
 
     def __init__(self, case: Case, receivers: np.ndarray) -> None:
-        from sionna import rt
-
+        rt = import_module("sionna.rt")
         self.case = case
         self.scene = load_scene_xml(getattr(rt.scene, case.scene))
         self.receivers = torch.from_numpy(receivers)
@@ -285,9 +284,9 @@ def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("out/channels"))
+    out = parser.parse_args().out
     metrics = measure()
-    write(metrics, table(metrics), parser.parse_args().out)
-    json.dumps(metrics)
+    write(metrics, table(metrics), out)
 
 
 if __name__ == "__main__":

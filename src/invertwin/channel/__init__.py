@@ -5,6 +5,7 @@ from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle
 from invertwin.channel.field.speckle import draw_speckle as draw_speckle
 from invertwin.channel.field.specular import trace_paths as trace_paths
+from invertwin.channel.field.waves import polarisations as polarisations
 from invertwin.channel.paths import Grid as Grid
 from invertwin.channel.paths import Link as Link
 from invertwin.channel.paths import Paths as Paths

@@ -32,7 +32,7 @@ _ASIDE = 4.0  # margins between the rays that try a segment
 _EXACT = 1e-9  # of the scene's size: float64 places closer than this are one
 
 
-class Surroundings(Occluders):
+class Walls(Occluders):
     """What may be in the way between antennas, and the planes that mirror.
 
     Args:
@@ -142,7 +142,7 @@ def corners_of(
 
 
 def chains_between(
-    around: Surroundings,
+    walls: Walls,
     steps: Int64[Tensor, "sequence step"],
     source: Float64[Tensor, "3"],
     targets: Float64[Tensor, "target 3"],
@@ -151,20 +151,20 @@ def chains_between(
     """The paths that follow given sequences from one source to all targets.
 
     Args:
-        around: The scene.
+        walls: The scene.
         steps: Sequences, see ``sequences``.
         source, targets: World positions [m].
         number: Of the source.
     """
     found: list[Chains] = []
     for some in steps.split(_LANES):
-        screen = _Screen(around, some, source)
+        screen = _Screen(walls, some, source)
         block = max(1, _LANES // len(some))
         for begin in range(0, len(targets), block):
             target, sequence, faces = screen.passed(targets[begin : begin + block])
             target = target + begin
             chosen = some[sequence]
-            good, faces = _verified(around, chosen, faces, source, targets[target])
+            good, faces = _verified(walls, chosen, faces, source, targets[target])
             found.append(
                 Chains(
                     torch.full((int(good.sum()),), number),
@@ -179,12 +179,12 @@ def chains_between(
 class _Screen:
     """Tries all sequences from one source by one ray a segment, in kernels of many lanes."""
 
-    def __init__(self, around: Surroundings, steps: Tensor, source: Tensor) -> None:
-        self.around = around
+    def __init__(self, walls: Walls, steps: Tensor, source: Tensor) -> None:
+        self.walls = walls
         self.length = steps.shape[1]
         self.count = len(steps)
-        planes = around.planes
-        place = (source - around.origin).expand(self.count, 3)
+        planes = walls.planes
+        place = (source - walls.origin).expand(self.count, 3)
         plane = steps >> 1
         seen = images(place, planes.point[plane], planes.normal[plane], (steps & 1).bool())
         self.images = to_double(torch.stack(seen, 1))
@@ -195,7 +195,7 @@ class _Screen:
         lane = dr.arange(mi.UInt32, self.count * len(targets))
         count = opaque(self.count)
         target, row = lane // count, lane % count
-        places = to_double(targets - self.around.origin)
+        places = to_double(targets - self.walls.origin)
         end = dr.gather(mi.Vector3d, places, target)
         ok, corners, planes, normals = self._corners(row, end)
         good, faces = self._clear(row, ok, [*corners, end], planes, normals)
@@ -207,9 +207,9 @@ class _Screen:
 
     def _corners(self, row: Any, end: Any) -> tuple[Any, list[Any], list[Any], list[Any]]:
         """Where the lines to the images cut the planes, inside of their rectangles."""
-        around, table = self.around, self.around.device_planes
-        near = opaque(_EXACT * around.size, "Float64")
-        wide = opaque(around.margin, "Float64")
+        walls, table = self.walls, self.walls.device_planes
+        near = opaque(_EXACT * walls.size, "Float64")
+        wide = opaque(walls.margin, "Float64")
         ok, place = mi.Bool(True), end
         corners, planes, normals = [], [], []
         for step in reversed(range(self.length)):
@@ -241,8 +241,8 @@ class _Screen:
         self, row: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
     ) -> tuple[Any, list[Any]]:
         """Whether one ray a segment finds nothing in the way, and the triangles at its ends."""
-        around = self.around
-        margin, scene = opaque(around.margin, "Float64"), around.scene
+        walls = self.walls
+        margin, scene = opaque(walls.margin, "Float64"), walls.scene
         start = dr.gather(mi.Vector3d, self.images, row * (self.length + 1))
         faces = []
         for step, end in enumerate(ends):
@@ -264,7 +264,7 @@ class _Screen:
             if last:
                 ok &= ~valid
                 break
-            plane = dr.gather(mi.UInt32, around.device_planes["of_face"], hit.prim_index, valid)
+            plane = dr.gather(mi.UInt32, walls.device_planes["of_face"], hit.prim_index, valid)
             there = valid & (plane == planes[step]) & (hit.t > mi.Float(length - over))
             faces.append(dr.select(there, mi.Int32(hit.prim_index), -1))
             ok &= there | ~valid
@@ -288,16 +288,16 @@ class _Segments:
 
 
 def _verified(
-    around: Surroundings, steps: Tensor, faces: Tensor, source: Tensor, targets: Tensor
+    walls: Walls, steps: Tensor, faces: Tensor, source: Tensor, targets: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Which paths there are, and the triangles that they meet."""
     count, length = steps.shape
     if not count:
         return torch.zeros(0, dtype=torch.bool), faces
-    planes, plane = around.planes, steps >> 1
+    planes, plane = walls.planes, steps >> 1
     point, normal = planes.point[plane], planes.normal[plane]
-    place = (source - around.origin).expand(count, 3)
-    target = targets - around.origin
+    place = (source - walls.origin).expand(count, 3)
+    target = targets - walls.origin
     seen = images(place, point, normal, (steps & 1).bool())
     nodes = torch.stack([place, *corners_of(target, seen, point, normal), target], 1)
     none = torch.full((count, 1), -1)
@@ -305,13 +305,13 @@ def _verified(
     pieces = _Segments(
         nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3), before.ravel(), after.ravel()
     )
-    met, good = _tried(around, pieces)
+    met, good = _tried(walls, pieces)
     met, good = met.view(count, length + 1), good.view(count, length + 1)
-    apart = (target - seen[-1]).norm(dim=1) > _EXACT * around.size
+    apart = (target - seen[-1]).norm(dim=1) > _EXACT * walls.size
     return good.all(1) & apart, met[:, :length]
 
 
-def _tried(around: Surroundings, pieces: _Segments) -> tuple[Tensor, Tensor]:
+def _tried(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
     """The triangle at the end of each segment, and whether the segment exists."""
     way = pieces.end - pieces.start
     unit = normalize(way, dim=1)
@@ -321,12 +321,12 @@ def _tried(around: Surroundings, pieces: _Segments) -> tuple[Tensor, Tensor]:
     met = torch.full_like(votes, -1)
     for number in range(4):  # the last one goes straight
         angle = torch.tensor(2.1 * number, dtype=torch.float64)
-        aside = _ASIDE * around.margin * (angle.cos() * first + angle.sin() * second)
+        aside = _ASIDE * walls.margin * (angle.cos() * first + angle.sin() * second)
         if number == 3:
             aside = torch.zeros_like(aside)
-        start = pieces.start + _in_plane(around, aside, unit, pieces.plane_before)
-        end = pieces.end + _in_plane(around, aside, unit, pieces.plane)
-        face = _cast(around, start, end, pieces)
+        start = pieces.start + _in_plane(walls, aside, unit, pieces.plane_before)
+        end = pieces.end + _in_plane(walls, aside, unit, pieces.plane)
+        face = _cast(walls, start, end, pieces)
         good = torch.where(pieces.plane >= 0, face >= 0, face == -1)
         votes += good
         met = face
@@ -334,22 +334,22 @@ def _tried(around: Surroundings, pieces: _Segments) -> tuple[Tensor, Tensor]:
     good = votes == 4
     if len(unsure):
         rows = _Segments(*(column[unsure] for column in vars(pieces).values()))
-        good[unsure], met[unsure] = _decided(around, rows)
+        good[unsure], met[unsure] = _decided(walls, rows)
     return met, good
 
 
-def _in_plane(around: Surroundings, aside: Tensor, unit: Tensor, plane: Tensor) -> Tensor:
+def _in_plane(walls: Walls, aside: Tensor, unit: Tensor, plane: Tensor) -> Tensor:
     """A step aside, prolonged along the segment to stay in the plane at its end."""
-    normal = around.planes.normal[plane.clamp_min(0)]
+    normal = walls.planes.normal[plane.clamp_min(0)]
     falls = dot(unit, normal)
     steep = (plane >= 0) & (falls.abs() > 0.02)
     share = torch.where(steep, dot(aside, normal) / torch.where(steep, falls, 1.0), 0.0)
     return aside - share[:, None] * unit
 
 
-def _cast(around: Surroundings, start: Tensor, end: Tensor, pieces: _Segments) -> Tensor:
+def _cast(walls: Walls, start: Tensor, end: Tensor, pieces: _Segments) -> Tensor:
     """Triangle of the right plane at each segment's end; −1 nothing met, −2 something else met."""
-    planes, margin = around.planes, around.margin
+    planes, margin = walls.planes, walls.margin
     way = end - start
     length = way.norm(dim=1)
     unit = normalize(way, dim=1)
@@ -362,7 +362,7 @@ def _cast(around: Surroundings, start: Tensor, end: Tensor, pieces: _Segments) -
     origin = _vector(mi.Point3f, begin)
     direction = _vector(mi.Vector3f, unit.to(torch.float32))
     far = mi.Float(to_double((length + over).clamp_min(0.0)))
-    hit = around.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction, far, 0.0, []))
+    hit = walls.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction, far, 0.0, []))
     valid = hit.is_valid()
     face = to_torch(dr.select(valid, mi.Int32(hit.prim_index), -1)).long()
     distance = to_torch(dr.select(valid, hit.t, 0.0)).double()
@@ -375,16 +375,16 @@ def _vector(kind: Any, values: Tensor) -> Any:
     return kind(*(to_float(values[:, k]) for k in range(3)))
 
 
-def _decided(around: Surroundings, pieces: _Segments) -> tuple[Tensor, Tensor]:
+def _decided(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
     """The same in float64, over all triangles; their edges belong to them."""
-    planes, vertices = around.planes, around.exact_vertices
-    a, b, c = vertices[around.topology.faces].unbind(1)
+    planes, vertices = walls.planes, walls.exact_vertices
+    a, b, c = vertices[walls.topology.faces].unbind(1)
     first, second = b - a, c - a
     area = cross(first, second)
     square = dot(area, area).clamp_min(1e-300)
     good = torch.ones(len(pieces.start), dtype=torch.bool)
     met = torch.full((len(good),), -1)
-    near, wide = _EXACT * around.size, 1e-9
+    near, wide = _EXACT * walls.size, 1e-9
     every = torch.arange(len(good))
     for some in every.split(max(1, _PAIRS // len(a))):
         start, end = pieces.start[some, None], pieces.end[some, None]

@@ -19,7 +19,7 @@ from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel.field.chains import (
     Chains,
-    Surroundings,
+    Walls,
     chains_between,
     corners_of,
     images,
@@ -142,17 +142,17 @@ def _searched(
     tx, rx = plain(stage.tx), plain(stage.rx)
     swapped = len(rx) < len(tx)
     sources, targets = (rx, tx) if swapped else (tx, rx)
-    around = Surroundings(plain(stage.vertices), stage.topology, torch.cat([sources, targets]))
+    walls = Walls(plain(stage.vertices), stage.topology, torch.cat([sources, targets]))
     if not depth:
         sequences = Sequences((), None)
     elif rays is None:
-        sequences = every_sequence(around.planes, powers, depth)
+        sequences = every_sequence(walls.planes, powers, depth)
     else:
-        sequences = shot_sequences(around, around.planes, powers, sources, depth, rays, seed)
+        sequences = shot_sequences(walls, walls.planes, powers, sources, depth, rays, seed)
     found: list[Chains] = []
     for steps in (torch.zeros(1, 0, dtype=torch.int64), *sequences.steps):
         for number, source in enumerate(sources) if len(steps) else ():
-            found += chains_between(around, steps, source, targets, number)
+            found += chains_between(walls, steps, source, targets, number)
     return [chains.reversed() if swapped else chains for chains in found], sequences.missed
 
 
