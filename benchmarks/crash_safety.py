@@ -38,9 +38,10 @@ from invertwin.capture import Capture
 from invertwin.folders import UNFINISHED
 
 KILLS, PAIRS, SECONDS = 100, 20, 900.0
+SAME = 1e-6  # a difference of numbers of one run [m, or relative]
 REQUIRED: Required = {
     "lost": ("<=", 0),
-    "largest_difference": ("<=", 1e-6),
+    "largest_difference": ("<=", SAME),
     "mixed": ("<=", 0),
 }
 COUNTED = {
@@ -177,6 +178,10 @@ class Case:
         self.numbers = numbers(self.out)
         (self.out / OWN).write_text("mine")
 
+    def same(self) -> bool:
+        """Whether the folder holds what the run that was not killed has found."""
+        return difference(self.out, self.numbers) <= SAME
+
     def killed(self, share: float) -> tuple[bool, bool, float]:
         """Whether a kill came before the end, whether something was lost, and the difference."""
         before = results(self.out)
@@ -192,9 +197,11 @@ class Case:
             process.send_signal(signal.SIGKILL)
             process.wait()
         after = results(self.out)
-        whole = after == before or process.returncode == 0
-        # A kill amid the moves leaves files of both; the next command finishes them.
+        # A kill amid the moves leaves files of both; the next command finishes them. One between
+        # the last move and the end of the process leaves the new files.
         begun = (self.out / UNFINISHED).exists()
+        renewed = not begun and set(after) == set(before) and self.same()
+        whole = after == before or renewed
         resumes = self.name not in ("simulate", "train-prior")
         code, said = ended(self.name, self.out, "--resume" if begun and resumes else "--overwrite")
         moving = begun and not whole
@@ -224,7 +231,7 @@ class Case:
             text.count("\n") == 1 and "no other run uses" in text for text in refused
         )
         left = (self.out / UNFINISHED).exists() or (self.out / OWN).read_text() != "mine"
-        mixed = not clean or left or difference(self.out, self.numbers) > 1e-6
+        mixed = not clean or left or not self.same()
         if mixed:
             print(f"{self.name}, two at once: {codes} {said}")
         return mixed

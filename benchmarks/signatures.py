@@ -7,8 +7,8 @@ A car of conducting metal (`experiments/car.ply`, each triangle in four) at an o
 polarisations, of the complex profile p with one tube per wavelength and the profile q with
 `CONVERGED`. Prints a table and writes `metrics.json` into DIR (default `out/signatures`):
 
-- `profile_error_db`, `seconds`, `tubes` (rays that start): of one tube per wavelength. Its first
-  run compiles kernels and is not counted.
+- `profile_error_db`, `seconds`, `tubes`: of one tube per wavelength. Its first run compiles kernels
+  and is not counted. `patches.<n>`: where tubes of the n-th bounce end; `tubes` is the largest.
 - `converging_db.<tubes per wavelength>`: the errors of other numbers of tubes.
 - `order_error_db.order <n>`: the error of the n-th bounce alone, over the whole profile.
 - `rays_per_second`: rays of all bounces over the time; `tracing_share`: the share of the time in
@@ -51,36 +51,35 @@ REQUIRED: Required = {
 
 
 class Rays:
-    """Counts the rays that are traced, and the time that it takes."""
+    """Counts rays and the patches that they find, and the time that tracing takes."""
 
     def __init__(self) -> None:
-        self.counts: list[int] = []
-        self.shadows = 0
+        self.count = 0
         self.seconds = 0.0
+        self.patches: list[int] = []
 
-    def next_surface(self, trace: Callable[..., Any]) -> Callable[..., Any]:
-        """A tracer of tubes, with a count for each bounce."""
+    def traced(self, trace: Callable[..., Any]) -> Callable[..., Any]:
+        """A tracer, with a count."""
 
         def counted(occluders: Any, start: Tensor, end: Tensor) -> Any:
-            self.counts.append(len(start))
-            return self._timed(trace, occluders, start, end)
+            self.count += len(start)
+            begin = perf_counter()
+            found = trace(occluders, start, end)
+            self.seconds += perf_counter() - begin
+            return found
 
         return counted
 
-    def visible(self, trace: Callable[..., Any]) -> Callable[..., Any]:
-        """A tracer of shadows, with a count."""
+    def bounced(self, tubes: Callable[..., Any]) -> Callable[..., Any]:
+        """What follows tubes from bounce to bounce, with a count for each."""
 
-        def counted(occluders: Any, start: Tensor, end: Tensor) -> Any:
-            self.shadows += len(start)
-            return self._timed(trace, occluders, start, end)
+        def counted(facets: Any, occluders: Any, lit: Any, *rest: Any) -> Any:
+            self.patches.append(len(lit.aspect))
+            for bounce in tubes(facets, occluders, lit, *rest):
+                self.patches.append(len(bounce.aspect))
+                yield bounce
 
         return counted
-
-    def _timed(self, trace: Callable[..., Any], *arguments: Any) -> Any:
-        start = perf_counter()
-        found = trace(*arguments)
-        self.seconds += perf_counter() - start
-        return found
 
 
 def car() -> Scene:
@@ -129,8 +128,9 @@ def measure(
     signed(scene, 0.25, (*frequencies[:2], 2))
     rays = Rays()
     with (
-        patch.object(tubes, "next_surface", rays.next_surface(tubes.next_surface)),
-        patch.object(signature, "visible", rays.visible(signature.visible)),
+        patch.object(tubes, "next_surface", rays.traced(tubes.next_surface)),
+        patch.object(signature, "visible", rays.traced(signature.visible)),
+        patch.object(signature, "tubes", rays.bounced(signature.tubes)),
     ):
         start = perf_counter()
         found = signed(scene, DENSITY, frequencies)
@@ -152,9 +152,10 @@ def measure(
             f"{density:g}": error_db(signed(scene, density, frequencies), truth)
             for density in others
         },
-        "tubes": rays.counts[0],
+        "tubes": max(rays.patches),
+        "patches": {str(n): count for n, count in enumerate(rays.patches, 1)},
         "seconds": seconds,
-        "rays_per_second": (sum(rays.counts) + rays.shadows) / seconds,
+        "rays_per_second": rays.count / seconds,
         "tracing_share": rays.seconds / seconds,
         "frequencies": frequencies[2],
         "backend": backend(),
@@ -170,7 +171,7 @@ def table(metrics: dict[str, Any]) -> Table:
         REQUIRED,
     )
     page.row("triangles", metrics["triangles"], ".0f")
-    page.row("tubes", metrics["tubes"], ".0f", "rays that start, one a wavelength apart")
+    page.row("tubes", metrics["tubes"], ".0f", "patches of the bounce that has the most")
     page.row(
         "profile_error_db", metrics["profile_error_db"], ".1f", "of the range profile, complex"
     )

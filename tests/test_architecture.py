@@ -8,7 +8,9 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {"constants", "errors", "limits", "seeds", "folders", "memory", "untrusted"}
+FOUNDATION = {
+    *("constants", "errors", "limits", "seeds", "folders", "memory", "untrusted", "progress"),
+}
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "threads", "channel"}
 RADAR = CHANNEL - {"doctor", "threads"} | {"radar"}
@@ -28,6 +30,7 @@ ALLOWED = {
     "folders": {"errors"},
     "memory": {"errors"},
     "untrusted": {"errors"},
+    "progress": set(),
     "threads": set(),
     "doctor": FOUNDATION,
     "scene": SCENE,

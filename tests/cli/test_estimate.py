@@ -4,7 +4,6 @@ import time
 import tomllib
 
 import pytest
-import torch
 
 from cli.small import GRADCHECK, RUN, STARTS, call
 from invertwin.cli import estimate as estimates
@@ -13,7 +12,7 @@ from invertwin.cli.fits import problem
 from invertwin.cli.run_file import validate
 from invertwin.cli.running import time_left
 from invertwin.errors import PhysicsWarning
-from invertwin.scene import Mesh, shapes
+from invertwin.scene import shapes
 from invertwin.scene.files import save_mesh
 
 PAINT = 'material = { kind = "rough_dielectric", permittivity = 4.0 }\n'
@@ -136,13 +135,6 @@ def test_check_says_memory_and_time_and_leaves_nothing(run_file, monkeypatch, ca
 def test_times_as_people_say_them():
     said = [time_left(seconds) for seconds in (3.2, 90.0, 150.0, 3 * 3600.0, 1e6)]
     assert said == ["3 s", "90 s", "2 min", "3 h", "12 days"]
-
-
-def test_areas_and_separable_arrays():
-    plate = shapes.plate(2.0, 3.0)
-    assert estimates._area(plate) == pytest.approx(6.0)
-    bent = Mesh(torch.eye(3, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
-    assert estimates._area(bent) == pytest.approx(3**0.5 / 2)
 
 
 @pytest.mark.usefixtures("idle")

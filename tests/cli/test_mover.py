@@ -88,7 +88,7 @@ def test_the_run_file_holds_what_its_note_says(repository, data_folder, tmp_path
     [
         (
             ('kind = "mover"', 'kind = "translation"'),
-            "data: expected a parameter of kind mover, since the recording has chirps and movers",
+            "data: expected one chirp of a recording with movers, got the mean",
         ),
         (
             ("[optimizer]", '[starts]\nobject = "mover"\ndistance = [0.1, 0.1]\n[optimizer]'),

@@ -50,6 +50,30 @@ def test_a_target_is_compared_and_drawn(tmp_path):
     assert len(rows[1].split(",")) == len(rows[0].split(",")) == 12
 
 
+def test_check_says_what_a_signature_needs(tmp_path, capsys):
+    (tmp_path / "plate.toml").write_text(PLATE)
+    run("check", tmp_path / "plate.toml")
+    said = capsys.readouterr().out
+    assert "values of the field" in said
+    assert "for 21 aspects" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["plate.toml"]
+
+
+@pytest.mark.parametrize("command", ["rcs", "check"])
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (("count = 5", "count = 2_000_000_000"), "rcs.frequencies"),
+        (("count = 21", "count = 900_000_000"), "rcs.theta_deg"),
+        (("pixels = 16", "pixels = 90_000"), "rcs.image.pixels"),
+    ],
+)
+def test_what_no_memory_holds_is_refused_before_work(tmp_path, command, change, key):
+    (tmp_path / "plate.toml").write_text(PLATE.replace(*change))
+    with pytest.raises(InputError, match=rf"{key}: expected a run within .* lower {key}"):
+        run(command, tmp_path / "plate.toml")
+
+
 @pytest.mark.parametrize("name", ["dihedral", "dihedral_rolled", "trihedral", "trihedral_square"])
 def test_corners_are_what_they_should_be(repository, tmp_path, name):
     run("rcs", repository / "experiments" / "rcs" / f"{name}.toml", "-o", tmp_path / "out")

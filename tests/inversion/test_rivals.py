@@ -7,7 +7,7 @@ import torch
 
 from blobs import LAW, Blob, Needle
 from invertwin.inversion import Observation, Optimizer, Schedule, displaced, reconstruct
-from invertwin.inversion.rivals import rivals, same, turns
+from invertwin.inversion.rivals import Rival, rivals, same, turns
 from invertwin.scene import Mesh, Pose, Scene, Translation, box, sphere, text
 from scenes import float64, thing
 
@@ -57,6 +57,22 @@ def test_poses_that_look_alike_are_the_same():
     assert not same(scene, turned(30.0), ["it"])
     moved = displaced(scene["it"], float64([0.05, 0.0, 0.0])).pose
     assert not same(scene, scene.replace("it", pose=moved), ["it"])
+
+
+def test_a_body_that_is_nearly_its_own_half_turn_is_not_the_same():
+    mesh = box([0.9, 0.25, 0.35])
+    vertices = mesh.vertices.clone()
+    vertices[vertices[:, 0] > 0, 1] *= 0.6  # its back is lower than its front
+    body = thing(Mesh(vertices, mesh.faces), (0.1, 0.0, 2.0))
+    half = displaced(body, torch.zeros(3, dtype=torch.float64), math.pi * float64([0, 1, 0]))
+    assert not same(Scene({"it": body}), Scene({"it": half}), ["it"])
+    assert angles(body.mesh, Pose("it", **YAW)) == [180.0]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(("score", "better", "rejected"), [(3.0, False, True), (3.0, True, False)])
+def test_a_rival_that_explains_the_data_better_is_never_rejected(score, better, rejected):
+    assert Rival(None, score, better, "turned").rejected is rejected  # pyright: ignore[reportArgumentType]
 
 
 def wedge() -> Scene:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.scene import Mesh
+from invertwin.scene import Mesh, plate
 
 TRIANGLE = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]], dtype=torch.float64)
 FACE = torch.tensor([[0, 1, 2]])
@@ -27,6 +27,12 @@ def test_center_is_the_middle_of_the_bounding_box():
     assert torch.equal(
         Mesh(TRIANGLE, FACE).center, torch.tensor([0.5, 1.0, 0.0], dtype=torch.float64)
     )
+
+
+def test_area_is_that_of_all_triangles():
+    assert plate(2.0, 3.0).area == pytest.approx(6.0)
+    bent = Mesh(torch.eye(3, dtype=torch.float64, requires_grad=True), torch.tensor([[0, 1, 2]]))
+    assert bent.area == pytest.approx(3**0.5 / 2)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import json
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,8 +23,9 @@ from invertwin.cli.options import (
     console,
     with_options,
 )
+from invertwin.cli.report import Table
 from invertwin.cli.run_file import about_file
-from invertwin.cli.running import load_runs, now_and_then, print_tables, run_folder
+from invertwin.cli.running import load_runs, now_and_then, print_tables, progress, run_folder
 from invertwin.errors import InputError, interruptible, one_line
 
 
@@ -94,7 +95,7 @@ def simulate(options: Options, file: FileArgument) -> None:
     with run_folder(options, Path("out", file.stem), runs) as folder:
         from invertwin.cli.run_simulate import run_simulate
 
-        with about_file(file):
+        with about_file(file), progress(console):
             tables = run_simulate(runs[file.stem], folder)
         print_tables(tables)
 
@@ -152,24 +153,22 @@ def look(options: Look) -> None:
 
     default = Path("out") / options.recording.name.split(".")[0]
     with run_folder(options, default) as folder:
-        print_tables(run_look(options, folder))
+        with progress(console):
+            tables = run_look(options, folder)
+        print_tables(tables)
 
 
 @app.command()
 @with_options(Resumable)
 def gradcheck(options: Resumable, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
-    runs = load_runs(files, options, "gradcheck", _needs_of_gradcheck)
-    default = Path("out", files[0].stem if len(files) == 1 else "gradcheck")
-    with run_folder(options, default, runs) as folder:
-        if folder.complete:
-            return
+
+    def work(*given: Any) -> list[Table]:
         from invertwin.cli.run_gradcheck import run_gradcheck
 
-        with console.status("tracing") as status:
-            say = status.update if console.is_terminal else now_and_then()
-            tables = run_gradcheck(runs, {file.stem: file for file in files}, folder, say)
-        print_tables(tables)
+        return run_gradcheck(*given)
+
+    _each(options, files, "gradcheck", _needs_of_gradcheck, work)
 
 
 def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
@@ -180,17 +179,13 @@ def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
 @with_options(Resumable)
 def rcs(options: Resumable, files: FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
-    runs = load_runs(files, options, "rcs", ("rcs",))
-    default = Path("out", files[0].stem if len(files) == 1 else "rcs")
-    with run_folder(options, default, runs) as folder:
-        if folder.complete:
-            return
+
+    def work(*given: Any) -> list[Table]:
         from invertwin.cli.run_rcs import run_rcs
 
-        with console.status("tracing") as status:
-            say = status.update if console.is_terminal else now_and_then()
-            tables = run_rcs(runs, {file.stem: file for file in files}, folder, say)
-        print_tables(tables)
+        return run_rcs(*given)
+
+    _each(options, files, "rcs", ("rcs",), work)
 
 
 @app.command()
@@ -233,6 +228,25 @@ def main() -> None:
     except InputError as error:
         print(f"invertwin: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def _each(
+    options: Resumable,
+    files: Sequence[Path],
+    command: str,
+    sections: Sequence[str] | Callable[[Any], Sequence[str]],
+    work: Callable[..., list[Table]],
+) -> None:
+    """Several run files with one report."""
+    runs = load_runs(files, options, command, sections)
+    default = Path("out", files[0].stem if len(files) == 1 else command)
+    with run_folder(options, default, runs) as folder:
+        if folder.complete:
+            return
+        with console.status("tracing") as status:
+            say = status.update if console.is_terminal else now_and_then()
+            tables = work(runs, {file.stem: file for file in files}, folder, say)
+        print_tables(tables)
 
 
 def _reconstruct(file: Path, options: Resumable, default: Path) -> None:

@@ -9,8 +9,9 @@ import torch
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid
-from invertwin.cli.run_file import about
+from invertwin.cli.run_file import about, need
 from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema.signature import count_of
 from invertwin.errors import InputError
 from invertwin.inversion import require_edge
 from invertwin.memory import free_memory, gigabytes
@@ -27,6 +28,7 @@ _POINT, _ROW = 250, 300  # of a rough surface; of a path in one frame
 _SAMPLE = 64  # of a beat signal
 _BIN, _FITTED_BIN = 60, 100  # of a recorded spectrum; of a map with its derivative
 _PHASOR = 32
+_MATRIX = 200  # of 2 × 2 amplitudes, with what is made of them
 _COPY = 10_000  # of an object at another place
 _SIMULATED_RAYS = 2e6  # of the smooth map beside a simulation
 _MOST_RAYS = 1e13  # twelve days at 10⁷ a second
@@ -141,6 +143,28 @@ def estimate_of(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> Es
     return Estimate(kept, *_rays(run), recordings, rows)
 
 
+def of_signature(run: RunFile, scene: Scene) -> Estimate:
+    """What `[rcs]` needs.
+
+    Args:
+        run: The run file.
+        scene: Its scene.
+    """
+    table = need(run, "rcs", run.task)
+    sizes = {n: count_of(getattr(table, n)) for n in ("frequencies", "theta_deg", "phi_deg")}
+    values = sizes["frequencies"] * max(sizes["theta_deg"], sizes["phi_deg"])
+    largest = max(sizes, key=lambda name: sizes[name])
+    parts = [
+        _triangles(run, scene),
+        Part("values of the field", values, values * _MATRIX * (table.depth + 2), f"rcs.{largest}"),
+    ]
+    if table.image is not None:
+        pixels = table.image.pixels**2
+        parts.append(Part("pixels", pixels, pixels * _MATRIX, "rcs.image.pixels"))
+    ordered = tuple(sorted(parts, key=lambda part: -part.memory))
+    return Estimate(ordered, 0, 0, "rcs.frequencies", 0, 0)
+
+
 def require_room(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> None:
     """Refuse a run that this machine cannot do; arguments and errors as of `estimate_of`."""
     for sensor in sensors.values():
@@ -210,7 +234,7 @@ def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
 def _of_simulation(data: SimulatedData, scene: Scene, frames: int) -> Iterator[tuple[Part, float]]:
     """Paths of exact signals, and how many there are over all frames."""
     rough = [item for item in scene.objects.values() if not item.material.coherent]
-    area = sum(_area(Mesh(item.vertices.detach(), item.mesh.faces)) for item in rough)
+    area = sum(Mesh(item.vertices, item.mesh.faces).area for item in rough)
     points = area * data.points_per_m2
     each = _POINT + frames * _ROW
     name = f"points on {area:.3g} m² of rough surfaces"
@@ -308,8 +332,3 @@ def _separable(radar: Radar) -> bool:
         len(part.round().unique(dim=0)) for part in (places[:, :1], places[:, 1:2], places)
     )
     return x * y == both
-
-
-def _area(mesh: Mesh) -> float:
-    a, b, c = mesh.vertices[mesh.faces].unbind(1)
-    return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())

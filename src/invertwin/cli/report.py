@@ -10,8 +10,6 @@ from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment
-
 from invertwin import __version__
 
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
@@ -57,6 +55,8 @@ def report_html(
         again: The command that does it again, in the run's own folder.
         files: Run files as used, by their path in the folder.
     """
+    from jinja2 import Environment
+
     pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     pages.filters |= {"shown": shown, "base64": _base64}
     backend = os.environ.get("INVERTWIN_BACKEND")

@@ -8,20 +8,21 @@ import torch
 
 from invertwin.channel import Sampling
 from invertwin.cli import build
-from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor
+from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
 from invertwin.cli.fits.problem import sensors_of
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Table, texts
-from invertwin.cli.run_file import need
+from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import chirp_train, exact
 from invertwin.cli.running import time_left
 from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema.signature import count_of
 from invertwin.cli.shape_tables import Mover
 from invertwin.memory import free_memory, gigabytes
 from invertwin.models import SurrogateMap
 from invertwin.scene import Scene, Translation
 
-_FRAMES = 4  # of the radar, in the probe
+_FRAMES = 4  # of the radar, or aspects, in the probe
 _FEW, _MANY = 10_000, 100_000  # rays or paths that are timed: less than a second of work
 _FITS = ("reconstruct", "demo")
 
@@ -32,6 +33,8 @@ def run_check(run: RunFile) -> tuple[list[Table], str]:
     Raises:
         InputError: What the run's own command refuses before it begins.
     """
+    if run.rcs is not None:
+        return _of_signature(run)
     truth, sensors = build.true_scene(run), _sensors(run)
     build.parameters(
         [table for table in run.parameters if not isinstance(table, Mover)],
@@ -41,13 +44,41 @@ def run_check(run: RunFile) -> tuple[list[Table], str]:
     found = estimate_of(run, truth, sensors)
     found.require()
     seconds = _seconds(run, found, truth, sensors)
+    return _tables(found, truth, seconds, f"{found.rays:.2g} rays and {found.rows:.2g} paths")
+
+
+def _tables(found: Estimate, scene: Scene, seconds: float, work: str) -> tuple[list[Table], str]:
     rows = [[part.name, part.count, part.memory / 1e9, part.key] for part in found.parts]
     heads = ("needs", "how many", "GB", "key")
     line = (
         f"about {gigabytes(found.memory)} of {gigabytes(free_memory())} free, and "
-        f"{time_left(seconds)} for {found.rays:.2g} rays and {found.rows:.2g} paths"
+        f"{time_left(seconds)} for {work}"
     )
-    return [Table("Estimate", heads, rows, texts("notes")["estimate"]), _meshes(truth)], line
+    return [Table("Estimate", heads, rows, texts("notes")["estimate"]), _meshes(scene)], line
+
+
+def _of_signature(run: RunFile) -> tuple[list[Table], str]:
+    """The same of `[rcs]`: its time is that of one aspect and of a few more, carried on."""
+    table, scene = need(run, "rcs", run.task), build.scene(run)
+    found = of_signature(run, scene)
+    found.require()
+    count = max(count_of(table.theta_deg), count_of(table.phi_deg))
+
+    def traced(aspects: int) -> float:
+        chosen = torch.linspace(0, count - 1, aspects).round().long().tolist()
+        begin = time.perf_counter()
+        with about("rcs"), torch.no_grad():
+            table.at(chosen).build({Scene: scene})
+        return time.perf_counter() - begin
+
+    traced(1)  # compiled now
+    one, few = traced(1), traced(min(count, _FRAMES))
+    slope = max(0.0, few - one) / max(1, min(count, _FRAMES) - 1)
+    check = run.gradcheck if run.task == "gradcheck" else None
+    times = 1 if check is None else 4 * (check.repeats + check.max_pairs)
+    seconds = times * (one + slope * (count - 1))
+    again = "" if times == 1 else f", {times} times"
+    return _tables(found, scene, seconds, f"{count} aspects{again}")
 
 
 def _meshes(scene: Scene) -> Table:

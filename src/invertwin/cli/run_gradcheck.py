@@ -12,14 +12,14 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build
-from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.estimate import Sensor, of_signature, require_room
 from invertwin.cli.report import Picture, Table, finish, picture, texts
-from invertwin.cli.run_file import about, about_file, need
+from invertwin.cli.run_file import about, need
+from invertwin.cli.running import in_parts
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.schema.signature import swept
 from invertwin.errors import InputError
-from invertwin.folders import PARTS
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
 from invertwin.models import ForwardModel, SignatureMap, SurrogateMap
@@ -95,22 +95,17 @@ def run_gradcheck(
     folder: RunFolder,
     say: Callable[[str], None],
 ) -> list[Table]:
-    """Check every run file, write the folder, and return the tables to print.
-
-    Scenes that an interrupted run has finished are not computed again.
-    """
+    """Check every run file, write the folder, and return the tables to print."""
     begin = time.perf_counter()
     scenes: dict[str, Any] = {}
     compared: dict[str, Any] = {}
     studies: list[Table] = []
     pictures: list[Picture] = []
-    for name, run in runs.items():
-        part = f"{PARTS}/{name}.json"
-        found = folder.read_json(part)
-        if found is None:
-            with about_file(files[name]):
-                found = _check(name, run, folder, lambda line, name=name: say(f"{name}: {line}"))
-            folder.write_json(part, found)
+
+    def check(name: str, run: RunFile) -> dict[str, Any]:
+        return _check(name, run, folder, lambda line: say(f"{name}: {line}"))
+
+    for name, run, found in in_parts(runs, files, folder, check):
         scenes[name] = found
         shown = {f"{name}_scene": (run.title or name, ""), name: (name, _note(run, found))}
         for key, study in _studies(run).items():
@@ -139,9 +134,10 @@ class _Seen:
     draw: Callable[[GradientReport], Figure]
 
 
-def _signature(run: RunFile, settings: Gradcheck) -> _Seen:
+def _signature(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
     """The signature of `[rcs]`."""
     table = need(run, "rcs", "gradcheck")
+    of_signature(run, scene).require()
 
     def signature(scene: Scene, **more: Any) -> Signature:
         with about("rcs"):
@@ -184,7 +180,7 @@ def _check(
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
     scene = build.scene(run)
-    seen = _map(run, settings, scene) if run.rcs is None else _signature(run, settings)
+    seen = _map(run, settings, scene) if run.rcs is None else _signature(run, settings, scene)
     module, tangent = build.tangent(run, scene)
     for key in _studies(run):
         if seen.device is None:

@@ -13,6 +13,7 @@ from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.problem import Problem, another, observations_of, problem_of, unknowns_of
 from invertwin.cli.report import Table, finish, texts
 from invertwin.cli.run_file import need
+from invertwin.cli.running import progress
 from invertwin.cli.schema import Plan, RunFile, SimulatedData
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
@@ -47,7 +48,8 @@ def run_plan(
         wide = run.model_copy(update={"radar": radar.model_copy(update={"positions": every})})
     own = problem_of(wide, console)
     console.print("error bars")
-    found, added = planned(_at_truth(own), len(places))
+    with progress(console):
+        found, added = planned(_at_truth(own), len(places))
     metrics: dict[str, Any] = {"task": "plan", **bars(found), "verdict_reasons": []}
     first = len(own.first.radar.positions) - len(places)
     metrics["candidates"] = [

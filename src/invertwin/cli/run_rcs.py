@@ -12,12 +12,13 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.capture import load_section
 from invertwin.cli import build
+from invertwin.cli.estimate import of_signature
 from invertwin.cli.report import Picture, Table, finish, picture, texts
-from invertwin.cli.run_file import about, about_file, need
+from invertwin.cli.run_file import about, need
+from invertwin.cli.running import in_parts
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.signature import Measurement, Rcs
 from invertwin.errors import InputError
-from invertwin.folders import PARTS
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.signatures import Signature, decibels
@@ -34,21 +35,16 @@ def run_rcs(
     folder: RunFolder,
     say: Callable[[str], None],
 ) -> list[Table]:
-    """Compute every run file's signature, write the folder, and return the tables to print.
-
-    Files that an interrupted run has finished are not computed again.
-    """
+    """Compute every run file's signature, write the folder, and return the tables to print."""
     begin = time.perf_counter()
     scenes: dict[str, _Found] = {}
     pictures: list[Picture] = []
-    for name, run in runs.items():
-        part = f"{PARTS}/{name}.json"
-        found = folder.read_json(part)
-        if found is None:
-            say(name)
-            with about_file(files[name]):
-                found = _signature(name, run, folder)
-            folder.write_json(part, found)
+
+    def compute(name: str, run: RunFile) -> _Found:
+        say(name)
+        return _signature(name, run, folder)
+
+    for name, run, found in in_parts(runs, files, folder, compute):
         scenes[name] = found
         for file, title in found.pop("pictures").items():
             title = title if len(runs) == 1 else f"{name}: {title}"
@@ -76,8 +72,10 @@ def run_rcs(
 def _signature(name: str, run: RunFile, folder: RunFolder) -> _Found:
     begin = time.perf_counter()
     table: Rcs = need(run, "rcs", "rcs")
+    scene = build.scene(run)
+    of_signature(run, scene).require()
     with about("rcs"):
-        found = table.build({Scene: build.scene(run)})
+        found = table.build({Scene: scene})
     kept: _Found = {
         "peak_dbsm": {
             channel: _level(found.dbsm[:, :, i, j]) for channel, (i, j) in table.channels.items()

@@ -33,6 +33,7 @@ from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table, finish, picture
+from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.inversion import Reconstruction
@@ -78,11 +79,13 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         "twin": sharp_maps(problem, twin, radars),
     }
     start, twin = without_clouds(start), without_clouds(twin)
+    with progress(console):
+        believed = certainty(found, known_of(problem))
     metrics = {
         "task": run.task,
         **summary(problem, rows, modes),
         **(coverage(rows[FULL]) if recorded_anew(run) else {}),
-        **certainty(found, known_of(problem)),
+        **believed,
         **{key: best[key] for key in ("other_ends", "ambiguities") if key in best},
         **{k: best[k] for k in best if (k in COLUMNS or is_shape_key(k)) and k != "seconds"},
         "start_loss_sharp": misfit(problem, maps["start"], maps["measured"]),

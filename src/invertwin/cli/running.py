@@ -17,6 +17,8 @@ from invertwin.cli.options import Options, Where, console
 from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.run_file import about_file, load_run, need, to_toml
 from invertwin.errors import InputError
+from invertwin.folders import PARTS
+from invertwin.progress import listening
 from invertwin.runs import RunFolder, open_run
 
 _LOG_SECONDS = 10.0  # between lines of progress in a log
@@ -84,6 +86,33 @@ def load_runs(
     return runs
 
 
+def in_parts(
+    runs: Mapping[str, Any],
+    files: Mapping[str, Path],
+    folder: RunFolder,
+    compute: Callable[[str, Any], dict[str, Any]],
+) -> Iterator[tuple[str, Any, dict[str, Any]]]:
+    """What every run file gives, kept as it comes: an interrupted run does not compute it again.
+
+    Args:
+        runs: Run files by stem.
+        files: Where they are.
+        folder: Keeps what is done.
+        compute: Takes a stem and its run file.
+
+    Yields:
+        Stem, run file and what was computed.
+    """
+    for name, run in runs.items():
+        part = f"{PARTS}/{name}.json"
+        found = folder.read_json(part)
+        if found is None:
+            with about_file(files[name]):
+                found = compute(name, run)
+            folder.write_json(part, found)
+        yield name, run, found
+
+
 @contextmanager
 def counted(shown: Console, name: str, total: int) -> Iterator[Callable[[], None]]:
     """Progress with the time that is left: a bar, or a line now and then where no terminal is.
@@ -111,6 +140,23 @@ def counted(shown: Console, name: str, total: int) -> Iterator[Callable[[], None
                 say(f"{name}: {done} of {total}, {left} left")
 
         yield advance
+
+
+@contextmanager
+def progress(shown: Console) -> Iterator[None]:
+    """Show how far long loops have come: on one line, or a line now and then in a log.
+
+    Args:
+        shown: Where.
+    """
+    with shown.status("working") as status:
+        say = status.update if shown.is_terminal else now_and_then(shown, time.monotonic())
+
+        def hear(name: str, done: int, total: int, left: float) -> None:
+            say(f"{name}: {done} of {total}, {time_left(left)} left")
+
+        with listening(hear):
+            yield
 
 
 def time_left(seconds: float) -> str:

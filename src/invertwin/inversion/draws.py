@@ -11,6 +11,7 @@ from torch import Tensor
 
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.loss import Maps, SpectrumLoss, pooled
+from invertwin.progress import told
 from invertwin.seeds import derived_seed
 
 _LOOKS = 64  # they tell a standard deviation to 9 %
@@ -97,7 +98,7 @@ class End:
         if not min(self.gains) > 0 or len(looks) < len(self.maps):
             return
         noises = [_noise(*pair, g) for pair, g in zip(self.maps, self.gains, strict=True)]
-        for number in range(_LOOKS):
+        for number in told(range(_LOOKS), "looks at the twin"):
             yield [
                 look(derived_seed(number, k), noise)
                 for k, (look, noise) in enumerate(zip(looks, noises, strict=True))

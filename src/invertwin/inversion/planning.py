@@ -10,6 +10,7 @@ from invertwin.inversion.draws import End
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.uncertainty import Evidence, Uncertainty, coordinates
+from invertwin.progress import told
 
 _STEPS, _REACH = 5, 0.1  # of a fit that begins at the truth
 
@@ -57,7 +58,7 @@ def planned(fit: Fit, candidates: int = 0) -> tuple[Uncertainty, list[Added]]:
     known = list(range(every - candidates))
     bars = evidence.bars(known, looks)
     added = []
-    for frame in range(every - candidates, every):
+    for frame in told(range(every - candidates, every), "positions to add"):
         more = evidence.bars([*known, frame], looks)
         change = torch.linalg.slogdet(more.covariance)[1] - torch.linalg.slogdet(bars.covariance)[1]
         added.append(Added(frame, math.exp(0.5 * float(change) / len(bars.names)), more))

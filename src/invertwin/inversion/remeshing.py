@@ -62,8 +62,7 @@ def require_edge(mesh: Mesh, edge: float) -> float:
         InputError: what `remeshed` refuses.
     """
     length = checked_number(edge, "edge length [m]", 0.0, open_low=True)
-    a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
-    area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+    area = mesh.area
     if not area > 0:
         raise InputError("expected a surface with area, got none; check the mesh")
     do = "give metres, or a longer edge"

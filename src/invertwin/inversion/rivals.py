@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
@@ -12,7 +13,8 @@ from invertwin.errors import InputError
 from invertwin.inversion.draws import End, zscore
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
-from invertwin.inversion.metrics import compare_shapes, residual
+from invertwin.inversion.metrics import residual, surface_points
+from invertwin.inversion.remeshing import closest_points
 from invertwin.inversion.starts import displaced
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import Pose
@@ -22,10 +24,9 @@ from invertwin.scene.scene import Object, Scene
 REJECTED = 2.33  # standard deviations: one right rival in a hundred is rejected
 SAME_PLACE, SAME_TURN = 0.03, 0.1  # m and rad: ends as near are one
 _PARTS = (4, 3)  # of a whole turn: the first after which the object nearly keeps its shape
-_NEARLY = 0.06  # of the diagonal: distance of surfaces that look much the same
-_EQUAL = 1.3  # times the distance of two draws from one surface
+_NEARLY, _EQUAL = 0.07, 0.002  # of the diagonal: distance of surfaces much alike, of one surface
 _CLEAR = 5.0  # standard deviations of a loss: so large a difference needs no looks
-_POINTS = 5_000  # of each surface
+_POINTS = 1_000  # of each surface
 _STEPS, _REACH, _BLUR = 6, 0.1, 0.4  # of a rival's fit: Gauss–Newton, its first share of widths
 
 
@@ -37,17 +38,19 @@ class Rival:
         end: With the rival's own maps and looks.
         score: How unlikely the difference of both losses is, were the rival right, in standard
             deviations over looks at it; None where there are no looks.
+        better: Whether its loss is the lower one.
         told: How it differs, in words.
     """
 
     end: End
     score: float | None
+    better: bool
     told: str
 
     @property
     def rejected(self) -> bool:
         """Whether the data speak against the rival."""
-        return self.score is not None and self.score >= REJECTED
+        return not self.better and self.score is not None and self.score >= REJECTED
 
 
 def rivals(end: End) -> Iterator[Rival]:
@@ -62,7 +65,9 @@ def rivals(end: End) -> Iterator[Rival]:
             found = _refitted(end.fit, number, turn)
             if found is not None and not same(found.twin(), twin, [_name(module)]):
                 other = End(found)
-                yield Rival(other, score(end, other), way(twin, found.twin(), [_name(module)]))
+                better = found.objective(other.maps) < end.fit.objective(end.maps)
+                told = way(twin, found.twin(), [_name(module)])
+                yield Rival(other, score(end, other), bool(better), told)
 
 
 def turns(module: nn.Module, twin: Scene) -> Iterator[Float64[Tensor, "3"]]:
@@ -82,7 +87,6 @@ def turns(module: nn.Module, twin: Scene) -> Iterator[Float64[Tensor, "3"]]:
     world = torch.eye(3, dtype=torch.float64)
     own = item.transform.detach()[:3, :3].T if len(free) == 3 else world
     kept = [_placed(item)]
-    extent = kept[0].vertices.amax(0) - kept[0].vertices.amin(0)
 
     def turned(vector: Tensor) -> Mesh:
         return _placed(displaced(item, torch.zeros(3, dtype=torch.float64), vector))
@@ -90,13 +94,12 @@ def turns(module: nn.Module, twin: Scene) -> Iterator[Float64[Tensor, "3"]]:
     for axis, name in zip(own, ("pitch", "yaw", "roll"), strict=True):
         if name not in free:
             continue
-        near = (_distance(turned(2 * math.pi / n * axis), kept[0]) for n in _PARTS)
-        shapes = zip(_PARTS, near, strict=True)
-        parts = next((n for n, far in shapes if far < _NEARLY * float(extent.norm())), None)
+        near = (_apart(turned(2 * math.pi / n * axis), kept[0]) for n in _PARTS)
+        parts = next((n for n, far in zip(_PARTS, near, strict=True) if far < _NEARLY), None)
         for share in (0.5, *((k / parts for k in range(1, parts)) if parts else ())):
             vector = 2 * math.pi * (share - (share > 0.5)) * axis
             found = turned(vector)
-            if all(_distance(found, other) > _EQUAL * _spread(found) for other in kept):
+            if all(_apart(found, other) > _EQUAL for other in kept):
                 kept.append(found)
                 yield vector
 
@@ -173,8 +176,7 @@ def _equal_after(first: Object, second: Object) -> bool:
     a, b = _placed(first), _placed(second)
     a = Mesh(a.vertices - first.center.detach() + second.center.detach(), a.faces)
     # A turn that counts as none moves points so far.
-    slack = 0.12 * SAME_TURN * float((a.vertices.amax(0) - a.vertices.amin(0)).norm())
-    return _distance(a, b) < _EQUAL * _spread(a) + slack
+    return _apart(a, b) < 0.13 * SAME_TURN
 
 
 def _refitted(fit: Fit, number: int, turn: Tensor) -> Fit | None:
@@ -208,14 +210,15 @@ def _placed(item: Object) -> Mesh:
     return Mesh(item.vertices.detach(), item.mesh.faces)
 
 
-def _distance(first: Mesh, second: Mesh) -> float:
-    return compare_shapes(first, second, count=_POINTS, voxel=None).chamfer
-
-
-def _spread(mesh: Mesh) -> float:
-    """The distance of two draws of points from one surface."""
-    a, b, c = mesh.vertices[mesh.faces].unbind(1)
-    return 0.5 * math.sqrt(0.5 * float((b - a).cross(c - a, 1).norm(dim=1).sum()) / _POINTS)
+def _apart(first: Mesh, second: Mesh) -> float:
+    """Root mean square distance of points of each surface from the other, over the diagonal."""
+    squares = [
+        np.square(points - closest_points(other, points)).sum(1).mean()
+        for own, other in ((first, second), (second, first))
+        for points in [surface_points(own, _POINTS, 0, 0)[0].numpy()]
+    ]
+    extent = first.vertices.amax(0) - first.vertices.amin(0)
+    return math.sqrt(sum(squares) / 2) / float(extent.norm())
 
 
 def _name(module: nn.Module) -> str:

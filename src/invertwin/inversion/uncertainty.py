@@ -16,6 +16,7 @@ from invertwin.inversion.draws import End
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import along, penalty_curvature
 from invertwin.inversion.loss import SpectrumLoss
+from invertwin.progress import told
 from invertwin.scene.parameters import Coordinate, Entries
 
 _MOST = 64  # coordinates; each costs derivatives of the map
@@ -190,7 +191,7 @@ def coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
 def _derivatives(fit: Fit, found: Sequence[Coordinate], number: int) -> list[Tensor]:
     """For every observation the derivatives of its predicted map [coordinate, …]."""
     rows: list[list[Tensor]] = []
-    for coordinate in found:
+    for coordinate in told(found, "derivatives"):
         with forward_ad.dual_level(), along(fit.modules, coordinate.tangents):
             duals = [forward_ad.unpack_dual(predicted) for predicted, _ in fit.sharp_maps(number)]
             rows.append([torch.zeros_like(p) if t is None else t for p, t in duals])

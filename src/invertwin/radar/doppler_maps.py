@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.progress import told
 from invertwin.radar.detection import PointCloud, cell_averaging_cfar, point_cloud
 from invertwin.radar.direction import capon, music
 from invertwin.radar.doppler import (
@@ -112,7 +113,7 @@ def doppler_maps(
     everything, movers = torch.zeros(2, *grid.shape, dtype=torch.float64)
     peaks = []
     seen = (grid.u[:, None].square() + grid.v.square()) <= 1
-    for rows in torch.arange(chirps.count).split(chunk):
+    for rows in told(torch.arange(chirps.count).split(chunk), "range rates"):
         power = beamform(cube[rows], radar.frames([0] * len(rows)), grid).double() * seen
         everything += power.sum(0)
         movers += power[moving[rows]].sum(0)

@@ -12,6 +12,7 @@ from invertwin.channel import Paths, alone
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
+from invertwin.progress import told
 from invertwin.radar.nonuniform import (
     beat_of_delays,
     instants_derivative,
@@ -157,7 +158,7 @@ def every_ramp(
         ramp: Signals of one ramp, from its start [s] and the transmitters that send then.
     """
     rows = []
-    for starts in chirps.times(transmitters).tolist():
+    for starts in told(chirps.times(transmitters).tolist(), "chirps"):
         signals = {}
         for start in sorted(set(starts)):
             senders = [tx for tx, time in enumerate(starts) if time == start]

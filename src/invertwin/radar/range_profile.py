@@ -10,6 +10,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.progress import told
 from invertwin.radar.nonuniform import beat_of_delays
 from invertwin.radar.radar import Radar, checked_beat, sampled
 from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, unit_window
@@ -56,7 +57,7 @@ def beat_signal(
     order = torch.argsort(paths.frame, stable=True)
     counts = torch.bincount(paths.frame, minlength=radar.frame_count).tolist()
     frames: list[Tensor] = []
-    for frame, rows in enumerate(torch.split(order, counts)):
+    for frame, rows in told(list(enumerate(torch.split(order, counts))), "beat signals"):
         first, last, coefficient = paths.first[rows], paths.last[rows], paths.coefficient[rows]
         # What remains of the delay without the segments to the antennas.
         inner = (

@@ -75,6 +75,12 @@ class Mesh:
         """Middle of the bounding box [m]."""
         return (self.vertices.amin(0) + self.vertices.amax(0)) / 2
 
+    @property
+    def area(self) -> float:
+        """Of the surface [m²]; carries no gradient."""
+        a, b, c = self.vertices.detach()[self.faces].unbind(1)
+        return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+
 
 def joined(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
     """Several shapes as one rigid object of one material.

@@ -21,6 +21,7 @@ from invertwin.channel.reference.radar_equation import (
 from invertwin.channel.reference.shadows import ShadowEdge, boundary_rows
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
+from invertwin.progress import told
 from invertwin.scene.scene import Scene
 
 _ROWS_AT_ONCE = 1 << 18  # frames × paths
@@ -93,7 +94,7 @@ def _fields(
     """The paths in every frame in which their field does not vanish."""
     found, count = [], len(paths.weight)
     frames = torch.arange(rays.link.frame_count)
-    for some in frames.split(max(1, _ROWS_AT_ONCE // max(1, count))):
+    for some in told(frames.split(max(1, _ROWS_AT_ONCE // max(1, count))), f"{kind} paths"):
         frame, row = some.repeat_interleave(count), torch.arange(count).repeat(len(some))
         seen = unblocked(rays, frame, paths.keep(row))
         kept = paths.keep(row[seen])

@@ -23,6 +23,7 @@ from invertwin.channel.reference.radar_equation import SurfacePaths, conductor_f
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.progress import told
 
 _GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
 _ROWS_AT_ONCE = 1 << 18  # frames × rays
@@ -52,7 +53,7 @@ def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]
     found: list[Paths] = []
     frames = torch.arange(rays.link.frame_count)
     with torch.no_grad():
-        for some in frames.split(max(1, _ROWS_AT_ONCE // len(points.weight))):
+        for some in told(frames.split(max(1, _ROWS_AT_ONCE // len(points.weight))), "mirrors"):
             row = torch.arange(len(points.weight)).repeat(len(some))
             frame = some.repeat_interleave(len(points.weight))
             for from_receiver in (False,) if same else (False, True):

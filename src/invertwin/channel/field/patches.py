@@ -1,20 +1,21 @@
 """Meshes: what a plane wave lights first, triangle by triangle.
 
 A triangle that is seen whole counts exactly. One that is seen in part is split in four until its
-pieces are as small as ray tubes.
+pieces are as small as asked for; these are cut where light ends.
 """
 
 from collections.abc import Callable, Iterator
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.field.beams import Bounce, Facets
 from invertwin.channel.field.waves import dot
 
 _LARGE = 8.0  # times the smallest piece: larger triangles are split before they are looked at
-_INSET = 0.1  # from a corner to the middle, where a corner is looked at
+_INSET = 0.02  # from a corner to the middle, where a corner is looked at
+_HALVINGS = 4  # of a side, to find where it is cut
 _ROWS_AT_ONCE = 1 << 18
 _ASIDE = 2e-6  # of the scene's size: from how far above a surface rays start
 
@@ -58,29 +59,94 @@ def _lit(
     number: Tensor,
     corners: Tensor,
 ) -> Bounce:
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
-    while len(aspect):
-        d = incident[aspect]
-        normal = _towards(facets.normal[number].detach(), d)
-        middle = corners.mean(1, keepdim=True)
-        points = torch.cat([middle, corners + _INSET * (middle - corners)], 1)
-        points = points + _ASIDE * facets.size * normal[:, None]
-        back = -d[:, None].expand_as(points)
-        seen = clear(points.flatten(0, 1), back.flatten(0, 1)).view(-1, 4)
-        small = _longest(corners) <= smallest
-        lit = seen.all(1) | (small & seen[:, 0])
-        split = seen.any(1) & ~lit & ~small
-        found.append((aspect[lit], number[lit], corners[lit]))
-        aspect = aspect[split].repeat_interleave(4)
-        number = number[split].repeat_interleave(4)
-        corners = _quarters(corners[split])
-    aspect, number, corners = (
-        map(torch.cat, zip(*found, strict=True)) if found else (aspect, number, corners)
-    )
     d = incident[aspect]
+    normal = _towards(facets.normal[number].detach(), d)
+
+    def seen(row: Tensor, points: Tensor) -> Tensor:
+        starts = points + above(facets, normal[row])[:, None]
+        back = -d[row][:, None].expand_as(starts)
+        return clear(starts.flatten(0, 1), back.flatten(0, 1)).view(starts.shape[:2]).long()
+
+    row, corners, lit = divided(corners, seen, lambda _, pieces: _longest(pieces) <= smallest)
+    row, corners = row[lit > 0], corners[lit > 0]
+    aspect, number, d = aspect[row], number[row], d[row]
     normal = _towards(facets.normal[number], d)
     before = torch.full_like(aspect, -1)
     return Bounce(aspect, number, normal, d, torch.zeros_like(d[:, 0]), corners, before)
+
+
+def divided(
+    corners: Float64[Tensor, "row 3 3"],
+    look: Callable[[Tensor, Tensor], Tensor],
+    narrow: Callable[[Tensor, Tensor], Tensor],
+) -> tuple[Int64[Tensor, " piece"], Float64[Tensor, "piece 3 3"], Int64[Tensor, " piece"]]:
+    """Pieces of triangles in each of which all points look alike.
+
+    Args:
+        corners: Of the triangles.
+        look: Rows and points of each [row, point, 3] → numbers of what is seen there [row, point].
+        narrow: Rows and pieces → whether a piece is not split in four, but cut along a line.
+
+    Returns:
+        For every piece: the row, its corners, the number.
+    """
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    row = torch.arange(len(corners))
+    while True:
+        seen = look(row, _inner_points(corners))
+        whole = (seen == seen[:, :1]).all(1)
+        found.append((row[whole], corners[whole], seen[whole, 0]))
+        row, corners, seen = row[~whole], corners[~whole], seen[~whole]
+        if not len(row):
+            break
+        last = narrow(row, corners)
+        found += _cut(row[last], corners[last], seen[last], look)
+        row, corners = row[~last].repeat_interleave(4), _quarters(corners[~last])
+    pieces = zip(*found, strict=True)
+    return torch.cat(next(pieces)), torch.cat(next(pieces)), torch.cat(next(pieces))
+
+
+def _cut(
+    row: Tensor, corners: Tensor, seen: Tensor, look: Callable[[Tensor, Tensor], Tensor]
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Triangles one corner of which sees something else, cut; others look as their middles do."""
+    first, second, third = seen[:, 1:].unbind(1)
+    pairs = (first == second).long() + (second == third).long() + (third == first).long()
+    single = pairs != 1
+    yield row[single], corners[single], seen[single, 0]
+    odd = torch.where(second == third, 0, torch.where(third == first, 1, 2))[~single]
+    order = (odd[:, None] + torch.arange(3)) % 3
+    row, seen = row[~single], seen[~single, 1:].gather(1, order)
+    corners = corners[~single].gather(1, order[..., None].expand(-1, -1, 3))
+    inner = _inner_points(corners)[:, 1:]
+    # How far the sides that begin at the odd corner look as it does.
+    low = torch.zeros(len(row), 2, dtype=torch.float64)
+    for step in range(1, _HALVINGS + 1):
+        middle = low + 0.5**step
+        points = inner[:, :1] + middle[..., None] * (inner[:, 1:] - inner[:, :1])
+        low = torch.where(look(row, points) == seen[:, :1], middle, low)
+    share = (low + 0.5 ** (_HALVINGS + 1))[..., None]
+    a, b, c = corners.unbind(1)
+    p, q = (a[:, None] + share * (corners[:, 1:] - a[:, None])).unbind(1)
+    yield row, torch.stack([a, p, q], 1), seen[:, 0]
+    for part in ((p, b, c), (p, c, q)):
+        yield row, torch.stack(part, 1), seen[:, 1]
+
+
+def above(facets: Facets, normal: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:
+    """How far above a surface rays start.
+
+    Args:
+        facets: All triangles.
+        normal: Of the surface, towards the rays.
+    """
+    return _ASIDE * facets.size * normal
+
+
+def _inner_points(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "row 4 3"]:
+    """The middle of each triangle, and a point near each corner."""
+    middle = corners.mean(1, keepdim=True)
+    return torch.cat([middle, corners + _INSET * (middle - corners)], 1)
 
 
 def _towards(normal: Tensor, direction: Tensor) -> Tensor:
@@ -92,7 +158,7 @@ def _longest(corners: Tensor) -> Tensor:
     return (corners.roll(-1, 1) - corners).norm(dim=2).amax(1)
 
 
-def _quarters(corners: Tensor) -> Tensor:
+def _quarters(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "more 3 3"]:
     """Each triangle in four alike."""
     a, b, c = corners.unbind(1)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2

@@ -25,6 +25,7 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry, flatten
 from invertwin.channel.rays.scene import RayScene, face_areas
 from invertwin.channel.reference.radar_equation import SurfacePaths, passed, radar_equation
+from invertwin.progress import told
 from invertwin.scene.scene import Scene
 
 _LANES = 1 << 18  # walked at a time
@@ -63,7 +64,7 @@ def draw_rough_paths(
     with torch.no_grad():
         drawer = _Drawer(flatten(scene, link.wavelength, motion="fixed"), link, seed)
         rounds = -(-count // _LANES)
-        parts = [drawer.draw(turn, count // rounds, depth) for turn in range(rounds)]
+        parts = [drawer.draw(turn, count // rounds, depth) for turn in told(range(rounds), "paths")]
         return tuple(map(drawer.joined, zip(*parts, strict=True)))
 
 

@@ -11,7 +11,6 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import torch
 from jaxtyping import Complex128, Float64
@@ -21,7 +20,7 @@ from torch.nn.functional import normalize
 from invertwin.channel.field.beams import Bounce, Facets, beams
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
-from invertwin.channel.field.tubes import TubeBounce, tubes
+from invertwin.channel.field.tubes import tubes
 from invertwin.channel.field.waves import (
     Skins,
     dot,
@@ -53,7 +52,6 @@ _SMOOTH = (1e-6, 0.35)  # rad that normals turn from facet to facet where a surf
 _SEGMENTS = 2.0  # of an edge per wavelength; each is seen or not
 _OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
 _ROWS_AT_ONCE = 1 << 18
-_Lit = Bounce | TubeBounce
 
 
 @dataclass(frozen=True)
@@ -176,36 +174,31 @@ class _View:
     def _bounces(self, depth: int, spacing: float | None, boundary: bool) -> dict[str, Tensor]:
         """Physical optics of every order: of beams, or of tubes where a spacing is given."""
         body, orders = self.body, [list(self._none()) for _ in range(depth)]
-        chains: Iterable[tuple[int, Sequence[_Lit]]]
+        chains: Iterable[Sequence[Bounce]]
         if spacing is None:
-            lit = beams(body.facets, -self.transmitters, depth, boundary=boundary)
-            chains = [(0, list(lit))]
+            chains = [list(beams(body.facets, -self.transmitters, depth, boundary=boundary))]
         else:
             chains = self._sampled(depth, spacing)
-        for first, chain in chains:
+        for chain in chains:
             currents: list[Tensor] = []
             integrals = [bounce.integral(self.receivers[bounce.aspect]) for bounce in chain]
             for f, k in enumerate(body.wave_numbers):
                 if not (body.plain and currents):
                     currents = self._currents(chain, body.skins[f], 1.0 if body.plain else k)
                 rows = zip(orders, chain, integrals, currents, strict=False)
-                for order, bounce, integral, current in islice(rows, first, None):
+                for order, bounce, integral, current in rows:
                     strength = integral(k) * (k if body.plain else 1.0)
                     sent = current * strength[:, None, None]
                     order[f] = order[f].index_add(0, bounce.aspect, sent)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
-    def _sampled(self, depth: int, spacing: float) -> Iterator[tuple[int, Sequence[_Lit]]]:
-        """Many facets: the first order triangle by triangle, the others by tubes."""
-        body, incident = self.body, -self.transmitters
-        for lit in lit_triangles(body.facets, body.clear, incident, spacing):
-            yield 0, [lit]
-        if depth > 1:
-            corners = body.facets.corners.detach()
-            for chain in tubes(body.occluders, corners, incident, spacing, depth):
-                yield 1, chain
+    def _sampled(self, depth: int, spacing: float) -> Iterator[Sequence[Bounce]]:
+        """Many facets: tubes that begin as lit triangles."""
+        facets = self.body.facets
+        for lit in lit_triangles(facets, self.body.clear, -self.transmitters, spacing):
+            yield [lit, *tubes(facets, self.body.occluders, lit, spacing, depth)]
 
-    def _currents(self, chain: Sequence[_Lit], skins: Skins, k: float) -> list[Tensor]:
+    def _currents(self, chain: Sequence[Bounce], skins: Skins, k: float) -> list[Tensor]:
         """S per m² of all patches, order by order: [row, receive, transmit] each."""
         found: list[Tensor] = []
         again = torch.zeros(0)

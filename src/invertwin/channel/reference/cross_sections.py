@@ -6,7 +6,7 @@ Each is of a conductor as the built-in shape of its name stands, unturned, and s
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -68,19 +68,36 @@ class PlateSection(CrossSection):
 
 
 @dataclass(frozen=True)
-class DihedralSection(CrossSection):
+class _CornerPeak(CrossSection):
+    edge: Positive
+    _factor: ClassVar[float]
+
+    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
+        """σ [m²], that of boresight in all directions."""
+        peak = self._factor * math.pi * self.edge**4 / _wavelengths(frequencies) ** 2
+        return peak.expand(-1, len(directions))
+
+
+@dataclass(frozen=True)
+class DihedralSection(_CornerPeak):
     """Peak of two square plates at a right angle, two bounces at boresight: 8πa⁴/λ².
 
     Attributes:
         edge: of the plates [m].
     """
 
-    edge: Positive
+    _factor = 8.0
 
-    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
-        """σ [m²], that of boresight in all directions."""
-        peak = 8 * math.pi * self.edge**4 / _wavelengths(frequencies) ** 2
-        return peak.expand(-1, len(directions))
+
+@dataclass(frozen=True)
+class SquareTrihedralSection(_CornerPeak):
+    """Peak of a corner of three squares, three bounces at boresight: 12πa⁴/λ².
+
+    Attributes:
+        edge: of the squares [m].
+    """
+
+    _factor = 12.0
 
 
 @dataclass(frozen=True)
@@ -104,22 +121,6 @@ class TrihedralSection(CrossSection):
         narrow = 4 * low * middle / total
         area = torch.where(low + middle <= high, narrow, total - 2 / total) * self.edge**2
         return 4 * math.pi * (area / _wavelengths(frequencies)) ** 2
-
-
-@dataclass(frozen=True)
-class SquareTrihedralSection(CrossSection):
-    """Peak of a corner of three squares, three bounces at boresight: 12πa⁴/λ².
-
-    Attributes:
-        edge: of the squares [m].
-    """
-
-    edge: Positive
-
-    def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
-        """σ [m²], that of boresight in all directions."""
-        peak = 12 * math.pi * self.edge**4 / _wavelengths(frequencies) ** 2
-        return peak.expand(-1, len(directions))
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,13 @@ class _Numbers:
 Swept = Annotated[Any, _Numbers]
 
 
+def count_of(value: Any) -> int:
+    """How many numbers a sweep, a list or a single one has."""
+    if isinstance(value, Sweep):
+        return value.count
+    return len(value) if isinstance(value, list) else 1
+
+
 def swept(value: Any) -> Tensor:
     """The numbers of a sweep, a list or a single one."""
     if isinstance(value, Sweep):
@@ -118,10 +125,23 @@ class Rcs(Table):
                     f"({', '.join(known)}), got {channel}; choose one",
                     f"{path}.channel",
                 )
-        theta, phi = len(swept(self.theta_deg)), len(swept(self.phi_deg))
+        theta, phi = count_of(self.theta_deg), count_of(self.phi_deg)
         if theta != phi and 1 not in (theta, phi):
             fail(f"expected one angle or as many as theta_deg ({theta}), got {phi}", "phi_deg")
         return self
+
+    def at(self, aspects: list[int]) -> "Rcs":
+        """The same of some aspects, and nothing to compare them with."""
+        count = max(count_of(self.theta_deg), count_of(self.phi_deg))
+
+        def chosen(section: Any) -> dict[str, list[float]]:
+            return {
+                name: swept(getattr(section, name)).expand(count)[aspects].tolist()
+                for name in ("theta_deg", "phi_deg")
+            }
+
+        receiver = self.receiver and self.receiver.model_copy(update=chosen(self.receiver))
+        return self.model_copy(update={**chosen(self), "receiver": receiver})
 
     @property
     def angles(self) -> tuple[Tensor, str]:

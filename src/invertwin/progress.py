@@ -1,0 +1,55 @@
+"""Progress of long work, told to whoever listens; by default nobody does."""
+
+import time
+from collections.abc import Callable, Collection, Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import TypeVar
+
+_T = TypeVar("_T")
+
+
+@dataclass
+class _Listener:
+    hear: Callable[[str, int, int, float], None]
+    busy: bool = False
+
+
+_listener: ContextVar[_Listener | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def listening(hear: Callable[[str, int, int, float], None]) -> Generator[None]:
+    """Hear how far long loops have come while the block is worked on.
+
+    Args:
+        hear: Takes what is worked on, how many parts of it are done, how many there are, and the
+            time that is left [s].
+    """
+    token = _listener.set(_Listener(hear))
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+def told(parts: Collection[_T], name: str) -> Generator[_T]:
+    """Go through parts of some work, and tell how many are done; loops inside keep silent.
+
+    Args:
+        parts: What there is to do.
+        name: What is worked on, for people.
+    """
+    listener = _listener.get()
+    if listener is None or listener.busy:
+        yield from parts
+        return
+    listener.busy, begin = True, time.monotonic()
+    try:
+        for done, part in enumerate(parts, 1):
+            yield part
+            left = (time.monotonic() - begin) / done * (len(parts) - done)
+            listener.hear(name, done, len(parts), left)
+    finally:
+        listener.busy = False
