@@ -1,6 +1,7 @@
 """Specular paths: closed forms, laws, odd places, derivatives."""
 
 import cmath
+import itertools
 import math
 
 import pytest
@@ -450,6 +451,37 @@ def test_ten_thousand_receivers():
     assert row.shape == (1, 10_000, 25)  # 1, 6 and 18 images
     assert filled.all()
     assert torch.equal(paths.rx[row[0]], torch.arange(10_000)[:, None].expand(-1, 25))
+
+
+def test_a_scene_of_20_000_triangles():
+    """Every path obeys the laws: lengths are those of its pieces, angles at mirrors are equal."""
+    ball = Object(sphere(0.5, 5), METAL, rigid(translation=[0.0, 0.0, 2.0]))
+    scene = Scene({**room(size=(6.0, 6.0, 6.0)).objects, "ball": ball})
+    places = torch.rand(60, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    tx, rx = float64([0.3, 0.0, 0.0]), places * float64([2.0, 2.0, 1.0])
+    rx[0] = float64([0.0, 0.0, 2.9])
+    paths = trace(scene, tx, rx, rays=100_000)
+    assert len(ball.mesh.faces) == 20_480
+    met = paths.objects == paths.names.index("ball")
+    assert int(met.any(1).sum()) >= 3
+    assert not bool((paths.between(0, 0).depth == 0).any())  # in its shadow
+    radius = (paths.vertices[met] - float64([0.0, 0.0, 2.0])).norm(dim=1)
+    assert float((radius - 0.5).abs().max()) < 1e-3
+    vertices = torch.cat([item.vertices for item in scene.objects.values()])
+    room_faces = scene["room"].mesh.faces
+    faces = torch.cat([room_faces, ball.mesh.faces + len(scene["room"].mesh.vertices)])
+    for row in torch.nonzero(met.any(1))[:20, 0].tolist():
+        depth = int(paths.depth[row])
+        points = [tx, *paths.vertices[row, :depth], rx[paths.rx[row]]]
+        pieces = [b - a for a, b in itertools.pairwise(points)]
+        total = sum(float(piece.norm()) for piece in pieces)
+        assert paths.length[row].item() == pytest.approx(total, rel=1e-12)
+        for before, after, face in zip(pieces, pieces[1:], paths.faces[row], strict=False):
+            a, b, c = vertices[faces[face]]
+            normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=0)
+            change = after / after.norm() - before / before.norm()
+            along = change - (change @ normal) * normal
+            assert float(along.norm()) < 1e-9
 
 
 def test_padded_links_may_be_empty():

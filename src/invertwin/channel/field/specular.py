@@ -280,19 +280,20 @@ def _columns(stage: _Stage, chains: Chains) -> tuple[Tensor, ...]:
     spread = SPEED_OF_LIGHT / stage.frequency / (4 * math.pi) / distance
     nodes = corners_of(rx, seen, point, normal)
     vertices = torch.stack(nodes, 1) if nodes else torch.zeros(count, 0, 3, dtype=torch.float64)
-    rate = dot(ways[-1], stage.rx_velocity[chains.target])
-    rate = rate - dot(ways[0], stage.tx_velocity[chains.source])
+    # How fast the path gets shorter.
+    rate = dot(ways[0], stage.tx_velocity[chains.source])
+    rate = rate - dot(ways[-1], stage.rx_velocity[chains.target])
     if stage.velocities is not None and length:
         moved = _at_points(stage.velocities[stage.topology.faces[chains.faces]], corners, vertices)
         for step in range(length):
-            rate = rate + dot(ways[step] - ways[step + 1], moved[:, step])
+            rate = rate + dot(ways[step + 1] - ways[step], moved[:, step])
     return (
         distance / SPEED_OF_LIGHT,
         field * spread[:, None, None],
         ways[0],
         -ways[-1],
         vertices,
-        -stage.frequency / SPEED_OF_LIGHT * rate,
+        stage.frequency / SPEED_OF_LIGHT * rate,
     )
 
 
