@@ -453,6 +453,22 @@ def test_ten_thousand_receivers():
     assert torch.equal(paths.rx[row[0]], torch.arange(10_000)[:, None].expand(-1, 25))
 
 
+def test_pieces_add_up(monkeypatch):
+    """Many paths are computed piece by piece, and again for their derivatives."""
+    rx = [[-1.4, 0.9, -0.6], [0.4, 1.2, -1.0], [2.0, -1.5, 1.0]]
+    found = []
+    for rows in (1 << 15, 7):
+        monkeypatch.setattr("invertwin.channel.field.specular._ROWS_AT_ONCE", rows)
+        walls = box((5.0, 4.0, 3.0))
+        vertices = walls.vertices.clone().requires_grad_()
+        scene = room(Dielectric(4.0, 0.1)).replace("room", mesh=Mesh(vertices, walls.faces))
+        paths = trace(scene, [1.3, -1.1, 0.7], rx, depth=3)
+        response(paths).abs().square().sum().backward()
+        found.append((paths.delay.detach(), paths.coefficient.detach(), vertices.grad))
+    for whole, pieces in zip(*found, strict=True):
+        torch.testing.assert_close(pieces, whole)
+
+
 def test_a_scene_of_20_000_triangles():
     """Every path obeys the laws: lengths are those of its pieces, angles at mirrors are equal."""
     ball = Object(sphere(0.5, 5), METAL, rigid(translation=[0.0, 0.0, 2.0]))

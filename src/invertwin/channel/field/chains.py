@@ -26,7 +26,7 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, Occluders
 from invertwin.channel.rays.topology import Topology
 
-_LANES = 1 << 20
+_LANES = 1 << 19
 _PAIRS = 1 << 22  # segments × triangles of the exact test at a time
 _ASIDE = 4.0  # margins between the rays that try a segment
 _EXACT = 1e-9  # of the scene's size: float64 places closer than this are one
@@ -161,10 +161,10 @@ def chains_between(
         screen = _Screen(walls, some, source)
         block = max(1, _LANES // len(some))
         for begin in range(0, len(targets), block):
-            target, sequence, faces = screen.passed(targets[begin : begin + block])
+            target, sequence = screen.passed(targets[begin : begin + block])
             target = target + begin
             chosen = some[sequence]
-            good, faces = _verified(walls, chosen, faces, source, targets[target])
+            good, faces = _verified(walls, chosen, source, targets[target])
             found.append(
                 Chains(
                     torch.full((int(good.sum()),), number),
@@ -190,20 +190,17 @@ class _Screen:
         self.images = to_double(torch.stack(seen, 1))
         self.steps = to_index(steps) if self.length else None
 
-    def passed(self, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Targets, sequences and triangles (−1: unknown yet) of what may be paths."""
+    def passed(self, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """Targets and sequences of what may be paths."""
         lane = dr.arange(mi.UInt32, self.count * len(targets))
         count = opaque(self.count)
         target, row = lane // count, lane % count
         places = to_double(targets - self.walls.origin)
         end = dr.gather(mi.Vector3d, places, target)
         ok, corners, planes, normals = self._corners(row, end)
-        good, faces = self._clear(row, ok, [*corners, end], planes, normals)
-        dr.eval(good, *faces)
-        keep = torch.nonzero(to_torch(good))[:, 0]
-        columns = [to_torch(face).long()[keep] for face in faces]
-        met = torch.stack(columns, 1) if columns else torch.zeros(len(keep), 0, dtype=torch.int64)
-        return keep // self.count, keep % self.count, met
+        good = to_torch(self._clear(row, ok, [*corners, end], planes, normals))
+        keep = torch.nonzero(good)[:, 0]
+        return keep // self.count, keep % self.count
 
     def _corners(self, row: Any, end: Any) -> tuple[Any, list[Any], list[Any], list[Any]]:
         """Where the lines to the images cut the planes, inside of their rectangles."""
@@ -239,12 +236,11 @@ class _Screen:
 
     def _clear(
         self, row: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
-    ) -> tuple[Any, list[Any]]:
-        """Whether one ray a segment finds nothing in the way, and the triangles at its ends."""
+    ) -> Any:
+        """Whether one ray a segment meets nothing, or what it should; seams let rays through."""
         walls = self.walls
         margin, scene = opaque(walls.margin, "Float64"), walls.scene
         start = dr.gather(mi.Vector3d, self.images, row * (self.length + 1))
-        faces = []
         for step, end in enumerate(ends):
             way = end - start
             length = dr.norm(way)
@@ -262,14 +258,11 @@ class _Screen:
             hit = scene.ray_intersect_preliminary(ray, active=ok)
             valid = hit.is_valid() & ok
             if last:
-                ok &= ~valid
-                break
+                return ok & ~valid
             plane = dr.gather(mi.UInt32, walls.device_planes["of_face"], hit.prim_index, valid)
-            there = valid & (plane == planes[step]) & (hit.t > mi.Float(length - over))
-            faces.append(dr.select(there, mi.Int32(hit.prim_index), -1))
-            ok &= there | ~valid
+            ok &= ~valid | ((plane == planes[step]) & (hit.t > mi.Float(length - over)))
             start = end
-        return ok, faces
+        return ok
 
 
 @dataclass(frozen=True)
@@ -288,12 +281,12 @@ class _Segments:
 
 
 def _verified(
-    walls: Walls, steps: Tensor, faces: Tensor, source: Tensor, targets: Tensor
+    walls: Walls, steps: Tensor, source: Tensor, targets: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Which paths there are, and the triangles that they meet."""
     count, length = steps.shape
     if not count:
-        return torch.zeros(0, dtype=torch.bool), faces
+        return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps)
     planes, plane = walls.planes, steps >> 1
     point, normal = planes.point[plane], planes.normal[plane]
     place = (source - walls.origin).expand(count, 3)
