@@ -76,6 +76,18 @@ class Body:
         return aspects(theta, phi)
 
 
+def _seven_points() -> list[tuple[float, ...]]:
+    """A rule of the fifth degree on a triangle: three shares and a weight for each point."""
+    a, b, u, v = 0.059715871789770, 0.797426985353087, 0.470142064105115, 0.101286507323456
+    rule: list[tuple[float, ...]] = [(1 / 3, 1 / 3, 1 / 3, 0.225)]
+    for near, far, weight in ((u, a, 0.132394152788506), (v, b, 0.125939180544827)):
+        rule += [(*np.roll((far, near, near), turn), weight) for turn in range(3)]
+    return rule
+
+
+SEVEN_POINTS = _seven_points()
+
+
 def sheets(squares: Sequence[tuple[Any, Any, Any]], step: float) -> Grid:
     """Parallelograms (a corner and two sides) as one mesh without seams.
 
@@ -193,19 +205,11 @@ def solve(body: Body, step: float) -> dict[str, Any]:
     """
     from scipy.linalg import lu_factor, lu_solve
 
-    bempp = importlib.import_module("bempp_cl.api")
     start = perf_counter()
     points, faces = body.shape(step)
     # The solver's fields turn with exp(−iωt); ours are the conjugates.
     k = 2 * math.pi
-    grid = bempp.Grid(points.T, faces.T)
-    currents, tests = (bempp.function_space(grid, kind, 0) for kind in ("RWG", "SNC"))
-    near = bempp.operators.boundary.maxwell.electric_field(
-        currents, currents, tests, k, assembler="only_singular_part"
-    )
-    matrix = _apart(points, faces, currents, k)
-    touching = near.weak_form().A.tocoo()
-    np.add.at(matrix, (touching.row, touching.col), touching.data.astype(np.complex64))
+    matrix, currents = system(points, faces, k)
     assembled = perf_counter() - start
     factors = lu_factor(matrix, overwrite_a=True, check_finite=False)
     found: dict[str, Any] = {}
@@ -224,7 +228,26 @@ def solve(body: Body, step: float) -> dict[str, Any]:
     return found | {"unknowns": len(matrix), "step": step}
 
 
-def _functions(
+def system(points: np.ndarray, faces: np.ndarray, k: float) -> tuple[np.ndarray, Any]:
+    """The electric field integral equation's matrix, and the space of its currents.
+
+    Args:
+        points, faces: the mesh.
+        k: wave number.
+    """
+    bempp = importlib.import_module("bempp_cl.api")
+    grid = bempp.Grid(points.T, faces.T)
+    currents, tests = (bempp.function_space(grid, kind, 0) for kind in ("RWG", "SNC"))
+    near = bempp.operators.boundary.maxwell.electric_field(
+        currents, currents, tests, k, assembler="only_singular_part"
+    )
+    matrix = _apart(points, faces, currents, k)
+    touching = near.weak_form().A.tocoo()
+    np.add.at(matrix, (touching.row, touching.col), touching.data.astype(np.complex64))
+    return matrix, currents
+
+
+def functions(
     points: np.ndarray, faces: np.ndarray, space: Any, rule: Sequence[tuple[float, ...]]
 ) -> tuple[np.ndarray, list[Any], Any]:
     """RWG functions at points of all triangles, times the points' weights.
@@ -262,7 +285,7 @@ def _apart(points: np.ndarray, faces: np.ndarray, space: Any, k: float) -> np.nd
 
     far, near = 2 / 3, 1 / 6
     rule = [(*np.roll((far, near, near), turn), 1 / 3) for turn in range(3)]
-    spots, parts, charge = _functions(points, faces, space, rule)
+    spots, parts, charge = functions(points, faces, space, rule)
     parts = [part.astype(np.complex64) for part in (*parts, 1j / k * charge)]
     corner = csr_array(
         (np.ones(faces.size), (np.arange(len(faces)).repeat(3), faces.ravel())),
@@ -289,11 +312,7 @@ def _excitations(
     points: np.ndarray, faces: np.ndarray, space: Any, waves: np.ndarray, sent: np.ndarray
 ) -> Complex128[np.ndarray, "aspect 2 unknown"]:
     """∫ f·p exp(−ik u·x) of every RWG function f, by seven points a triangle."""
-    a, b, u, v = 0.059715871789770, 0.797426985353087, 0.470142064105115, 0.101286507323456
-    rule: list[tuple[float, ...]] = [(1 / 3, 1 / 3, 1 / 3, 0.225)]
-    for near, far, weight in ((u, a, 0.132394152788506), (v, b, 0.125939180544827)):
-        rule += [(*np.roll((far, near, near), turn), weight) for turn in range(3)]
-    spots, parts, _ = _functions(points, faces, space, rule)
+    spots, parts, _ = functions(points, faces, space, SEVEN_POINTS)
     turn = np.exp(-1j * waves @ spots.T)
     along = [(part.T @ turn.T).T for part in parts]
     return np.einsum("apx,xan->apn", sent, np.stack(along))

@@ -82,3 +82,19 @@ class Needle(Blob):
         power = 0.05 + sum(torch.exp(-((BINS - s * way[2]) ** 2) / 0.08) for s in (1.0, -1.0))
         assert isinstance(power, Tensor)
         return power.expand(self.frames, -1)[..., None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Ripple(Blob):
+    """Shows the place of the object up to whole periods, to some 0.05 m.
+
+    Attributes:
+        period: [m].
+    """
+
+    period: float = 0.2
+
+    def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
+        turn = 2 * torch.pi * scene["ball"].center[0] / self.period
+        power = 1 + 0.16 * self.period * torch.sin(turn + torch.pi * BINS)
+        return power.expand(self.frames, -1)[..., None, None]

@@ -10,9 +10,16 @@ from invertwin.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
-from invertwin.models import ExactMap, MotionMap, SurrogateMap, surrogate_correlation
+from invertwin.models import (
+    ChainField,
+    ChainMap,
+    ExactMap,
+    MotionMap,
+    SurrogateMap,
+    surrogate_correlation,
+)
 from invertwin.radar import Chirps, Radar, Surrogate, velocity_axis
-from invertwin.scene import PerfectConductor, Scene, plate
+from invertwin.scene import PerfectConductor, Scene, plate, trihedral
 from invertwin.simulation import simulate, simulate_chirps
 from scenes import float64, occluder, radar, relative, thing
 
@@ -197,3 +204,63 @@ def test_a_part_of_a_map_is_cut_around_an_echo():
     assert torch.allclose(cut, whole[:, rows][:, :, columns], rtol=1e-6, atol=1e-12)
     with pytest.raises(InputError, match="expected an echo within the map"):
         model.around(9.0, 1.2, 3, device)
+
+
+def corner() -> Scene:
+    item = thing(trihedral(0.05), (0.02, 0.0, 1.0), material=PerfectConductor())
+    return Scene({"corner": item})
+
+
+def test_chains_have_the_strength_of_a_corner_reflector():
+    """All chains of three bounces add in phase; the power model adds their powers."""
+    device = radar()
+    grid = device.grid(0.7, 1.3)
+    drawn = Sampling(depth=3, samples=60_000, boundary=False)
+    truth = simulate(corner(), device, grid, seed=1, sampling=drawn).spectrum
+    found = ChainMap(grid, sampling=Sampling(depth=3)).predict(corner(), device, 0)
+    assert float(found.max()) == pytest.approx(float(truth.max()), rel=0.15)
+    assert relative(found, truth.float()) < 0.1
+
+
+def test_chains_blur_both_maps_alike_and_have_looks():
+    device = radar()
+    grid = device.grid(0.7, 1.3)
+    model = ChainMap(grid, Surrogate(range_width=2.0), Sampling(depth=3))
+    sharp = model.narrowed(0.0)
+    assert model.widened
+    assert not sharp.widened
+    flat = sharp.predict(corner(), device, 0)
+    assert torch.allclose(model.predict(corner(), device, 0), model.blurred(flat, device))
+    look = sharp.looks(corner(), device, 0)
+    assert look is not None
+    assert torch.allclose(look(0, 0.0), flat, rtol=1e-3, atol=float(flat.max()) * 1e-5)
+    noise = 1e-3 * float(flat.max())
+    assert not torch.equal(look(0, noise), look(1, noise))
+
+
+def test_chain_fields_are_the_range_profiles_of_a_recording():
+    device = radar()
+    grid = device.grid(0.7, 1.3)
+    drawn = Sampling(depth=3, samples=60_000, boundary=False)
+    beat = simulate(corner(), device, grid, seed=1, sampling=drawn).beat
+    model = ChainField(grid, sampling=Sampling(depth=3))
+    truth = model.observe(Capture.from_beat(beat, device))
+    found = model.predict(corner(), device, 0)
+    assert found.shape == truth.shape == (*found.shape[:3], 2)
+    assert relative(found, truth) < 0.2
+    away = corner().replace("corner", pose=thing(plate(1, 1), (0.02, 0.0, 1.001)).pose)
+    assert relative(model.predict(away, device, 0), truth) > 1.0
+
+
+def test_looks_at_chain_fields_have_the_noise_that_is_asked_for():
+    device = radar()
+    model = ChainField(device.grid(0.7, 1.3), sampling=Sampling(depth=3))
+    flat = model.predict(corner(), device, 0)
+    look = model.looks(corner(), device, 0)
+    assert look is not None
+    assert torch.allclose(look(0, 0.0), flat)
+    noise = 0.01 * float(flat.square().max())
+    found = torch.stack([look(number, noise) - flat for number in range(20)])
+    # How strong noise is in a map is known from one draw of it.
+    assert float(found.square().mean()) == pytest.approx(noise, rel=0.3)
+    assert abs(float(found.mean())) < 0.1 * noise**0.5

@@ -17,14 +17,23 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field, trace_power
+from invertwin.channel import (
+    Grid,
+    Paths,
+    Sampling,
+    Speckle,
+    draw_speckle,
+    trace_chains,
+    trace_field,
+    trace_power,
+)
 from invertwin.errors import InputError
 from invertwin.radar.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.looks import Looks
 from invertwin.radar.motion import Chirps
 from invertwin.radar.moving_power import moving_power
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import beat_signal
+from invertwin.radar.range_profile import beat_signal, range_profile
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
 from invertwin.radar.waveform import SampledWaveform
@@ -44,11 +53,13 @@ class ForwardModel(ABC):
             included. Gauss–Newton and gradient checks need that.
         random: Whether maps depend on the seed. Of a model whose maps do not, gradient checks take
             one derivative and one pair of differences.
+        fields: Whether maps hold parts of fields, of either sign, not power.
     """
 
     redraws: ClassVar[bool] = True
     smooth: ClassVar[bool] = True
     random: ClassVar[bool] = True
+    fields: ClassVar[bool] = False
 
     @abstractmethod
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Float[Tensor, "frame *map"]:
@@ -98,8 +109,8 @@ class ForwardModel(ABC):
             seed: Of the points on rough surfaces.
 
         Returns:
-            A function of a seed and of the mean noise in a bin that returns a map, as ``observe``
-            would show it. None where the model cannot say.
+            A function of a seed and of the mean noise in a bin, of ``fields`` its mean square, that
+            returns a map, as ``observe`` would show it. None where the model cannot say.
         """
         return None
 
@@ -215,43 +226,150 @@ class SurrogateMap(ForwardModel):
             return None
         fields = replace(self.sampling, boundary=False)
         looks = Looks(trace_field(scene, sensor.link(), sampling=fields, seed=seed), sensor)
-        white = torch.randn(
-            *sensor.shape,
-            sensor.waveform.samples,
-            dtype=torch.complex64,
-            generator=torch.Generator().manual_seed(seed),
+        return _noisy(
+            lambda number: looks.beat(derived_seed(number, 0)),
+            lambda beat: exact_spectrum(beat, sensor, self.grid).to(torch.float32),
+            sensor,
+            seed,
         )
-        share = float(exact_spectrum(white, sensor, self.grid).mean())
-
-        def look(number: int, noise: float) -> Tensor:
-            beat = looks.beat(derived_seed(number, 0))
-            generator = torch.Generator().manual_seed(derived_seed(number, 1))
-            white = torch.randn(beat.shape, dtype=beat.dtype, generator=generator)
-            beat += (noise / share) ** 0.5 * white
-            return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
-
-        return look
 
     @property
     def widened(self) -> bool:
         """Whether the surrogate has extra widths."""
-        return self.kernels.range_width > 0 or self.kernels.angle_width > 0
+        return self.kernels.widened
 
     def narrowed(self, share: float) -> "SurrogateMap":
         """The surrogate with this share of its extra widths."""
-        kernels = self.kernels
-        return replace(
-            self,
-            surrogate=replace(
-                kernels,
-                range_width=kernels.range_width * share,
-                angle_width=kernels.angle_width * share,
-            ),
-        )
+        return replace(self, surrogate=self.kernels.narrowed(share))
 
     def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
         """A measured spectrum with the extra widths."""
         return self.kernels.blur(observed, sensor, self.grid)
+
+
+def _noisy(
+    beat_of: Callable[[int], Tensor],
+    shown: Callable[[Tensor], Tensor],
+    sensor: Radar,
+    seed: int,
+    *,
+    fields: bool = False,
+) -> Callable[[int, float], Tensor]:
+    """Looks with noise: a function of their number gives beat signals, another shows them."""
+    assert isinstance(sensor.waveform, SampledWaveform)
+    shape = (*sensor.shape, sensor.waveform.samples)
+
+    def white(key: int) -> Tensor:
+        generator = torch.Generator().manual_seed(key)
+        return torch.randn(shape, dtype=torch.complex64, generator=generator)
+
+    whole = shown(white(seed))
+    share = float((whole.square() if fields else whole).mean())
+
+    def look(number: int, noise: float) -> Tensor:
+        return shown(beat_of(number) + (noise / share) ** 0.5 * white(derived_seed(number, 1)))
+
+    return look
+
+
+@dataclass(frozen=True)
+class ChainMap(ForwardModel):
+    """The power spectrum of a few flat conductors that mirror one another: |sum of fields|².
+
+    Chains of a corner reflector add in phase, where a ``SurrogateMap`` adds their powers and is
+    up to 8 dB too low. There are no samples and no speckle: the map is smooth in the pose, corners
+    and beams' edges included, as long as one chain or one corner dominates each cell; echoes of
+    several targets in one cell interfere, with a minimum every half wavelength.
+
+    Attributes:
+        grid: Bins, see ``Radar.grid``.
+        surrogate: Extra widths, which are zero at the end of a fit; its kernels do not count.
+        sampling: Most bounces; nothing else counts.
+    """
+
+    grid: Grid
+    surrogate: Surrogate = field(default_factory=Surrogate)
+    sampling: Sampling = Sampling()
+
+    redraws: ClassVar[bool] = False
+
+    def _beat(self, scene: Scene, sensor: Radar) -> Tensor:
+        return beat_signal(trace_chains(scene, sensor.link(), self.sampling.depth), sensor)
+
+    def _shown(self, beat: Tensor, sensor: Radar) -> Tensor:
+        return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """The spectrum of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
+        return self.blurred(self._shown(self._beat(scene, sensor), sensor), sensor)
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
+        """The measured power spectrum of a capture."""
+        return recording.spectrum(self.grid).to(torch.float32)
+
+    def looks(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Callable[[int, float], Tensor] | None:
+        """The map with other noise each time; None for waveforms without samples."""
+        if not isinstance(sensor.waveform, SampledWaveform):
+            return None
+        beat = self._beat(scene, sensor)
+        return _noisy(
+            lambda _: beat,
+            lambda signal: self._shown(signal, sensor),
+            sensor,
+            seed,
+            fields=self.fields,
+        )
+
+    @property
+    def widened(self) -> bool:
+        """Whether there are extra widths."""
+        return self.surrogate.widened
+
+    def narrowed(self, share: float) -> "ChainMap":
+        """The model with this share of its extra widths."""
+        return replace(self, surrogate=self.surrogate.narrowed(share))
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
+        """A map with the extra widths."""
+        return self.surrogate.blur(observed, sensor, self.grid)
+
+
+@dataclass(frozen=True)
+class ChainField(ChainMap):
+    """The complex range profiles of a few flat conductors that mirror one another.
+
+    The phase tells the range to parts of a wavelength. So its loss has a minimum every half
+    wavelength: it refines what a ``ChainMap`` has found to a tenth of a wavelength in range, in a
+    later stage of a fit. Maps hold real and imaginary parts; compare them by a ``SpectrumLoss`` of
+    kind ``mse`` with one level. The radar's phase is calibrated.
+    """
+
+    fields: ClassVar[bool] = True
+
+    def _shown(self, beat: Tensor, sensor: Radar) -> Tensor:
+        profile = range_profile(beat.to(torch.complex128), sensor, self.grid)
+        return torch.view_as_real(profile.flatten(1, 2).mT).contiguous()
+
+    def predict(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Float[Tensor, "frame range channel part"]:
+        """The range profiles of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
+        return super().predict(scene, sensor, seed)
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range channel part"]:
+        """The measured range profiles of a capture."""
+        return self._shown(recording.beat, recording.radar())
+
+    @property
+    def widened(self) -> bool:
+        """Fields have no extra widths."""
+        return False
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Tensor:
+        """A map as it is."""
+        return observed
 
 
 @dataclass(frozen=True)

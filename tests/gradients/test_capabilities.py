@@ -15,7 +15,15 @@ from torch.func import functional_call
 
 from invertwin.capture import Capture
 from invertwin.capture.track import Track
-from invertwin.channel import Sampling, deposit_power, trace_field, trace_paths
+from invertwin.channel import (
+    Link,
+    Paths,
+    Sampling,
+    deposit_power,
+    trace_chains,
+    trace_field,
+    trace_paths,
+)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check, gradcheck
@@ -56,6 +64,7 @@ MECHANISMS = {
     "rough field": "rough",
     "signature": "signature",
     "paths between antennas": "antennas",
+    "chains": "chains",
 }
 ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
 METAL = PerfectConductor()
@@ -248,7 +257,11 @@ def pushed(function: Callable[[Tensor], Tensor]) -> Tensor:
 def response(scene: Scene, radar: Radar, sampling: Sampling, seed: int) -> Tensor:
     """Real and imaginary parts of the channel at the carrier, per frame."""
     antennas = radar.link()
-    paths = trace_field(scene, antennas, sampling=sampling, seed=seed)
+    return at_carrier(trace_field(scene, antennas, sampling=sampling, seed=seed), antennas)
+
+
+def at_carrier(paths: Paths, antennas: Link) -> Tensor:
+    """Real and imaginary parts of the sum of field paths, per frame."""
     phase = 2 * math.pi / antennas.wavelength * SPEED_OF_LIGHT * paths.delay
     field = paths.coefficient * torch.polar(torch.ones_like(phase), -phase)
     total = torch.zeros(antennas.frame_count, dtype=torch.complex128)
@@ -341,6 +354,19 @@ def antenna_case(parameter: str) -> Found:
     return Found(found, found, (up - down) / 2e-5, 0.0)
 
 
+def chain_case(parameter: str) -> Found:
+    """Chains between two plates, one of which hides the other; no random numbers."""
+    scene, radar, moves = occluder(wall=METAL, occluder=METAL), field_radar(0.3), MOVES[parameter]
+
+    def value(theta: Tensor) -> Tensor:
+        moved, device = moves(scene, radar, theta)
+        return at_carrier(trace_chains(moved, device.link(), 2), device.link())
+
+    up, down = (value(torch.tensor(sign * 1e-6).double()) for sign in (1, -1))
+    found = pushed(value)
+    return Found(found, found, (up - down) / 2e-6, 0.0)
+
+
 _power: dict[str, Found] = {}
 
 
@@ -353,6 +379,8 @@ def case(parameter: str, mechanism: str) -> Found:
         return signature_case(parameter)
     if mechanism == "antennas":
         return antenna_case(parameter)
+    if mechanism == "chains":
+        return chain_case(parameter)
     if parameter not in _power:
         _power[parameter] = bias_case() if parameter == "range bias" else power_case(parameter)
     return _power[parameter]
@@ -409,6 +437,11 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     if mechanism == "antennas":
         between(scene, radar.positions[0])
         return
+    if mechanism == "chains":
+        exact_spectrum(
+            beat_signal(trace_chains(scene, radar.link(), 2), radar), radar, radar.grid(0.4, 2.8)
+        )
+        return
     if mechanism.endswith(("interior", "boundary")):
         grid = radar.grid(0.4, 2.8, 0.6)
         drawn = Sampling(
@@ -464,7 +497,7 @@ REFUSED = [cell for cell, said in CELLS.items() if said == "refused"]
 
 @pytest.mark.parametrize(("parameter", "mechanism"), REFUSED)
 def test_refused(parameter, mechanism):
-    surface = METAL if mechanism == "coherent" else ROUGH
+    surface = METAL if mechanism in ("coherent", "chains") else ROUGH
     scene, radar = occluder(wall=surface, occluder=surface), power_radar()
     message = NAMES.get(parameter, "expected no geometry derivative of rough field paths")
     theta = torch.zeros((), dtype=torch.float64, requires_grad=True)

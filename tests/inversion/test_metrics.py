@@ -1,6 +1,7 @@
 """Metrics of shape against closed forms."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,14 +11,15 @@ from invertwin.errors import InputError
 from invertwin.inversion.metrics import (
     ShapeMetrics,
     Topology,
+    axis_error,
     compare_shapes,
     is_watertight,
     surface_points,
     topology,
     volume_iou,
 )
-from invertwin.scene import Mesh, box, plate, rotation_from_vector, sphere, text
-from scenes import float64
+from invertwin.scene import Mesh, box, plate, rigid, rotation_from_vector, sphere, text
+from scenes import float64, thing
 
 
 def shifted(mesh: Mesh, *offset: float) -> Mesh:
@@ -209,3 +211,15 @@ def test_parts_and_holes_are_counted():
     assert topology(Mesh(corners, torch.cat([ball.faces + 1, thin]))) == topology(ball)
     with pytest.raises(InputError, match="expected a watertight mesh"):
         topology(plate(1.0, 1.0))
+
+
+def test_an_axis_knows_no_turns_about_itself():
+    there = thing(box((1.0, 1.0, 1.0)), (0.1, 0.0, 0.0), (0.0, 0.3, 0.0))
+    rolled = (
+        there.transform @ thing(box((1.0, 1.0, 1.0)), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)).transform
+    )
+    moved = replace(there, pose=rigid(translation=float64([0.0, 0.03, 0.04])) @ rolled)
+    assert axis_error(moved, there, (0.0, 0.0, -2.0)) == pytest.approx((0.05, 0.0), abs=1e-12)
+    assert axis_error(moved, there, (1.0, 0.0, 0.0))[1] == pytest.approx(1.0)
+    with pytest.raises(InputError, match="expected an axis of some length"):
+        axis_error(moved, there, (0.0, 0.0, 0.0))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from blobs import LAW, Blob, deviation, scene
+from blobs import LAW, Blob, Ripple, deviation, scene
 from invertwin.errors import InputError
 from invertwin.inversion import (
     Observation,
@@ -77,6 +77,16 @@ def test_what_has_no_effect_is_not_observed_and_named():
     assert found.deviations["ball.z"] >= 0.5
     assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 4), rel=0.25)
     assert abs(float(found.correlations[0, 1])) < 0.1
+
+
+def test_a_direction_whose_loss_falls_again_is_not_observed():
+    """Two spans away, 0.2 m, lies the next of many equal minima, or the slope of one."""
+    steady = fitted(Ripple(period=2.0)).uncertainty
+    assert steady.unobserved == ()
+    assert 0.025 < steady.deviations["ball.x"] < 0.1
+    repeated = fitted(Ripple(period=0.2)).uncertainty
+    assert repeated.unobserved == ("ball.x: not observed",)
+    assert repeated.deviations["ball.x"] > 1.0
 
 
 class Mixed(nn.Module):

@@ -11,6 +11,7 @@ from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.minima import pose_grid
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.starts import nearby, posed
+from invertwin.models import ChainField, ChainMap
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate
 from invertwin.registry.kinds import Group, Registry, Table
 from invertwin.registry.section import fail, key
@@ -45,7 +46,7 @@ class SearchTable(Table):
 
 
 def register(registry: Registry) -> None:
-    """Add losses and optimizers; forward models of one's own come from plugins."""
+    """Add losses, optimizers and models beside the surrogate's; others come from plugins."""
     registry.groups["loss"] = Group(default="mse")
     registry.groups["optimizer"] = Group(default="adam")
     registry.groups["model"] = Group()
@@ -53,6 +54,8 @@ def register(registry: Registry) -> None:
     registry.given |= {Grid, Surrogate, Sampling, Object, torch.Generator}
     registry.add("loss", "mse", SpectrumLoss, without=("floor",))
     registry.add("loss", "likelihood", SpectrumLoss)
+    registry.add("model", "chains", ChainMap, checked=False)
+    registry.add("model", "chain_field", ChainField, checked=False)
     for name, make in (("random", nearby), ("grid", pose_grid), ("given", posed)):
         registry.add("search", name, make)
     for name in ("adam", "sgd", "gauss_newton"):

@@ -10,7 +10,14 @@ from rich.console import Console
 
 from invertwin.cli import build
 from invertwin.cli.fits.certainty import certainty_table
-from invertwin.cli.fits.problem import Problem, another, observations_of, problem_of, unknowns_of
+from invertwin.cli.fits.problem import (
+    Problem,
+    another,
+    observations_of,
+    problem_of,
+    stages_of,
+    unknowns_of,
+)
 from invertwin.cli.report import Table, finish, texts
 from invertwin.cli.run_file import need
 from invertwin.cli.running import progress
@@ -73,9 +80,11 @@ def run_plan(
 
 
 def _at_truth(problem: Problem) -> Any:
+    # Error bars are those of the last stage, which may have another model.
+    last = replace(problem, run=stages_of(problem.run)[-1][1])
     return fit_at(
         problem.truth,
-        observations_of(problem),
+        observations_of(last),
         unknowns_of(problem.run),
         loss=build.made(problem.run, "loss"),
         seed=problem.run.seed,

@@ -97,7 +97,9 @@ class End:
         looks = [look for look in self.fit.looks(0) if look is not None]
         if not min(self.gains) > 0 or len(looks) < len(self.maps):
             return
-        noises = [_noise(*pair, g) for pair, g in zip(self.maps, self.gains, strict=True)]
+        models = [observation.model for observation in self.fit.observations]
+        every = zip(self.maps, self.gains, models, strict=True)
+        noises = [_noise(*pair, gain, model.fields) for pair, gain, model in every]
         for number in told(range(_LOOKS), "looks at the twin"):
             yield [
                 look(derived_seed(number, k), noise)
@@ -138,8 +140,9 @@ def zscore(value: float, drawn: Sequence[float]) -> float:
     return (value - float(others.mean())) / max(float(others.std()), 1e-30)
 
 
-def _noise(predicted: Tensor, observed: Tensor, gain: float) -> float:
+def _noise(predicted: Tensor, observed: Tensor, gain: float, fields: bool) -> float:
     """Mean noise in a bin, in units of the predicted map: what its darkest bins hold beyond it."""
     flat: Any = predicted.flatten()
-    dark = flat.argsort()[: max(1, math.ceil(_DARK * len(flat)))]
-    return max(0.0, float((observed.flatten()[dark] / gain - flat[dark]).mean()))
+    dark = flat.abs().argsort()[: max(1, math.ceil(_DARK * len(flat)))]
+    rest = observed.flatten()[dark] / gain - flat[dark]
+    return max(0.0, float((rest.square() if fields else rest).mean()))

@@ -112,6 +112,26 @@ def residual(found: Object, truth: Object) -> Residual | None:
     return Residual(offset, vector, 1 / scale if scale else math.nan)
 
 
+def axis_error(found: Object, truth: Object, axis: ArrayLike) -> tuple[float, float]:
+    """Distance of the origins of two poses [m], and angle between one axis of both [rad].
+
+    Args:
+        found, truth: the result, and where it really is.
+        axis: in the object's frame, of any length.
+
+    Raises:
+        InputError: an axis of no length.
+    """
+    line = torch.as_tensor(axis, dtype=torch.float64)
+    if line.shape != (3,) or not float(line.norm()) > 0:
+        raise InputError(f"expected an axis of some length, got {axis}; give x, y, z")
+    a, b = (item.transform.detach() for item in (found, truth))
+    one, other = a[:3, :3] @ line, b[:3, :3] @ line
+    # The sine and the cosine: an arc cosine knows no angles below 1e-8.
+    angle = math.atan2(float(torch.linalg.cross(one, other).norm()), float(one @ other))
+    return float((a[:3, 3] - b[:3, 3]).norm()), angle
+
+
 def compare_shapes(
     found: Mesh,
     truth: Mesh,

@@ -24,6 +24,10 @@ _TRUSTED = 0.5  # of the information that the noise of the derivatives feigns
 _BLIND = 20.0  # times the variance of the best known coordinate, in spans: not observed
 _LARGE = 25.0  # spans squared: not observed, however the others are
 _PART = 0.3  # of a direction: smaller components are not named
+_WEAK = 1 / 16  # spans squared: worse known, a direction is looked at where errors matter
+_FAR = 2.0  # spans: where
+_REFITS = 3  # Gauss–Newton steps of the others there
+_LEAST = 1e-3  # of the rise: so much at least
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,9 @@ class Uncertainty:
     """The error bars of a fit.
 
     They hold what speckle and noise do to the estimate, near the minimum that was found. A wrong
-    minimum, a wrong model or a wrong start are the matter of the verdict.
+    minimum, a wrong model or a wrong start are the matter of the verdict. A direction that is known
+    to a quarter of its span at best has the error bar of the loss two spans away, where this rises
+    less than the curvature at the minimum says.
 
     Attributes:
         names: Of the coordinates, such as "letter.x".
@@ -107,7 +113,7 @@ class Evidence:
         # What nothing depends on is held fixed, unless it has a meaning of its own.
         moves = [any(bool(rows[k].any()) for rows in first) for k in range(len(found))]
         kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
-        self._found = [found[k] for k in kept]
+        self._kept, self._found = kept, [found[k] for k in kept]
         first, second = ([rows[kept] for rows in side] for side in (first, second))
         # J₁J₂ᵀ + J₂J₁ᵀ = 2 (mean mean − half half), with half the difference of J₁ and J₂.
         pairs = list(zip(first, second, strict=True))
@@ -146,6 +152,8 @@ class Evidence:
         spans = torch.where(spans.isinf(), own, spans)
         square = spans * spans[:, None]
         covariance = _inverted(*(m * square for m in (curvature, feigned, scatter, chance)))
+        if frames is None:
+            covariance = self._widened(covariance, spans)
         return Uncertainty(
             tuple(c.name for c in found),
             tuple(c.unit for c in found),
@@ -154,6 +162,63 @@ class Evidence:
             count,
             by,
         )
+
+    def _widened(self, covariance: Tensor, spans: Tensor) -> Tensor:
+        """The covariance, in units of the spans, with what the loss says far off in weak ways."""
+        fit, known = self._end.fit, torch.tensor([math.isfinite(c.span) for c in self._found])
+        pairs = zip(*_eigen(covariance[known][:, known]), strict=True)
+        weak = [(float(error), axis) for error, axis in pairs if _WEAK < error < 1]
+        if not weak or bool(_penalty(fit, self._found).any()):
+            return covariance
+        with torch.no_grad():
+            target = [predicted for predicted, _ in fit.sharp_maps(0)]
+        own = fit.objective.curvature([(a, a) for a in target], self._rows[0])
+        inverse = torch.linalg.pinv(own * spans * spans[:, None], hermitian=True)
+        for error, axis in weak:
+            way = torch.zeros(len(spans), dtype=torch.float64)
+            way[known] = axis
+            said = 0.5 * _FAR**2 / float(way @ inverse @ way)
+            rise = min(self._risen(far * way, spans, target) for far in (_FAR, -_FAR))
+            more = error * (said / max(rise, _LEAST * said) - 1)
+            covariance = covariance + max(more, 0.0) * way * way[:, None]
+        return covariance
+
+    def _risen(self, move: Tensor, spans: Tensor, target: list[Tensor]) -> float:
+        """The loss where the twin is moved and all other coordinates make the best of it.
+
+        It is infinite where the scene refuses the move.
+
+        Args:
+            move: In units of the spans.
+            spans: Of the coordinates.
+            target: What stands for the data: the twin's own maps.
+        """
+        fit, least = self._end.fit.copied(), math.inf
+
+        def here() -> list[Coordinate]:
+            every = list(coordinates(fit.modules))
+            return [every[k] for k in self._kept]
+
+        across = torch.linalg.svd(move[None])[2][1:]  # the ways that are perpendicular to the move
+        for step in range(_REFITS + 1):
+            with torch.no_grad():
+                for change, coordinate in zip((move * spans).tolist(), here(), strict=True):
+                    for name, tangent in coordinate.tangents.items():
+                        fit.modules.get_parameter(name).add_(tangent, alpha=change)
+                try:
+                    maps = [(a, b) for (a, _), b in zip(fit.sharp_maps(0), target, strict=True)]
+                except InputError:
+                    return least
+            loss, slopes = self._end.slopes(maps)
+            least = min(least, loss)
+            if step < _REFITS:
+                rows = _derivatives(fit, here(), 0)
+                parts = zip(rows, slopes, strict=True)
+                slope = torch.stack([a.flatten(1) @ b.flatten() for a, b in parts]).sum(0)
+                own = fit.objective.curvature(maps, rows) * spans * spans[:, None]
+                own, slope = across @ own @ across.T, across @ (slope.double() * spans)
+                move = -across.T @ torch.linalg.pinv(own, hermitian=True) @ slope
+        return least
 
 
 def coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:

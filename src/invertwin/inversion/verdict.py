@@ -68,7 +68,7 @@ def verdict(end: End) -> Verdict:
     """
     fit = end.fit
     explained = [
-        gain * float(a.mean()) / max(float(b.mean()), 1e-300)
+        gain * float(a.abs().mean()) / max(float(b.abs().mean()), 1e-300)
         for gain, (a, b) in zip(end.gains, end.maps, strict=True)
     ]
     if min(explained) < _EMPTY:
@@ -90,7 +90,8 @@ def verdict(end: End) -> Verdict:
     if max(excess, structure) > _DOUBT:
         mean = sum(end.draws.losses) / len(end.draws.losses)
         reasons = [f"the loss is {loss:.4g}, on recordings of the twin itself {mean:.4g}", *bounds]
-        reasons += [text for map_ in enumerate(residuals) if (text := _marked(*map_))]
+        marked = enumerate(zip(residuals, fit.observations, strict=True))
+        reasons += [text for k, (map_, o) in marked if (text := _marked(k, map_, o.model.fields))]
         reasons += _deeper(end, loss - _DEEPER * float(torch.tensor(end.draws.losses).std()))
         return Verdict("inconsistent", excess, structure, tuple(reasons), residuals)
     others = tuple(rivals(end))
@@ -136,11 +137,14 @@ def _residuals(end: End) -> tuple[list[Tensor], float]:
     return found, zscore(float(data), drawn.tolist())
 
 
-def _marked(number: int, residual: Tensor) -> str:
+def _marked(number: int, residual: Tensor, fields: bool) -> str:
     """What a residual map shows."""
     more, less = int((residual > _MARKED).sum()), int((residual < -_MARKED).sum())
     if not more + less:
         return ""
+    if fields:
+        off, count = more + less, residual.numel()
+        return f"observation {number + 1}: {off} of {count} coarse bins are not those of the twin"
     return (
         f"observation {number + 1}: {more} of {math.prod(residual.shape)} coarse bins hold more "
         f"power than the twin explains, {less} less"

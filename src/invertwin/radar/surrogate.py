@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Literal
@@ -61,6 +61,20 @@ class Surrogate:
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    @property
+    def widened(self) -> bool:
+        """Whether there are extra widths."""
+        return self.range_width > 0 or self.angle_width > 0
+
+    def narrowed(self, share: float) -> "Surrogate":
+        """With this share of the extra widths.
+
+        Args:
+            share: 0 takes them away.
+        """
+        widths = {"range_width": self.range_width * share, "angle_width": self.angle_width * share}
+        return replace(self, **widths)
 
     def shape(
         self, deposit: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid

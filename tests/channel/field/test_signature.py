@@ -262,7 +262,7 @@ def half_plane(angle: float) -> tuple[Wedges, Tensor, Tensor, Tensor]:
     ends = float64([[0, -0.5, 0]]), float64([[0, 0.5, 0]])
     inwards = float64([[[1, 0, 0], [1, 0, 0]]])
     normals = float64([[[0, 0, 1], [0, 0, -1]]])
-    wedge = Wedges(*ends, inwards, normals, float64([2.0]), torch.tensor([0]))
+    wedge = Wedges(*ends, inwards, normals, float64([2.0]), torch.tensor([[0, 0]]))
     towards = float64([[math.cos(angle), 0, math.sin(angle)]])
     fields = torch.stack([float64([0, 1, 0]), torch.linalg.cross(float64([0, 1, 0]), towards[0])])
     return wedge, -towards, fields[None], towards

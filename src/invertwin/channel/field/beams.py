@@ -12,9 +12,13 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from invertwin.channel.field.waves import area_vector, cross, dot, mirrored, polygon_integral
+from invertwin.channel.rays.topology import Topology
 
+FEW = 24
+"""Triangles of a scene up to which beams are clipped exactly."""
 _EMPTY = 1e-12  # of the scene's size squared: a polygon of less area is none
 _FLAT = 1e-12  # of a polygon's size: a side between less different heights lies in the plane
 _BEFORE = 1e-9  # of the scene's size: what rises less above a facet hides nothing of it
@@ -35,6 +39,24 @@ class Facets:
     normal: Float64[Tensor, "facet 3"]
     solid: Bool[Tensor, " facet"]
     size: float
+
+
+def facets_of(vertices: Float64[Tensor, "v 3"], topology: Topology) -> Facets:
+    """The triangles of meshes as facets.
+
+    Args:
+        vertices: of all meshes [m].
+        topology: their faces and edges.
+    """
+    corners = vertices[topology.faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    volume = dot(corners.detach()[:, 0], area.detach()) / 6
+    solid = torch.zeros(len(corners), dtype=torch.bool)
+    for number in range(int(topology.face_object.max()) + 1):
+        own = topology.face_object == number
+        solid[own] = number not in topology.open_objects and bool(volume[own].sum() > 0)
+    extent = vertices.detach().amax(0) - vertices.detach().amin(0)
+    return Facets(corners, normalize(area, dim=1), solid, float(extent.norm()))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.beams import Bounce, Facets, beams
+from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
 from invertwin.channel.field.tubes import tubes
@@ -45,8 +45,6 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene.scene import Scene
 
-FEW = 24
-"""Triangles of a scene up to which beams are clipped exactly; more are shot with tubes."""
 _SAGITTA = 1 / 50  # wavelengths that a facet may be off the curved surface
 _SMOOTH = (1e-6, 0.35)  # rad that normals turn from facet to facet where a surface is curved
 _SEGMENTS = 2.0  # of an edge per wavelength; each is seen or not
@@ -220,7 +218,7 @@ class _View:
         topology = body.topology
         ends = body.vertices[topology.edges]
         wedges = find_wedges(body.facets.corners, ends, topology.beside)
-        wedges = wedges.rows(body.skins[0].conducting[wedges.face])
+        wedges = wedges.rows(body.skins[0].conducting[wedges.faces[:, 0]])
         found = {"edges 1": self._once(wedges)}
         plates = plates_of(wedges) if most > 1 else []
         totals = [list(self._none()) for _ in range(2, most + 1)]
@@ -303,15 +301,7 @@ def _body(scene: Scene, frequencies: Tensor, up: Tensor) -> _Body:
         )
     vertices = torch.cat([item.vertices for item in objects.values()])
     topology = topology_of([item.mesh for item in objects.values()])
-    corners = vertices[topology.faces]
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    volume = dot(corners.detach()[:, 0], area.detach()) / 6
-    solid = torch.zeros(len(corners), dtype=torch.bool)
-    for number in range(len(objects)):
-        own = topology.face_object == number
-        solid[own] = number not in topology.open_objects and bool(volume[own].sum() > 0)
-    extent = vertices.detach().amax(0) - vertices.detach().amin(0)
-    facets = Facets(corners, normalize(area, dim=1), solid, float(extent.norm()))
+    facets = facets_of(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
     skins = [_skins(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]

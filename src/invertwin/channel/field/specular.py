@@ -1,6 +1,6 @@
 """Specular paths between antennas: geometry and polarised fields, differentiable.
 
-Which paths there are is found by rays and is detached (``chains``). What they are worth is computed
+Which paths there are is found by rays and is detached (``images``). What they are worth is computed
 here from the vertices of the triangles that they meet: the length to the image of the transmitter,
 and the field, turned from one plane of incidence to the next.
 
@@ -17,7 +17,7 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel.field.chains import (
+from invertwin.channel.field.images import (
     Chains,
     Walls,
     chains_between,

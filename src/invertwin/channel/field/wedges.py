@@ -11,6 +11,7 @@ Source: derivations §14; Michaeli, "Elimination of infinities in equivalent edg
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
@@ -20,6 +21,9 @@ from invertwin.channel.field.waves import cross, dot
 
 LEAST_ANGLE = math.radians(10.0)
 """Nearer to grazing, or to the edge itself, fringe currents are not valid."""
+_ALIKE = 1e-6  # radians, and share of the scene's size: lines and planes that count as one
+_ANYWHERE = torch.tensor([0.8123, 0.4571, 0.3623], dtype=torch.float64)
+_SECOND_FIRST = torch.tensor([1, 0])
 _SHARP = 0.35  # rad that the normals of neighbours turn at an edge; less is a curved surface
 _POLE = 1e-5
 
@@ -33,7 +37,7 @@ class Wedges:
         inwards: unit vectors from the edge into either face, across the edge.
         normals: outward normals of the faces; opposite for the two sides of a sheet.
         opening: exterior angle over π: N = 2 of a half plane, 1.5 of a cube.
-        face: a triangle beside the edge.
+        faces: triangles beside the edge; of an edge that ends a sheet, the same one twice.
     """
 
     start: Float64[Tensor, "row 3"]
@@ -41,7 +45,7 @@ class Wedges:
     inwards: Float64[Tensor, "row 2 3"]
     normals: Float64[Tensor, "row 2 3"]
     opening: Float64[Tensor, " row"]
-    face: Int64[Tensor, " row"]
+    faces: Int64[Tensor, "row 2"]
 
     def rows(self, index: Tensor) -> "Wedges":
         """Some rows."""
@@ -80,7 +84,7 @@ def find_wedges(
             normals = torch.cat([normal, -normal], 1)
             opening = torch.full((len(edge),), 2.0, dtype=torch.float64)
             found.append(
-                Wedges(ends[edge, 0], ends[edge, 1], inwards, normals, opening, faces[:, 0])
+                Wedges(ends[edge, 0], ends[edge, 1], inwards, normals, opening, faces.expand(-1, 2))
             )
             continue
         # Angle from the first face to the second about the edge, through the first one's normal.
@@ -91,12 +95,56 @@ def find_wedges(
             keep = angle.detach() > math.pi + _SHARP
             # Normals that point into this region: along the first turn, against the second.
             normals = torch.stack([sign * normal[:, 0], -sign * normal[:, 1]], 1)
-            wedge = Wedges(
-                ends[edge, 0], ends[edge, 1], inward, normals, angle / math.pi, faces[:, 0]
-            )
+            wedge = Wedges(ends[edge, 0], ends[edge, 1], inward, normals, angle / math.pi, faces)
             found.append(wedge.rows(keep))
     columns = zip(*(vars(part).values() for part in found), strict=True)
     return Wedges(*(torch.cat(column) for column in columns))
+
+
+def edge_axis(wedges: Wedges) -> Float64[Tensor, "row 3"]:
+    """Unit vectors along the edges, about which azimuths are counted from the first face."""
+    return cross(wedges.inwards[:, 0], wedges.normals[:, 0])
+
+
+def joined_wedges(wedges: Wedges) -> Wedges:
+    """Edges that go on in a straight line between the same two planes as one, each along its axis.
+
+    Args:
+        wedges: one row each.
+    """
+    if not len(wedges.start):
+        return wedges
+    # Both orders of the faces are one edge: the first one leans more to some direction.
+    lean = (wedges.inwards + wedges.normals * math.sqrt(3)).detach() @ _ANYWHERE
+    order = torch.where((lean[:, :1] < lean[:, 1:]), _SECOND_FIRST, _SECOND_FIRST.flip(0))
+    rows = torch.arange(len(order))[:, None]
+    inwards, normals = wedges.inwards[rows, order], wedges.normals[rows, order]
+    axis = cross(inwards[:, 0], normals[:, 0]).detach()
+    against = (dot(axis, wedges.end - wedges.start) < 0)[:, None]
+    start = torch.where(against, wedges.end, wedges.start)
+    end = torch.where(against, wedges.start, wedges.end)
+    low, high = dot(axis, start.detach()), dot(axis, end.detach())
+    size = float(torch.maximum(low.abs(), high.abs()).amax()) + float((high - low).amax())
+    aside = (start.detach() - low[:, None] * axis) / size
+    key = torch.cat([aside, inwards.flatten(1), normals.flatten(1)], 1).detach()
+    # Adding zero makes negative zeros positive.
+    rounded = (key / _ALIKE).round().numpy() + 0.0
+    line = np.unique(rounded, axis=0, return_inverse=True)[1].ravel()
+    sequence = torch.from_numpy(np.lexsort((low.numpy(), line)))
+    line = torch.from_numpy(line)[sequence]
+    new = torch.ones(len(line), dtype=torch.bool)
+    gap = (low[sequence][1:] - high[sequence][:-1]).abs() > _ALIKE * size
+    new[1:] = (line[1:] != line[:-1]) | gap
+    first = sequence[new]
+    last = sequence[new.roll(-1)]
+    return Wedges(
+        start[first],
+        end[last],
+        inwards[first],
+        normals[first],
+        wedges.opening[first],
+        wedges.faces[rows, order][first],
+    )
 
 
 def outside(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
@@ -106,7 +154,7 @@ def outside(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
         wedges: one row each.
         direction: unit vectors from the edge.
     """
-    angle = _azimuth(wedges, direction, 0)
+    angle = azimuth(wedges, direction, 0)
     along = normalize(wedges.end - wedges.start, dim=1)
     return (angle <= wedges.opening * math.pi) & (
         dot(along, direction).abs() < math.cos(LEAST_ANGLE)
@@ -124,16 +172,30 @@ def grazes(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
     return flat & (dot(wedges.normals[:, 0], direction).abs() < math.sin(LEAST_ANGLE))
 
 
-def _azimuth(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
-    """Angle about the edge from a face, through its normal, in [0, 2π)."""
+def azimuth(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
+    """Angle about the edge from a face, through its normal, in [0, 2π).
+
+    Args:
+        wedges: one row each.
+        direction: vectors from the edge, of any length.
+        face: 0 or 1.
+    """
     return torch.atan2(
         dot(wedges.normals[:, face], direction), dot(wedges.inwards[:, face], direction)
     ) % (2 * math.pi)
 
 
-def _azimuth_outside(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
-    """The same of a direction outside: one that grazes a face is not taken for one inside."""
-    angle, last = _azimuth(wedges, direction, face), wedges.opening * math.pi
+def azimuth_outside(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
+    """Angle about the edge from a face, of a direction outside, in [0, opening · π].
+
+    One that grazes a face is not taken for one inside.
+
+    Args:
+        wedges: one row each.
+        direction: unit vectors from the edge.
+        face: 0 or 1, the face from which the angle is counted.
+    """
+    angle, last = azimuth(wedges, direction, face), wedges.opening * math.pi
     grazed = torch.where(angle > last / 2 + math.pi, 0.0 * angle, last)
     return torch.where(angle > last, grazed, angle)
 
@@ -162,8 +224,8 @@ def fringe_field(
         along = cross(wedges.inwards[:, face], wedges.normals[:, face])
         cos_in, cos_out = dot(along, direction), dot(along, towards)
         sin_in, sin_out = (1 - cos_in**2).sqrt(), (1 - cos_out**2).sqrt()
-        phi_in = _azimuth_outside(wedges, -direction, face)
-        phi_out = _azimuth_outside(wedges, towards, face)
+        phi_in = azimuth_outside(wedges, -direction, face)
+        phi_out = azimuth_outside(wedges, towards, face)
         mu = sin_out * torch.cos(phi_out) / sin_in
         electric, magnetic = _strengths(wedges.opening, phi_in, mu)
         across = cross(towards, along)

@@ -24,7 +24,7 @@ from invertwin.cli.schema import Stage as StageTable
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
-from invertwin.models import ExactMap, ForwardModel, SurrogateMap
+from invertwin.models import ChainMap, ExactMap, ForwardModel, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
@@ -323,6 +323,15 @@ def models_of(problem: Problem) -> list[ForwardModel]:
         else:
             found.append(SurrogateMap(sight.grid, kernels, sampling))
     return found
+
+
+def shown_models(problem: Problem) -> list[ForwardModel]:
+    """Models of the spectra that are shown, sharp: of chains where these are fitted."""
+    fitted = models_of(problem)
+    if all(isinstance(model, ChainMap) for model in fitted):
+        sights = problem.sights.values()
+        return [ChainMap(sight.grid, sampling=sampling_of(problem.run)) for sight in sights]
+    return [*sharp_models(problem)]
 
 
 def sharp_models(problem: Problem) -> list[SurrogateMap]:

@@ -10,12 +10,19 @@ import torch
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
 from invertwin.cli import build
-from invertwin.cli.fits.problem import Problem, fitted_of, points_per_m2, settings_of, sharp_models
+from invertwin.cli.fits.problem import (
+    Problem,
+    fitted_of,
+    points_per_m2,
+    settings_of,
+    sharp_models,
+    shown_models,
+)
 from invertwin.cli.fits.shape_scores import shape_scores
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
-from invertwin.inversion.metrics import residual, value_errors
+from invertwin.inversion.metrics import axis_error, residual, value_errors
 from invertwin.models import surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
@@ -48,6 +55,20 @@ def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
         "success": after.distance <= settings.position_limit,
         "position": place,
     }
+    if settings.axis is not None:
+        ends = [(s[name], problem.truth[name]) for s in (start, twin)]
+        (far, tilted), (near, tilt) = (axis_error(*pair, settings.axis) for pair in ends)
+        good = near <= settings.position_limit and tilt <= math.radians(settings.rotation_limit_deg)
+        return {
+            "start_distance_m": far,
+            "start_angle_deg": math.degrees(tilted),
+            "position_error_m": near,
+            "rotation_error_deg": math.degrees(tilt),
+            "turn_error_deg": math.degrees(after.angle),
+            "success": good,
+            "position": twin[name].transform[:3, 3].tolist(),
+            **shapes,
+        }
     fitted = fitted_of(problem.run).values()
     kinds = {table.kind for table in fitted}
     if "pose" in kinds:
@@ -136,7 +157,7 @@ def sharp_maps(problem: Problem, scene: Scene, radars: Sequence[Radar]) -> list[
     with torch.no_grad():
         return [
             model.sampled_by(**counts).predict(scene, radar, problem.run.seed)
-            for model, radar in zip(sharp_models(problem), radars, strict=True)
+            for model, radar in zip(shown_models(problem), radars, strict=True)
         ]
 
 

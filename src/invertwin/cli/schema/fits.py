@@ -56,6 +56,11 @@ class Reconstruct(Budget):
     nuisances: list[Literal["range_bias", "clock_offset"]] = key("of the radar, fitted too", [])
     position_limit: Positive = key("m, largest error of a success", 0.03)
     rotation_limit_deg: Positive = key("largest error of a success", 3.0)
+    axis: Vector | None = key(
+        "in the object's frame: success is judged by its origin and by this axis, turns about "
+        "which do not count",
+        None,
+    )
     joint_limit_deg: Positive = key("largest mean error over the free joints of a body", 5.0)
 
 
@@ -80,6 +85,7 @@ class Part(Section):
     surrogate: Annotated[Any, TableOf(Surrogate, SurrogateTable), *_GIVEN] = key(
         "what differs from [surrogate], or a name that replaces it", None
     )
+    model: AnyTable | None = key("what differs from [model]; another `kind` replaces it", None)
 
     def changes(self) -> dict[str, Any]:
         """What is merged over the run; a part has no stages."""
@@ -107,7 +113,6 @@ class Variant(Part):
         "what differs from [reconstruct]", None
     )
     loss: AnyTable | None = key("what differs from [loss]", None)
-    model: AnyTable | None = key("what differs from [model]", None)
     parameters: list[Annotated[Any, OneOf("parameter")]] | None = key(
         "in place of [[parameters]]", None
     )

@@ -108,7 +108,7 @@ class ObservationTable(Section):
     data: AnyData | None = key("what is fitted", None)
     surrogate: AnySurrogate | None = key("kernels of the smooth model", None)
     chirps: AnyChirps | None = key("several ramps a frame", None)
-    model: AnyModel | None = key("a plugin's forward model, in place of the surrogate's", None)
+    model: AnyModel | None = key("a forward model in place of the surrogate's", None)
     weight: Positive = key("weight of its loss in the mean", 1.0)
 
 
@@ -143,7 +143,7 @@ class _RunFile(Section):
         "where the fit starts by conventional processing, not with [starts]", None
     )
     surrogate: AnySurrogate = key("kernels of the smooth model", {}, validate_default=True)
-    model: AnyModel | None = key("a plugin's forward model, in place of the surrogate's", None)
+    model: AnyModel | None = key("a forward model in place of the surrogate's", None)
     loss: Annotated[Any, OneOf("loss")] = key("how maps are compared", {}, validate_default=True)
     optimizer: Annotated[Any, OneOf("optimizer")] = key(
         "how a gradient becomes a step", {}, validate_default=True

@@ -1,0 +1,576 @@
+"""The uniform theory of diffraction against exact solutions, and round a cube.
+
+    python benchmarks/diffraction.py [-o DIR]
+    python benchmarks/diffraction.py --solve STEP
+
+Prints a table and writes `metrics.json` into DIR (default `out/diffraction`).
+`transition` is the largest relative error of the transition function. `half_plane`, `wedge.<λ>` and
+`point_source.<λ>` are the largest errors of the whole field round an edge, at that distance, over
+the largest field there (a plane wave; exterior angle 3π/2) or the field in free space over the
+edge (a point source). `jump.<case>` is the largest step of the field at a shadow or reflection
+boundary, at oblique incidence, over the field; `reciprocity.<case>` what changes when the antennas
+change places. `slope_jump` is the step of the field's derivative at a shadow boundary where the
+source's field has a slope, with the slope term, over the derivative.
+
+A receiver walks round a conducting cube of five wavelengths in steps of a twentieth of a
+wavelength. Wherever a path comes or goes between two steps, the place is found to 1e-4 of a
+wavelength. `jump_db_next` is the largest jump of the field there, of either polarisation of the
+transmitter; `jump_db_first` the same with paths over one edge only. `full_wave` is the error of the
+field on a ring about a cube of 3.12 wavelengths, over the field, in the mean of squares. The truth
+is stored in `benchmarks/full_wave_data/cube_dipole.npz`; `--solve` computes it anew with bempp-cl,
+with a mesh of that step in wavelengths.
+"""
+
+import argparse
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import mpmath
+import numpy as np
+import torch
+from full_wave import SEVEN_POINTS, bodies, functions, system
+from full_wave import SIDE as SOLVED_SIDE
+from jaxtyping import Float64
+from report import MetricTable, Required, write
+from rich.table import Table
+from torch import Tensor
+
+from invertwin.channel.field.diffracted import EdgedScene, diffracted_paths
+from invertwin.channel.field.diffraction import Faces, Turn, conductor, diffraction_dyad
+from invertwin.channel.field.edge_paths import Edge, over_edges, slope_transfer
+from invertwin.channel.field.transition import transition
+from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.scene import Occluders, visible
+from invertwin.channel.rays.topology import topology_of
+from invertwin.channel.reference.wedges import (
+    half_plane_of_plane_wave,
+    half_plane_of_point_source,
+    wedge_of_plane_wave,
+)
+from invertwin.scene import box
+from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
+from invertwin.scene.material.slab import Sheet, slab_coefficients
+
+WAVE_NUMBER = 2 * math.pi  # a wavelength is a metre
+PERMITTIVITY = 5 - 0.3j
+THICKNESS = 0.12  # of the sheet, in wavelengths
+ASIDE = 1e-9  # rad from a boundary, on either side
+REQUIRED: Required = {
+    "transition": ("<=", 1e-12),
+    "half_plane": ("<=", 1e-10),
+    "wedge.3": ("<=", 6e-4),
+    "wedge.10": ("<=", 2e-4),
+    "point_source.3": ("<=", 2e-3),
+    "jump": ("<=", 1e-6),
+    "reciprocity": ("<=", 1e-9),
+    "jump_db_next": ("<=", 1.0),
+    "full_wave": ("<=", 0.035),
+}
+STORED = Path(__file__).parent / "full_wave_data" / "cube_dipole.npz"
+SIDE, RADIUS, HEIGHT = 5.0, 6.0, 0.7  # of the cube, and of the way round it, in wavelengths
+PLACES = ((9.0, 5.3, 1.1), (9.0, 8.3, 2.1), (9.0, 7.3, 4.1))  # of the transmitter
+HALVINGS = 9  # of a step in which a path comes or goes
+
+
+@dataclass(frozen=True)
+class Bend:
+    """An endless edge anywhere.
+
+    Attributes:
+        opening: exterior angle over π.
+        faces: what its faces do.
+        axes: of x into the face 0, of y off it, and along the edge.
+    """
+
+    opening: float
+    faces: Faces = conductor
+    axes: Float64[Tensor, "3 3"] | None = None
+
+    def wedges(self, count: int) -> Wedges:
+        """As many rows of it."""
+        angle = self.opening * math.pi
+        x, y, z = torch.eye(3, dtype=torch.float64) if self.axes is None else self.axes
+        inwards = torch.stack([x, math.cos(angle) * x + math.sin(angle) * y])
+        normals = torch.stack([y, math.sin(angle) * x - math.cos(angle) * y])
+        columns = (-z, z, inwards, normals, torch.tensor(self.opening, dtype=torch.float64))
+        rows = [column.expand(count, *column.shape) for column in columns]
+        return Wedges(*rows, faces=torch.zeros(count, 2, dtype=torch.int64))
+
+    def place(self, distance: Any, azimuth: Tensor, height: float) -> Float64[Tensor, "row 3"]:
+        """Points about it."""
+        x, y, z = torch.eye(3, dtype=torch.float64) if self.axes is None else self.axes
+        ring = azimuth.cos()[:, None] * x + azimuth.sin()[:, None] * y
+        return distance * ring + height * z
+
+    def optics(self, tx: Tensor, rx: Tensor, k: float) -> Tensor:
+        """Straight and mirrored waves with phase, switched hard at their boundaries."""
+        wedges = self.wedges(len(rx))
+        across = edge_axis(wedges)
+        azimuth_in, azimuth = (
+            azimuth_outside(wedges, _unit(p - dot(p, across)[:, None] * across), 0)
+            for p in (tx, rx)
+        )
+        length, way = _leg(tx, rx)
+        lit = ((azimuth - azimuth_in).abs() < math.pi).double()[:, None, None]
+        one = torch.eye(3, dtype=torch.complex128) - way[:, :, None] * way[:, None]
+        normal = wedges.normals[:, 0]
+        law = self.faces(0, dot(normal, way).abs())
+        s, p, _ = (v[:, 0] for v in plane_of_incidence(normal, way))
+        through = _outer(law.transmission_s, s, s) + _outer(law.transmission_p, p, p)
+        total = (lit * one + (1 - lit) * through) * _wave(k, length)
+        last = (2 * self.opening - 1) * math.pi
+        sees = ((0, azimuth + azimuth_in < math.pi), (1, azimuth + azimuth_in > last))
+        for face, bright in sees:
+            normal = wedges.normals[:, face]
+            length, way = _leg(mirrored(tx, normal), rx)
+            before = mirrored(way, normal)
+            law = self.faces(face, dot(normal, way).abs())
+            s, p, after = (v[:, 0] for v in plane_of_incidence(normal, before))
+            sent = _outer(law.reflection_s, s, s) + _outer(law.reflection_p, after, p)
+            total = total + bright.double()[:, None, None] * sent * _wave(k, length)
+        return total
+
+    def diffracted(self, tx: Tensor, rx: Tensor, k: float) -> Tensor:
+        """What the edge sends, with phase."""
+        found = over_edges([Edge(self.wedges(len(rx)), self.faces, endless=True)], tx, rx, k)
+        turn = torch.polar(torch.ones_like(found.length), -k * found.length)
+        return found.transfer * turn[:, None, None]
+
+    def boundaries(self, azimuth: float) -> dict[str, float]:
+        """Azimuths at which geometric optics jumps."""
+        found = {
+            "shadow": azimuth + math.pi,
+            "shadow of the other face": azimuth - math.pi,
+            "mirror": math.pi - azimuth,
+            "other mirror": (2 * self.opening - 1) * math.pi - azimuth,
+        }
+        return {name: angle for name, angle in found.items() if 0 < angle < self.opening * math.pi}
+
+
+def _unit(vector: Tensor) -> Tensor:
+    return vector / vector.norm(dim=-1, keepdim=True)
+
+
+def _leg(tx: Tensor, rx: Tensor) -> tuple[Tensor, Tensor]:
+    length = (rx - tx).norm(dim=1)
+    return length, (rx - tx) / length[:, None]
+
+
+def _wave(k: float, length: Tensor) -> Tensor:
+    """exp(−jkR)/R."""
+    return torch.polar(1 / length, -k * length)[:, None, None]
+
+
+def _outer(strength: Tensor, left: Tensor, right: Tensor) -> Tensor:
+    return strength[:, None, None] * (left[:, :, None] * right[:, None])
+
+
+def lossy(face: int, cosine: Tensor) -> FieldCoefficients:
+    """Faces of a lossy body."""
+    found = fresnel_coefficients(torch.tensor(PERMITTIVITY), cosine)
+    none = torch.zeros_like(found.reflection_s)
+    return found._replace(transmission_s=none, transmission_p=none)
+
+
+def sheet(face: int, cosine: Tensor) -> FieldCoefficients:
+    """Both sides of a sheet, about its middle."""
+    frequency = 299_792_458.0 * WAVE_NUMBER / (2 * math.pi)
+    layer = Sheet(torch.tensor(PERMITTIVITY), torch.tensor(0j), torch.tensor(THICKNESS))
+    found = slab_coefficients([layer], cosine, frequency)
+    turn = torch.polar(torch.ones_like(cosine), WAVE_NUMBER * THICKNESS * cosine)
+    return FieldCoefficients(*(turn * value for value in found))
+
+
+def transition_error() -> float:
+    """Of numbers from 1e-6 to 100."""
+    worst = 0.0
+    for s in np.geomspace(1e-6, 100, 41).tolist():
+        with mpmath.workdps(30):
+            x, turn = mpmath.mpf(s), mpmath.expjpi(0.25)
+            size = mpmath.sqrt(mpmath.pi) * turn
+            truth = complex(size * mpmath.expj(x * x) * mpmath.erfc(turn * x))
+        found = transition(torch.tensor(s, dtype=torch.float64)).item()
+        worst = max(worst, abs(found - truth) / abs(truth))
+    return worst
+
+
+def plane_wave_error(opening: float, distance: float, truth: Callable[..., Any]) -> float:
+    """Largest error of both polarisations over all azimuths, over the largest field."""
+    azimuth_in, worst = math.radians(50.0), 0.0
+    azimuth = torch.linspace(1e-3, opening * math.pi - 1e-3, 721, dtype=torch.float64)
+    bend = Bend(opening)
+    wedges = bend.wedges(len(azimuth))
+    towards = bend.place(1.0, azimuth, 0.0)
+    direction = -bend.place(1.0, torch.full_like(azimuth, azimuth_in), 0.0)
+    turn = Turn(
+        wedges,
+        direction,
+        towards,
+        torch.full_like(azimuth, azimuth_in),
+        azimuth,
+        torch.full_like(azimuth, distance),
+    )
+    dyad = diffraction_dyad(turn, WAVE_NUMBER)
+    axis = edge_axis(wedges)
+    parts = {
+        # E along the edge, and H along it, of both waves.
+        "soft": torch.einsum("ri,rij,rj->r", axis + 0j, dyad, axis + 0j),
+        "hard": torch.einsum(
+            "ri,rij,rj->r", cross(axis, towards) + 0j, dyad, cross(axis, direction) + 0j
+        ),
+    }
+    reach = WAVE_NUMBER * distance
+    for polarisation, sent in parts.items():
+        sign = -1.0 if polarisation == "soft" else 1.0
+        total = sent.numpy() * np.exp(-1j * reach) / math.sqrt(distance)
+        angle = azimuth.numpy()
+        mirror = 2 * opening * math.pi - angle - azimuth_in
+        for beta, strength in (
+            (angle - azimuth_in, 1.0),
+            (angle + azimuth_in, sign),
+            (mirror, sign),
+        ):
+            total = total + strength * (np.abs(beta) < math.pi) * np.exp(1j * reach * np.cos(beta))
+        exact = truth(WAVE_NUMBER, azimuth_in, distance, angle, polarisation)
+        worst = max(worst, float(np.abs(total - exact).max() / np.abs(exact).max()))
+    return worst
+
+
+def sommerfeld(k: float, azimuth_in: float, distance: float, angle: Any, polarisation: Any) -> Any:
+    """The half plane for many azimuths."""
+    return np.array(
+        [half_plane_of_plane_wave(k, azimuth_in, distance, a, polarisation) for a in angle]
+    )
+
+
+def series(k: float, azimuth_in: float, distance: float, angle: Any, polarisation: Any) -> Any:
+    """The wedge of 3π/2."""
+    return wedge_of_plane_wave(k, 1.5, azimuth_in, distance, angle, polarisation)
+
+
+def point_source_error(distance: float) -> float:
+    """A point source beside a half plane, as far away as the receiver and aside along the edge.
+
+    The scalar fields are those of the two polarisations' coefficients.
+    """
+    bend, azimuth_in, height = Bend(2.0), math.radians(50.0), 0.8 * distance
+    azimuth = torch.linspace(1e-3, 2 * math.pi - 1e-3, 181, dtype=torch.float64) + 1e-5
+    tx = bend.place(distance, torch.full_like(azimuth, azimuth_in), 0.0)
+    rx = bend.place(distance, azimuth, height)
+    sent = bend.diffracted(tx, rx, WAVE_NUMBER)
+    wedges = bend.wedges(len(azimuth))
+    axis, middle = edge_axis(wedges), bend.place(0.0, azimuth, height / 2)
+    direction, towards = _unit(middle - tx), _unit(rx - middle)
+    across = [_unit(cross(axis, way)) for way in (direction, towards)]
+    parts = {
+        "hard": torch.einsum("ri,rij,rj->r", across[1] + 0j, sent, across[0] + 0j),
+        "soft": torch.einsum(
+            "ri,rij,rj->r",
+            cross(across[1], towards) + 0j,
+            sent,
+            cross(across[0], direction) + 0j,
+        ),
+    }
+    reference, worst = 1 / float((middle - tx)[0].norm() + (rx - middle)[0].norm()), 0.0
+    for polarisation in ("soft", "hard"):
+        field = parts[polarisation]
+        sign = -1.0 if polarisation == "soft" else 1.0
+        total = field.numpy()
+        for beta, strength in ((azimuth - azimuth_in, 1.0), (azimuth + azimuth_in, sign)):
+            square = 2 * distance**2 * (1 - torch.cos(beta)) + height**2
+            length = square.sqrt().numpy()
+            lit = (beta.abs() < math.pi).numpy()
+            total = total + strength * lit * np.exp(-1j * WAVE_NUMBER * length) / length
+        exact = [
+            half_plane_of_point_source(
+                WAVE_NUMBER, (distance, azimuth_in), (distance, a, height), polarisation
+            )
+            for a in azimuth.tolist()
+        ]
+        worst = max(worst, float(np.abs(total - np.array(exact)).max() / reference))
+    return worst
+
+
+def bends() -> dict[str, list[Bend]]:
+    """Cases by name; turned anyhow."""
+    generator = torch.Generator().manual_seed(1)
+    axes, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    axes = axes * torch.linalg.det(axes)
+    openings = (2.0, 1.5, 1.25)
+    return {
+        "conductor": [Bend(n, conductor, axes) for n in openings],
+        "lossy": [Bend(n, lossy, axes) for n in openings],
+        "sheet": [Bend(2.0, sheet, axes)],
+    }
+
+
+def jump(bend: Bend, *, diffracted: bool = True) -> float:
+    """Largest step of the field at a boundary, over the field."""
+    worst = 0.0
+    for degrees in (50.0, 130.0):
+        azimuth_in = math.radians(degrees)
+        for name, boundary in bend.boundaries(azimuth_in).items():
+            if bend.opening == 2.0 and name == "other mirror":
+                continue  # the same plane seen from its other side
+            azimuth = torch.tensor([boundary - ASIDE, boundary + ASIDE], dtype=torch.float64)
+            tx = bend.place(11.0, torch.full_like(azimuth, azimuth_in), 8.0)
+            rx = bend.place(9.0, azimuth, -5.0)
+            total = bend.optics(tx, rx, WAVE_NUMBER)
+            if diffracted:
+                total = total + bend.diffracted(tx, rx, WAVE_NUMBER)
+            step = (total[1] - total[0]).norm() / total[0].norm()
+            worst = max(worst, float(step))
+    return worst
+
+
+def reciprocity(bend: Bend) -> float:
+    """What changes when the antennas change places, over the diffracted field."""
+    azimuth = torch.linspace(0.1, bend.opening * math.pi - 0.1, 40, dtype=torch.float64)
+    tx = bend.place(11.0, torch.full_like(azimuth, math.radians(50.0)), 8.0)
+    rx = bend.place(9.0, azimuth, -5.0)
+    there, back = bend.diffracted(tx, rx, WAVE_NUMBER), bend.diffracted(rx, tx, WAVE_NUMBER)
+    return float((there - back.mT).norm() / there.norm())
+
+
+def slope_jump(*, corrected: bool = True) -> float:
+    """Step of ∂|E|²/∂φ at a shadow boundary, at oblique incidence, over its size.
+
+    The source's field grows by its size per radian about the edge.
+    """
+    bend, azimuth_in = Bend(1.5), math.radians(50.0)
+    boundary = azimuth_in + math.pi
+    azimuth = torch.tensor([boundary - 1e-7, boundary + 1e-7], dtype=torch.float64)
+    azimuth.requires_grad_()
+    tx = bend.place(11.0, torch.full((2,), azimuth_in, dtype=torch.float64), 8.0)
+    rx = bend.place(9.0, azimuth, -5.0)
+    wedges = bend.wedges(2)
+    found = over_edges([Edge(wedges, endless=True)], tx, rx, WAVE_NUMBER)
+    direction = _unit(found.points[:, 0] - tx).detach()
+    turned = _unit(cross(direction, edge_axis(wedges)))  # −e × d
+    vector = edge_axis(wedges) + 0j
+
+    def emitted(way: Tensor) -> Tensor:
+        return (1 + dot(way, turned))[:, None] * vector
+
+    length, way = _leg(tx, rx)
+    lit = ((azimuth - azimuth_in).abs() < math.pi).double()[:, None]
+    straight = torch.polar(1 / length, -WAVE_NUMBER * length)[:, None]
+    total = lit * straight * _across(emitted(way), way)
+    phase = torch.polar(torch.ones_like(found.length), -WAVE_NUMBER * found.length)[:, None]
+    before = _unit(found.points[:, 0] - tx)
+    sent = (found.transfer @ emitted(before)[..., None])[..., 0]
+    if corrected:
+        slope = slope_transfer(Edge(wedges, endless=True), tx, rx, WAVE_NUMBER)
+        sent = sent + (slope @ vector[..., None])[..., 0]
+    power = (total + sent * phase).abs().square().sum(1)
+    (gradient,) = torch.autograd.grad(power.sum(), azimuth)
+    return float((gradient[1] - gradient[0]).abs() / gradient.abs().mean())
+
+
+def _across(field: Tensor, way: Tensor) -> Tensor:
+    return field - dot(field, way + 0j)[:, None] * way
+
+
+class Cube:
+    """A conducting cube about the origin, seen by point antennas; a wavelength is a metre."""
+
+    def __init__(self, side: float) -> None:
+        mesh = box((side, side, side))
+        topology = topology_of([mesh])
+        rays = Occluders(mesh.vertices, topology, torch.zeros(3, dtype=torch.float64))
+        self.half = side / 2
+        self.around = EdgedScene(
+            mesh.vertices, topology, rays, lambda _, cosine: conductor(0, cosine)
+        )
+
+    def optics(self, tx: Tensor, rx: Tensor) -> tuple[Tensor, Tensor]:
+        """Straight and mirrored waves [row, 3, 3], and which of the seven there are [row, 7]."""
+        length, way = _leg(tx, rx)
+        eye = torch.eye(3, dtype=torch.float64)
+        lit = [visible(self.around.occluders, tx, rx)]
+        total = lit[0][:, None, None] * _across_dyad(way) * _wave(WAVE_NUMBER, length)
+        for axis in range(3):
+            others = [other for other in range(3) if other != axis]
+            for sign in (1.0, -1.0):
+                normal = (sign * eye[axis]).expand(len(rx), 3)
+                image = tx + 2 * (self.half - dot(tx, normal))[:, None] * normal
+                length, way = _leg(image, rx)
+                share = (self.half - dot(image, normal)) / dot(rx - image, normal)
+                met = image + share[:, None] * (rx - image)
+                bright = (dot(tx, normal) > self.half) & (dot(rx, normal) > self.half)
+                lit.append(bright & (met[:, others].abs() <= self.half).all(1))
+                turned = 2 * normal[:, :, None] * normal[:, None] - eye
+                sent = turned.to(torch.complex128) @ _across_dyad(mirrored(way, normal))
+                total = total + lit[-1][:, None, None] * sent * _wave(WAVE_NUMBER, length)
+        return total, torch.stack(lit, 1)
+
+    def field(self, tx: Tensor, rx: Tensor, order: int) -> tuple[Tensor, list[frozenset[Any]]]:
+        """The field [row, 3, 3], and which paths make it."""
+        with tracing():
+            total, lit = self.optics(tx, rx)
+            found = diffracted_paths(self.around, tx, rx, WAVE_NUMBER, order) if order else []
+        paths: list[set[Any]] = [set(torch.nonzero(row)[:, 0].tolist()) for row in lit]
+        for part in found:
+            turn = torch.polar(torch.ones_like(part.length), -WAVE_NUMBER * part.length)
+            total = total.index_add(0, part.link, part.transfer * turn[:, None, None])
+            for link, edges in zip(part.link.tolist(), part.edge.tolist(), strict=True):
+                paths[link].add(tuple(edges))
+        return total, list(map(frozenset, paths))
+
+
+def _across_dyad(way: Tensor) -> Tensor:
+    """What takes a field's part along a wave off."""
+    return torch.eye(3, dtype=torch.complex128) - way[:, :, None] * way[:, None]
+
+
+def polarised(tx: Tensor) -> Float64[Tensor, "3 2"]:
+    """Unit vectors across the way from a transmitter to the origin: V and H."""
+    across = _unit(torch.linalg.cross(tx, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)))
+    return torch.stack([_unit(torch.linalg.cross(across, tx)), across], 1)
+
+
+def largest_jump(order: int) -> float:
+    """[dB] of the walk round the cube where a path comes or goes."""
+    cube, worst = Cube(SIDE), 0.0
+    count = math.ceil(2 * math.pi * RADIUS * 20)
+    for place in map(torch.tensor, PLACES):
+        tx = place.double()
+
+        def walked(azimuth: Tensor, tx: Tensor = tx) -> tuple[Tensor, list[frozenset[Any]]]:
+            ring = [RADIUS * azimuth.cos(), RADIUS * azimuth.sin(), 0 * azimuth + HEIGHT]
+            sent, paths = cube.field(tx.expand(len(azimuth), 3), torch.stack(ring, 1), order)
+            return (sent @ polarised(tx).to(sent.dtype)).norm(dim=1), paths
+
+        azimuth = torch.arange(count + 1, dtype=torch.float64) / count * 2 * math.pi + 1e-4
+        _, paths = walked(azimuth)
+        at = [i for i, (a, b) in enumerate(pairwise(paths)) if a != b]
+        low, high, before = azimuth[at], azimuth[[i + 1 for i in at]], [paths[i] for i in at]
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            same = [a == b for a, b in zip(walked(middle)[1], before, strict=True)]
+            low = torch.where(torch.tensor(same), middle, low)
+            high = torch.where(torch.tensor(same), high, middle)
+        jumps = 20 * torch.log10(walked(high)[0] / walked(low)[0]).abs()
+        worst = max(worst, float(jumps.nan_to_num(torch.inf).max()))
+    return worst
+
+
+def full_wave_error() -> dict[str, float]:
+    """Of the field on the ring, without diffraction, with one edge and with two."""
+    stored = np.load(STORED)
+    tx, rx, truth = (torch.from_numpy(stored[name]) for name in ("tx", "rx", "total"))
+    cube, vectors = Cube(SOLVED_SIDE), polarised(tx).to(torch.complex128)
+    found = {}
+    for order, name in enumerate(("optics", "first", "second")):
+        sent, _ = cube.field(tx.expand(len(rx), 3), rx, order)
+        found[name] = float((sent @ vectors - truth).norm() / truth.norm())
+    return found
+
+
+def solve(step: float) -> None:
+    """The field of a dipole beside the cube by the method of moments, on a ring about it."""
+    from scipy.linalg import lu_factor, lu_solve
+
+    tx = np.array([10.0, 5.5, 2.5])
+    angle = np.radians(np.arange(360) + 0.5)
+    rx = np.stack([5 * np.cos(angle), 5 * np.sin(angle), 0 * angle + 0.5], 1)
+    points, faces = bodies()["cube"].shape(step)
+    matrix, currents = system(points, faces, WAVE_NUMBER)
+    spots, parts, charge = functions(points, faces, currents, SEVEN_POINTS)
+    vectors = polarised(torch.from_numpy(tx)).numpy().T
+    driven = [
+        sum(p.T @ e for p, e in zip(parts, dipole(v, tx, spots).T, strict=True)) for v in vectors
+    ]
+    factors = lu_factor(matrix, overwrite_a=True, check_finite=False)
+    answer = lu_solve(factors, np.stack(driven, 1).astype(np.complex64), check_finite=False)
+    flow, ends = np.stack([part @ answer for part in parts], 1), charge @ answer
+    total = np.stack([dipole(vector, tx, rx) for vector in vectors], 2)
+    for row, place in enumerate(rx):
+        apart = place - spots
+        distance = np.linalg.norm(apart, axis=1)
+        wave = np.exp(1j * WAVE_NUMBER * distance) / (4 * np.pi * distance)
+        slope = (wave * (1j * WAVE_NUMBER - 1 / distance) / distance)[:, None] * apart
+        total[row] += 1j * WAVE_NUMBER * np.einsum("s,sip->ip", wave, flow)
+        total[row] += 1j / WAVE_NUMBER * np.einsum("si,sp->ip", slope, ends)
+    # The solver's fields turn with exp(−iωt); ours are the conjugates.
+    np.savez_compressed(STORED, tx=tx, rx=rx, total=total.conj(), step=step)
+
+
+def dipole(vector: np.ndarray, place: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Field of a Hertzian dipole [point, 3], exp(jkR)/R far away; the solver's convention."""
+    offset = points - place
+    distance = np.linalg.norm(offset, axis=1)[:, None]
+    way, reach = offset / distance, WAVE_NUMBER * distance
+    along = (way @ vector)[:, None] * way
+    near = 1j / reach - 1 / reach**2
+    return np.exp(1j * reach) / distance * ((vector - along) * (1 + near) - 2 * along * near)
+
+
+def measure() -> dict[str, Any]:
+    """All metrics."""
+    cases = bends()
+    return {
+        "transition": transition_error(),
+        "half_plane": max(
+            plane_wave_error(2.0, x, sommerfeld) for x in (0.5, 1.0, 3.0, 10.0, 30.0)
+        ),
+        "wedge": {f"{x:g}": plane_wave_error(1.5, x, series) for x in (0.5, 1.0, 3.0, 10.0)},
+        "point_source": {f"{x:g}": point_source_error(x) for x in (1.0, 3.0, 10.0)},
+        "jump": {name: max(map(jump, some)) for name, some in cases.items()},
+        "jump_optics": min(min(map(partial(jump, diffracted=False), b)) for b in cases.values()),
+        "reciprocity": {name: max(map(reciprocity, some)) for name, some in cases.items()},
+        "slope_jump": slope_jump(),
+        "slope_jump_plain": slope_jump(corrected=False),
+        "jump_db_next": largest_jump(2),
+        "jump_db_first": largest_jump(1),
+        "full_wave_of": full_wave_error(),
+    }
+
+
+def table(metrics: dict[str, Any]) -> Table:
+    """What was counted, and what must hold."""
+    page = MetricTable("Uniform theory of diffraction", REQUIRED)
+    page.row("transition", metrics["transition"], ".1e", "transition function, relative")
+    page.row("half_plane", metrics["half_plane"], ".1e", "plane wave, 0.5 to 30 wavelengths")
+    for name, text in (("wedge", "plane wave"), ("point_source", "half plane")):
+        for distance, error in metrics[name].items():
+            page.row(f"{name}.{distance}", error, ".1e", f"{text}, at {distance} wavelengths")
+    for name, text in (("jump", "at boundaries"), ("reciprocity", "antennas exchanged")):
+        for case, value in metrics[name].items():
+            key = f"{name}.{case}"
+            page.required[key] = REQUIRED[name]
+            page.row(key, value, ".1e", text)
+    page.row("jump_optics", metrics["jump_optics"], ".2f", "the least one without diffraction")
+    page.row("slope_jump", metrics["slope_jump"], ".1e", "of the derivative at a boundary")
+    page.row("slope_jump_plain", metrics["slope_jump_plain"], ".2f", "without the slope term")
+    page.row("jump_db_next", metrics["jump_db_next"], ".2f", "round a cube, up to two edges")
+    page.row("jump_db_first", metrics["jump_db_first"], ".2f", "up to one edge")
+    page.row("full_wave", metrics["full_wave"], ".3f", "field on a ring about a cube")
+    for case, value in metrics["full_wave_of"].items():
+        page.row(f"full_wave_of.{case}", value, ".3f", "the same, up to this order")
+    return page.grid
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/diffraction"))
+    parser.add_argument("--solve", type=float, metavar="STEP", help="store truth anew")
+    arguments = parser.parse_args()
+    if arguments.solve is not None:
+        solve(arguments.solve)
+        return
+    metrics = measure()
+    metrics["full_wave"] = metrics["full_wave_of"]["second"]
+    write(metrics, table(metrics), arguments.out)
+
+
+if __name__ == "__main__":
+    main()

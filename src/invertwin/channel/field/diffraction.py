@@ -1,0 +1,211 @@
+"""What a wedge does to a wave that meets its edge: the uniform theory of diffraction, as dyads.
+
+The field beyond an edge is that of geometric optics, switched hard at its shadow and reflection
+boundaries, plus what the edge sends: E(s) = A exp(−jks) D·E(Q). D jumps at every boundary by as
+much as geometric optics does, with the other sign, so that the sum is smooth; no boundary term is
+left over for derivatives. Convention exp(+jωt).
+
+Source: derivations §9; Kouyoumjian and Pathak, "A uniform geometrical theory of diffraction for an
+edge in a perfectly conducting surface", Proc. IEEE 62, 1974; Luebbers, IEEE TAP 32, 1984.
+
+Differs from the source: each of the four cotangents and its transition function are one function
+that is finite on its boundary, and of an edge with ends. Faces that are no conductors reflect by
+dyads in the basis of the mirrored direction; D is the mean of both ways, so that it is reciprocal.
+The straight wave's terms of a sheet count by 1 − T.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invertwin.channel.field.transition import edge_transition, edge_transition_slope
+from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.field.wedges import Wedges, edge_axis
+from invertwin.scene.material.fresnel import FieldCoefficients
+
+_TURN = complex(math.sqrt(0.5), -math.sqrt(0.5))  # exp(−jπ/4)
+_FLAT = 1e-6  # of an opening: both faces are those of one sheet
+_SERIES = 1e-4  # rad from a boundary, within which a quotient is its series
+_SIGNS = ((-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0), (1.0, -1.0))
+"""By term: φ − φ′ or φ + φ′, and the sign of π beside it. The third is the face n, the last 0."""
+
+Order = Literal["value", "in", "out"]
+"""The coefficient, or its derivative by the azimuth of incidence or of departure [1/rad]."""
+
+
+Faces = Callable[[int, Float64[Tensor, " row"]], FieldCoefficients]
+"""Coefficients of the faces 0 and 1 (n) of some wedges, at cosines of the angle of incidence.
+
+Those of a sheet are about its middle, its transmission that of the straight path through air.
+"""
+
+
+def conductor(face: int, cosine: Float64[Tensor, " row"]) -> FieldCoefficients:
+    """The faces of a perfect conductor.
+
+    Args:
+        face: 0 or 1.
+        cosine: of the angle of incidence.
+    """
+    one = torch.ones_like(cosine).to(torch.complex128)
+    return FieldCoefficients(-one, one, 0 * one, 0 * one)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Waves that turn at edges, one row each.
+
+    Attributes:
+        wedges: whose edges they meet.
+        direction: unit vectors of the waves before the edge.
+        towards: after it.
+        azimuth_in, azimuth: φ′ and φ about the edge from the face 0, through the exterior [rad].
+        parameter: distance parameter L, of a spherical wave s s′ sin²β/(s + s′) [m].
+        faces: what the wedges' faces do to waves.
+        ends: by how much longer, as √phase, paths over the edge's ends are; None = no ends.
+    """
+
+    wedges: Wedges
+    direction: Float64[Tensor, "row 3"]
+    towards: Float64[Tensor, "row 3"]
+    azimuth_in: Float64[Tensor, " row"]
+    azimuth: Float64[Tensor, " row"]
+    parameter: Float64[Tensor, " row"]
+    faces: Faces = conductor
+    ends: Float64[Tensor, "row 2"] | None = None
+
+    def reversed(self) -> "Turn":
+        """The same waves on their way back."""
+        return replace(
+            self,
+            direction=-self.towards,
+            towards=-self.direction,
+            azimuth_in=self.azimuth,
+            azimuth=self.azimuth_in,
+        )
+
+    @property
+    def sine(self) -> Float64[Tensor, " row"]:
+        """Of the angle β between the waves and the edge."""
+        return cross(edge_axis(self.wedges), self.direction).norm(dim=1)
+
+
+def diffraction_dyad(turn: Turn, wave_number: float, order: Order = "value") -> Tensor:
+    """D of a wedge: E(s) = A exp(−jks) D·E(Q), with E in world coordinates, [row, 3, 3] in √m.
+
+    A = √(s′/(s(s + s′))) for a spherical wave. With ``order="in"``, times 1/(jk sinβ), it is the
+    slope dyad that acts on the derivative of E(Q) along φ′.
+
+    Args:
+        turn: the waves.
+        wave_number: k [1/m].
+        order: the dyad, or its derivative by an azimuth.
+    """
+    there = _one_way(turn, wave_number, order)
+    if turn.faces is conductor:
+        return there
+    flipped: dict[Order, Order] = {"value": "value", "in": "out", "out": "in"}
+    back = _one_way(turn.reversed(), wave_number, flipped[order])
+    return (there + back.mT) / 2
+
+
+def _one_way(turn: Turn, wave_number: float, order: Order) -> Tensor:
+    weights = _terms(turn, wave_number, order)
+    straight, last, first = _carried(turn)
+    whole = (weights[0] + weights[1])[:, None, None] * straight
+    return whole + weights[2][:, None, None] * last + weights[3][:, None, None] * first
+
+
+def _terms(turn: Turn, wave_number: float, order: Order) -> list[Complex128[Tensor, " row"]]:
+    """The four scalar coefficients, or their derivatives."""
+    scale = -_TURN / (2 * turn.wedges.opening * math.sqrt(2 * math.pi * wave_number) * turn.sine)
+    root = torch.sqrt(2 * wave_number * turn.parameter)
+    found = []
+    for other, sign in _SIGNS:
+        beta = turn.azimuth + other * turn.azimuth_in
+        value, slope = _cotangent(turn, beta, sign, root, order != "value")
+        if order != "value":
+            value = slope * (other if order == "in" else 1.0)
+        found.append(scale * value)
+    return found
+
+
+def _cotangent(
+    turn: Turn, beta: Tensor, sign: float, root: Tensor, sloped: bool
+) -> tuple[Tensor, Tensor]:
+    """cot((π ± β)/2n) F(kLa) in one, and its derivative by β where it is asked for.
+
+    With δ the angle past the boundary, it is −[sin(δ/2)/tan(δ/2n)] √(2kL) g(√(2kL) sin(δ/2)).
+    """
+    opening = turn.wedges.opening
+    turns = torch.round((beta + sign * math.pi) / (2 * math.pi * opening)).detach()
+    half = (sign * (2 * math.pi * opening * turns - beta) - math.pi) / 2
+    near = half.abs() < _SERIES
+    safe = torch.where(near, torch.full_like(half, _SERIES), half)
+    bend = opening * (1 / 6 + 1 / (3 * opening**2))
+    sine, tangent = torch.sin(safe), torch.tan(safe / opening)
+    quotient = torch.where(near, opening - bend * half**2, sine / tangent)
+    s = root * torch.sin(half)
+    sent = edge_transition(s, turn.ends)
+    value = -quotient * root * sent
+    if not sloped:
+        return value, value
+    past = torch.cos(safe) / tangent - sine / (opening * torch.sin(safe / opening) ** 2)
+    past = torch.where(near, -2 * bend * half, past)
+    by_s = edge_transition_slope(s, turn.ends, sent)
+    by_half = -root * (past * sent + quotient * by_s * root * torch.cos(half))
+    return value, by_half * (-sign / 2)
+
+
+def _basis(along: Tensor, direction: Tensor) -> Float64[Tensor, "row 2 3"]:
+    """β̂ and φ̂ of waves that leave an edge."""
+    across = normalize(cross(along, direction), dim=-1)
+    return torch.stack([cross(across, direction), across], 1)
+
+
+def _carried(turn: Turn) -> list[Complex128[Tensor, "row 3 3"]]:
+    """What becomes of the field: less what passes straight on, reflected by the faces n and 0.
+
+    Each is the field of geometric optics, turned from its own direction about the edge.
+    """
+    along, direction = edge_axis(turn.wedges), turn.direction
+    leaving = _basis(along, turn.towards)
+    lost = torch.eye(3, dtype=torch.complex128) - _passed(turn)
+    found = [_turned(leaving, _basis(along, direction), lost)]
+    for face in (1, 0):
+        normal = turn.wedges.normals[:, face]
+        across, before, after = (v[:, 0] for v in plane_of_incidence(normal, direction))
+        law = turn.faces(face, dot(normal, direction).abs())
+        mirror = _outer(law.reflection_s, across, across) + _outer(law.reflection_p, after, before)
+        onwards = mirrored(direction, normal)
+        found.append(_turned(leaving, _basis(along, onwards), mirror))
+    return found
+
+
+def _outer(strength: Tensor, left: Tensor, right: Tensor) -> Complex128[Tensor, "row 3 3"]:
+    return strength[:, None, None] * (left[:, :, None] * right[:, None])
+
+
+def _turned(leaving: Tensor, arriving: Tensor, law: Tensor) -> Complex128[Tensor, "row 3 3"]:
+    """A dyad whose fields are turned about the edge, from the arriving to the leaving basis."""
+    return (leaving.mT @ arriving).to(torch.complex128) @ law
+
+
+def _passed(turn: Turn) -> Complex128[Tensor, "row 3 3"]:
+    """The dyad of the shadow: zero behind bodies; one sheet at its end, two at a crease."""
+    flat = (turn.wedges.opening > 2 - _FLAT)[:, None, None]
+    total = torch.eye(3, dtype=torch.complex128)
+    for face in (0, 1):
+        normal = turn.wedges.normals[:, face]
+        across, before, _ = (v[:, 0] for v in plane_of_incidence(normal, turn.direction))
+        law = turn.faces(face, dot(normal, turn.direction).abs())
+        through = _outer(law.transmission_s, across, across)
+        through = through + _outer(law.transmission_p, before, before)
+        total = through if face == 0 else torch.where(flat, total, through @ total)
+    return total

@@ -1,0 +1,220 @@
+"""Transition functions of diffraction: what an edge sends near the shadow of a straight wave.
+
+With s² the phase by which the path over the edge is longer than the straight one, an endless edge
+sends g(s) = 2j exp(js²) ∫ exp(−jt²) dt from s to ∞; t² is the same phase of other points of the
+edge. The transition function of Kouyoumjian and Pathak is F(x) = √x g(√x). Convention exp(+jωt).
+
+Source: derivations §9; Weideman, "Computation of the complex error function", SIAM J. Numer. Anal.
+31, 1994; Owen, "Tables for computing bivariate normal probabilities", Ann. Math. Stat. 27, 1956.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+_TERMS = 40  # of Weideman's sum: 1e-14
+_POINTS = 24  # of either quadrature: 1e-14
+_NEAR = 16.0  # s² + t² from which on the far quadrature serves
+_TURN = complex(math.sqrt(0.5), math.sqrt(0.5))  # exp(jπ/4)
+_ROOT = math.sqrt(math.pi)
+
+
+def _weideman(terms: int) -> tuple[float, list[float]]:
+    """Scale and coefficients of the rational sum of w(z) = exp(−z²) erfc(−jz)."""
+    count = 2 * terms
+    scale = math.sqrt(terms / math.sqrt(2))
+    node = scale * np.tan(np.arange(-count + 1, count) * math.pi / count / 2)
+    sampled = np.concatenate([[0.0], np.exp(-(node**2)) * (scale**2 + node**2)])
+    found = np.fft.fft(np.fft.fftshift(sampled)).real / (2 * count)
+    return scale, found[terms:0:-1].tolist()
+
+
+_SCALE, _COEFFICIENTS = _weideman(_TERMS)
+_LEGENDRE = tuple(zip(*np.polynomial.legendre.leggauss(_POINTS), strict=True))
+_LAGUERRE = tuple(zip(*np.polynomial.laguerre.laggauss(_POINTS), strict=True))
+
+
+def transition(s: Float64[Tensor, "*row"]) -> Complex128[Tensor, "*row"]:
+    """g(s) = 2j exp(js²) ∫ exp(−jt²) dt from s to ∞ for s ≥ 0, and g(−s) = −g(s).
+
+    Near zero it jumps by 2√π exp(jπ/4), as the straight wave does; far away it is 1/s. Its
+    derivative is g′ = 2jsg − 2j on either side.
+
+    Args:
+        s: any finite numbers.
+    """
+    return _Transition.apply(s)  # type: ignore[return-value]
+
+
+def end_transition(
+    s: Float64[Tensor, "*#row"], t: Float64[Tensor, "*#row"]
+) -> Complex128[Tensor, "*row"]:
+    """The part of g(s) that an edge beyond t sends: exp(jπ/4)/√π ∫ s exp(−jτ²)/(s² + τ²) dτ.
+
+    An edge whose ends are t₁ and t₂ away from the point of diffraction, counted outwards, sends
+    g(s) less the part beyond either end; t < 0 where that point lies beyond the end. Sums over the
+    edges of a plate have no jump, at its corners either: they are the Fresnel integral over it.
+
+    Args:
+        s: as in ``transition``.
+        t: lower limit τ = t of the integral; its upper limit is ∞.
+    """
+    beyond = _Beyond.apply(s, t.abs())
+    return torch.where(t < 0, transition(s) - beyond, beyond)  # type: ignore[operator]
+
+
+def edge_transition(
+    s: Float64[Tensor, "*#row"], ends: Float64[Tensor, "*#row 2"] | None
+) -> Complex128[Tensor, "*row"]:
+    """g(s) of an edge with two ends.
+
+    Args:
+        s: as in ``transition``.
+        ends: t of both ends, as in ``end_transition``; None of an endless edge.
+    """
+    sent = transition(s)
+    if ends is None:
+        return sent
+    return sent - end_transition(s, ends[..., 0]) - end_transition(s, ends[..., 1])
+
+
+def edge_transition_slope(
+    s: Float64[Tensor, "*#row"],
+    ends: Float64[Tensor, "*#row 2"] | None,
+    sent: Complex128[Tensor, "*row"],
+) -> Complex128[Tensor, "*row"]:
+    """Derivative of ``edge_transition`` by s.
+
+    Args:
+        s, ends: as there.
+        sent: its value.
+    """
+    slope = 2j * s * sent - 2j
+    for t in () if ends is None else ends.unbind(-1):
+        size = _half(t.abs())
+        share = torch.where(t < 0, 1 - size, size)
+        square = (s * s + t * t).clamp_min(1e-300)
+        slope = slope + 2j * share - _TURN / _ROOT * _wave(-t * t) / square * t
+    return slope
+
+
+def _scaled_erfc(x: Tensor) -> Tensor:
+    """exp(jx²) erfc(exp(jπ/4) x) of x ≥ 0: w(exp(j3π/4) x) by Weideman's sum."""
+    turned = x * complex(-_TURN.imag, -_TURN.real)  # j exp(j3π/4) x
+    below = _SCALE - turned
+    ratio = (_SCALE + turned) / below
+    total = torch.zeros_like(ratio) + _COEFFICIENTS[0]
+    for coefficient in _COEFFICIENTS[1:]:
+        total = total * ratio + coefficient
+    return (2 * total / below + 1 / _ROOT) / below
+
+
+def _wave(phase: Tensor) -> Tensor:
+    """exp(j phase)."""
+    return torch.complex(phase.cos(), phase.sin())
+
+
+def _half(x: Tensor) -> Tensor:
+    """½ erfc(exp(jπ/4) x) of x ≥ 0: the part of a straight wave that passes an edge."""
+    return 0.5 * _wave(-x * x) * _scaled_erfc(x)
+
+
+class _Transition(torch.autograd.Function):
+    """g(s)."""
+
+    @staticmethod
+    def forward(s: Tensor) -> Tensor:  # type: ignore[override]
+        size = _ROOT * _TURN * _scaled_erfc(s.abs())
+        return torch.where(s < 0, -size, size)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:  # type: ignore[override]
+        ctx.save_for_backward(*inputs, output)
+        ctx.save_for_forward(*inputs, output)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
+        s, g = ctx.saved_tensors
+        return (grad.conj() * (2j * s * g - 2j)).real
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor) -> Tensor:  # type: ignore[override]
+        s, g = ctx.saved_tensors
+        return tangent * (2j * s * g - 2j)
+
+
+class _Beyond(torch.autograd.Function):
+    """The part beyond t ≥ 0, odd in s."""
+
+    @staticmethod
+    def forward(s: Tensor, t: Tensor) -> Tensor:  # type: ignore[override]
+        s, t = torch.broadcast_tensors(s, t)
+        found = _beyond(s.abs().reshape(-1), t.reshape(-1)).reshape(s.shape)
+        return torch.where(s < 0, -found, found)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # type: ignore[override]
+        ctx.save_for_backward(*inputs, output)
+        ctx.save_for_forward(*inputs, output)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        s, t, found = ctx.saved_tensors
+        by_s, by_t = ((grad.conj() * slope).real for slope in _slopes(s, t, found))
+        return by_s.sum_to_size(s.shape), by_t.sum_to_size(t.shape)
+
+    @staticmethod
+    def jvp(ctx: Any, tangent_s: Tensor | None, tangent_t: Tensor | None) -> Tensor:  # type: ignore[override]
+        s, t, found = ctx.saved_tensors
+        by_s, by_t = _slopes(s, t, found)
+        zero = torch.zeros_like(s)
+        return by_s * (zero if tangent_s is None else tangent_s) + by_t * (
+            torch.zeros_like(t) if tangent_t is None else tangent_t
+        )
+
+
+def _slopes(s: Tensor, t: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of the part beyond t by s and by t; finite at s = t = 0, where there are none."""
+    square = (s * s + t * t).clamp_min(1e-300)
+    front = _TURN / _ROOT * _wave(-t * t) / square
+    return 2j * s * found - 2j * _half(t) + front * t, -front * s
+
+
+def _beyond(s: Tensor, t: Tensor) -> Tensor:
+    """The part beyond t ≥ 0 of s ≥ 0, in one dimension."""
+    found = torch.empty(s.shape, dtype=torch.complex128)
+    square = s * s + t * t
+    for rule, rows in ((_near, square < _NEAR), (_far, square >= _NEAR)):
+        at = torch.nonzero(rows)[:, 0]
+        found[at] = rule(s[at], t[at])
+    return _TURN / _ROOT * found
+
+
+def _near(s: Tensor, t: Tensor) -> Tensor:
+    """exp(js²) [atan(s/t) − √π exp(jπ/4) s ∫ exp(−js²x²) erfc(exp(jπ/4) t x) dx], x from 0 to 1."""
+    total = torch.zeros(s.shape, dtype=torch.complex128)
+    square = s * s + t * t
+    for node, weight in _LEGENDRE:
+        x = (node + 1) / 2
+        total = total + weight / 2 * _wave(-x * x * square) * _scaled_erfc(x * t)
+    return _wave(s * s) * (torch.atan2(s, t) - _ROOT * _TURN * s * total)
+
+
+def _far(s: Tensor, t: Tensor) -> Tensor:
+    """Down the steepest path, τ² = t² − jv; where s > t by way of the part with both exchanged.
+
+    The parts beyond (s, t) and (t, s) are those of a right angle: a product of two edges.
+    """
+    low, high = torch.minimum(s, t), torch.maximum(s, t)
+    total = torch.zeros(s.shape, dtype=torch.complex128)
+    square = high * high
+    for node, weight in _LAGUERRE:
+        lower = torch.complex(square, torch.full_like(square, -node))
+        total = total + weight / (torch.sqrt(lower) * (lower + low * low))
+    part = -0.5j * low * total * _wave(-high * high)
+    both = 0.5 * math.pi * _scaled_erfc(s) * _scaled_erfc(t) * _wave(-t * t)
+    return torch.where(s > t, both - part * _wave(s * s - low * low), part)
