@@ -3,8 +3,10 @@
 import cmath
 import itertools
 import math
+from typing import Any
 
 import pytest
+import scipy.special
 import torch
 from torch import Tensor
 
@@ -498,6 +500,54 @@ def test_a_scene_of_20_000_triangles():
             change = after / after.norm() - before / before.norm()
             along = change - (change @ normal) * normal
             assert float(along.norm()) < 1e-9
+
+
+def walk(places: Tensor, plane: Scene, edges: int) -> Tensor:
+    """Field over that of free space along a walk behind a plate."""
+    paths = trace(plane, [0.0, 0.0, -8.0], places, edges=edges, depth=1)
+    fields = [response(paths.between(0, n))[0, 0].abs() for n in range(len(places))]
+    free = WAVELENGTH / (4 * math.pi * (places - float64([0.0, 0.0, -8.0])).norm(dim=1))
+    return torch.stack(fields) / free
+
+
+def test_shadows_have_no_edge_with_diffraction():
+    """Half of the field on the boundary of a half plane, and no jump there."""
+    half = Scene({"half": Object(plate(60.0, 60.0), METAL, rigid(translation=[-30.0, 0.0, 0.0]))})
+    x = torch.linspace(-0.5, 0.5, 41, dtype=torch.float64) + 1e-4
+    places = torch.stack([x, torch.zeros(41).double(), torch.full((41,), 6.0).double()], 1)
+    optics, whole = walk(places, half, 0), walk(places, half, 1)
+    assert float(optics.diff().abs().max()) == pytest.approx(1.0, abs=1e-6)
+    assert float(whole.diff().abs().max()) < 0.15
+    assert whole[20].item() == pytest.approx(0.5, abs=0.01)
+    # Kirchhoff's integral of a straight edge, a few wavelengths off the boundary and more.
+    v = x * math.sqrt(2 / WAVELENGTH * (8 + 6) / (8 * 6)) * 8 / 14
+    s, c = (torch.from_numpy(f) for f in scipy.special.fresnel((-v).numpy()))
+    knife = ((0.5 - c) ** 2 + (0.5 - s) ** 2).sqrt() / math.sqrt(2)
+    torch.testing.assert_close(whole, knife, rtol=0, atol=0.02)
+
+
+def test_the_size_of_a_plate_has_a_derivative_with_diffraction():
+    def value(size: Tensor, edges: int) -> Tensor:
+        base = plate(1.0, 1.0)
+        mesh = Mesh(base.vertices * (1 + size), base.faces)
+        scene = Scene({"plate": Object(mesh, METAL, rigid(translation=[0.05, 0.02, 0.0]))})
+        found = trace(scene, [0.1, 0.2, 2.0], [0.3, -0.1, 1.5], edges=edges)
+        return torch.view_as_real(response(found)).flatten()
+
+    zero = torch.zeros((), dtype=torch.float64)
+    for edges in (1, 2):
+        found: Any = torch.autograd.functional.jacobian(lambda t, n=edges: value(t, n), zero)
+        truth = (value(zero + 1e-5, edges) - value(zero - 1e-5, edges)) / 2e-5
+        assert float((found - truth).norm() / truth.norm()) < 1e-4
+    assert not (value(zero + 1e-3, 0) - value(zero, 0)).any()
+
+
+def test_edges_of_objects_in_motion_are_refused():
+    moving = GROUND.replace("ground", velocity=float64([0.0, 0.0, 1.0]))
+    with pytest.raises(InputError, match="a scene at rest for diffracted paths"):
+        trace(moving, *HEIGHTS, edges=1)
+    with pytest.raises(InputError, match="at most 2 edges"):
+        trace(GROUND, *HEIGHTS, edges=3)
 
 
 def test_padded_links_may_be_empty():

@@ -17,6 +17,7 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
+from invertwin.channel.field.diffracted import EdgedScene, diffracted_paths
 from invertwin.channel.field.images import (
     Chains,
     Walls,
@@ -31,8 +32,9 @@ from invertwin.channel.field.sequences import (
     shot_sequences,
 )
 from invertwin.channel.field.waves import dot, mirrored, plane_of_incidence, polarisations
-from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION, RayPaths, joined
+from invertwin.channel.ray_paths import DIFFRACTION, REFLECTION, TRANSMISSION, RayPaths, joined
 from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.scene import Occluders
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -47,7 +49,7 @@ from invertwin.scene.checks import (
 )
 from invertwin.scene.scene import Scene
 
-_DEEPEST = 6
+_DEEPEST, _MOST_EDGES = 6, 2
 _ROWS_AT_ONCE = 1 << 15
 _UP = (0.0, 0.0, 1.0)
 _STILL = "give one vector, or one per antenna"
@@ -85,17 +87,20 @@ def trace_paths(
     frequency: float,
     *,
     depth: int = 3,
+    edges: int = 0,
     rays: int | None = 1_000_000,
     seed: int = 0,
     tx_velocity: ArrayLike = (0.0, 0.0, 0.0),
     rx_velocity: ArrayLike = (0.0, 0.0, 0.0),
 ) -> RayPaths:
-    """All specular paths between point antennas: line of sight, mirrored, and through sheets.
+    """Paths between point antennas: line of sight, mirrored, through sheets, and round edges.
 
     Smooth surfaces mirror on both sides; sheets (``Slab``, ``Multilayer``) also let through, on a
     straight line. Delays, directions, vertices, coefficients and Doppler shifts are differentiable
     with respect to the scene, its materials and the antennas, at fixed visibility. A link without a
-    path has no rows.
+    path has no rows. With ``edges``, sharp edges diffract by the uniform theory: the sum of all
+    paths then has no jump where one of them is lost, and derivatives by sizes and across shadows
+    are right.
 
     Candidates are the sequences of surfaces that ``rays`` rays follow, shot from the side with
     fewer antennas. A sequence that fills the solid angle Ω about such an antenna is missed with
@@ -108,21 +113,30 @@ def trace_paths(
         rx: Receivers, [3] or [rx, 3] [m].
         frequency: Of the coefficients [Hz].
         depth: Most surfaces that a path meets, 0 to 6; a sheet that it passes counts as one.
+        edges: Most edges that a path goes round, 0 to 2; such paths meet no mirrors or sheets.
         rays: Shot from each antenna of the side with fewer; None tries every sequence.
         seed: Of the rays' directions.
         tx_velocity: Of the transmitters, one or one for each [m/s].
         rx_velocity: Of the receivers [m/s].
 
     Raises:
-        InputError: Wrong shapes or numbers, a cloud, or too many sequences to try one by one.
+        InputError: Wrong shapes or numbers, a cloud, too many sequences to try one by one, or edges
+            in a scene with objects in motion.
 
-    Source: derivations §10.
+    Source: derivations §9 and §10.
     """
     stage = _staged(scene, tx, rx, frequency, tx_velocity, rx_velocity)
     most = checked_count(depth, "depth", 0)
     if most > _DEEPEST:
         raise InputError(
             f"expected a depth of at most {_DEEPEST}, got {most}; paths of more mirrors are weak"
+        )
+    if checked_count(edges, "edges", 0) > _MOST_EDGES:
+        raise InputError(f"expected at most {_MOST_EDGES} edges on a path, got {edges}")
+    if edges and stage.velocities is not None:
+        raise InputError(
+            "expected a scene at rest for diffracted paths, got objects with velocities; their "
+            "Doppler shifts are not computed: use edges=0, or scene.at(time)"
         )
     if rays is not None and not 1 <= checked_count(rays, "rays", 1) <= MOST:
         raise InputError(f"expected at most {MOST:,} rays, got {rays}; shoot fewer")
@@ -132,6 +146,7 @@ def trace_paths(
         with _DisableFuncTorch():
             found, missed = _searched(stage, powers, most, rays, seed)
         parts = [part for chains in found for part in _computed(stage, chains)]
+        parts += _diffracted(stage, edges) if edges else []
     return replace(joined(parts), missed=missed)
 
 
@@ -221,6 +236,54 @@ def _powers(stage: _Stage) -> Powers:
         reflect.append((moduli[0] + moduli[1]) > 0)
         transmit.append((moduli[2] + moduli[3]) > 0)
     return Powers(torch.cat(reflect), torch.cat(transmit))
+
+
+def _diffracted(stage: _Stage, edges: int) -> list[RayPaths]:
+    """Paths round edges."""
+    vertices = plain(stage.vertices)
+    scene = EdgedScene(
+        stage.vertices,
+        stage.topology,
+        Occluders(vertices, stage.topology, vertices.mean(0)),
+        lambda faces, cosine: _coefficients(stage, faces, cosine),
+    )
+    if not len(scene.wedges.start):
+        return []
+    count = len(stage.tx), len(stage.rx)
+    source = torch.arange(count[0]).repeat_interleave(count[1])
+    target = torch.arange(count[1]).repeat(count[0])
+    k = 2 * math.pi * stage.frequency / SPEED_OF_LIGHT
+    up = torch.tensor(_UP, dtype=torch.float64)
+    found: list[RayPaths] = []
+    for part in diffracted_paths(scene, stage.tx[source], stage.rx[target], k, edges):
+        tx, rx = source[part.link], target[part.link]
+        departure = normalize(part.points[:, 0] - stage.tx[tx], dim=1)
+        arrival = normalize(part.points[:, -1] - stage.rx[rx], dim=1)
+        sent, received = polarisations(departure, up), polarisations(arrival, up)
+        matrix = torch.einsum(
+            "pri,pij,ptj->prt", received.to(part.transfer), part.transfer, sent.to(part.transfer)
+        )
+        faces = scene.wedges.faces[part.edge, 0]
+        rate = dot(departure, stage.tx_velocity[tx]) + dot(arrival, stage.rx_velocity[rx])
+        found.append(
+            RayPaths(
+                count,
+                stage.frequency,
+                tx,
+                rx,
+                part.length / SPEED_OF_LIGHT,
+                matrix * (SPEED_OF_LIGHT / stage.frequency / (4 * math.pi)),
+                departure,
+                arrival,
+                part.points,
+                torch.full_like(part.edge, DIFFRACTION),
+                faces,
+                stage.topology.face_object[faces],
+                stage.scene.names,
+                stage.frequency / SPEED_OF_LIGHT * rate,
+            )
+        )
+    return found
 
 
 def _computed(stage: _Stage, chains: Chains) -> list[RayPaths]:
