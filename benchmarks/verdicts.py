@@ -11,7 +11,7 @@ after which the object has the same surface. Prints a table and writes `metrics.
 - `right_first_with_starts`: the share of `search` over a grid of starts, 1 m and all turns about
   the same bad start, whose best end is right.
 
-On two idle cores 100 fits take some two hours. Each is kept in `rows.jsonl` as it ends; the same
+On one idle core 100 fits take some 50 minutes. Each is kept in `rows.jsonl` as it ends; the same
 command goes on after an interruption. `--fits` stops earlier.
 """
 

@@ -1,5 +1,7 @@
 """Exact signals: their mean is the surrogate's, their noise, and what is refused."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,7 +9,14 @@ from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.models import ExactMap, SurrogateMap
 from invertwin.radar import Impairments
-from invertwin.scene import PerfectConductor, RoughDielectric, Scene, plate
+from invertwin.scene import (
+    AntennaArray,
+    PerfectConductor,
+    RoughDielectric,
+    Scene,
+    dihedral,
+    plate,
+)
 from invertwin.simulation import simulate
 from scenes import float64, occluder, radar, relative, thing
 
@@ -102,3 +111,22 @@ def test_wrong_types_are_told_in_one_line():
 
     with pytest.raises(iw.InputError, match=r"expected a scene \(Scene\), got None; build one"):
         iw.simulate(None, radar="x", grid=None, seed=1)  # type: ignore[arg-type]
+
+
+def test_a_radar_of_both_polarisations_hears_each_as_one_of_its_own():
+    """Channels of elements that differ are those of radars whose elements are alike."""
+    scene = Scene(
+        {
+            "metal": thing(dihedral(0.1), (0, 0, 1.5), (0, 0, 0.4), material=PerfectConductor()),
+            "rough": thing(plate(0.1, 0.1), (0.2, 0, 1.5), material=RoughDielectric(4.0)),
+        }
+    )
+    spots = float64([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    device = replace(radar(), receivers=AntennaArray(spots, polarisation=[[1.0, 0.0], [0.0, 1.0]]))
+    few = Sampling(depth=2, samples=2_000, points_per_m2=1000.0, rough_paths=1000, boundary=False)
+    both = simulate(scene, device, device.grid(0.5, 2.5), seed=0, sampling=few).beat
+    for number, polarisation in enumerate("VH"):
+        one = replace(device, receivers=AntennaArray(spots[:1], polarisation=polarisation))
+        alone = simulate(scene, one, one.grid(0.5, 2.5), seed=0, sampling=few).beat
+        assert torch.allclose(both[:, :, number], alone[:, :, 0], rtol=1e-6, atol=1e-14)
+        assert alone.any()

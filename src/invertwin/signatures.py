@@ -19,9 +19,8 @@ from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.scene import Scene
 from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.scene.polarisation import jones_basis
 
-_JONES = {"V": (1.0, 0.0), "H": (0.0, 1.0), "circular": (0.5**0.5, 0.5**0.5 * 1j)}
-_LEVELS = "a polarisation as V, H, circular or two complex numbers (V, H)"
 _AT_ONCE = 1 << 22  # frequencies × aspects × points
 _EVEN = 1e-3  # of a step, by which steps of frequencies may differ: those of float32 do
 
@@ -192,7 +191,7 @@ def rcs(
         up=axis / axis.norm(),
         boundary=boundary,
     )
-    basis = _basis(polarisation)
+    basis = jones_basis(polarisation)
     turned = {name: basis.T @ value @ basis for name, value in parts.items()}
     return Signature(turned, swept, sent, sent if received is None else received)
 
@@ -227,24 +226,6 @@ def _directions(values: ArrayLike, what: str) -> Tensor:
     if not len(found) or not bool((length > 0).all()):
         raise InputError(f"expected {what} of some length, got {len(found)}; give x, y, z of each")
     return found / length
-
-
-def _basis(polarisation: str | Sequence[complex]) -> Tensor:
-    """The polarisation and the one orthogonal to it, as columns over (V, H)."""
-    if isinstance(polarisation, str):
-        if polarisation not in _JONES:
-            raise InputError(f"expected {_LEVELS}, got {polarisation!r}; use one of them")
-        polarisation = _JONES[polarisation]
-    try:
-        first = torch.as_tensor(polarisation, dtype=torch.complex128)
-        length = float(first.norm())
-    except (TypeError, ValueError, RuntimeError):
-        length, first = 0.0, torch.zeros(0)
-    if first.shape != (2,) or not 0 < length < math.inf:
-        raise InputError(f"expected {_LEVELS}, got {polarisation!r}; give two, not both zero")
-    first = first / length
-    second = torch.stack([-first[1].conj(), first[0].conj()])
-    return torch.stack([first, second], 1)
 
 
 def _hann(count: int) -> Tensor:

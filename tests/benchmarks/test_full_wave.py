@@ -44,3 +44,8 @@ def test_a_cube_whose_faces_are_grazed_exactly(full_wave):
     for polarisation in "VH":
         assert metrics["rms_db"][f"cube_face_{polarisation}"] < 2.0
         assert metrics["rms_db"][f"cube_oblique_{polarisation}"] < 2.0
+
+
+def test_facets_about_a_tip_are_no_edges(full_wave):
+    metrics = full_wave.measure(["ogive"])
+    assert max(metrics["phase_deg"].values()) < 20.0

@@ -1,6 +1,7 @@
 """Every waveform survives the way into a file and back."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import torch
 from invertwin.capture import Capture
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, OFDM, Impulse, Radar, SteppedFrequency
-from invertwin.scene.antenna import linear_array
+from invertwin.scene import JonesTable, linear_array
 
 
 def radar(waveform) -> Radar:
@@ -38,6 +39,29 @@ def test_range_profiles_of_an_impulse_radar(tmp_path):
     capture = Capture.from_range_profile(profile, ranges, radar(Impulse(4e9, 1e9)))
     capture.save(tmp_path / "capture.nc")
     assert Capture.load(tmp_path / "capture.nc").radar().waveform == Impulse(4e9, 1e9)
+
+
+def test_polarisations(tmp_path):
+    vectors = torch.tensor([[[1, 0]], [[0.6, 0.8j]]], dtype=torch.complex128)
+    table = JonesTable(torch.tensor([0.0, 1.0]).double(), torch.zeros(1).double(), vectors)
+    there = torch.tensor([[0.3, 0.2, 0.9]], dtype=torch.float64)
+    cases: list[dict[str, Any]] = [
+        {"polarisation": "H", "leakage": [0.0, 0.3]},
+        {"polarisation": "circular"},
+        {"polarisation": table},
+        {"polarisation": table, "leakage": 0.2},
+    ]
+    for options in cases:
+        arrays = linear_array(1, 1.0), linear_array(2, 1e-3, **options)
+        radar = Radar(*arrays, FMCW(76e9, 1e9, 40e-6, 16), torch.zeros(1, 3, dtype=torch.float64))
+        beat = torch.ones(1, 1, 2, 16, dtype=torch.complex128)
+        Capture.from_beat(beat, radar).save(tmp_path / "capture.nc")
+        loaded = Capture.load(tmp_path / "capture.nc").radar()
+        assert loaded.transmitters.jones.equals(radar.transmitters.jones)
+        one, other = (r.receivers.jones for r in (radar, loaded))
+        assert torch.allclose(
+            one.mixtures @ one.towards(there), other.mixtures @ other.towards(there)
+        )
 
 
 def test_waveforms_of_ones_own_are_refused():

@@ -304,6 +304,38 @@ def test_table_pattern_in_degrees_and_decibels():
     torch.testing.assert_close(found.gain(ahead), expected, rtol=1e-3, atol=0)
 
 
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ({}, [1, 0]),
+        ({"polarisation": "H"}, [0, 1]),
+        ({"polarisation": "circular"}, [0.5**0.5, 0.5**0.5 * 1j]),
+        ({"polarisation": [3, 4.0]}, [0.6, 0.8]),
+        ({"polarisation": [[3, 4.0]], "leakage": [0.5]}, [0.2 * 0.8**0.5, 1.1 * 0.8**0.5]),
+        ({"leakage": 0.75}, [0.8, 0.6]),
+    ],
+)
+def test_polarisation_of_elements(said, expected):
+    found = build.radar(read(radar=RADAR | {"receivers": ELEMENT | said}).radar).receivers.jones
+    torch.testing.assert_close(found.vectors[0], torch.tensor(expected, dtype=torch.complex128))
+
+
+@pytest.mark.parametrize("wrong", ["X", [1.0, "a"], [0.0, 0.0], {"V": 1.0}])
+def test_polarisation_errors_name_the_key(wrong):
+    with pytest.raises(InputError, match=r"radar\.receivers(\.polarisation)?"):
+        build.radar(read(radar=RADAR | {"receivers": ELEMENT | {"polarisation": wrong}}).radar)
+
+
+def test_polarisation_of_a_board():
+    bare = {
+        name: value for name, value in RADAR.items() if name not in ("transmitters", "receivers")
+    }
+    board = {"name": "xWR1642", "polarisation": "H"}
+    found = build.radar(read(radar=bare | {"board": board}).radar)
+    for array in (found.transmitters, found.receivers):
+        assert torch.equal(array.jones.vectors[0], torch.tensor([0, 1], dtype=torch.complex128))
+
+
 def test_table_pattern_of_the_wrong_shape_names_the_key():
     pattern = {"kind": "table", "theta_deg": [0, 60], "gain_db": [[6.0, 1.0], [0.0]]}
     with pytest.raises(InputError, match=r"receivers\.pattern: .*2 rows of 1, .*1 or 2"):

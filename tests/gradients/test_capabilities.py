@@ -164,6 +164,7 @@ MOVES: dict[str, Move] = {
     "thickness": material("thickness", 3e-3, BOARD),
     "roughness": material("rms_slope", 0.4, COATED),
     "scattering coefficient": material("scattering", 0.6, COATED),
+    "depolarisation": material("depolarisation", 0.1),
     "density": soft(),
 }
 
@@ -473,6 +474,11 @@ def patterns(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
     return scene, replace(radar, receivers=replace(radar.receivers, pattern=pattern))
 
 
+def polarisations(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
+    vector = torch.ones(2, dtype=torch.complex128, requires_grad=True)
+    return scene, replace(radar, receivers=replace(radar.receivers, polarisation=vector))
+
+
 def elements(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
     places = radar.receivers.positions.clone().requires_grad_()
     return scene, replace(radar, receivers=AntennaArray(places))
@@ -481,15 +487,18 @@ def elements(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
 REFUSALS: dict[str, Callable[[Scene, Radar], tuple[Scene, Radar]]] = {
     "object velocity": velocity,
     "antenna pattern": patterns,
+    "antenna polarisation": polarisations,
     "element positions": elements,
 }
 NAMES = {
     "object velocity": "velocities on wall",
     "antenna pattern": "expected a pattern without derivatives",
+    "antenna polarisation": "expected a polarisation without derivatives",
     "element positions": "expected element positions without derivatives",
     "permittivity": "expected a material with permittivity",
     "conductivity": "expected a material with conductivity",
     "diffuse fraction": "expected a material with diffuse",
+    "depolarisation": "expected a material with depolarisation",
     "density": "expected objects with surfaces, got clouds for occluder",
 }
 REFUSED = [cell for cell, said in CELLS.items() if said == "refused"]

@@ -29,7 +29,7 @@ SAMPLES, MOST = 1_000_000, 24
 IN_THE_ROOM = {"vertices", "radar position", "clock offset"}
 MATERIALS = {
     "permittivity", "conductivity", "diffuse fraction", "lobe width", "thickness", "roughness",
-    "scattering coefficient",
+    "scattering coefficient", "depolarisation",
 }  # fmt: skip
 
 

@@ -112,6 +112,26 @@ def test_dipoles_that_are_crossed_do_not_talk():
     assert amplitude[2] < 1e-15
 
 
+def test_polarisations_of_elements_count():
+    """Circular antennas: of one hand they hear each other, and a mirror turns the hand."""
+    paths = trace(
+        Scene({"wall": Object(plate(9.0, 9.0), METAL, rigid(translation=[0.0, 0.0, -1.0]))}),
+        [0, 0, 0],
+        [0.01, 0, 3.0],
+    )
+    one = torch.zeros(1, 3, dtype=torch.float64)
+    axes = torch.eye(3, dtype=torch.float64)
+    right, left = (
+        Terminals(AntennaArray(one, polarisation=jones), axes) for jones in ("circular", [1, -1j])
+    )
+    same, other = (path_amplitudes(paths, right, rx)[0].abs().flatten() for rx in (right, left))
+    ratio = (same / other).log10()
+    assert ratio[0].item() > 2
+    assert ratio[1].item() < -2
+    both = Terminals(AntennaArray(float64([[0, 0, 0]] * 2), polarisation=[[1, 0], [0, 1]]), axes)
+    assert path_amplitudes(paths, both, both)[0].shape == (2, 2, 2)
+
+
 def test_patterns_weigh_directions():
     ground = Scene({"far": Object(plate(1.0, 1.0), METAL, rigid(translation=[0.0, 0.0, -50.0]))})
     paths = trace(ground, [0, 0, 0], [[5.0, 0, 0], [-5.0, 0, 0], [3.0, 4.0, 0]], depth=0)

@@ -201,9 +201,7 @@ def test_values_and_gradients_in_both_modes_equal_the_plain_sum(samples, track):
             tangents.append(forward_ad.unpack_dual(signal).tangent)
     assert tangents[0] is not None
     assert (tangents[1] - tangents[0]).norm() < 1e-7 * tangents[0].norm()
-    empty = torch.zeros(0, dtype=torch.int64)
-    columns = {n: getattr(paths, n)[empty] for n in vars(paths) if n not in ("kind", "velocity")}
-    none = replace(paths, **columns)
+    none = paths.chosen(torch.zeros(0, dtype=torch.int64))
     assert not beat_signal(none, radar).any()
 
 

@@ -1,7 +1,7 @@
 """Convert a radar to labelled arrays and attributes, and back."""
 
 from collections.abc import Hashable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -13,6 +13,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, Table
+from invertwin.scene.polarisation import JonesTable, Polarisation
 
 WAVEFORMS: dict[str, type[Waveform]] = {
     kind.__name__: kind for kind in (FMCW, Impulse, SteppedFrequency, OFDM)
@@ -46,7 +47,7 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     for end, array in (("tx", radar.transmitters), ("rx", radar.receivers)):
         variables[f"{end}_position"] = labelled((end, "radar_axis"), array.positions, "m")
         arrays, named = _pattern_fields(end, array.pattern)
-        variables |= arrays
+        variables |= arrays | _jones_fields(end, array.jones)
         attributes |= named
     return variables, attributes
 
@@ -160,4 +161,36 @@ def _array_from_fields(end: str, dataset: xr.Dataset) -> AntennaArray:
         "table": lambda: Table(*(tensor(dataset, f"{end}_{k}") for k in ("theta", "phi", "gain"))),
     }
     pattern = _named(dataset.attrs, f"{end}_pattern", patterns)()
-    return AntennaArray(tensor(dataset, f"{end}_position"), pattern)
+    array = AntennaArray(tensor(dataset, f"{end}_position"), pattern)
+    if f"{end}_jones" in dataset.variables:
+        return replace(array, polarisation=_complex(dataset, f"{end}_jones"))
+    if f"{end}_jones_table" not in dataset.variables:
+        return array
+    angles = (tensor(dataset, f"{end}_jones_{name}") for name in ("theta", "phi"))
+    table = JonesTable(*angles, _complex(dataset, f"{end}_jones_table"))
+    mixtures = _complex(dataset, f"{end}_mixture")
+    return replace(array, polarisation=table, leakage=mixtures[:, 1] / mixtures[:, 0])
+
+
+def _jones_fields(end: str, jones: Polarisation) -> dict[str, xr.DataArray]:
+    """Polarisations; none where all elements are V, as in files of earlier versions."""
+
+    def of(dims: tuple[str, ...], value: Tensor) -> xr.DataArray:
+        return labelled((*dims, "polarisation", "part"), torch.view_as_real(value), "1")
+
+    if not isinstance(jones.base, JonesTable):
+        vectors = jones.vectors.resolve_conj()
+        plain = bool((vectors == torch.tensor([1.0, 0.0])).all())
+        return {} if plain else {f"{end}_jones": of((end,), vectors)}
+    theta, phi = f"{end}_jones_theta", f"{end}_jones_phi"
+    mixtures = torch.nn.functional.pad(jones.mixtures, (0, 2 - jones.mixtures.shape[1]))
+    return {
+        theta: labelled((theta,), jones.base.theta, "rad"),
+        phi: labelled((phi,), jones.base.phi, "rad"),
+        f"{end}_jones_table": of((theta, phi), jones.base.vectors),
+        f"{end}_mixture": of((end,), mixtures),
+    }
+
+
+def _complex(dataset: xr.Dataset, name: str) -> Tensor:
+    return torch.view_as_complex(tensor(dataset, name).contiguous())

@@ -12,6 +12,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.scene.checks import check_fields
+from invertwin.scene.polarisation import VERTICAL, Polarisation
 
 
 @runtime_checkable
@@ -90,6 +91,8 @@ class Link:
         wavelength: [m].
         shared_visibility: One visibility test from ``tx`` serves both antennas (V·V = V); the
             boundary then has one term instead of two (derivations §3).
+        tx_jones: Polarisation of the transmitters, about the radar's y axis.
+        rx_jones: That of the receivers.
     """
 
     tx: Float64[Tensor, "frame 3"]
@@ -99,6 +102,8 @@ class Link:
     rx_pattern: Pattern
     wavelength: float
     shared_visibility: bool
+    tx_jones: Polarisation = VERTICAL
+    rx_jones: Polarisation = VERTICAL
 
     def __post_init__(self) -> None:
         frames = self.tx.shape[0]
@@ -136,6 +141,9 @@ class Paths:
         boundary: Which rows are boundary paths: zero in value, with the derivative of a moving
             shadow edge (derivations §3).
         velocity: World velocity of the scattering point [m/s]; None = at rest.
+        matrix: Field coefficients between the polarisations that the elements of the arrays mix,
+            receive × transmit; None where all elements are alike. ``coefficient`` is that of the
+            mean elements.
     """
 
     frame: Int64[Tensor, " path"]
@@ -147,6 +155,7 @@ class Paths:
     kind: str
     boundary: Bool[Tensor, " path"]
     velocity: Float64[Tensor, "path 3"] | None = None
+    matrix: Complex128[Tensor, "path r t"] | None = None
 
     def __len__(self) -> int:
         return self.delay.shape[0]
@@ -156,10 +165,26 @@ class Paths:
         """Half the path length [m]."""
         return 0.5 * SPEED_OF_LIGHT * self.delay
 
-    def chosen(self, mask: Bool[Tensor, " path"]) -> "Paths":
-        """Only the paths that the mask marks."""
+    def chosen(self, mask: Bool[Tensor, " path"] | Int64[Tensor, " chosen"]) -> "Paths":
+        """Only the paths of a mask, or of indices."""
         rows = {n: value[mask] for n, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **rows)
+
+    @property
+    def carries(self) -> Bool[Tensor, " path"]:
+        """Which paths have a field, between any of the elements."""
+        own = self.coefficient != 0
+        return own if self.matrix is None else own | (self.matrix != 0).flatten(1).any(1)
+
+    def weighted(self, weight: float | Float64[Tensor, " path"]) -> "Paths":
+        """The paths with fields of other strength.
+
+        Args:
+            weight: Factor of the fields.
+        """
+        factor = torch.as_tensor(weight, dtype=torch.float64).reshape(-1)
+        matrix = None if self.matrix is None else self.matrix * factor[:, None, None]
+        return replace(self, coefficient=self.coefficient * factor, matrix=matrix)
 
     def __add__(self, other: "Paths") -> "Paths":
         return joined([self, other])
@@ -167,11 +192,17 @@ class Paths:
 
 def joined(parts: Sequence[Paths]) -> Paths:
     """All paths in order."""
-    names = [f.name for f in fields(Paths) if f.name not in ("kind", "velocity")]
+    names = [f.name for f in fields(Paths) if f.name not in ("kind", "velocity", "matrix")]
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     velocity = None
     if any(part.velocity is not None for part in parts):
         still = [torch.zeros_like(p.last) if p.velocity is None else p.velocity for p in parts]
         velocity = torch.cat(still)
     kinds = {part.kind for part in parts}
-    return Paths(**columns, kind=kinds.pop() if len(kinds) == 1 else "field", velocity=velocity)
+    matrices = [part.matrix for part in parts if part.matrix is not None]
+    return Paths(
+        **columns,
+        kind=kinds.pop() if len(kinds) == 1 else "field",
+        velocity=velocity,
+        matrix=torch.cat(matrices) if len(matrices) == len(parts) else None,
+    )

@@ -1,11 +1,11 @@
 """Radars of run files: waveforms, antennas, boards, tracks, poses, grids."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, MinLen
-from pydantic import Tag, model_validator
+from pydantic import GetCoreSchemaHandler, Tag, model_validator
 from torch import Tensor
 
 from invertwin.capture.radar_fields import WAVEFORMS
@@ -16,7 +16,7 @@ from invertwin.radar.impairments import Impairments
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
-from invertwin.registry.kinds import Group, OneOf, Registry, Table, TableOf
+from invertwin.registry.kinds import Group, OneOf, Registry, Table, TableOf, number_or_list
 from invertwin.registry.section import TAG_MARK, Section, Vector, about, check_presence, key, tag_by
 from invertwin.scene import (
     AntennaArray,
@@ -33,10 +33,29 @@ from invertwin.scene import Table as PatternTable
 Numbers = Annotated[list[Count], MinLen(1)]
 
 
+@dataclass(frozen=True)
+class _OneOrEach:
+    """Annotates a key of one value for all elements, or of a list."""
+
+    one: Any
+    each: Any
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(number_or_list(self.one, list[self.each]))
+
+
+_NUMBERS = _OneOrEach(float, float)
+Polarised = Annotated[Any, _OneOrEach(Literal["V", "H", "circular"], Annotated[Any, _NUMBERS])]
+_POLARISED = '"V", "H", "circular" (right-hand) or two numbers (V, H), of all elements or of each'
+_LEAKAGE = "field of the orthogonal polarisation over that of the wanted one"
+
+
 class ArrayTable(Table):
     """Antenna elements in the radar frame (x right, y up, z boresight)."""
 
     center: Vector = key("m, in the radar frame", [0.0, 0.0, 0.0])
+    polarisation: Polarised = key(_POLARISED, "V")
+    leakage: Annotated[Any, _NUMBERS] = key(_LEAKAGE + ", of all elements or of each", 0.0)
 
     def build(self, given: Any = None, /, **more: Any) -> AntennaArray:
         """The elements about their centre."""
@@ -58,6 +77,8 @@ class BoardTable(Table):
         "numbers from 1, ascending; without it all, or those of the recording", None
     )
     pattern: Annotated[Any, OneOf("pattern")] | None = key("of every element; else isotropic", None)
+    polarisation: Polarised | None = key(_POLARISED + "; without it the board's", None)
+    leakage: float = key(_LEAKAGE, 0.0)
 
     def build(self, given: Any = None, /, **more: Any) -> boards.Mounting:
         """The board as it is mounted."""
@@ -68,6 +89,8 @@ class BoardTable(Table):
             self.transmitters,
             self.receivers,
             None if self.pattern is None else self.pattern.build(),
+            self.polarisation,
+            self.leakage,
         )
 
 

@@ -37,8 +37,8 @@ def _single() -> AntennaArray:
 class Terminals:
     """What stands at the places of transmitters, or of receivers: the same array at each.
 
-    Elements send and receive V: in the plane of the direction and the array's y axis. By default a
-    terminal is one isotropic element, and y is the world's z axis.
+    V and H of the array's polarisation are about its y axis. By default a terminal is one isotropic
+    element for V, and y is the world's z axis.
 
     Attributes:
         array: Elements about each place.
@@ -76,12 +76,13 @@ class Terminals:
         gain = self.array.pattern.gain(local)
         lit = gain > 0  # a root of zero has no derivative
         strength = torch.where(lit, torch.where(lit, gain, 1.0).sqrt(), 0.0)
-        vertical = polarisations(local, torch.tensor(_UP, dtype=torch.float64))[:, 0]
-        sent = torch.einsum("pij,pj->pi", turn, vertical)
+        own = polarisations(local, torch.tensor(_UP, dtype=torch.float64))
         basis = polarisations(direction, torch.tensor(_VERTICAL, dtype=torch.float64))
-        field = strength[:, None] * torch.einsum("pbi,pi->pb", basis, sent)
-        count = len(self.array.positions)
-        return field[:, None].expand(-1, count, -1).to(torch.complex128)
+        change = torch.einsum("pwi,pij,pbj->pwb", basis, turn, own).to(torch.complex128)
+        jones = self.array.jones
+        mixed = jones.towards(local).expand(len(local), -1, -1)
+        weights = torch.einsum("pwb,ek,pkb->pew", change, jones.mixtures, mixed)
+        return strength[:, None, None] * weights
 
     def advances(
         self, direction: Float64[Tensor, "path 3"], place: Int64[Tensor, " path"]

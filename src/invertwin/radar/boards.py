@@ -17,8 +17,8 @@ from torch import Tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Among, Frequency, Positive
-from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern
-from invertwin.scene.checks import check_fields, checked_tensor
+from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern, Polarised
+from invertwin.scene.checks import ArrayLike, check_fields, checked_tensor
 
 Elements = tuple[AntennaArray, AntennaArray]  # TX and RX
 Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
@@ -44,6 +44,8 @@ class Board:
             take the middle of the band (xWR1642, xWR1843, AWR2944), or that of their sister, the
             IWR6843L of TI's SWRU585 (IWR6843ISK, IWR6843AOP).
         source: where the numbers come from.
+        polarisation: of all elements, as in `AntennaArray`. The sources of the presets name none:
+            V is assumed.
 
     Raises:
         InputError: no elements, places that are not pairs of numbers, or a frequency that is not
@@ -55,6 +57,7 @@ class Board:
     receivers: Places
     design_frequency: Frequency
     source: str = "user"
+    polarisation: Polarised = "V"
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -77,6 +80,8 @@ class Board:
         transmitters: Sequence[int] | None = None,
         receivers: Sequence[int] | None = None,
         pattern: Pattern | None = None,
+        polarisation: Polarised | None = None,
+        leakage: float | ArrayLike = 0.0,
     ) -> Elements:
         """TX and RX elements in the radar frame (x right, y up, z boresight).
 
@@ -91,6 +96,8 @@ class Board:
             transmitters: numbers from 1 of the elements in use, in this order; None = all.
             receivers: the same for RX.
             pattern: gain of every element, isotropic by default.
+            polarisation: of every element, the board's by default.
+            leakage: field of the orthogonal polarisation over that of the wanted one.
 
         Returns:
             transmitters, receivers.
@@ -114,7 +121,10 @@ class Board:
             grid = torch.tensor(places, dtype=torch.float64)
             grid = (grid - grid.mean(dim=0)) * torch.tensor(signs, dtype=torch.float64) * unit
             positions = torch.cat([grid, torch.zeros_like(grid[:, :1])], dim=1)
-            return AntennaArray(positions[self._indices(places, chosen, name)], pattern)
+            own = self.polarisation if polarisation is None else polarisation
+            return AntennaArray(
+                positions[self._indices(places, chosen, name)], pattern, own, leakage
+            )
 
         return array(self.transmitters, transmitters, "TX"), array(self.receivers, receivers, "RX")
 
@@ -139,6 +149,8 @@ class Mounting:
         transmitters: numbers from 1 in the order of sending; None = all, or those of a recording.
         receivers: numbers from 1, ascending; None = all, or those of a recording.
         pattern: gain of every element; None = isotropic.
+        polarisation: of every element; None = the board's.
+        leakage: field of the orthogonal polarisation over that of the wanted one.
     """
 
     board: Board | str
@@ -147,6 +159,8 @@ class Mounting:
     transmitters: Sequence[int] | None = None
     receivers: Sequence[int] | None = None
     pattern: Pattern | None = None
+    polarisation: Polarised | None = None
+    leakage: float = 0.0
 
     def arrays(
         self, transmitters: Sequence[int] | None = None, receivers: Sequence[int] | None = None
@@ -174,6 +188,8 @@ class Mounting:
             transmitters=transmitters or self.transmitters,
             receivers=receivers or self.receivers,
             pattern=self.pattern,
+            polarisation=self.polarisation,
+            leakage=self.leakage,
         )
 
 

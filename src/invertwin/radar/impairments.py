@@ -8,7 +8,7 @@ errors of the channels, thermal noise, then the converter.
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
 from typing import Annotated
@@ -280,7 +280,7 @@ def noisy_oscillator_beat(
         with warnings.catch_warnings():
             # All paths have been judged together.
             warnings.simplefilter("ignore", PhysicsWarning)
-            part = replace(part, coefficient=part.coefficient * weight[chosen])
+            part = part.weighted(weight[chosen])
             beat = _clean_beat(part, radar, chirps)
         residual = residual_phase(noise, radar, first + node * spacing, seed=seed, chirps=chirps)
         return beat * _turn(residual).unsqueeze(-2).to(beat.device)

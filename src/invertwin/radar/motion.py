@@ -240,19 +240,19 @@ class Train:
         for frame in range(self.radar.frame_count):
             rows = torch.nonzero(paths.frame == frame)[:, 0]
             points = self._when_scattered(placed[:, rows], centers[1][frame])
-            coefficient, rest = paths.coefficient[rows], inner[rows]
+            own, rest = paths.chosen(rows), inner[rows]
             ends = points + span[rows]
             back = [(ends - place).norm(dim=-1) for place in receivers[frame]]
             for tx, found in zip(senders, signals, strict=True):
                 forth = (points - transmitters[frame, tx]).norm(dim=-1)
                 channels = [
                     beat_of_delays(
-                        coefficient,
+                        self.radar.coefficient(own, tx, rx),
                         (forth + segment) / SPEED_OF_LIGHT + rest,
                         waveform,
                         self.tolerance,
                     )
-                    for segment in back
+                    for rx, segment in enumerate(back)
                 ]
                 found.append(torch.stack(channels))
         return torch.stack([torch.stack(found) for found in signals], dim=1)

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import torch
 from annotated_types import Ge, Gt, Le
-from jaxtyping import Complex, Float64, Int64
+from jaxtyping import Complex, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, differentiated
+from invertwin.channel import Grid, Link, Paths, differentiated
 from invertwin.errors import InputError
 from invertwin.limits import MOST, Among, NonNegative, Positive
 from invertwin.memory import require_at_most
@@ -134,16 +134,41 @@ class Radar:
         return bias != 0
 
     def link(self) -> Link:
-        """What the channel needs to know: phase centres, axes, patterns."""
+        """What the channel needs to know: phase centres, axes, patterns, polarisations."""
         return Link(
             tx=self._world(self.transmitters.positions.mean(0, keepdim=True))[:, 0],
             rx=self._world(self.receivers.positions.mean(0, keepdim=True))[:, 0],
             rotations=self._rotations,
             tx_pattern=self.transmitters.pattern,
             rx_pattern=self.receivers.pattern,
+            tx_jones=self.transmitters.jones,
+            rx_jones=self.receivers.jones,
             wavelength=self.waveform.wavelength,
             shared_visibility=self._shared_visibility,
         )
+
+    def coefficient(
+        self, paths: Paths, transmitter: int, receiver: int
+    ) -> Complex128[Tensor, " path"]:
+        """Field coefficients of paths for one of the channels.
+
+        Args:
+            paths: Field paths.
+            transmitter, receiver: Numbers of the elements.
+
+        Raises:
+            InputError: Paths of antennas that mix other polarisations.
+        """
+        if paths.matrix is None:
+            return paths.coefficient
+        sent, received = self.transmitters.jones.mixtures, self.receivers.jones.mixtures
+        expected = received.shape[1], sent.shape[1]
+        if tuple(paths.matrix.shape[1:]) != expected:
+            raise InputError(
+                f"expected paths between {expected[1]} and {expected[0]} polarisations, got "
+                f"{list(paths.matrix.shape[1:])}; trace with the link of the same radar"
+            )
+        return torch.einsum("r,prt,t->p", received[receiver], paths.matrix, sent[transmitter])
 
     def moved(self, rotation: Float64[Tensor, "3 3"], translation: Float64[Tensor, "3"]) -> "Radar":
         """All poses moved rigidly: turned about the mean position, then translated.

@@ -58,7 +58,8 @@ def beat_signal(
     counts = torch.bincount(paths.frame, minlength=radar.frame_count).tolist()
     frames: list[Tensor] = []
     for frame, rows in told(list(enumerate(torch.split(order, counts))), "beat signals"):
-        first, last, coefficient = paths.first[rows], paths.last[rows], paths.coefficient[rows]
+        own = paths.chosen(rows)
+        first, last = own.first, own.last
         # What remains of the delay without the segments to the antennas.
         inner = (
             paths.delay[rows]
@@ -69,10 +70,13 @@ def beat_signal(
             inner + (first - place).norm(dim=1) / SPEED_OF_LIGHT for place in tx[frame][channels[0]]
         ]
         back = [(last - place).norm(dim=1) / SPEED_OF_LIGHT for place in rx[frame][channels[1]]]
+        senders, hearers = (
+            range(n)[part] for n, part in zip(radar.shape[1:], channels, strict=True)
+        )
         signals = [
-            beat_of_delays(coefficient, (f + b)[None], waveform, tolerance)
-            for f in forth
-            for b in back
+            beat_of_delays(radar.coefficient(own, t, r), (f + b)[None], waveform, tolerance)
+            for t, f in zip(senders, forth, strict=True)
+            for r, b in zip(hearers, back, strict=True)
         ]
         frames.append(torch.stack(signals).unflatten(0, (len(forth), len(back))))
     return torch.stack(frames)

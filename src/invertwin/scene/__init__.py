@@ -64,6 +64,7 @@ from invertwin.scene.parameters import Pose as Pose
 from invertwin.scene.parameters import Scale as Scale
 from invertwin.scene.parameters import Translation as Translation
 from invertwin.scene.parameters import Vertices as Vertices
+from invertwin.scene.polarisation import JonesTable as JonesTable
 from invertwin.scene.pose import compose as compose
 from invertwin.scene.pose import look_at as look_at
 from invertwin.scene.pose import quaternion_from_vector as quaternion_from_vector

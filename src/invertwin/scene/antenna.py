@@ -18,8 +18,10 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Count, NonNegative, Positive
 from invertwin.memory import require_at_most
-from invertwin.scene.checks import checked_count, checked_number, checked_tensor
+from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.scene.polarisation import JonesTable, Polarisation
 
+Polarised = str | ArrayLike | JonesTable
 _MOST_ELEMENTS = 1e5
 COSINE_COUNT = 2049
 """Nodes of a pattern table over cosθ, at linspace(−1, 1, 2049)."""
@@ -190,14 +192,22 @@ class AntennaArray:
     Attributes:
         positions: element positions in the radar frame [m].
         pattern: gain of every element.
+        polarisation: "V", "H", "circular" (right-hand) or a Jones vector (V, H) of all elements or
+            of each. V lies in the plane of the direction and the radar's y axis, H across it. In
+            Python also a `JonesTable` over direction.
+        leakage: field of the orthogonal polarisation over that of the wanted one, of all elements
+            or of each. The gain holds both.
 
     Raises:
-        InputError: no elements, wrong shape, NaN, positions that require grad, or a pattern of
-            another type.
+        InputError: no elements, wrong shape, NaN, positions that require grad, a pattern of
+            another type, an unknown polarisation.
     """
 
     positions: Float64[Tensor, "n 3"]
     pattern: Pattern = field(default_factory=Isotropic)
+    polarisation: Polarised = "V"
+    leakage: float | ArrayLike = 0.0
+    jones: Polarisation = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per element"
@@ -215,10 +225,17 @@ class AntennaArray:
                 "give Isotropic(), Cosine(exponent) or Table(theta, phi, gains)"
             )
         object.__setattr__(self, "positions", positions)
+        jones = Polarisation.of(self.polarisation, self.leakage, len(positions))
+        object.__setattr__(self, "jones", jones)
 
 
 def linear_array(
-    count: Count, spacing: Positive, axis: Literal["x", "y"] = "x", pattern: Pattern | None = None
+    count: Count,
+    spacing: Positive,
+    axis: Literal["x", "y"] = "x",
+    pattern: Pattern | None = None,
+    polarisation: Polarised = "V",
+    leakage: float | ArrayLike = 0.0,
 ) -> AntennaArray:
     """Elements in a row, centred at the origin of the radar frame.
 
@@ -227,6 +244,8 @@ def linear_array(
         spacing: distance between neighbours [m].
         axis: direction of the row.
         pattern: gain of every element, isotropic by default.
+        polarisation: "V", "H", "circular" or a Jones vector (V, H), see `AntennaArray`.
+        leakage: field of the orthogonal polarisation over that of the wanted one.
 
     Raises:
         InputError: no elements, a spacing that is not positive, or another axis.
@@ -234,11 +253,15 @@ def linear_array(
     if axis not in ("x", "y"):
         raise InputError(f"expected axis x or y, got {axis!r}; arrays lie in the x-y plane")
     counts = (count, 1) if axis == "x" else (1, count)
-    return planar_array(counts, (spacing, spacing), pattern)
+    return planar_array(counts, (spacing, spacing), pattern, polarisation, leakage)
 
 
 def planar_array(
-    count: tuple[Count, Count], spacing: tuple[Positive, Positive], pattern: Pattern | None = None
+    count: tuple[Count, Count],
+    spacing: tuple[Positive, Positive],
+    pattern: Pattern | None = None,
+    polarisation: Polarised = "V",
+    leakage: float | ArrayLike = 0.0,
 ) -> AntennaArray:
     """Elements on a grid, centred at the origin of the radar frame; y runs fastest.
 
@@ -246,6 +269,8 @@ def planar_array(
         count: elements along x, y.
         spacing: distance between neighbours along x, y [m].
         pattern: gain of every element, isotropic by default.
+        polarisation: "V", "H", "circular" or a Jones vector (V, H), see `AntennaArray`.
+        leakage: field of the orthogonal polarisation over that of the wanted one.
 
     Raises:
         InputError: no elements, or a spacing that is not positive.
@@ -256,7 +281,8 @@ def planar_array(
     y = _centred(count[1], spacing[1], "elements along y")
     plane = torch.cartesian_prod(x, y)
     positions = torch.cat([plane, torch.zeros_like(plane[:, :1])], dim=1)
-    return AntennaArray(positions, Isotropic() if pattern is None else pattern)
+    gain = Isotropic() if pattern is None else pattern
+    return AntennaArray(positions, gain, polarisation, leakage)
 
 
 def _centred(count: int, spacing: float, what: str) -> Tensor:

@@ -333,7 +333,7 @@ class MaterialValues(nn.Module):
         start: by the names of `RANGES` of the materials, inside their ranges, ends
             excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
             lobe_width [rad], scattering, rms_slope, lambertian, directive, directive_exponent,
-            backscatter_exponent, rms_height [m].
+            backscatter_exponent, rms_height [m], depolarisation.
 
     Attributes:
         raw: unbounded parameters by field: for values with one limit, such as the permittivity,

@@ -3,6 +3,7 @@
 import math
 from itertools import pairwise
 
+import pytest
 import torch
 
 from invertwin.channel.field.diffraction import conductor
@@ -152,6 +153,7 @@ def test_long_edge_is_endless():
     assert (over_edges([Edge(FIRST)], TX, RX, K).transfer - endless).norm() > 0.02 * endless.norm()
 
 
+@pytest.mark.slow
 def test_derivatives():
     edges = grazing()
 

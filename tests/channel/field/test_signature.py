@@ -1,6 +1,7 @@
 """Signatures: laws of waves first, then targets that are known."""
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ from invertwin.channel.field.waves import (
     radiated,
     reflected,
 )
-from invertwin.channel.field.wedges import Wedges, fringe_field
+from invertwin.channel.field.wedges import Wedges, find_wedges, fringe_field, run_on
+from invertwin.channel.rays.topology import topology_of
 from invertwin.channel.reference.cross_sections import strip_across, strip_along
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
@@ -317,6 +319,61 @@ def test_creases_between_facets_of_a_flat_or_smooth_surface_are_no_edges():
         for n in (1, 3)
     )
     assert torch.allclose(fine, coarse, rtol=1e-6)
+
+
+def edges_of(mesh: Mesh) -> tuple[int, int]:
+    """How many sharp edges a mesh has, and how many of them are edges of the body."""
+    shape = topology_of([mesh])
+    corners = mesh.vertices[shape.faces]
+    wedges = find_wedges(corners, mesh.vertices[shape.edges], shape.beside)
+    return len(wedges.start), int(run_on(wedges, 2 * WAVELENGTH).sum())
+
+
+def spindle(length: float, radius: float, step: float, base: bool) -> Mesh:
+    """A body of revolution with a tip, round or cut off at the other end."""
+    places = np.linspace(0, 1, round(length / step) + 1)
+    outline = radius * (np.sin(math.pi * places) if not base else places)
+    points, faces = [[0.0, 0.0, 0.0]], []
+    rings = [[0]]
+    for place, r in zip(places[1:-1] if not base else places[1:], outline[1:], strict=False):
+        count = max(6, round(2 * math.pi * r / step))
+        turns = 2 * math.pi * np.arange(count) / count
+        rings.append(list(range(len(points), len(points) + count)))
+        points += [[r * math.cos(t), r * math.sin(t), length * place] for t in turns]
+    rings.append([len(points)])
+    points.append([0.0, 0.0, length])
+    for low, high in pairwise(rings):
+        i = j = 0
+        m, n = (len(ring) if len(ring) > 1 else 0 for ring in (low, high))
+        while i < m or j < n:
+            a, b = low[i % len(low)], high[j % len(high)]
+            i, j = (i + 1, j) if j == n or (i < m and (i + 1) * n <= (j + 1) * m) else (i, j + 1)
+            last = low[i % len(low)] if low[i % len(low)] != a else high[j % len(high)]
+            faces.append([a, last, b])
+    return Mesh(float64(points), torch.tensor(faces))
+
+
+def test_facets_about_a_tip_are_no_edges():
+    found, kept = edges_of(spindle(5 * WAVELENGTH, WAVELENGTH, WAVELENGTH / 16, base=False))
+    assert found > 20
+    assert kept == 0
+    found, kept = edges_of(spindle(5 * WAVELENGTH, WAVELENGTH, WAVELENGTH / 16, base=True))
+    assert found > kept
+    assert kept == round(2 * math.pi * 16)  # the rim of a cone
+
+
+@pytest.mark.parametrize("size", [0.2, 1.0, 3.0])
+def test_edges_of_bodies_stay(size):
+    a = size * WAVELENGTH
+    thin = box((a, a, 0.1 * a))
+    assert edges_of(thin) == (12, 12)
+    assert edges_of(plate(a, a)) == (4, 4)
+    assert edges_of(plate(3 * a, a, divisions=5)) == (20, 20)
+    pyramid = Mesh(
+        float64([[0, 0, a], [a, 0, 0], [0, a, 0], [-a, 0, 0], [0, -a, 0]]),
+        torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [1, 4, 3], [1, 3, 2]]),
+    )
+    assert edges_of(pyramid) == (8, 8)
 
 
 # Every bounce.

@@ -91,5 +91,5 @@ def test_derivatives():
 def test_at_a_corner_values_and_derivatives_are_finite():
     s, t = number(0.0).requires_grad_(), number(0.0).requires_grad_()
     for found in (transition(s), end_transition(s, t)):
-        found.abs().backward()
-    assert torch.isfinite(torch.stack([s.grad, t.grad])).all()
+        slopes = torch.autograd.grad(found.abs(), (s, t), allow_unused=True)
+        assert all(bool(torch.isfinite(slope)) for slope in slopes if slope is not None)

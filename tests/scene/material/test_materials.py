@@ -110,6 +110,7 @@ VALUES = {
     "directive_exponent": 3.0,
     "backscatter_exponent": 5.0,
     "rms_height": 2e-4,
+    "depolarisation": 0.1,
 }
 
 

@@ -14,10 +14,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
+from invertwin.channel.field.polarised import (
+    antenna_fields,
+    combined,
+    conductor_field,
+    current_kernel,
+)
 from invertwin.channel.field.waves import area_vector, dot, polygon_integral
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.rays.geometry import flatten
-from invertwin.channel.reference.radar_equation import conductor_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
@@ -26,11 +31,12 @@ from invertwin.scene.scene import Scene
 def trace_chains(scene: Scene, link: Link, depth: int) -> Paths:
     """Field paths between few flat conductors, one for every beam; differentiable.
 
-    ``a = −(j/4π) (−1)^(m−1) √(G_t G_r)/(R r) (cosθ + cosθ')/2 ∫ exp(−jk(d − s)·x) dA`` after m
-    bounces, R the unfolded way to the centroid of the lit polygon. Beams are clipped as those of a
-    plane wave from the antenna to the middle of the scene, and phases are plane over a polygon, so
-    that antennas should be in its far field. Only other facets hide a facet from the transmitter;
-    nothing hides it from the receiver.
+    ``a = −(j/4π) √(G_t G_r)/(R r) p_r · [n × (d × E)] ∫ exp(−jk(d − s)·x) dA`` after m bounces,
+    E the field as the mirrors before have turned it, R the unfolded way to the centroid of the lit
+    polygon; the bracket is the mean of both ways. Beams are clipped as those of a plane wave from
+    the antenna to the middle of the scene, and phases are plane over a polygon, so that antennas
+    should be in its far field. Only other facets hide a facet from the transmitter; nothing hides
+    it from the receiver.
 
     Args:
         scene: Smooth conductors of at most 24 triangles together.
@@ -106,18 +112,25 @@ def _paths(bounce: Bounce, unfolding: _Unfolding, link: Link, order: int) -> Pat
     gain = link.tx_pattern.gain(torch.einsum("nij,ni->nj", rotation, start))
     gain = gain * link.rx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -onwards))
     area = polygon_integral(bounce.polygon - place[:, None], onwards - arriving)
-    cosines = -dot(bounce.normal, arriving), dot(bounce.normal, onwards)
-    field = conductor_field(gain / (length * distance) ** 2, *cosines)
-    field = field * area(2 * torch.pi / link.wavelength)
+    sent = antenna_fields(link.tx_jones, rotation, start)
+    # A mirror turns E as it turns places, and its sign.
+    sent = (-1.0) ** (order - 1) * sent @ unfolding.turn.to(sent.dtype)
+    received = antenna_fields(link.rx_jones, rotation, -onwards)
+    kernel = current_kernel(bounce.normal, arriving, sent, -onwards, received)
+    spread, leaving = gain / (length * distance) ** 2, dot(bounce.normal, onwards)
+    fields = conductor_field(spread, kernel, leaving)
+    integral = area(2 * torch.pi / link.wavelength)
+    coefficient, matrix = combined(link, fields * integral[:, None, None])
     return Paths(
         frame=frame,
         delay=(length + distance) / SPEED_OF_LIGHT,
-        coefficient=field * (-1.0) ** (order - 1),
+        coefficient=coefficient,
         power=torch.zeros_like(length),
         first=image,
         last=place,
         kind="coherent",
         boundary=torch.zeros(len(frame), dtype=torch.bool),
+        matrix=matrix,
     )
 
 

@@ -1,11 +1,13 @@
 """Fields: physical optics of conductors, fixed random-phase points and paths of rough surfaces."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from invertwin.channel.field.mirrors import mirrored_paths, spread_points
+from invertwin.channel.field.polarised import combined, mirror_matrix, rough_matrix
 from invertwin.channel.field.speckle import Speckle, draw_speckle
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.rays.backend import tracing
@@ -14,7 +16,6 @@ from invertwin.channel.rays.scene import RayScene, face_areas
 from invertwin.channel.reference.radar_equation import (
     Echo,
     SurfacePaths,
-    mirror_field,
     path_view,
     unblocked,
 )
@@ -84,7 +85,7 @@ def trace_field(
         smooth = torch.tensor(geometry.coherent)[geometry.face_object]
         for paths in (fixed.points, *fixed.paths[: depth - 1]):
             mixed = paths.keep(~smooth[paths.face].all(1))
-            parts += _fields(rays, mixed, "rough", _rough_field)
+            parts += _fields(rays, mixed, "rough", partial(_rough_field, link))
         return joined(parts)
 
 
@@ -100,17 +101,19 @@ def _fields(
         kept = paths.keep(row[seen])
         echo = path_view(rays, frame[seen], kept)
         velocity = kept.velocity(rays.geometry)
-        rows = echo.paths(kind, coefficient=field(kept, echo), velocity=velocity)
-        found.append(rows.chosen(rows.coefficient != 0))
+        coefficient, matrix = combined(rays.link, field(kept, echo))
+        rows = echo.paths(kind, coefficient=coefficient, matrix=matrix, velocity=velocity)
+        found.append(rows.chosen(rows.carries))
     return found
 
 
-def _rough_field(paths: SurfacePaths, echo: Echo) -> Tensor:
-    """Amplitude sqrt(f · weight), with the phase of the path."""
+def _rough_field(link: Link, paths: SurfacePaths, echo: Echo) -> Tensor:
+    """Amplitude sqrt(f · weight), with the phase of the path, from polarisation to polarisation."""
     # A root of zero has no derivative.
     lit = echo.power > 0
     root = (torch.where(lit, echo.power, 1.0) * paths.weight).sqrt()
-    return torch.polar(torch.where(lit, root, 0.0), paths.phase)
+    field = torch.polar(torch.where(lit, root, 0.0), paths.phase)
+    return field[:, None, None] * rough_matrix(link, echo, paths.phase)
 
 
 def _conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
@@ -118,12 +121,13 @@ def _conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
     coherent = torch.tensor(rays.geometry.coherent)[rays.geometry.face_object]
 
     def field(paths: SurfacePaths, echo: Echo) -> Tensor:
-        return mirror_field(rays.link, echo) * paths.weight
+        return mirror_matrix(rays.link, echo) * paths.weight[:, None, None]
 
     def row(edge: ShadowEdge, echo: Echo) -> Paths:
-        amount = mirror_field(rays.link, echo).detach() * edge.speed
-        coefficient = (amount - amount.detach()) * coherent[edge.face]
-        return echo.paths("coherent", coefficient=coefficient, boundary=True)
+        speed = (edge.speed - edge.speed.detach()) * coherent[edge.face]
+        fields = mirror_matrix(rays.link, echo).detach() * speed[:, None, None]
+        coefficient, matrix = combined(rays.link, fields)
+        return echo.paths("coherent", coefficient=coefficient, matrix=matrix, boundary=True)
 
     points = spread_points(face_areas(rays.geometry) * coherent, sampling.samples, seed)
     parts = _fields(rays, points, "coherent", field)

@@ -7,7 +7,6 @@ antenna, so that delays are exact for every element of an array.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,11 +14,17 @@ from jaxtyping import Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.field.polarised import (
+    antenna_fields,
+    combined,
+    conductor_field,
+    current_kernel,
+)
 from invertwin.channel.field.waves import dot, mirrored
 from invertwin.channel.paths import Paths
 from invertwin.channel.rays.geometry import silhouettes_move
 from invertwin.channel.rays.scene import NEAR, RayScene, face_areas, next_surface
-from invertwin.channel.reference.radar_equation import SurfacePaths, conductor_field, passed
+from invertwin.channel.reference.radar_equation import SurfacePaths, passed
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -32,9 +37,10 @@ _ROWS_AT_ONCE = 1 << 18  # frames × rays
 def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
     """Field paths of two bounces and more that only conductors mirror; detached.
 
-    ``a = −(j/4π) (−1)^(m−1) √(G_t G_r)/(R r) (cosθ + cosθ')/2 dA`` after m bounces, R the unfolded
-    way to the last one. Rays begin at both antennas, each way with half of the field, which keeps
-    reciprocity. The sign is that of E along the creases between the mirrors.
+    ``a = −(j/4π) √(G_t G_r)/(R r) p_r · [n × (d × E)] dA`` after m bounces, R the unfolded way to
+    the last one, E ← 2(n·E)n − E at the others. The bracket is the mean of both ways, as in
+    ``mirror_matrix``. Rays begin at both antennas, each way with half of the field, which keeps
+    reciprocity.
 
     Args:
         rays: The scene and its antennas.
@@ -49,7 +55,8 @@ def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]
     geometry = rays.geometry
     smooth = torch.tensor(geometry.coherent)[geometry.face_object]
     points = spread_points(face_areas(geometry) * smooth, sampling.samples, seed)
-    same = torch.equal(rays.link.tx, rays.link.rx)
+    link = rays.link
+    same = torch.equal(link.tx, link.rx) and link.tx_jones.equals(link.rx_jones)
     found: list[Paths] = []
     frames = torch.arange(rays.link.frame_count)
     with torch.no_grad():
@@ -59,18 +66,14 @@ def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]
             for from_receiver in (False,) if same else (False, True):
                 share = 1.0 if same else 0.5
                 chain = _chain(rays, sampling.depth, smooth, frame, points.keep(row), from_receiver)
-                found += [path for paths in chain if len(path := _weighted(paths, share))]
+                lit = [paths.chosen(paths.carries).weighted(share) for paths in chain]
+                found += [paths for paths in lit if len(paths)]
     if found and silhouettes_move(geometry, rays.link):
         raise InputError(
             "expected depth 1 for derivatives of fields between conductors, got "
             f"{sampling.depth}: mirrored paths have none; use depth=1, power paths, or rcs"
         )
     return found
-
-
-def _weighted(paths: Paths, share: float) -> Paths:
-    rows = paths.chosen(paths.coefficient != 0)
-    return replace(rows, coefficient=rows.coefficient * share)
 
 
 def _chain(
@@ -86,6 +89,8 @@ def _chain(
     here, there = (link.rx, link.tx) if from_receiver else (link.tx, link.rx)
     patterns = link.tx_pattern, link.rx_pattern
     own, other = patterns[::-1] if from_receiver else patterns
+    both = link.tx_jones, link.rx_jones
+    own_jones, other_jones = both[::-1] if from_receiver else both
     (place,) = points.places(geometry)
     antenna, position = here[frame], place.position
     seen, extra = passed(rays, antenna, position)
@@ -98,17 +103,19 @@ def _chain(
     # The solid angle of a ray, from the area that its first point stands for.
     angle = points.weight[keep] * dot(normal, start).abs() / length**2
     direction = start
+    sent = antenna_fields(own_jones, link.rotations[frame], start)
     extent = geometry.vertices.detach()
     reach = float((extent.amax(0) - extent.amin(0)).norm()) * 1.01
-    for bounce in range(2, depth + 1):
+    for _ in range(2, depth + 1):
         # Rays begin a little above the mirror: the ray tracer rounds places far from the antennas.
         above = -dot(normal, direction).sign() * NEAR * (position - rays.origin).norm(dim=1)
         direction = mirrored(direction, normal)
+        sent = -mirrored(sent, normal[:, None])
         begin = position + above[:, None] * normal
         face, _ = next_surface(rays, begin, begin + reach * direction)
         hit = (face >= 0) & smooth[face.clamp_min(0)]
-        columns = (face, frame, position, length, start, gain, angle, direction, extra)
-        face, frame, position, length, start, gain, angle, direction, extra = (
+        columns = (face, frame, position, length, start, gain, angle, direction, sent, extra)
+        face, frame, position, length, start, gain, angle, direction, sent, extra = (
             column[hit] for column in columns
         )
         p0, p1, p2 = (corner.detach() for corner in geometry.corners(face))
@@ -123,13 +130,18 @@ def _chain(
         open_, more = passed(rays, position, there[frame])
         spread = gain * other.gain(leaving) * open_ / (length * distance) ** 2
         area = angle * length**2 / facing.abs().clamp_min(1e-9)
-        field = conductor_field(spread, -facing, dot(normal, onwards)) * area
+        lit_normal = -facing.sign()[:, None] * normal
+        received = antenna_fields(other_jones, link.rotations[frame], -onwards)
+        kernel = current_kernel(lit_normal, direction, sent, -onwards, received)
+        fields = conductor_field(spread, kernel, dot(lit_normal, onwards)) * area[:, None, None]
+        coefficient, matrix = combined(link, fields.mT if from_receiver else fields)
         image = here[frame] + length[:, None] * start  # the last point, unfolded
         first, last = (position, image) if from_receiver else (image, position)
         yield Paths(
             frame=frame,
             delay=(length + distance + extra + more) / SPEED_OF_LIGHT,
-            coefficient=field * (-1.0) ** (bounce - 1),
+            coefficient=coefficient,
+            matrix=matrix,
             power=torch.zeros_like(length),
             first=first,
             last=last,

@@ -36,6 +36,7 @@ from invertwin.channel.field.wedges import (
     fringe_field,
     grazes,
     outside,
+    run_on,
 )
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import differentiated
@@ -48,6 +49,7 @@ from invertwin.scene.scene import Scene
 _SAGITTA = 1 / 50  # wavelengths that a facet may be off the curved surface
 _SMOOTH = (1e-6, 0.35)  # rad that normals turn from facet to facet where a surface is curved
 _SEGMENTS = 2.0  # of an edge per wavelength; each is seen or not
+_LEAST_LINE = 2.0  # wavelengths that an edge which ends in a smooth surface runs on at least
 _OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
 _ROWS_AT_ONCE = 1 << 18
 
@@ -219,6 +221,7 @@ class _View:
         ends = body.vertices[topology.edges]
         wedges = find_wedges(body.facets.corners, ends, topology.beside)
         wedges = wedges.rows(body.skins[0].conducting[wedges.faces[:, 0]])
+        wedges = wedges.rows(run_on(wedges, body.wavelength * _LEAST_LINE))
         found = {"edges 1": self._once(wedges)}
         plates = plates_of(wedges) if most > 1 else []
         totals = [list(self._none()) for _ in range(2, most + 1)]

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -26,6 +28,9 @@ _ANYWHERE = torch.tensor([0.8123, 0.4571, 0.3623], dtype=torch.float64)
 _SECOND_FIRST = torch.tensor([1, 0])
 _SHARP = 0.35  # rad that the normals of neighbours turn at an edge; less is a curved surface
 _POLE = 1e-5
+_SAME = 1e-9  # of the body's size: ends of edges this near are one
+_STRAIGHT = -math.cos(math.radians(30.0))  # cosine of two ends that run on
+_LIKE = 0.2  # of openings along a line, over π
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,55 @@ def find_wedges(
             found.append(wedge.rows(keep))
     columns = zip(*(vars(part).values() for part in found), strict=True)
     return Wedges(*(torch.cat(column) for column in columns))
+
+
+def run_on(wedges: Wedges, least: float) -> Bool[Tensor, " row"]:
+    """Which edges are edges of the body, and not of the facets about a tip of a smooth one.
+
+    Edges run on into others of like opening. About a tip, smooth facets turn sharply, but where the
+    rings have more of them they do not: such lines are short and end in a smooth surface. Lines of
+    the body end at others, or are long.
+
+    Args:
+        wedges: sharp edges.
+        least: extent of a long line [m].
+    """
+    count = len(wedges.start)
+    ends = torch.cat([wedges.start, wedges.end]).detach()
+    if not count:
+        return torch.zeros(0, dtype=torch.bool)
+    size = float((ends.amax(0) - ends.amin(0)).norm())
+    _, vertex = torch.unique((ends / (_SAME * size)).round(), dim=0, return_inverse=True)
+    away = normalize(ends[:count] - ends[count:], dim=1)
+    away = torch.cat([-away, away])
+    opening = wedges.opening.detach().repeat(2)
+    order, number = torch.argsort(vertex), torch.bincount(vertex)
+    pairs: list[Tensor] = [torch.zeros(2, 0, dtype=torch.int64)]
+    for step in range(1, int(number.max())):
+        own, other = order[:-step], order[step:]
+        joined = (vertex[own] == vertex[other]) & (dot(away[own], away[other]) < _STRAIGHT)
+        joined &= (opening[own] - opening[other]).abs() < _LIKE
+        pairs.append(torch.stack([own[joined], other[joined]]) % count)
+    row, column = torch.cat(pairs, 1).numpy()
+    graph = coo_array((np.ones(len(row)), (row, column)), shape=(count, count))
+    line = torch.from_numpy(connected_components(graph, directed=False)[1]).long()
+    lines = int(line.max()) + 1
+    index = line.repeat(2)[:, None].expand(-1, 3)
+    low, high = (
+        torch.zeros(lines, 3, dtype=torch.float64).scatter_reduce(
+            0, index, ends, reduce, include_self=False
+        )
+        for reduce in ("amin", "amax")
+    )
+    short = (high - low).norm(dim=1) < least
+    kept, left = torch.ones(lines, dtype=torch.bool), -1
+    # Taking one away may leave the next with a loose end.
+    while left != int(kept.sum()):
+        left = int(kept.sum())
+        there = kept[line.repeat(2)]
+        loose = there & (torch.bincount(vertex[there], minlength=len(number))[vertex] == 1)
+        kept[line.repeat(2)[loose]] &= ~short[line.repeat(2)[loose]]
+    return kept[line]
 
 
 def edge_axis(wedges: Wedges) -> Float64[Tensor, "row 3"]:

@@ -259,6 +259,7 @@ def _interior_segment(
             length=done["so_far"] + distance + extra,
         )  # fmt: skip
         state |= {"u": done["u"], "v": done["v"], "to_receiver": ~ends_at_receiver}
+        state["earlier"] = count
         speed = shadow.speed if number == 0 else shadow_points().speed
         yield BoundaryPaths(speed, state, run)
 

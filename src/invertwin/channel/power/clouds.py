@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample
 
+from invertwin.channel.coupling import power_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch
@@ -168,6 +169,8 @@ class _Rays:
         ]
         gain = link.tx_pattern.gain(towards[0]) * link.rx_pattern.gain(towards[1])
         scale = (link.wavelength / (4 * math.pi)) ** 2 * self.cloud.albedo / (4 * math.pi)
+        (share,) = power_shares(link, depolarised=False)
+        scale = scale * share.of(1)
         power = scale * weight[:, None] * gain * held / return_way.square()
         total = 0.5 * (distance + return_way)
         columns = [power, total, towards[1][..., 0], towards[1][..., 1]]

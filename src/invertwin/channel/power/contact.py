@@ -225,6 +225,7 @@ def contact_paths(
             "to_receiver": other_end,
             "u": dr.select(deep, done["u"], seen.x),
             "v": dr.select(deep, done["v"], seen.y),
+            "earlier": count,
         }
     normals = [place.normal for place in places]
     throughput *= fixed.scale * depth * drawn.transmittance

@@ -5,6 +5,7 @@ while these fit the memory budget, and replayed for the derivative.
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -12,6 +13,7 @@ from jaxtyping import Float32
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
+from invertwin.channel.coupling import power_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins, replay
 from invertwin.channel.power.clouds import deposit_density
@@ -43,7 +45,8 @@ def deposit_power(
     distribution of the material and both cosines for every point.
     Differentiable in both modes with respect to vertices, material values and radar poses;
     moving silhouettes included unless ``boundary`` is off. Objects that are clouds add the power
-    of ``deposit_density``, each with all ``samples``.
+    of ``deposit_density``, each with all ``samples``. Antennas take what their polarisations and
+    the surfaces' depolarisation leave of a path (``channel.coupling``).
 
     Args:
         scene: What is seen.
@@ -62,7 +65,8 @@ def deposit_power(
 
     Raises:
         InputError: No silhouette samples where a derivative needs them, an
-            antenna pattern that carries derivatives, objects in motion, an unknown backend.
+            antenna pattern that carries derivatives, objects in motion, an unknown backend, a
+            polarisation over direction.
     """
     if scheme not in ("rays", "area"):
         raise InputError(f"expected scheme 'rays' or 'area', got {scheme!r}; choose one")
@@ -82,12 +86,23 @@ def deposit_power(
                 "expected an antenna pattern without derivatives, got one that carries them; "
                 "power paths do not differentiate patterns: detach its values"
             )
-        with _DisableFuncTorch():
-            bare = without_derivatives(geometry, link)
-            trace = Trace(*bare, sampling, seed, scheme=scheme, reference=fixed)
-        tables = tables_of(geometry, link)
-        found = _Deposit.apply(trace, grid, any(map(differentiated, tables)), *tables)
-    return found + torch.stack(soft).sum(0) if soft else found  # type: ignore[no-any-return]
+        turned = geometry.surfaces.depolarisation
+        depolarised = differentiated(turned) or bool(turned.any())
+        parts = list(soft)
+        for share in power_shares(link, depolarised=depolarised):
+            lossy = geometry
+            if share.loss:
+                surfaces = geometry.surfaces.scaled(1 - share.loss * turned)
+                lossy = replace(geometry, surfaces=surfaces)
+            with _DisableFuncTorch():
+                bare = without_derivatives(lossy, link)
+                coupling = share.odd, share.even
+                trace = Trace(
+                    *bare, sampling, seed, scheme=scheme, reference=fixed, coupling=coupling
+                )
+            tables = tables_of(lossy, link)
+            parts.append(_Deposit.apply(trace, grid, any(map(differentiated, tables)), *tables))
+    return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
 
 
 def _sorted(scene: Scene) -> tuple[Scene | None, list[Object]]:

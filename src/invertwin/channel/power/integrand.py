@@ -67,6 +67,7 @@ class Inputs:
     tx_pattern: "PatternTable"
     rx_pattern: "PatternTable"
     scale: float  # (λ/4π)²
+    coupling: tuple[float, float] = (1.0, 1.0)  # of paths with an odd, an even number of bounces
 
     @staticmethod
     def of(rays: RayScene, *, monostatic: bool = False) -> "Inputs":
@@ -106,6 +107,11 @@ class Inputs:
     def detached(self) -> "Inputs":
         """These values without derivatives."""
         return self.replaced({name: dr.detach(self.table(name)) for name in DIFFERENTIABLE})
+
+    def coupled(self, bounces: Any) -> Any:
+        """What the antennas' polarisations take of paths with so many bounces."""
+        odd, even = self.coupling
+        return mi.Float(odd) if odd == even else dr.select((bounces & 1) == 1, odd, even)
 
     def antenna(self, frame: Any, receiver: Any, active: Any = True) -> Any:
         """Position of the receiver or the transmitter (a Python bool, or one per lane).

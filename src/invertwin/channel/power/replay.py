@@ -33,6 +33,7 @@ class _Vertex:
     arriving: Any  # gain at the start, 1/R² of the segment here, Jacobian
     segment: Any  # optical length of the segment here
     connection: integrand.Connection
+    coupled: Any  # what the antennas' polarisations take of the path that ends here
     scattered: Any  # towards the next vertex
     passed: Passage  # by the connection
     twice: Any  # whether the connection passes what the segment here passed
@@ -41,7 +42,7 @@ class _Vertex:
     def path(self) -> Contribution:
         """The path that ends here."""
         found, passed = self.connection, self.passed
-        power = self.throughput * found.factor * passed.transmittance
+        power = self.throughput * found.factor * passed.transmittance * self.coupled
         length = 0.5 * (self.length + found.distance + passed.extra)
         return Contribution(self.frame, power, length, found.seen.x, found.seen.y)
 
@@ -116,6 +117,7 @@ def _vertex(rays: RayScene, inputs: Inputs, records: Records, number: Any, depth
         arriving=arriving,
         segment=optical,
         connection=connection,
+        coupled=inputs.coupled(number + 1),
         scattered=scattered,
     )
 

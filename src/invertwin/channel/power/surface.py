@@ -13,8 +13,8 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.scene import Surface
 
-#: Names of a surface's tables.
-SURFACE = tuple(field.name for field in fields(Surface))
+#: Names of a surface's tables that kernels read; depolarisation scales others (``deposit_power``).
+SURFACE = tuple(field.name for field in fields(Surface) if field.name != "depolarisation")
 
 
 @dataclass(frozen=True)

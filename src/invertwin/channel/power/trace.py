@@ -47,7 +47,9 @@ def without_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, Link]
         link: Antennas.
     """
     tables = dict(zip(DIFFERENTIABLE, map(plain, tables_of(geometry, link)), strict=True))
-    rows = replace(geometry.surfaces, **{name: tables.pop(name) for name in SURFACE})
+    rows = {name: tables.pop(name) for name in SURFACE}
+    rows["depolarisation"] = plain(geometry.surfaces.depolarisation)
+    rows = replace(geometry.surfaces, **rows)
     return replace(geometry, vertices=tables.pop("vertices"), surfaces=rows), replace(
         link, **tables
     )
@@ -65,6 +67,7 @@ class Trace:
         *,
         scheme: str = "rays",
         reference: tuple[Geometry, Link] | None = None,
+        coupling: tuple[float, float] = (1.0, 1.0),
     ) -> None:
         """Upload a scene and prepare the samplers.
 
@@ -75,13 +78,15 @@ class Trace:
             seed: Of all random numbers.
             scheme: Where paths start, see ``deposit_power``.
             reference: What fixes how starts are drawn, see ``deposit_power``.
+            coupling: Factors of paths with an odd and an even number of bounces.
         """
         self.sampling, self.seed = sampling, seed
         self.recorded: Records | None = None  # the last paths, where they fit
         self.rays = RayScene(geometry, link)
         sampler = RaySampler if scheme == "rays" else AreaSampler
         self.sampler = sampler(self.rays, sampling.samples, seed, reference)
-        self.fixed = Inputs.of(self.rays, monostatic=bool((link.tx == link.rx).all()))
+        one_place = bool((link.tx == link.rx).all())
+        self.fixed = replace(Inputs.of(self.rays, monostatic=one_place), coupling=coupling)
         self._walk = Walk(self.rays, self.fixed, seed)
         edges = sampling.boundary and sampling.contacts and sampling.boundary_samples
         self.contacts = contacts_of(self.rays) if edges else None

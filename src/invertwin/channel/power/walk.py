@@ -5,7 +5,7 @@ The loop is compiled once for any depth, and keeps no vertex unless asked to: th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -39,7 +39,8 @@ def start(
 ) -> State:
     """The state at the first vertex.
 
-    A state with a ``weight`` also follows one over the probability of its points per area.
+    A state with a ``weight`` also follows one over the probability of its points per area. One with
+    ``earlier`` continues paths that have had so many vertices.
 
     Args:
         index: Number of the path.
@@ -135,9 +136,11 @@ class Walk:
         """
         zero = dr.zeros(mi.Float, dr.width(first["index"]))
         first = first | {"u": zero, "v": zero, "amount": zero, "so_far": zero, "here": receiver}
+        # What the antennas' polarisations take counts once, at the other end.
+        inputs = replace(self.inputs, coupling=(1.0, 1.0))
 
         def ending(state: State, point: Place) -> None:
-            path, exists = connect(self.rays, self.inputs, state, point, state["here"])
+            path, exists = connect(self.rays, inputs, state, point, state["here"])
             last = exists & (state["number"] == state["last"])
             state["amount"] = dr.select(last, path.power, state["amount"])
             state["so_far"] = dr.select(last, 2 * path.range, state["so_far"])
@@ -231,7 +234,8 @@ def connect(
     u, v = found.seen.x, found.seen.y
     if receiver is not True:
         u, v = dr.select(receiver, u, state["u"]), dr.select(receiver, v, state["v"])
-    power = state["throughput"] * found.factor
+    bounces = state["number"] + state.get("earlier", 0)
+    power = state["throughput"] * found.factor * inputs.coupled(bounces)
     exists = state["active"] & (power != 0) & (state["number"] >= least)
     one, none = mi.Float(1.0), mi.Float(0.0)
     transmittance, extra = state.get("transmittance", one), state.get("extra", none)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import torch
 
+from invertwin.channel.coupling import coupled_power
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.power.trace import Trace
 from invertwin.channel.power.walk import Records
@@ -56,13 +57,15 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
             )
         parts = [paths for records in trace.records() for paths in _walked(trace, records)]
         if boundary and simple and edges:
-            parts += boundary_rows(trace.rays, edges, seed, lambda *found: _row(geometry, *found))
+            parts += boundary_rows(
+                trace.rays, edges, seed, lambda *found: _row(geometry, link, *found)
+            )
         return joined(parts)
 
 
-def _row(geometry: Geometry, edge: ShadowEdge, echo: Echo) -> Paths:
+def _row(geometry: Geometry, link: Link, edge: ShadowEdge, echo: Echo) -> Paths:
     """Boundary paths: no power, but a derivative."""
-    amount = echo.power * edge.speed
+    amount = echo.power * coupled_power(link, echo.depolarisation) * edge.speed
     velocity = geometry.velocity(edge.face, edge.b1, edge.b2)
     return echo.paths(
         "power",
@@ -85,4 +88,5 @@ def _walked(trace: Trace, records: Records) -> Iterator[Paths]:
         paths = SurfacePaths(*places, weight, torch.zeros_like(weight))
         found = path_view(trace.rays, to_torch(records.frame).long()[lit], paths)
         power = weight * found.power / found.arriving.detach().clamp_min(1e-300)
+        power = power * coupled_power(trace.rays.link, found.depolarisation)
         yield found.paths("power", power=power, velocity=paths.velocity(trace.rays.geometry))

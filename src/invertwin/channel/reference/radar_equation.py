@@ -91,6 +91,7 @@ class Echo:
         arriving: The same at the last point, before it scatters.
         spread: Gains and 1/R² alone: the power without scattering, over (λ/4π)².
         length: Length from antenna to antenna [m].
+        depolarisation: Share of the power that changes its polarisation, at every point.
     """
 
     frame: Int64[Tensor, " n"]
@@ -99,6 +100,7 @@ class Echo:
     arriving: Float64[Tensor, " n"]
     spread: Float64[Tensor, " n"]
     length: Float64[Tensor, " n"]
+    depolarisation: Sequence[Float64[Tensor, " n"]]
 
     def paths(
         self,
@@ -106,13 +108,14 @@ class Echo:
         *,
         power: Float64[Tensor, " n"] | None = None,
         coefficient: Complex128[Tensor, " n"] | None = None,
+        matrix: Complex128[Tensor, "n r t"] | None = None,
         boundary: bool = False,
         velocity: Float64[Tensor, "n 3"] | None = None,
     ) -> Paths:
         """Paths of one kind, see ``Paths``; power or coefficient that are not given are zero.
 
         Args:
-            kind, power, coefficient, velocity: What ``Paths`` holds.
+            kind, power, coefficient, matrix, velocity: What ``Paths`` holds.
             boundary: Whether all of them are boundary paths.
         """
         zero = torch.zeros(len(self.frame), dtype=torch.float64)
@@ -126,6 +129,7 @@ class Echo:
             kind=kind,
             boundary=torch.full((len(self.frame),), boundary),
             velocity=velocity,
+            matrix=matrix,
         )
 
 
@@ -162,40 +166,17 @@ def radar_equation(
         for point, back, on in zip(places, ways, ways[1:], strict=False)
     )
     arriving = math.prod(earlier, start=(link.wavelength / (4 * torch.pi)) ** 2 * spread)
-    return Echo(frame, places, arriving * last * ending, arriving, spread * ending, length)
-
-
-def mirror_field(link: Link, echo: Echo) -> Complex128[Tensor, " n"]:
-    """Field coefficient per m² of a perfect conductor by physical optics; Jacobians included.
-
-    ``a = (λ/4π) S / (R_t R_r)`` with ``S = −(jk/2π) ∫ (n·d)₊ V dA`` (derivations §4); for separate
-    antennas ``n·d`` is the mean of both cosines, which keeps reciprocity.
-    Differs from the source: the paper gives no field of a surface.
-
-    Args:
-        link: Antennas.
-        echo: The radar equation of single points.
-    """
-    (point,) = echo.places
-    cosines = [
-        (point.normal * normalize(antenna[echo.frame] - point.position, dim=1)).sum(1)
-        for antenna in (link.tx, link.rx)
+    turned = [
+        _depolarisation(geometry, point, -back, on)
+        for point, back, on in zip(places, ways, ways[1:], strict=False)
     ]
-    return conductor_field(echo.spread, *cosines) * point.jacobian
+    return Echo(frame, places, arriving * last * ending, arriving, spread * ending, length, turned)
 
 
-def conductor_field(
-    spread: Float64[Tensor, " n"], incoming: Float64[Tensor, " n"], outgoing: Float64[Tensor, " n"]
-) -> Complex128[Tensor, " n"]:
-    """Field coefficient per m² of a lit conductor: ``−(j/4π) √spread (cosθ + cosθ')/2``.
-
-    Args:
-        spread: gains and 1/R² of both ways, without scattering.
-        incoming, outgoing: cosines to where the wave comes from and goes to; zero where they
-            are on different sides.
-    """
-    lit = (incoming * outgoing > 0).to(spread)
-    return -1j / (4 * torch.pi) * (spread.sqrt() * lit * 0.5 * (incoming + outgoing).abs())
+def _depolarisation(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Tensor:
+    """χ of what is scattered; what passes through a skin keeps its polarisation."""
+    back, on = ((point.normal * way).sum(1) for way in (back, on))
+    return torch.where(back * on > 0, geometry.surfaces.depolarisation[point.row], 0.0)
 
 
 def _scattered(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Tensor:

@@ -31,7 +31,6 @@ from invertwin.scene.material.roughness import (
     ROUGH_LOBE_WIDTH,
     ROUGH_SCATTERING,
     EffectiveRoughness,
-    Weights,
     lobe_exponent,
     specular_weights,
 )
@@ -181,7 +180,7 @@ class RoughConductor(_Values, EffectiveRoughness, Material):
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-        return Surface(_MIRROR, *self.weights())
+        return Surface(_MIRROR, *self.weights(), **self.turned)
 
     def skin(self, frequency: float) -> Skin | None:
         """What the surface does to fields at `frequency` [Hz]."""
@@ -199,16 +198,20 @@ class RoughDielectric(Medium, Material):
             into the lobe.
         lobe_width: full width at half maximum of the lobe around the mirror direction [rad],
             in [3.4e-4, π].
+        depolarisation: share of the scattered power that goes from V to H and from H to V, in
+            [0, 1/4]; 1/4 is a cloud of thin wires.
     """
 
     diffuse: Value = 1.0
     lobe_width: Annotated[Value, RADIANS] = ROUGH_LOBE_WIDTH
+    depolarisation: Value = 0.0
 
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
         weights = specular_weights(evaluated(self.diffuse), lobe_exponent(self.lobe_width))
-        return Surface(fresnel_amplitude(epsilon[..., None], _COSINES), *weights)
+        amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
+        return Surface(amplitude, *weights, depolarisation=evaluated(self.depolarisation))
 
 
 @dataclass(frozen=True)
@@ -225,7 +228,8 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     def surface(self, frequency: float) -> Surface:
         """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
-        return Surface(fresnel_amplitude(epsilon[..., None], _COSINES), *self.weights())
+        amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
+        return Surface(amplitude, *self.weights(), **self.turned)
 
     def skin(self, frequency: float) -> Skin | None:
         """What the surface does to fields at `frequency` [Hz]."""
@@ -253,6 +257,7 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
             refraction=fresnel_transmittance(epsilon[..., None], _COSINES),
             index=refractive_index(epsilon),
             attenuation=attenuation(epsilon, frequency),
+            **self.turned,
         )
 
     def skin(self, frequency: float) -> Skin | None:
@@ -293,7 +298,7 @@ class Slab(Layer, EffectiveRoughness, Material):
 
     def surface(self, frequency: float) -> Surface:
         """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
-        return _slab_surface([self], self.weights(), frequency)
+        return _slab_surface([self], self, frequency)
 
     def skin(self, frequency: float) -> Skin | None:
         """What the sheet does to fields at `frequency` [Hz]."""
@@ -334,7 +339,7 @@ class Multilayer(_Values, EffectiveRoughness, Material):
 
     def surface(self, frequency: float) -> Surface:
         """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
-        return _slab_surface(self.layers, self.weights(), frequency)
+        return _slab_surface(self.layers, self, frequency)
 
     def coefficients(
         self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
@@ -355,10 +360,12 @@ def _of_triangles(sheet: Sheet, triangle: Tensor) -> Sheet:
     return Sheet(*(value[triangle] if value.ndim else value for value in values))
 
 
-def _slab_surface(layers: Sequence[Layer], weights: Weights, frequency: float) -> Surface:
+def _slab_surface(
+    layers: Sequence[Layer], roughness: EffectiveRoughness, frequency: float
+) -> Surface:
     tables = slab_tables([layer.sheet(frequency) for layer in layers], _COSINES, frequency)
     # The root's derivative is infinite at zero, where the amplitude has none.
     seen = tables.reflectance > _SAFE_POWER
     amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
     through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}
-    return Surface(amplitude, *weights, **through)
+    return Surface(amplitude, *roughness.weights(), **through, **roughness.turned)

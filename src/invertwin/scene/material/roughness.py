@@ -104,6 +104,8 @@ class EffectiveRoughness:
         backscatter_exponent: α_i of the backscattering lobe.
         rms_height: of the roughness [m]: takes exp(−½(2kσ cosθ)²) off coherent fields (`skin`).
             Power maps do not see it.
+        depolarisation: share of the scattered power that goes from V to H and from H to V, in
+            [0, 1/4]; 1/4 is a cloud of thin wires. Coherent fields do not see it.
     """
 
     scattering: Value = 0.0
@@ -113,6 +115,7 @@ class EffectiveRoughness:
     directive_exponent: Value = 4.0
     backscatter_exponent: Value = 4.0
     rms_height: Value = 0.0
+    depolarisation: Value = 0.0
 
     def skin_of(self, permittivity: Tensor | None, thickness: Value = math.inf) -> Skin:
         """What the surface does to fields: the share 1 − S² of the power stays coherent.
@@ -123,6 +126,11 @@ class EffectiveRoughness:
         """
         coherent = (1 - evaluated(self.scattering) ** 2).sqrt()
         return Skin(permittivity, evaluated(thickness), coherent, evaluated(self.rms_height))
+
+    @property
+    def turned(self) -> dict[str, Tensor]:
+        """The part of a `Surface` that says what changes its polarisation."""
+        return {"depolarisation": evaluated(self.depolarisation)}
 
     def weights(self) -> Weights:
         """Weights and exponents of the Lambertian part and the three lobes."""

@@ -21,7 +21,7 @@ average and R exactly where both angles agree.
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -36,7 +36,7 @@ ANGLE_COUNT = 256
 """Nodes of the tables over the angle of incidence, at cosθ = linspace(0, 1, 256)."""
 LOBE_COUNT = 3
 """Lobes of a surface: specular, directive, backscattering."""
-_SCALARS = ("diffuse", "index", "attenuation")  # the other fields are tables
+_SCALARS = ("diffuse", "index", "attenuation", "depolarisation")  # the other fields are tables
 
 
 _NONE = torch.zeros(LOBE_COUNT, dtype=torch.float64)
@@ -66,6 +66,7 @@ class Surface:
             is not the skin of a refracting body.
         index: real refractive index of that body, else 1.
         attenuation: power attenuation in that body [1/m], else 0.
+        depolarisation: share of the scattered power that goes from V to H and from H to V.
     """
 
     amplitude: Float64[Tensor, "*#row 256"]
@@ -77,6 +78,7 @@ class Surface:
     refraction: Float64[Tensor, "*#row 256"] = _DARK
     index: Float64[Tensor, "*#row"] = _ONE
     attenuation: Float64[Tensor, "*#row"] = _ZERO
+    depolarisation: Float64[Tensor, "*#row"] = _ZERO
 
     def __post_init__(self) -> None:
         """Give all fields the same rows."""
@@ -87,6 +89,14 @@ class Surface:
         )
         for name, values in given.items():
             object.__setattr__(self, name, values.expand((*row, *widths[name])))
+
+    def scaled(self, share: Float64[Tensor, "*row"]) -> "Surface":
+        """The surface with this share of what it scatters.
+
+        Args:
+            share: of each row.
+        """
+        return replace(self, diffuse=self.diffuse * share, lobes=self.lobes * share[..., None])
 
 
 class Skin(NamedTuple):

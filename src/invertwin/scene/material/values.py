@@ -127,6 +127,7 @@ RANGES: Mapping[str, Range] = {
     "lambertian": Range("Lambertian share", 0.0, 1.0),
     "directive": Range("directive share", 0.0, 1.0),
     "directive_exponent": Range("exponent of the directive lobe", 0.0, 1e8),
+    "depolarisation": Range("depolarisation", 0.0, 0.25),
     "backscatter_exponent": Range("exponent of the backscattering lobe", 0.0, 1e8),
 }  # The kernel's float32 holds lobes down to an rms slope of 1e-4.
 """Every value of the library's materials by the name of its field."""

@@ -1,0 +1,269 @@
+"""Polarisation: Jones vectors over V and H, of waves and of antennas that send and receive them.
+
+V and H of a direction are unit vectors across it. About an axis, V lies in the plane of the axis
+and the direction, H across that plane: V is the field of a short dipole along the axis. A receiver
+takes p · E of a field E, without a conjugate, so that an antenna has one vector for both ways.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_tensor
+
+JONES: Mapping[str, tuple[complex, complex]] = MappingProxyType(
+    {"V": (1.0, 0.0), "H": (0.0, 1.0), "circular": (0.5**0.5, 0.5**0.5 * 1j)}
+)
+"""Jones vectors (V, H) by name; circular is right-hand for exp(+jωt)."""
+
+_LEVELS = "a polarisation as V, H, circular or two complex numbers (V, H)"
+_DETACHED = "polarisations cannot be fitted: detach them"
+
+
+def jones_basis(
+    polarisation: str | ArrayLike,
+) -> Complex128[Tensor, "2 2"]:
+    """The polarisation and the one orthogonal to it, of unit length, as columns over (V, H).
+
+    Args:
+        polarisation: a name of ``JONES``, or two complex numbers.
+
+    Raises:
+        InputError: another name, or no two numbers with a length.
+    """
+    if isinstance(polarisation, str):
+        if polarisation not in JONES:
+            raise InputError(f"expected {_LEVELS}, got {polarisation!r}; use one of them")
+        polarisation = JONES[polarisation]
+    try:
+        first = torch.as_tensor(polarisation, dtype=torch.complex128)
+        length = float(first.detach().norm())
+    except (TypeError, ValueError, RuntimeError):
+        length, first = 0.0, torch.zeros(0)
+    if first.shape != (2,) or not 0 < length < math.inf:
+        raise InputError(f"expected {_LEVELS}, got {polarisation!r}; give two, not both zero")
+    if first.requires_grad:
+        raise InputError(f"expected a polarisation without derivatives, got some; {_DETACHED}")
+    return torch.stack([first / length, orthogonal(first / length)], 1)
+
+
+def orthogonal(vector: Complex128[Tensor, "*row 2"]) -> Complex128[Tensor, "*row 2"]:
+    """The Jones vectors orthogonal to others, as long as they are.
+
+    Args:
+        vector: over (V, H).
+    """
+    first, second = vector.unbind(-1)
+    return torch.stack([-second.conj(), first.conj()], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class JonesTable:
+    """A measured or simulated polarisation over direction, bilinear between angles.
+
+    Only the direction of a vector counts: what an antenna sends and receives in all is its
+    pattern's gain. Beyond the last θ its vector holds.
+
+    Attributes:
+        theta: n ≥ 2 ascending angles to boresight [rad], from 0.
+        phi: m ascending angles around boresight [rad], spanning less than 2π; m = 1 for vectors
+            that do not depend on it.
+        vectors: over (V, H) of each direction, about the radar's y axis.
+
+    Raises:
+        InputError: wrong shapes, angles that do not ascend, a vector of no length, derivatives.
+    """
+
+    theta: Float64[Tensor, " n"]
+    phi: Float64[Tensor, " m"]
+    vectors: Complex128[Tensor, "n m 2"]
+
+    def __post_init__(self) -> None:
+        do = "give theta [n], phi [m] in rad and complex vectors [n, m, 2]"
+        theta = checked_tensor(self.theta, (None,), "angles theta of a polarisation", do)
+        phi = checked_tensor(self.phi, (None,), "angles phi of a polarisation", do)
+        vectors = torch.as_tensor(self.vectors, dtype=torch.complex128)
+        shape = (len(theta), len(phi), 2)
+        parts = checked_tensor(torch.view_as_real(vectors), (*shape, 2), "Jones vectors", do)
+        ascending = bool((theta.diff() > 0).all() & (phi.diff() > 0).all())
+        if not (ascending and len(theta) > 1 and len(phi) and theta[0] == 0):
+            raise InputError(f"expected ascending theta from 0 and phi, got others; {do}")
+        if phi[-1] - phi[0] >= 2 * math.pi - 1e-9:
+            raise InputError("expected phi spanning less than 2 pi rad, got more; leave out 2 pi")
+        if any(value.requires_grad for value in (theta, phi, parts)):
+            raise InputError(f"expected a polarisation without derivatives, got some; {_DETACHED}")
+        length = parts.flatten(-2).norm(dim=-1)
+        if not bool((length > 0).all()):
+            raise InputError(f"expected Jones vectors of some length, got zeros; {do}")
+        found = torch.view_as_complex(parts) / length[..., None]
+        for name, value in (("theta", theta), ("phi", phi), ("vectors", found)):
+            object.__setattr__(self, name, value)
+
+    def vector(self, direction: Float64[Tensor, "row 3"]) -> Complex128[Tensor, "row 2"]:
+        """Unit Jones vectors towards unit vectors in the radar frame.
+
+        Args:
+            direction: away from the antenna.
+        """
+        x, y, z = direction.unbind(-1)
+        # Neither the radius nor atan2 has a gradient on the axis itself; any φ serves there.
+        on_axis = (x == 0) & (y == 0)
+        radius = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, x**2 + y**2).sqrt())
+        row, up = _between(self.theta, torch.atan2(radius, z))
+        azimuth = torch.atan2(y, torch.where(on_axis, 1.0, x))
+        around = torch.cat([self.phi, self.phi[:1] + 2 * math.pi])
+        azimuth = self.phi[0] + (azimuth - self.phi[0]) % (2 * math.pi)
+        column, across = _between(around, azimuth)
+        after = (column + 1) % len(self.phi)
+        found = torch.zeros(len(direction), 2, dtype=torch.complex128)
+        for line, share in ((row, 1 - up), (row + 1, up)):
+            for place, part in ((column, 1 - across), (after, across)):
+                found = found + (share * part)[:, None] * self.vectors[line, place]
+        return found / torch.view_as_real(found).flatten(-2).norm(dim=-1).clamp_min(1e-9)[:, None]
+
+
+def _between(nodes: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+    """The node before each place, and how far on the way to the next it is."""
+    place = torch.minimum(place, nodes[-1])
+    low = torch.searchsorted(nodes, place.detach(), right=True).clamp(1, len(nodes) - 1) - 1
+    return low, (place - nodes[low]) / (nodes[low + 1] - nodes[low])
+
+
+@dataclass(frozen=True, eq=False)
+class Polarisation:
+    """What the elements of an array send and receive: mixtures of one or two Jones vectors.
+
+    Attributes:
+        base: the vectors [k, 2] over (V, H), or a table of the first; the second is orthogonal.
+        mixtures: share of each vector in every element; k = 1 where all elements are alike.
+    """
+
+    base: Complex128[Tensor, "k 2"] | JonesTable
+    mixtures: Complex128[Tensor, "element k"]
+
+    @staticmethod
+    def of(
+        polarisation: str | ArrayLike | JonesTable,
+        leakage: complex | ArrayLike,
+        elements: int,
+    ) -> "Polarisation":
+        """That of an array.
+
+        Args:
+            polarisation: a name of ``JONES``, a vector (V, H) for all elements or one for each, or
+                a table.
+            leakage: field of the orthogonal polarisation over that of the wanted one, of all
+                elements or of each.
+            elements: how many there are.
+
+        Raises:
+            InputError: another name, vectors of no length, or another number of them.
+        """
+        share = _leakage(leakage, elements)
+        if isinstance(polarisation, JonesTable):
+            if bool((share == share[0]).all()) and not share[0]:
+                return Polarisation(polarisation, share.new_ones(elements, 1))
+            return Polarisation(polarisation, _mixed(share))
+        vectors = _vectors(polarisation, elements)
+        if vectors is None:
+            basis = jones_basis(polarisation).T
+            mixtures = _mixed(share)
+        else:
+            basis = torch.eye(2, dtype=torch.complex128)
+            mixtures = (vectors + share[:, None] * orthogonal(vectors)) / _length(share)
+        if bool((mixtures == mixtures[0]).all()):
+            return Polarisation(mixtures[:1] @ basis, share.new_ones(elements, 1))
+        return Polarisation(basis, mixtures)
+
+    @property
+    def mean(self) -> Complex128[Tensor, " k"]:
+        """The mixture of the mean element."""
+        return self.mixtures.mean(0)
+
+    @property
+    def vectors(self) -> Complex128[Tensor, "element 2"]:
+        """The vectors of all elements; of a table none, see ``towards``.
+
+        Raises:
+            InputError: they depend on the direction.
+        """
+        if isinstance(self.base, JonesTable):
+            raise InputError(
+                "expected antennas of one Jones vector in all directions, got a table; power paths "
+                "and surrogates take a vector: give the one at boresight"
+            )
+        return self.mixtures @ self.base
+
+    def towards(self, direction: Float64[Tensor, "row 3"]) -> Complex128[Tensor, "#row k 2"]:
+        """The vectors that elements mix, one row where they are the same everywhere.
+
+        Args:
+            direction: unit vectors in the radar frame, away from the antenna.
+        """
+        if not isinstance(self.base, JonesTable):
+            return self.base[None]
+        first = self.base.vector(direction)
+        return torch.stack([first, orthogonal(first)], 1)[:, : self.mixtures.shape[1]]
+
+    def equals(self, other: "Polarisation") -> bool:
+        """Whether the mean elements of two arrays are alike, and all others like them.
+
+        Args:
+            other: that of another array.
+        """
+        if isinstance(self.base, JonesTable) or isinstance(other.base, JonesTable):
+            same = self.base is other.base
+        else:
+            same = torch.equal(self.base, other.base)
+        return same and self.mixtures.shape[1] == other.mixtures.shape[1] == 1
+
+
+def _leakage(value: complex | ArrayLike, elements: int) -> Tensor:
+    do = "give the field of the other polarisation over the wanted one, of all elements or of each"
+    try:
+        found = torch.as_tensor(value, dtype=torch.complex128)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"expected leakage as numbers, got {value!r}; {do}") from None
+    parts = torch.view_as_real(found)
+    if found.shape not in ((), (elements,)) or not bool(torch.isfinite(parts).all()):
+        raise InputError(
+            f"expected one finite leakage or {elements}, got shape {list(found.shape)}; {do}"
+        )
+    if found.requires_grad:
+        raise InputError(f"expected leakage without derivatives, got some; {_DETACHED}")
+    return found.expand(elements)
+
+
+def _vectors(polarisation: object, elements: int) -> Tensor | None:
+    """Unit vectors of the elements, where there is one for each."""
+    if isinstance(polarisation, str):
+        return None
+    try:
+        found = torch.as_tensor(polarisation, dtype=torch.complex128)
+    except (TypeError, ValueError, RuntimeError):
+        return None
+    if found.ndim != 2:
+        return None
+    if len(found) != elements:
+        raise InputError(
+            f"expected one Jones vector or {elements}, got {len(found)}; give one per element"
+        )
+    return torch.stack([jones_basis(vector)[:, 0] for vector in found])
+
+
+def _mixed(share: Tensor) -> Tensor:
+    return torch.stack([torch.ones_like(share), share], 1) / _length(share)
+
+
+def _length(share: Tensor) -> Tensor:
+    return (1 + share.abs() ** 2).sqrt()[:, None]
+
+
+VERTICAL = Polarisation.of("V", 0.0, 1)
+"""Of one element with V."""
