@@ -14,6 +14,7 @@ FOUNDATION = {
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "threads", "channel"}
 RADAR = CHANNEL - {"doctor", "threads"} | {"radar"}
+LINKS = CHANNEL - {"doctor", "threads"} | {"links"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
 SIGNATURES = CHANNEL | {"signatures"}
@@ -35,6 +36,7 @@ ALLOWED = {
     "scene": SCENE,
     "channel": CHANNEL,
     "radar": RADAR,
+    "links": LINKS,
     "simulation": SIMULATION,
     "signatures": SIGNATURES,
     "capture": CAPTURE,
@@ -45,7 +47,7 @@ ALLOWED = {
     "registry": FOUNDATION | {"registry"},
     "cli": INVERSION | SIGNATURES | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
-    "__init__": INVERSION | SIGNATURES | {"doctor", "threads"},
+    "__init__": INVERSION | LINKS | SIGNATURES | {"doctor", "threads"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}
 KNOW_THE_RAY_TRACER = {"channel"}

@@ -2,7 +2,8 @@
 
 Data flows one way. ``scene`` turns parameters θ (``scene/parameters.py``) into meshes, materials
 and antennas; ``channel`` traces them into paths; ``radar`` makes beat signals and spectra of paths,
-or their smooth mean, the surrogate; ``inversion`` compares spectra with a capture and moves θ.
+or their smooth mean, the surrogate; ``links`` makes responses of paths between antennas;
+``inversion`` compares spectra with a capture and moves θ.
 ``simulation.py`` is the way from scene to spectrum on one page. Beside it, ``capture`` holds
 measured data, ``plotting`` draws figures, ``registry`` says what run files may name and ``cli`` has
 the commands.
@@ -18,7 +19,7 @@ from invertwin import doctor, threads
 
 __version__ = "0.2.0"
 
-_ROOMS = ("capture", "channel", "inversion", "plotting", "radar", "scene")
+_ROOMS = ("capture", "channel", "inversion", "links", "plotting", "radar", "scene")
 
 # Name → module.
 _MENU = {
@@ -44,6 +45,7 @@ _MENU = {
     "search": "inversion.minima",
     "simulate": "simulation",
     "simulate_chirps": "simulation",
+    "trace_paths": "channel",
 }
 
 __all__ = ["__version__", *_MENU, *_ROOMS]  # pyright: ignore[reportUnsupportedDunderAll]

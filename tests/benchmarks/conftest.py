@@ -20,6 +20,7 @@ def script(name: str) -> Any:
 
 
 basin = script("basin")
+channels = script("channels")
 crash_safety = script("crash_safety")
 diffraction = script("diffraction")
 edges = script("edges")

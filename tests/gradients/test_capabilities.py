@@ -15,7 +15,15 @@ from torch.func import functional_call
 
 from invertwin.capture import Capture
 from invertwin.capture.track import Track
-from invertwin.channel import Link, Paths, Sampling, deposit_power, trace_chains, trace_field
+from invertwin.channel import (
+    Link,
+    Paths,
+    Sampling,
+    deposit_power,
+    trace_chains,
+    trace_field,
+    trace_paths,
+)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check, gradcheck
@@ -55,6 +63,7 @@ MECHANISMS = {
     "coherent field": "coherent",
     "rough field": "rough",
     "signature": "signature",
+    "paths between antennas": "antennas",
     "chains": "chains",
 }
 ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
@@ -319,6 +328,33 @@ def signature_case(parameter: str) -> Found:
     return Found(found, found, (up - down) / 2e-5, 0.0)
 
 
+def between(scene: Scene, place: Tensor) -> Tensor:
+    """Response and Doppler shifts between two antennas, which wall and occluder mirror."""
+    ends = place + float64([-0.07, 0.74, 0.19]), [-0.09, -0.46, 0.07]
+    paths = trace_paths(scene, *ends, 1e9, rays=4000)
+    assert len(paths) == 3  # the line of sight, and one mirror each
+    turn = torch.polar(torch.ones_like(paths.delay), -2e9 * math.pi * paths.delay)
+    field = (paths.coefficient * turn[:, None, None]).sum(0)
+    return torch.cat([torch.view_as_real(field).flatten(), paths.doppler])
+
+
+def antenna_case(parameter: str) -> Found:
+    """Differences are as smooth as the derivative, since no path appears or vanishes."""
+    wall = METAL if parameter in GEOMETRY else COATED
+    scene, radar = occluder(wall=wall, occluder=METAL), power_radar()
+
+    def value(theta: Tensor) -> Tensor:
+        if parameter == "object velocity":
+            speed = theta * float64([0.3, 0.2, 1.0])
+            return between(scene.replace("wall", velocity=speed), radar.positions[0])
+        changed = MOVES[parameter](scene, radar, theta)
+        return between(changed[0], changed[1].positions[0])
+
+    up, down = (value(torch.tensor(sign * 1e-5).double()) for sign in (1, -1))
+    found = pushed(value)
+    return Found(found, found, (up - down) / 2e-5, 0.0)
+
+
 def chain_case(parameter: str) -> Found:
     """Chains between two plates, one of which hides the other; no random numbers."""
     scene, radar, moves = occluder(wall=METAL, occluder=METAL), field_radar(0.3), MOVES[parameter]
@@ -342,6 +378,8 @@ def case(parameter: str, mechanism: str) -> Found:
         return rough_case(parameter)
     if mechanism == "signature":
         return signature_case(parameter)
+    if mechanism == "antennas":
+        return antenna_case(parameter)
     if mechanism == "chains":
         return chain_case(parameter)
     if parameter not in _power:
@@ -396,6 +434,9 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     """Use a scene and a radar as the mechanism does."""
     if mechanism == "signature":
         section(scene)
+        return
+    if mechanism == "antennas":
+        between(scene, radar.positions[0])
         return
     if mechanism == "chains":
         exact_spectrum(

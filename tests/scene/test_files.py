@@ -18,6 +18,7 @@ from invertwin.scene import (
     PerfectConductor,
     RoughDielectric,
     Scene,
+    Slab,
     box,
     load_mesh,
     load_parts,
@@ -26,6 +27,7 @@ from invertwin.scene import (
     rigid,
     rotation_from_vector,
     save_mesh,
+    save_scene_xml,
     sphere,
     text,
 )
@@ -345,6 +347,85 @@ def test_misspelled_material_is_refused(tmp_path):
     path = write_scene(tmp_path)
     with pytest.raises(InputError, match=r"\(mat-itu_concrete, mat-itu_metal\), got itu_metal"):
         load_scene_xml(path, {"itu_metal": PerfectConductor()})
+
+
+RADIO = """<scene version="2.1.0">
+  <bsdf type="itu-radio-material" id="walls">
+    <string name="type" value="glass"/><float name="thickness" value="0.01"/>
+  </bsdf>
+  <bsdf type="radio-material" id="own">
+    <float name="relative_permittivity" value="3.5"/><float name="conductivity" value="0.1"/>
+    <float name="scattering_coefficient" value="0.3"/>
+  </bsdf>
+  <shape type="cube" id="a"><ref id="walls" name="bsdf"/></shape>
+  <shape type="cube" id="b"><ref id="own" name="bsdf"/></shape>
+</scene>"""
+
+
+def test_radio_materials_are_sheets(tmp_path):
+    path = tmp_path / "radio.xml"
+    path.write_text(RADIO)
+    scene = load_scene_xml(path)
+    assert scene["a"].material == Slab.itu("glass", thickness=0.01)
+    assert scene["b"].material == Slab(3.5, 0.1, thickness=0.1, scattering=0.3)
+    metal = PerfectConductor()
+    assert load_scene_xml(path, {"own": metal})["b"].material is metal
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("glass", "glas", "material 'walls': .*did you mean glass"),
+        ('value="3.5"', 'value="much"', "material 'own': expected relative permittivity"),
+        ('value="0.3"', 'value="3"', "material 'own': expected scattering coefficient"),
+    ],
+)
+def test_bad_radio_materials_are_refused_in_one_line(tmp_path, old, new, message):
+    path = tmp_path / "radio.xml"
+    path.write_text(RADIO.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        load_scene_xml(path)
+
+
+def test_written_scenes_are_read_again(tmp_path):
+    glass, own = Slab.itu("glass", thickness=0.01), Slab(3.5, 0.1, thickness=0.2, scattering=0.3)
+    turned = rigid(rotation_from_vector(torch.tensor([0.1, 0.2, 0.3]).double()))
+    scene = Scene(
+        {
+            "pane": Object(box(0.3), glass, turned),
+            "other pane": Object(box(0.4), glass),
+            "wall": Object(box(0.5), own),
+            "car": Object(box(0.6), PerfectConductor()),
+        }
+    )
+    save_scene_xml(tmp_path / "scene.xml", scene)
+    again = load_scene_xml(tmp_path / "scene.xml")
+    assert again.names == scene.names
+    assert [again[name].material for name in again.names] == [
+        glass,
+        glass,
+        own,
+        Slab.itu("metal", thickness=0.1, scattering=0.0),
+    ]
+    for name in scene.names:
+        torch.testing.assert_close(again[name].vertices, scene[name].vertices, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "material",
+    [
+        RoughDielectric(4.0),
+        Slab([3.0] * 12, thickness=0.1),
+        Slab(3.0, thickness=0.1, loss_tangent=0.1),
+    ],
+)
+def test_what_sionna_has_no_words_for_is_not_written(tmp_path, material):
+    scene = Scene({"thing": Object(box(0.3), material)})
+    with pytest.raises(InputError, match="expected a Slab of single numbers"):
+        save_scene_xml(tmp_path / "scene.xml", scene)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match=r"ending in \.xml"):
+        save_scene_xml(tmp_path / "scene.txt", scene)
 
 
 def test_missing_scene_file_is_refused(tmp_path):

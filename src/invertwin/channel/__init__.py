@@ -5,12 +5,16 @@ from invertwin.channel.field.field import trace_field as trace_field
 from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle
 from invertwin.channel.field.speckle import draw_speckle as draw_speckle
+from invertwin.channel.field.specular import trace_paths as trace_paths
+from invertwin.channel.field.waves import polarisations as polarisations
 from invertwin.channel.paths import Grid as Grid
 from invertwin.channel.paths import Link as Link
 from invertwin.channel.paths import Paths as Paths
 from invertwin.channel.paths import Pattern as Pattern
 from invertwin.channel.power.clouds import deposit_density as deposit_density
 from invertwin.channel.power.deposit import deposit_power as deposit_power
+from invertwin.channel.ray_paths import KINDS as KINDS
+from invertwin.channel.ray_paths import RayPaths as RayPaths
 from invertwin.channel.rays.backend import alone as alone
 from invertwin.channel.rays.backend import backend as backend
 from invertwin.channel.rays.backend import torch_threads as torch_threads

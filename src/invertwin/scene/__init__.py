@@ -12,6 +12,7 @@ from invertwin.scene.files import load_mesh as load_mesh
 from invertwin.scene.files import load_parts as load_parts
 from invertwin.scene.files import load_scene_xml as load_scene_xml
 from invertwin.scene.files import save_mesh as save_mesh
+from invertwin.scene.files import save_scene_xml as save_scene_xml
 from invertwin.scene.geometry.anny_body import load_anny as load_anny
 from invertwin.scene.geometry.body import BodyTemplate as BodyTemplate
 from invertwin.scene.geometry.body import SkinnedBody as SkinnedBody

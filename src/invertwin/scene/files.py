@@ -21,6 +21,7 @@ from invertwin.scene.checks import checked_tensor
 from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.radio_materials import radio_bsdf, stated_material
 from invertwin.scene.scene import Object, Scene
 from invertwin.untrusted import existing_file, reader, reading
 
@@ -163,11 +164,13 @@ def load_scene_xml(
     """Read the geometry of a Mitsuba or Sionna scene file.
 
     Shapes of type obj, ply, rectangle, cube and sphere become objects in world coordinates, named
-    by their id (or their type and number). Sensors, emitters and appearance are ignored.
+    by their id (or their type and number). The radio materials of Sionna RT become sheets (`Slab`);
+    sensors, emitters and appearance are ignored.
 
     Args:
         path: the XML file; the mesh files it names are relative to it.
-        materials: material for each material id the shapes refer to, e.g. "mat-itu_concrete".
+        materials: material for each material id the shapes refer to, e.g. "mat-itu_concrete";
+            these take precedence over what the file states.
         default: material of all other shapes.
 
     Raises:
@@ -181,6 +184,46 @@ def load_scene_xml(
         return _scene_of(root, file.parent, dict(materials or {}), default)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
+
+
+def save_scene_xml(path: str | Path, scene: Scene) -> None:
+    """Write a scene for Sionna RT: an XML file, and a PLY mesh for each object beside it.
+
+    Meshes go into the folder `meshes` where the file is. Materials are `Slab` or
+    `PerfectConductor`; velocities are left out.
+
+    Args:
+        path: the file, ending in .xml, in an existing folder.
+        scene: what to write.
+
+    Raises:
+        InputError: another suffix, no such folder, or a material that Sionna RT does not have.
+        OSError: the file system refuses the write.
+    """
+    file = Path(path)
+    if file.suffix.lower() != ".xml":
+        raise InputError(f"expected a file name ending in .xml, got {file.name}; rename the output")
+    root = ElementTree.Element("scene", version="2.1.0")
+    names: dict[int, str] = {}
+    shapes = []
+    for number, (name, item) in enumerate(scene.objects.items()):
+        if id(item.material) not in names:
+            names[id(item.material)] = f"material-{len(names)}"
+            root.append(radio_bsdf(item.material, names[id(item.material)]))
+        shape = ElementTree.Element("shape", type="ply", id=name)
+        mesh = f"meshes/{number}.ply"
+        ElementTree.SubElement(shape, "string", name="filename", value=mesh)
+        ElementTree.SubElement(shape, "boolean", name="face_normals", value="true")
+        ElementTree.SubElement(shape, "ref", id=names[id(item.material)], name="bsdf")
+        shapes.append(shape)
+    root.extend(shapes)
+    ElementTree.indent(root)
+    with replacing(file) as part:
+        (file.parent / "meshes").mkdir(exist_ok=True)
+        for number, item in enumerate(scene.objects.values()):
+            mesh = Mesh(item.vertices, item.mesh.faces)
+            save_mesh(file.parent / "meshes" / f"{number}.ply", mesh)
+        part.write_bytes(ElementTree.tostring(root))
 
 
 def _scene_in(path: Path) -> trimesh.Scene:
@@ -270,6 +313,7 @@ def _scene_of(
         )
     objects: dict[str, Object] = {}
     referred = set()
+    known = _stated_materials(root) | materials
     for number, element in enumerate(root.findall("shape")):
         name = element.get("id") or f"{element.get('type')}_{number}"
         if name in objects:
@@ -280,15 +324,28 @@ def _scene_of(
             mesh = _shape(element, folder)
         except InputError as error:
             raise InputError(f"shape {name!r}: {error}") from None
-        objects[name] = Object(mesh, materials.get(material, default))
+        objects[name] = Object(mesh, known.get(material, default))
     unused = sorted(set(materials) - referred)
     if unused:
-        known = ", ".join(sorted(referred - {""})) or "none"
+        listed = ", ".join(sorted(referred - {""})) or "none"
         raise InputError(
-            f"expected material ids that shapes refer to ({known}), got {', '.join(unused)}; "
+            f"expected material ids that shapes refer to ({listed}), got {', '.join(unused)}; "
             "correct the names in `materials`"
         )
     return Scene(objects)
+
+
+def _stated_materials(root: ElementTree.Element) -> dict[str, Material]:
+    found: dict[str, Material] = {}
+    for element in root.iter("bsdf"):
+        name = element.get("id", "")
+        try:
+            material = stated_material(element)
+        except InputError as error:
+            raise InputError(f"material {name!r}: {error}") from None
+        if material is not None:
+            found[name] = material
+    return found
 
 
 def _material_id(shape: ElementTree.Element) -> str:
@@ -299,7 +356,9 @@ def _material_id(shape: ElementTree.Element) -> str:
 def _shape(element: ElementTree.Element, folder: Path) -> Mesh:
     kind = element.get("type")
     if kind in ("obj", "ply"):
-        mesh = load_mesh(folder / _property(element, "string", "filename", ""))
+        with warnings.catch_warnings():  # scene files are in metres, however large
+            warnings.simplefilter("ignore", PhysicsWarning)
+            mesh = load_mesh(folder / _property(element, "string", "filename", ""))
     elif kind == "rectangle":
         facing_back = shapes.plate(2.0, 2.0)
         mesh = Mesh(facing_back.vertices, facing_back.faces.flip(1))

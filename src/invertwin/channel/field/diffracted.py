@@ -165,9 +165,14 @@ def _once(
         sees = _sees(around, tx[some]) & _sees(around, rx[some])
         link, row = torch.nonzero(sees).T
         link = some[link]
-        if len(link):
-            sent = over_edges([around.edge(row)], tx[link], rx[link], wave_number)
-            yield from _seen(around, wave_number, link, row[:, None], (tx, rx), sent)
+        if not len(link):
+            continue
+
+        def send(chosen: Tensor, link: Tensor = link, row: Tensor = row) -> EdgePaths:
+            ends = tx[link[chosen]], rx[link[chosen]]
+            return over_edges([around.edge(row[chosen])], *ends, wave_number)
+
+        yield from _seen(around, wave_number, link, row[:, None], (tx, rx), send)
 
 
 def _twice(
@@ -183,17 +188,26 @@ def _twice(
             continue
         opening = around.wedges.opening[row]
         angles = torch.where(face < 0, torch.nan, face * opening * torch.pi)
-        edges = [
-            around.edge(row[:, 0], (None, angles[:, 0])),
-            around.edge(row[:, 1], (angles[:, 1], None)),
-        ]
-        sent = over_edges(edges, tx[link], rx[link], wave_number)
-        # Where no face lies between two edges, each must see the other's point.
-        apart = face[:, 0] < 0
-        for one, other in ((0, 1), (1, 0)):
-            outside = exterior(edges[one].wedges, sent.points[:, other])
-            sent = replace(sent, stationary=sent.stationary & (outside | ~apart))
-        yield from _seen(around, wave_number, link, row, (tx, rx), sent)
+
+        def send(
+            chosen: Tensor,
+            link: Tensor = link,
+            row: Tensor = row,
+            angles: Tensor = angles,
+            apart: Tensor = face[:, 0] < 0,
+        ) -> EdgePaths:
+            edges = [
+                around.edge(row[chosen, 0], (None, angles[chosen, 0])),
+                around.edge(row[chosen, 1], (angles[chosen, 1], None)),
+            ]
+            sent = over_edges(edges, tx[link[chosen]], rx[link[chosen]], wave_number)
+            # Where no face lies between two edges, each must see the other's point.
+            for one, other in ((0, 1), (1, 0)):
+                outside = exterior(edges[one].wedges, sent.points[:, other])
+                sent = replace(sent, stationary=sent.stationary & (outside | ~apart[chosen]))
+            return sent
+
+        yield from _seen(around, wave_number, link, row, (tx, rx), send)
 
 
 def _sees(around: EdgedScene, places: Tensor) -> Bool[Tensor, "place edge"]:
@@ -241,10 +255,16 @@ def _seen(
     link: Tensor,
     edge: Tensor,
     ends: tuple[Tensor, Tensor],
-    sent: EdgePaths,
+    send: Callable[[Tensor], EdgePaths],
 ) -> Iterator[DiffractedPaths]:
-    """The paths between whose points nothing lies."""
+    """The paths between whose points nothing lies.
+
+    They are computed again for these rows alone: others may be singular, and would spoil
+    derivatives.
+    """
     tx, rx = ends
+    with torch.no_grad():
+        sent = send(torch.arange(len(link)))
     wedges = [around.wedges.rows(column) for column in edge.T]
     places = [on_edge(at, sent.points[:, number]) for number, at in enumerate(wedges)]
     aside = [
@@ -258,13 +278,16 @@ def _seen(
         clear[rows] = visible(around.occluders, start[rows], end[rows])
     rows = torch.nonzero(clear)[:, 0]
     if len(rows):
-        points = torch.stack(places, 1)[rows]
+        sent = send(rows)
+        wedges = [around.wedges.rows(column) for column in edge[rows].T]
+        places = [on_edge(at, sent.points[:, number]) for number, at in enumerate(wedges)]
+        points = torch.stack(places, 1)
         stops = torch.cat([tx[link[rows], None], points, rx[link[rows], None]], 1)
         length = (stops[:, 1:] - stops[:, :-1]).norm(dim=2).sum(1)
         # What the end of an edge sends has the delay of the path over that end.
-        later = wave_number * (length - sent.length[rows])
+        later = wave_number * (length - sent.length)
         turn = torch.polar(torch.ones_like(later), later)[:, None, None]
-        yield DiffractedPaths(link[rows], edge[rows], points, length, sent.transfer[rows] * turn)
+        yield DiffractedPaths(link[rows], edge[rows], points, length, sent.transfer * turn)
 
 
 def on_edge(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:

@@ -27,6 +27,12 @@ class FieldCoefficients(NamedTuple):
     transmission_s: Complex128[Tensor, "*angle"]
     transmission_p: Complex128[Tensor, "*angle"]
 
+    def mirroring(self, share: Float64[Tensor, "*#angle"]) -> "FieldCoefficients":
+        """The same with a share of the reflected field."""
+        return self._replace(
+            reflection_s=share * self.reflection_s, reflection_p=share * self.reflection_p
+        )
+
 
 def complex_permittivity(
     permittivity: Value, conductivity: Value, frequency: float, loss_tangent: Value = 0.0

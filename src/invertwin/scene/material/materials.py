@@ -11,13 +11,14 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 import torch
 from annotated_types import MinLen
-from jaxtyping import Shaped
+from jaxtyping import Float64, Int64, Shaped
 from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS
 from invertwin.scene.checks import checked_number
 from invertwin.scene.material.fresnel import (
+    FieldCoefficients,
     attenuation,
     complex_permittivity,
     fresnel_amplitude,
@@ -33,7 +34,7 @@ from invertwin.scene.material.roughness import (
     lobe_exponent,
     specular_weights,
 )
-from invertwin.scene.material.slab import Sheet, slab_tables
+from invertwin.scene.material.slab import Sheet, sheet_coefficients, slab_tables
 from invertwin.scene.material.surface import ANGLE_COUNT, Material, Skin, Surface
 from invertwin.scene.material.values import RANGES, Value, checked_value, evaluated, row_count
 
@@ -340,9 +341,23 @@ class Multilayer(_Values, EffectiveRoughness, Material):
         """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
         return _slab_surface(self.layers, self, frequency)
 
+    def coefficients(
+        self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
+    ) -> FieldCoefficients:
+        """Coherent fields that the stack reflects and lets through, about its middle."""
+        layers = [_of_triangles(layer.sheet(frequency), triangle) for layer in self.layers]
+        kept = self.skin_of(None).rows(triangle).kept(frequency, cosine)
+        return sheet_coefficients(layers, cosine, frequency).mirroring(kept)
+
 
 def _value_names(holder: object) -> list[str]:
     return [entry.name for entry in fields(holder) if entry.name in RANGES]  # type: ignore[arg-type]
+
+
+def _of_triangles(sheet: Sheet, triangle: Tensor) -> Sheet:
+    """A layer with one value per row of triangles."""
+    values = (value[..., 0] for value in sheet)
+    return Sheet(*(value[triangle] if value.ndim else value for value in values))
 
 
 def _slab_surface(

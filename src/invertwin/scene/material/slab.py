@@ -89,6 +89,32 @@ def slab_coefficients(
     return FieldCoefficients(s.reflection, p.reflection, s.transmission, p.transmission)
 
 
+def sheet_coefficients(
+    layers: Sequence[Sheet], cos_theta: Float64[Tensor, "*angle"], frequency: float
+) -> FieldCoefficients:
+    """Coefficients of a stack for rays that take its mesh for a sheet without thickness.
+
+    The mesh is the middle of the stack, and the length of a ray is that of the straight line
+    through air. The stack begins d/2 before the mesh, so that both coefficients of
+    ``slab_coefficients`` gain the factor exp(+jkd cosθ).
+
+    Args:
+        layers: the layers in the order in which the wave meets them.
+        cos_theta: cosine of the angle of incidence, in [0, 1].
+        frequency: [Hz].
+
+    Raises:
+        InputError: no layers.
+
+    Source: derivations §10.
+    """
+    faces = slab_coefficients(layers, cos_theta, frequency)
+    wave_number = 2 * math.pi * frequency / SPEED_OF_LIGHT
+    through_air = wave_number * sum(layer.thickness for layer in layers) * cos_theta
+    turn = torch.polar(torch.ones_like(through_air), through_air)
+    return FieldCoefficients(*(turn * value for value in faces))
+
+
 def slab_tables(
     layers: Sequence[Sheet], cos_theta: Float64[Tensor, "*angle"], frequency: float
 ) -> SlabTables:

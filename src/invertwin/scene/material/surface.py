@@ -19,13 +19,18 @@ mean plane enters as sqrt(R(θi) R(θo)), which keeps reciprocity, so that a sur
 average and R exactly where both angles agree.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
+
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
+from invertwin.scene.material.slab import Sheet, sheet_coefficients
 
 ANGLE_COUNT = 256
 """Nodes of the tables over the angle of incidence, at cosθ = linspace(0, 1, 256)."""
@@ -109,6 +114,23 @@ class Skin(NamedTuple):
     coherent: Tensor
     rms_height: Tensor
 
+    def rows(self, triangle: Int64[Tensor, " n"]) -> "Skin":
+        """The values of some triangles; values for all triangles stay."""
+        epsilon, *others = (
+            value if value is None or not value.ndim else value[triangle] for value in self
+        )
+        return Skin(epsilon, *others)  # type: ignore[arg-type]
+
+    def kept(self, frequency: float, cosine: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+        """Share of the mirrored field that stays coherent: roughness spreads phases by 2kσ cosθ.
+
+        Args:
+            frequency: [Hz].
+            cosine: of the angle of incidence.
+        """
+        k = 2 * math.pi * frequency / SPEED_OF_LIGHT
+        return self.coherent * torch.exp(-0.5 * (2 * k * self.rms_height * cosine) ** 2)
+
 
 class Material(ABC):
     """What an object's surface does to the waves.
@@ -130,6 +152,36 @@ class Material(ABC):
         A coherent material is a perfect conductor, unless it says otherwise.
         """
         return Skin(None, _INFINITE, _ONE, _ZERO) if self.coherent else None
+
+    def coefficients(
+        self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
+    ) -> FieldCoefficients:
+        """Coherent fields that the surface reflects and lets through, about the mesh.
+
+        A sheet is centred on its mesh, as in ``sheet_coefficients``; a body lets nothing through;
+        a surface that is only rough does neither.
+
+        Args:
+            frequency: [Hz].
+            cosine: of the angles of incidence, in [0, 1].
+            triangle: the triangle of the object's mesh that is met, for values per triangle.
+        """
+        skin = self.skin(frequency)
+        one = torch.ones_like(cosine).to(torch.complex128)
+        if skin is None:
+            return FieldCoefficients(0 * one, 0 * one, 0 * one, 0 * one)
+        skin = skin.rows(triangle)
+        kept = skin.kept(frequency, cosine)
+        if skin.permittivity is None:
+            return FieldCoefficients(-kept * one, kept * one, 0 * one, 0 * one)
+        if bool(torch.isfinite(skin.thickness).all()):
+            none = torch.zeros_like(skin.permittivity)  # dispersion, of which nothing here depends
+            sheet = Sheet(skin.permittivity, none, skin.thickness)
+            found = sheet_coefficients([sheet], cosine, frequency)
+        else:
+            half = fresnel_coefficients(skin.permittivity, cosine)
+            found = half._replace(transmission_s=0 * one, transmission_p=0 * one)
+        return found.mirroring(kept)
 
     @abstractmethod
     def surface(self, frequency: float) -> Surface:

@@ -1,0 +1,407 @@
+"""Specular paths by the method of images: which sequences of planes lead from antenna to antenna.
+
+The transmitter is mirrored at plane after plane. From the receiver, straight lines to these images
+cut the planes where the path meets them. A path exists if each such point lies on a triangle of its
+plane, and nothing lies between the points.
+
+Rays are float32, and may slip through where two triangles meet. So rays only choose: every segment
+is tried by four rays a little apart, and where they disagree, float64 decides over all triangles.
+
+Source: derivations §10.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invertwin.channel.field.planes import Planes, planes_of
+from invertwin.channel.field.waves import cross, dot, mirrored
+from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_index, to_torch
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import NEAR, Occluders
+from invertwin.channel.rays.topology import Topology
+
+_LANES = 1 << 19
+_PAIRS = 1 << 22  # segments × triangles of the exact test at a time
+_ASIDE = 4.0  # margins between the rays that try a segment
+_EXACT = 1e-9  # of the scene's size: float64 places closer than this are one
+
+
+class Walls(Occluders):
+    """What may be in the way between antennas, and the planes that mirror.
+
+    Args:
+        vertices: World positions, detached [m].
+        topology: Their triangles.
+        antennas: World positions [m].
+    """
+
+    def __init__(
+        self,
+        vertices: Float64[Tensor, "v 3"],
+        topology: Topology,
+        antennas: Float64[Tensor, "antenna 3"],
+    ) -> None:
+        ends = torch.cat([vertices, antennas])
+        super().__init__(vertices, topology, (ends.amax(0) + ends.amin(0)) / 2)
+        self.exact_vertices = vertices - self.origin
+        self.size = float((ends - self.origin).norm(dim=1).max())
+        self.margin = NEAR * self.size
+        self.planes: Planes = planes_of(self.exact_vertices, topology.faces)
+
+    @cached_property
+    def device_planes(self) -> dict[str, Any]:
+        """The planes, as flat arrays of the ray tracer."""
+        planes = self.planes
+        vectors = {
+            "point": planes.point,
+            "normal": planes.normal,
+            "first": planes.axes[:, 0],
+            "second": planes.axes[:, 1],
+        }
+        ends = {
+            "low0": planes.low[:, 0],
+            "low1": planes.low[:, 1],
+            "high0": planes.high[:, 0],
+            "high1": planes.high[:, 1],
+        }
+        tables = {name: to_double(value) for name, value in (vectors | ends).items()}
+        return tables | {"of_face": to_index(planes.face_plane.clamp_min(0))}
+
+
+@dataclass(frozen=True)
+class Chains:
+    """Specular paths of one number of steps, as triangles that they meet; detached.
+
+    Attributes:
+        source, target: Numbers of the antennas.
+        faces: Triangles, from the source on.
+        through: Whether the path goes through them instead of being mirrored.
+    """
+
+    source: Int64[Tensor, " path"]
+    target: Int64[Tensor, " path"]
+    faces: Int64[Tensor, "path step"]
+    through: Bool[Tensor, "path step"]
+
+    def reversed(self) -> "Chains":
+        """From target to source."""
+        return Chains(self.target, self.source, self.faces.flip(1), self.through.flip(1))
+
+
+def images(
+    place: Float64[Tensor, "row 3"],
+    point: Float64[Tensor, "row step 3"],
+    normal: Float64[Tensor, "row step 3"],
+    through: Bool[Tensor, "row step"],
+) -> list[Float64[Tensor, "row 3"]]:
+    """A place, and its images after each step.
+
+    Args:
+        place: Of the source.
+        point, normal: Of the planes.
+        through: Steps that leave the image where it is.
+    """
+    found = [place]
+    for step in range(point.shape[1]):
+        n, p = normal[:, step], point[:, step]
+        turned = p + mirrored(found[-1] - p, n)
+        found.append(torch.where(through[:, step, None], found[-1], turned))
+    return found
+
+
+def corners_of(
+    target: Float64[Tensor, "row 3"],
+    seen: list[Float64[Tensor, "row 3"]],
+    point: Float64[Tensor, "row step 3"],
+    normal: Float64[Tensor, "row step 3"],
+) -> list[Float64[Tensor, "row 3"]]:
+    """Where paths meet the planes, from the source on: back from the target to its images.
+
+    Args:
+        target: Places.
+        seen: From ``images``.
+        point, normal: Of the planes.
+    """
+    found: list[Tensor] = []
+    place = target
+    for step in reversed(range(point.shape[1])):
+        n, way = normal[:, step], seen[step + 1] - place
+        falls = dot(way, n)
+        share = dot(point[:, step] - place, n) / torch.where(
+            falls == 0, torch.ones_like(falls), falls
+        )
+        place = place + share[:, None] * way
+        found.insert(0, place)
+    return found
+
+
+def chains_between(
+    walls: Walls,
+    steps: Int64[Tensor, "sequence step"],
+    source: Float64[Tensor, "3"],
+    targets: Float64[Tensor, "target 3"],
+    number: int,
+) -> list[Chains]:
+    """The paths that follow given sequences from one source to all targets.
+
+    Args:
+        walls: The scene.
+        steps: Sequences, see ``sequences``.
+        source, targets: World positions [m].
+        number: Of the source.
+    """
+    found: list[Chains] = []
+    for some in steps.split(_LANES):
+        screen = _Screen(walls, some, source)
+        block = max(1, _LANES // len(some))
+        for begin in range(0, len(targets), block):
+            target, sequence = screen.passed(targets[begin : begin + block])
+            target = target + begin
+            chosen = some[sequence]
+            good, faces = _verified(walls, chosen, source, targets[target])
+            found.append(
+                Chains(
+                    torch.full((int(good.sum()),), number),
+                    target[good],
+                    faces[good],
+                    (chosen[good] & 1).bool(),
+                )
+            )
+    return found
+
+
+class _Screen:
+    """Tries all sequences from one source by one ray a segment, in kernels of many lanes."""
+
+    def __init__(self, walls: Walls, steps: Tensor, source: Tensor) -> None:
+        self.walls = walls
+        self.length = steps.shape[1]
+        self.count = len(steps)
+        planes = walls.planes
+        place = (source - walls.origin).expand(self.count, 3)
+        plane = steps >> 1
+        seen = images(place, planes.point[plane], planes.normal[plane], (steps & 1).bool())
+        self.images = to_double(torch.stack(seen, 1))
+        self.steps = to_index(steps) if self.length else None
+
+    def passed(self, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """Targets and sequences of what may be paths."""
+        lane = dr.arange(mi.UInt32, self.count * len(targets))
+        count = opaque(self.count)
+        target, row = lane // count, lane % count
+        places = to_double(targets - self.walls.origin)
+        end = dr.gather(mi.Vector3d, places, target)
+        ok, corners, planes, normals = self._corners(row, end)
+        good = to_torch(self._clear(row, ok, [*corners, end], planes, normals))
+        keep = torch.nonzero(good)[:, 0]
+        return keep // self.count, keep % self.count
+
+    def _corners(self, row: Any, end: Any) -> tuple[Any, list[Any], list[Any], list[Any]]:
+        """Where the lines to the images cut the planes, inside of their rectangles."""
+        walls, table = self.walls, self.walls.device_planes
+        near = opaque(_EXACT * walls.size, "Float64")
+        wide = opaque(walls.margin, "Float64")
+        ok, place = mi.Bool(True), end
+        corners, planes, normals = [], [], []
+        for step in reversed(range(self.length)):
+            code = dr.gather(mi.UInt32, self.steps, row * self.length + step)
+            plane, through = code >> 1, (code & 1) == 1
+            point = dr.gather(mi.Vector3d, table["point"], plane)
+            normal = dr.gather(mi.Vector3d, table["normal"], plane)
+            image = dr.gather(mi.Vector3d, self.images, row * (self.length + 1) + step + 1)
+            way = image - place
+            falls = dr.dot(way, normal)
+            ok &= falls != 0
+            share = dr.dot(point - place, normal) / dr.select(falls != 0, falls, 1.0)
+            reach = dr.norm(way)
+            along = share * reach
+            # A receiver on a mirror has a reflection; one on a sheet is not behind it.
+            ok &= along > dr.select(through, near, -near)
+            ok &= along < reach - near
+            place = place + share * way
+            for axis, bounds in (("first", "0"), ("second", "1")):
+                at = dr.dot(place - point, dr.gather(mi.Vector3d, table[axis], plane))
+                ok &= at >= dr.gather(mi.Float64, table["low" + bounds], plane) - wide
+                ok &= at <= dr.gather(mi.Float64, table["high" + bounds], plane) + wide
+            corners.insert(0, place)
+            planes.insert(0, plane)
+            normals.insert(0, normal)
+        return ok, corners, planes, normals
+
+    def _clear(
+        self, row: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
+    ) -> Any:
+        """Whether one ray a segment meets nothing, or what it should; seams let rays through."""
+        walls = self.walls
+        margin, scene = opaque(walls.margin, "Float64"), walls.scene
+        start = dr.gather(mi.Vector3d, self.images, row * (self.length + 1))
+        for step, end in enumerate(ends):
+            way = end - start
+            length = dr.norm(way)
+            unit = way / dr.maximum(length, 1e-300)
+            begin = start
+            if step:
+                normal = normals[step - 1]
+                begin = start + normal * dr.mulsign(margin, dr.dot(unit, normal))
+            last = step == self.length
+            over = -margin
+            if not last:
+                over = 2 * margin / dr.maximum(dr.abs(dr.dot(unit, normals[step])), 1e-3)
+            far = dr.maximum(length + over, 0.0)
+            ray = mi.Ray3f(mi.Point3f(begin), mi.Vector3f(unit), mi.Float(far), 0.0, [])
+            hit = scene.ray_intersect_preliminary(ray, active=ok)
+            valid = hit.is_valid() & ok
+            if last:
+                return ok & ~valid
+            plane = dr.gather(mi.UInt32, walls.device_planes["of_face"], hit.prim_index, valid)
+            ok &= ~valid | ((plane == planes[step]) & (hit.t > mi.Float(length - over)))
+            start = end
+        return ok
+
+
+@dataclass(frozen=True)
+class _Segments:
+    """Straight pieces of paths, one row each; planes are −1 at antennas.
+
+    Attributes:
+        start, end: [m].
+        plane_before, plane: Of the surfaces at start and end.
+    """
+
+    start: Tensor
+    end: Tensor
+    plane_before: Tensor
+    plane: Tensor
+
+
+def _verified(
+    walls: Walls, steps: Tensor, source: Tensor, targets: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Which paths there are, and the triangles that they meet."""
+    count, length = steps.shape
+    if not count:
+        return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps)
+    planes, plane = walls.planes, steps >> 1
+    point, normal = planes.point[plane], planes.normal[plane]
+    place = (source - walls.origin).expand(count, 3)
+    target = targets - walls.origin
+    seen = images(place, point, normal, (steps & 1).bool())
+    nodes = torch.stack([place, *corners_of(target, seen, point, normal), target], 1)
+    none = torch.full((count, 1), -1)
+    before, after = torch.cat([none, plane], 1), torch.cat([plane, none], 1)
+    pieces = _Segments(
+        nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3), before.ravel(), after.ravel()
+    )
+    met, good = _tried(walls, pieces)
+    met, good = met.view(count, length + 1), good.view(count, length + 1)
+    apart = (target - seen[-1]).norm(dim=1) > _EXACT * walls.size
+    return good.all(1) & apart, met[:, :length]
+
+
+def _tried(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
+    """The triangle at the end of each segment, and whether the segment exists."""
+    way = pieces.end - pieces.start
+    unit = normalize(way, dim=1)
+    first = normalize(cross(unit, torch.eye(3, dtype=unit.dtype)[unit.abs().argmin(1)]), dim=1)
+    second = cross(unit, first)
+    votes = torch.zeros(len(unit), dtype=torch.int64)
+    met = torch.full_like(votes, -1)
+    for number in range(4):  # the last one goes straight
+        angle = torch.tensor(2.1 * number, dtype=torch.float64)
+        aside = _ASIDE * walls.margin * (angle.cos() * first + angle.sin() * second)
+        if number == 3:
+            aside = torch.zeros_like(aside)
+        start = pieces.start + _in_plane(walls, aside, unit, pieces.plane_before)
+        end = pieces.end + _in_plane(walls, aside, unit, pieces.plane)
+        face = _cast(walls, start, end, pieces)
+        good = torch.where(pieces.plane >= 0, face >= 0, face == -1)
+        votes += good
+        met = face
+    unsure = torch.nonzero((votes > 0) & (votes < 4))[:, 0]
+    good = votes == 4
+    if len(unsure):
+        rows = _Segments(*(column[unsure] for column in vars(pieces).values()))
+        good[unsure], met[unsure] = _decided(walls, rows)
+    return met, good
+
+
+def _in_plane(walls: Walls, aside: Tensor, unit: Tensor, plane: Tensor) -> Tensor:
+    """A step aside, prolonged along the segment to stay in the plane at its end."""
+    normal = walls.planes.normal[plane.clamp_min(0)]
+    falls = dot(unit, normal)
+    steep = (plane >= 0) & (falls.abs() > 0.02)
+    share = torch.where(steep, dot(aside, normal) / torch.where(steep, falls, 1.0), 0.0)
+    return aside - share[:, None] * unit
+
+
+def _cast(walls: Walls, start: Tensor, end: Tensor, pieces: _Segments) -> Tensor:
+    """Triangle of the right plane at each segment's end; −1 nothing met, −2 something else met."""
+    planes, margin = walls.planes, walls.margin
+    way = end - start
+    length = way.norm(dim=1)
+    unit = normalize(way, dim=1)
+    before = planes.normal[pieces.plane_before.clamp_min(0)]
+    lift = torch.where(pieces.plane_before >= 0, margin * dot(unit, before).sign(), 0.0)
+    after = planes.normal[pieces.plane.clamp_min(0)]
+    over = 2 * margin / dot(unit, after).abs().clamp_min(1e-3)
+    over = torch.where(pieces.plane >= 0, over, -margin)
+    begin = (start + lift[:, None] * before).to(torch.float32)
+    origin = _vector(mi.Point3f, begin)
+    direction = _vector(mi.Vector3f, unit.to(torch.float32))
+    far = mi.Float(to_double((length + over).clamp_min(0.0)))
+    hit = walls.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction, far, 0.0, []))
+    valid = hit.is_valid()
+    face = to_torch(dr.select(valid, mi.Int32(hit.prim_index), -1)).long()
+    distance = to_torch(dr.select(valid, hit.t, 0.0)).double()
+    there = (face >= 0) & (planes.face_plane[face.clamp_min(0)] == pieces.plane)
+    there &= distance > length - over
+    return torch.where(there | (face < 0), face, -2)
+
+
+def _vector(kind: Any, values: Tensor) -> Any:
+    return kind(*(to_float(values[:, k]) for k in range(3)))
+
+
+def _decided(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
+    """The same in float64, over all triangles; their edges belong to them."""
+    planes, vertices = walls.planes, walls.exact_vertices
+    a, b, c = vertices[walls.topology.faces].unbind(1)
+    first, second = b - a, c - a
+    area = cross(first, second)
+    square = dot(area, area).clamp_min(1e-300)
+    good = torch.ones(len(pieces.start), dtype=torch.bool)
+    met = torch.full((len(good),), -1)
+    near, wide = _EXACT * walls.size, 1e-9
+    every = torch.arange(len(good))
+    for some in every.split(max(1, _PAIRS // len(a))):
+        start, end = pieces.start[some, None], pieces.end[some, None]
+        way = end - start
+        length = way.norm(dim=2)
+        falls = dot(way, area.expand(len(some), -1, -1))
+        share = dot(a - start, area.expand(len(some), -1, -1)) / torch.where(
+            falls == 0, torch.ones_like(falls), falls
+        )
+
+        def inside(point: Tensor) -> Tensor:
+            offset = point - a
+            v = dot(cross(first.expand_as(offset), offset), area.expand_as(offset)) / square
+            u = dot(cross(offset, second.expand_as(offset)), area.expand_as(offset)) / square
+            return torch.minimum(torch.minimum(u, v), 1 - u - v)
+
+        own = planes.face_plane
+        ends = (own == pieces.plane_before[some, None]) | (own == pieces.plane[some, None])
+        between = (share * length > near) & (share * length < length - near)
+        crossing = between & (falls != 0) & ~ends & (own >= 0)
+        blocked = crossing & (inside(start + share[..., None] * way) >= -wide)
+        depth = torch.where(own == pieces.plane[some, None], inside(end), -torch.inf)
+        best, face = depth.max(1)
+        surface = pieces.plane[some] >= 0
+        met[some] = torch.where(surface, face, -1)
+        good[some] = ~blocked.any(1) & (~surface | (best >= -wide))
+    return good, met

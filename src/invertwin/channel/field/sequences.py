@@ -1,0 +1,231 @@
+"""Which surfaces a path may meet, and in which order: candidates for specular paths.
+
+A step of a sequence is a plane and what happens there: 2·plane for a reflection, 2·plane + 1 for a
+transmission.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from invertwin.channel.field.planes import Planes
+from invertwin.channel.rays.arrays import to_float, to_index, to_torch
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import Occluders
+from invertwin.errors import InputError
+
+_LANES = 1 << 20
+_MOST = 1_000_000  # sequences that are tried one by one
+_GOLDEN = math.pi * (1 + math.sqrt(5))
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """Candidates by length.
+
+    Attributes:
+        steps: For each number of steps from 1, the sequences, [sequence, step].
+        missed: Estimated share of directions whose sequences have not been found; None if there are
+            no others.
+    """
+
+    steps: tuple[Tensor, ...]
+    missed: float | None
+
+
+@dataclass(frozen=True)
+class Powers:
+    """What triangles can do to a ray.
+
+    Attributes:
+        reflect: Whether they mirror it.
+        transmit: Whether they let it through.
+    """
+
+    reflect: Bool[Tensor, " f"]
+    transmit: Bool[Tensor, " f"]
+
+
+def every_sequence(planes: Planes, powers: Powers, depth: int) -> Sequences:
+    """All sequences of planes, no plane twice in a row.
+
+    Args:
+        planes: Of the scene.
+        powers: Of the triangles.
+        depth: Most steps.
+
+    Raises:
+        InputError: More than a million.
+    """
+    known = planes.face_plane >= 0
+    options = torch.cat(
+        [
+            2 * planes.face_plane[powers.reflect & known],
+            2 * planes.face_plane[powers.transmit & known] + 1,
+        ]
+    ).unique()
+    count = sum(len(options) ** step for step in range(1, depth + 1))
+    if count > _MOST:
+        raise InputError(
+            f"expected at most {_MOST:,} sequences to try one by one, got {count:.3g} of "
+            f"{len(planes)} planes and depth {depth}; give a number of rays, or a smaller depth"
+        )
+    found, last = [], torch.zeros(1, 0, dtype=torch.int64)
+    for _ in range(depth):
+        row = torch.arange(len(last)).repeat_interleave(len(options))
+        grown = torch.cat([last[row], options.repeat(len(last))[:, None]], 1)
+        if grown.shape[1] > 1:
+            grown = grown[grown[:, -1] // 2 != grown[:, -2] // 2]
+        found.append(grown)
+        last = grown
+    return Sequences(tuple(found), None)
+
+
+def shot_sequences(
+    occluders: Occluders,
+    planes: Planes,
+    powers: Powers,
+    places: Float64[Tensor, "place 3"],
+    depth: int,
+    rays: int,
+    seed: int,
+) -> Sequences:
+    """The sequences that rays from some places follow.
+
+    Directions are those of a spiral of evenly spread points, turned at random for every place. At a
+    surface that mirrors and lets through, a ray goes on both ways. Of random directions, a sequence
+    that fills the solid angle Ω about the antenna is missed by all N with the probability
+    (1 − Ω/4π)^N < exp(−NΩ/4π); even directions miss less.
+
+    ``Sequences.missed`` is the estimate of Good and Turing: sequences that one ray alone has
+    followed, over the number of rays.
+
+    Args:
+        occluders: The scene.
+        planes: Of the scene, about the same origin.
+        powers: Of the triangles.
+        places: From where rays are shot [m].
+        depth: Most steps.
+        rays: How many from each place.
+        seed: Of the turns.
+
+    Source: I. J. Good, "The population frequencies of species", Biometrika 40, 1953.
+    """
+    tables = _Tables(occluders, planes, powers)
+    # A ray may part at every step.
+    parts = 2 ** (depth if bool(powers.transmit.any()) else 0)
+    chunk = max(1, _LANES // parts)
+    leaves = torch.zeros(0, depth, dtype=torch.int64)
+    count = torch.zeros(0, dtype=torch.int64)
+    for number, place in enumerate(places):
+        turn = _random_turn(seed, number)
+        for start in range(0, rays, chunk):
+            index = torch.arange(start, min(start + chunk, rays))
+            directions = _spiral(index, rays) @ turn.T
+            row, times = tables.followed(place, directions, depth)
+            leaves, count = _merged(torch.cat([leaves, row]), torch.cat([count, times]))
+    found: list[Tensor] = []
+    for length in range(1, depth + 1):
+        some = leaves[(leaves[:, length - 1] >= 0), :length]
+        found.append(some.unique(dim=0) if len(some) else some)
+    missed = min(1.0, float((count == 1).sum()) / (rays * len(places)))
+    return Sequences(tuple(found), missed)
+
+
+def _merged(rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    alike, group = rows.unique(dim=0, return_inverse=True)
+    return alike, torch.zeros(len(alike), dtype=torch.int64).index_add(0, group, counts)
+
+
+def _spiral(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
+    """Evenly spread directions: of a golden spiral."""
+    z = 1 - (2 * index.double() + 1) / count
+    around = _GOLDEN * index.double()
+    ring = (1 - z**2).clamp_min(0).sqrt()
+    return torch.stack([ring * around.cos(), ring * around.sin(), z], 1)
+
+
+def _random_turn(seed: int, number: int) -> Float64[Tensor, "3 3"]:
+    draws = np.random.default_rng(np.random.SeedSequence([seed, number])).standard_normal((3, 3))
+    q, _ = np.linalg.qr(draws)
+    return torch.from_numpy(q)
+
+
+class _Tables:
+    """The scene as rays that follow sequences need it."""
+
+    def __init__(self, occluders: Occluders, planes: Planes, powers: Powers) -> None:
+        self.occluders = occluders
+        self.planes = planes
+        self.powers = powers
+        self.normal = to_float(planes.normal)
+        self.face_plane = to_index(planes.face_plane.clamp_min(0))
+
+    def followed(self, place: Tensor, directions: Tensor, depth: int) -> tuple[Tensor, Tensor]:
+        """Sequences of rays from a place, filled up with −1, and how many rays follow each."""
+        local = (place - self.occluders.origin).to(torch.float32)
+        origin = local.expand(len(directions), 3)
+        direction = directions.to(torch.float32)
+        # Sequences share their beginnings: each is the number of its parent, and one more step.
+        number = torch.zeros(len(directions), dtype=torch.int64)
+        ended: list[tuple[Tensor, Tensor]] = []
+        known = torch.zeros(1, 0, dtype=torch.int64)
+        for step in range(depth):
+            if step:
+                origin = origin + self.occluders.margin * direction
+            face, place_hit, mirrored = self._next(origin, direction)
+            hit = (face >= 0) & (self.planes.face_plane[face.clamp_min(0)] >= 0)
+            ended.append((known, number[~hit]))
+            number, face, place_hit, mirrored, direction = (
+                column[hit] for column in (number, face, place_hit, mirrored, direction)
+            )
+            both = []
+            for powers, onwards, bit in (
+                (self.powers.reflect, mirrored, 0),
+                (self.powers.transmit, direction, 1),
+            ):
+                goes = powers[face]
+                code = 2 * self.planes.face_plane[face[goes]] + bit
+                both.append((number[goes], code, place_hit[goes], onwards[goes]))
+            stops = ~(self.powers.reflect[face] | self.powers.transmit[face])
+            ended.append((known, number[stops]))
+            number, code, origin, direction = (
+                torch.cat(column) for column in zip(*both, strict=True)
+            )
+            options = 2 * len(self.planes)
+            pair, number = (number * options + code).unique(return_inverse=True)
+            known = torch.cat([known[pair // options], (pair % options)[:, None]], 1)
+            if step == depth - 1:
+                ended.append((known, number))
+        rows, counts = [], []
+        for table, number in ended:
+            some, count = number.unique(return_counts=True)
+            rows.append(torch.nn.functional.pad(table[some], (0, depth - table.shape[1]), value=-1))
+            counts.append(count)
+        return torch.cat(rows), torch.cat(counts)
+
+    def _next(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The triangle that each ray meets (−1: none), where, and the mirrored direction."""
+        if not len(origin):
+            none = torch.zeros(0, 3)
+            return torch.zeros(0, dtype=torch.int64), none, none
+        start = mi.Point3f(*(to_float(origin[:, k].contiguous()) for k in range(3)))
+        way = mi.Vector3f(*(to_float(direction[:, k].contiguous()) for k in range(3)))
+        hit = self.occluders.scene.ray_intersect_preliminary(mi.Ray3f(start, way))
+        valid = hit.is_valid()
+        face = dr.select(valid, mi.Int32(hit.prim_index), -1)
+        plane = dr.gather(mi.UInt32, self.face_plane, hit.prim_index, valid)
+        normal = dr.gather(mi.Vector3f, self.normal, plane, valid)
+        place = start + way * dr.select(valid, hit.t, 0.0)
+        mirrored = way - 2 * dr.dot(way, normal) * normal
+        dr.eval(face, place, mirrored)
+        found = to_torch(face).long()
+        return found, _columns(place), _columns(mirrored)
+
+
+def _columns(vector: object) -> Tensor:
+    return torch.stack([to_torch(vector[k]) for k in range(3)], 1)  # type: ignore[index]

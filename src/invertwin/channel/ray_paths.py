@@ -1,0 +1,169 @@
+"""Paths between point antennas: what a trace returns, one row a path."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Complex128, Float64, Int64
+from torch import Tensor
+
+from invertwin.constants import SPEED_OF_LIGHT
+
+KINDS = ("", "reflection", "transmission", "diffraction")
+"""What happens where a path meets a surface or an edge, by its number in ``RayPaths.kinds``."""
+REFLECTION, TRANSMISSION, DIFFRACTION = 1, 2, 3
+
+
+@dataclass(frozen=True, eq=False)
+class RayPaths:
+    """Discrete paths between antennas: line of sight, mirrored, through sheets, round edges.
+
+    Rows are in the order of transmitter, receiver and delay; a link may have any number, also none.
+    ``padded`` gives the same as a table with as many places for each link. Rows of vertices are
+    filled up behind the last one: with zeros, kind 0 and triangle −1.
+
+    The field at the receiver is ``coefficient`` times that of the transmitter, without the
+    propagation phase: ``H(f) = Σ a exp(−j2πfτ)``. Rows and columns are V and H, the unit vectors of
+    θ and φ about the world's z axis: a column for the field that leaves along ``departure``, a row
+    for an antenna that looks along ``arrival``. λ/4πL is included, antennas are not.
+
+    Attributes:
+        counts: Number of transmitters and of receivers.
+        frequency: Of the coefficients [Hz].
+        tx, rx: Numbers of the antennas of each path.
+        delay: Length over c [s].
+        coefficient: a, receive × transmit polarisation.
+        departure, arrival: Unit vectors in the world that point away from the antennas, along the
+            path.
+        vertices: Where the path meets surfaces and edges, from the transmitter on [m].
+        kinds: What happens there, by ``KINDS``.
+        faces: Triangles that are met, numbered through all objects.
+        objects: Numbers of the objects that are met, in ``names``.
+        names: Of the objects of the scene.
+        doppler: Shift of the frequency by motion of antennas and objects [Hz]; positive where
+            the path gets shorter.
+        missed: Of the directions of the antennas that rays were shot from, the share whose
+            sequences of surfaces no ray has followed: an estimate; None where all sequences have
+            been tried.
+    """
+
+    counts: tuple[int, int]
+    frequency: float
+    tx: Int64[Tensor, " path"]
+    rx: Int64[Tensor, " path"]
+    delay: Float64[Tensor, " path"]
+    coefficient: Complex128[Tensor, "path 2 2"]
+    departure: Float64[Tensor, "path 3"]
+    arrival: Float64[Tensor, "path 3"]
+    vertices: Float64[Tensor, "path vertex 3"]
+    kinds: Int64[Tensor, "path vertex"]
+    faces: Int64[Tensor, "path vertex"]
+    objects: Int64[Tensor, "path vertex"]
+    names: tuple[str, ...]
+    doppler: Float64[Tensor, " path"]
+    missed: float | None = None
+
+    def __len__(self) -> int:
+        return self.delay.shape[0]
+
+    @property
+    def length(self) -> Float64[Tensor, " path"]:
+        """[m]."""
+        return SPEED_OF_LIGHT * self.delay
+
+    @property
+    def depth(self) -> Int64[Tensor, " path"]:
+        """How many surfaces and edges each path meets; 0 = line of sight."""
+        return (self.kinds > 0).sum(1)
+
+    @property
+    def link(self) -> Int64[Tensor, " path"]:
+        """Number of the pair of antennas: receivers run fastest."""
+        return self.tx * self.counts[1] + self.rx
+
+    def chosen(self, rows: Bool[Tensor, " path"] | Int64[Tensor, " some"]) -> "RayPaths":
+        """Only some of the paths.
+
+        Args:
+            rows: A mask, or numbers of rows.
+        """
+        columns = {n: value[rows] for n, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **columns)
+
+    def between(self, tx: int, rx: int) -> "RayPaths":
+        """The paths of one link.
+
+        Args:
+            tx: Number of the transmitter.
+            rx: Number of the receiver.
+        """
+        return self.chosen((self.tx == tx) & (self.rx == rx))
+
+    def sorted(self) -> "RayPaths":
+        """The paths in the order of transmitter, receiver and delay."""
+        by_delay = self.delay.detach().argsort(stable=True)
+        return self.chosen(by_delay[self.link[by_delay].argsort(stable=True)])
+
+    def padded(self) -> tuple[Int64[Tensor, "tx rx place"], Bool[Tensor, "tx rx place"]]:
+        """Row numbers by link, filled up with zeros, and which of them are paths.
+
+        ``paths.delay[row]`` is then a table of delays; multiply by the mask what has to vanish.
+        """
+        count = torch.bincount(self.link, minlength=self.counts[0] * self.counts[1])
+        order = self.link.argsort(stable=True)
+        place = torch.arange(len(self)) - (count.cumsum(0) - count)[self.link[order]]
+        shape = (len(count), int(count.max()) if len(count) else 0)
+        row = torch.zeros(shape, dtype=torch.int64)
+        filled = torch.zeros(shape, dtype=torch.bool)
+        row[self.link[order], place] = order
+        filled[self.link[order], place] = True
+        return row.unflatten(0, self.counts), filled.unflatten(0, self.counts)
+
+    def reversed(self) -> "RayPaths":
+        """The same paths the other way, with transmitters and receivers exchanged."""
+        depth = self.depth[:, None]
+        width = torch.arange(self.kinds.shape[1])
+        back = torch.where(width < depth, depth - 1 - width, width)
+        rows = torch.arange(len(self))[:, None]
+        turned = {
+            n: getattr(self, n)[rows, back] for n in ("vertices", "kinds", "faces", "objects")
+        }
+        return replace(
+            self,
+            counts=self.counts[::-1],
+            tx=self.rx,
+            rx=self.tx,
+            coefficient=self.coefficient.mT,
+            departure=self.arrival,
+            arrival=self.departure,
+            **turned,
+        ).sorted()
+
+    def __add__(self, other: "RayPaths") -> "RayPaths":
+        return joined([self, other])
+
+
+def joined(parts: Sequence[RayPaths]) -> RayPaths:
+    """All paths of the same antennas and scene, in the order of ``RayPaths``.
+
+    Args:
+        parts: At least one; they may have other numbers of vertices.
+    """
+    first = parts[0]
+    width = max((part.kinds.shape[1] for part in parts if len(part)), default=0)
+    fill = {"vertices": 0.0, "kinds": 0, "faces": -1, "objects": -1}
+    columns: dict[str, Tensor] = {}
+    for name in (f.name for f in fields(RayPaths)):
+        values = [getattr(part, name) for part in parts]
+        if not isinstance(values[0], Tensor):
+            continue
+        if name in fill:
+            values = [_widened(value, width, fill[name]) for value in values]
+        columns[name] = torch.cat(values)
+    return replace(first, **columns).sorted()
+
+
+def _widened(value: Tensor, width: int, fill: float) -> Tensor:
+    value = value[:, :width]
+    more = value.new_full((len(value), width - value.shape[1], *value.shape[2:]), fill)
+    return torch.cat([value, more], 1)

@@ -1,0 +1,12 @@
+"""What paths between antennas add up to: responses, OFDM channels, spreads, tables."""
+
+from invertwin.links.conversion import ray_paths_of as ray_paths_of
+from invertwin.links.listing import path_table as path_table
+from invertwin.links.responses import Terminals as Terminals
+from invertwin.links.responses import frequency_response as frequency_response
+from invertwin.links.responses import impulse_response as impulse_response
+from invertwin.links.responses import ofdm_channel as ofdm_channel
+from invertwin.links.responses import path_amplitudes as path_amplitudes
+from invertwin.links.spreads import angle_spread as angle_spread
+from invertwin.links.spreads import delay_spread as delay_spread
+from invertwin.links.spreads import rician_factor as rician_factor

@@ -1,0 +1,82 @@
+"""Paths that Sionna RT has found, as ours."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from invertwin.channel import KINDS, RayPaths
+from invertwin.errors import InputError
+
+# What Sionna calls reflection, refraction, and diffraction; 2 is diffuse reflection.
+_KINDS = {
+    0: 0,
+    1: KINDS.index("reflection"),
+    4: KINDS.index("transmission"),
+    8: KINDS.index("diffraction"),
+}
+
+
+def ray_paths_of(paths: Any, frequency: float) -> RayPaths:
+    """The `Paths` of Sionna RT 2.2 as ``RayPaths``.
+
+    Its arrays must have one element with ``pattern="iso"`` and ``polarization="VH"``, so that its
+    coefficients are whole 2 × 2 matrices. Objects and triangles are not known by number, and its
+    convention of phases stays: sheets mirror at their surface, and the length of a path counts
+    their thickness twice.
+
+    Args:
+        paths: From its `PathSolver`.
+        frequency: Of its scene [Hz].
+
+    Raises:
+        InputError: Other arrays, or diffuse reflection.
+    """
+    real, imaginary = (np.asarray(part, dtype=np.float64) for part in paths.a)
+    field = real + 1j * imaginary
+    if field.ndim != 5 or field.shape[1] != 2 or field.shape[3] != 2:
+        raise InputError(
+            "expected paths of arrays of one element with polarization 'VH', got coefficients of "
+            f"shape {list(field.shape)}; use PlanarArray(num_rows=1, num_cols=1, pattern='iso', "
+            "polarization='VH') for both"
+        )
+    valid = np.asarray(paths.valid).astype(bool)  # [rx, tx, path]
+    rx, tx, _ = np.nonzero(valid)
+    kinds = np.moveaxis(np.asarray(paths.interactions), 0, -1)[valid].astype(np.int64)
+    unknown = sorted(set(np.unique(kinds).tolist()) - set(_KINDS))
+    if unknown:
+        raise InputError(
+            f"expected specular, refracted and diffracted paths, got interactions {unknown}; "
+            "trace with diffuse_reflection=False"
+        )
+    places = np.moveaxis(np.asarray(paths.vertices, dtype=np.float64), 0, -2)[valid]
+    known = np.vectorize(_KINDS.__getitem__, otypes=[np.int64])(kinds) if kinds.size else kinds
+    matrix = np.moveaxis(field, (0, 2, 4, 1, 3), (0, 1, 2, 3, 4))[valid]
+    found = RayPaths(
+        (valid.shape[1], valid.shape[0]),
+        float(frequency),
+        torch.from_numpy(tx),
+        torch.from_numpy(rx),
+        _rows(paths.tau, valid),
+        torch.from_numpy(np.ascontiguousarray(matrix)),
+        _directions(paths.theta_t, paths.phi_t, valid),
+        _directions(paths.theta_r, paths.phi_r, valid),
+        torch.from_numpy(np.where((known > 0)[..., None], places, 0.0)),
+        torch.from_numpy(known),
+        torch.full(known.shape, -1, dtype=torch.int64),
+        torch.full(known.shape, -1, dtype=torch.int64),
+        (),
+        _rows(paths.doppler, valid),
+    )
+    return found.sorted()
+
+
+def _rows(values: Any, valid: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.asarray(values, dtype=np.float64)[valid])
+
+
+def _directions(theta: Any, phi: Any, valid: np.ndarray) -> Tensor:
+    polar, around = _rows(theta, valid), _rows(phi, valid)
+    ring = polar.sin()
+    return torch.stack([ring * around.cos(), ring * around.sin(), polar.cos()], 1)

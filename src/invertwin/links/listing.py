@@ -1,0 +1,56 @@
+"""Paths as text."""
+
+import math
+
+import torch
+
+from invertwin.channel import KINDS, RayPaths
+from invertwin.links.responses import Terminals, path_amplitudes
+
+_DEFAULT = Terminals()
+_HEADER = (
+    f"{'path':>4} {'delay ns':>10} {'length m':>10} {'power dB':>9} {'departs az, el':>16} "
+    f"{'arrives az, el':>16} {'Doppler Hz':>11}  what it meets"
+)
+
+
+def path_table(
+    paths: RayPaths,
+    link: tuple[int, int] = (0, 0),
+    tx: Terminals = _DEFAULT,
+    rx: Terminals = _DEFAULT,
+) -> str:
+    """The paths of one link as text, the shortest first.
+
+    Powers are received over sent, of the first elements. Directions are azimuth and elevation in
+    the world in degrees, x towards y and up to z.
+
+    Args:
+        paths: From ``trace_paths``.
+        link: Numbers of transmitter and receiver.
+        tx: At the transmitters.
+        rx: At the receivers.
+    """
+    some = paths.between(*link)
+    amplitude, _ = path_amplitudes(some, tx, rx)
+    power = 20 * torch.log10(amplitude.detach()[:, 0, 0].abs().clamp_min(1e-30))
+    lines = [_HEADER]
+    for row in range(len(some)):
+        met = [
+            f"{KINDS[kind]} {some.names[item] if 0 <= item < len(some.names) else '?'}"
+            for kind, item in zip(some.kinds[row].tolist(), some.objects[row].tolist(), strict=True)
+            if kind
+        ]
+        lines.append(
+            f"{row:>4} {1e9 * some.delay[row].item():>10.3f} {some.length[row].item():>10.3f} "
+            f"{power[row].item():>9.2f} {_angles(some.departure[row].tolist()):>16} "
+            f"{_angles(some.arrival[row].tolist()):>16} {some.doppler[row].item():>11.2f}  "
+            f"{', '.join(met) or 'line of sight'}"
+        )
+    return "\n".join(lines)
+
+
+def _angles(direction: list[float]) -> str:
+    x, y, z = direction
+    azimuth = math.degrees(math.atan2(y, x))
+    return f"{azimuth:.2f}, {math.degrees(math.atan2(z, math.hypot(x, y))):.2f}"

@@ -1,0 +1,273 @@
+"""From paths to responses: over frequency, over delay, and over symbols and subcarriers.
+
+A path adds ``a exp(−j2πfτ)``. Every element of an array sees it earlier by (u·p)/c, with u the
+direction of the path at the array and p the element's place: arrays are small against the lengths
+of paths. Where they are not, trace the elements as antennas of their own.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Complex128, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel import RayPaths, polarisations
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.memory import require_memory
+from invertwin.scene import AntennaArray
+from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+
+_VALUES_AT_ONCE = 1 << 21
+_VERTICAL = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
+_UP = (0.0, 1.0, 0.0)  # of V in the frame of an array
+
+
+def _upright() -> Tensor:
+    """Axes of an array whose y axis is the world's z, and whose boresight is the world's x."""
+    return torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+
+
+def _single() -> AntennaArray:
+    return AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class Terminals:
+    """What stands at the places of transmitters, or of receivers: the same array at each.
+
+    V and H of the array's polarisation are about its y axis. By default a terminal is one isotropic
+    element for V, and y is the world's z axis.
+
+    Attributes:
+        array: Elements about each place.
+        rotations: Columns are the array's x, y and z axes in the world: one for all [3, 3], or one
+            for each place [place, 3, 3].
+
+    Raises:
+        InputError: Rotations of another shape, or that are not orthonormal.
+    """
+
+    array: AntennaArray = field(default_factory=_single)
+    rotations: Float64[Tensor, "*place 3 3"] = field(default_factory=_upright)
+
+    def __post_init__(self) -> None:
+        do = "give the axes as columns, for all or for each place"
+        given = torch.as_tensor(self.rotations, dtype=torch.float64)
+        shape = (3, 3) if given.ndim < 3 else (None, 3, 3)
+        turns = checked_tensor(given, shape, "rotations of terminals", do)
+        unit = torch.eye(3, dtype=torch.float64)
+        if float((turns.detach().mT @ turns.detach() - unit).abs().max()) > 1e-5:
+            raise InputError(f"expected rotations of terminals with orthonormal columns; {do}")
+        object.__setattr__(self, "rotations", turns)
+
+    def weights(
+        self, direction: Float64[Tensor, "path 3"], place: Int64[Tensor, " path"]
+    ) -> Complex128[Tensor, "path element 2"]:
+        """Field of each element along directions, over V and H of ``RayPaths``.
+
+        Args:
+            direction: Unit vectors in the world, away from the terminal.
+            place: Its number.
+        """
+        turn = self._turns(place)
+        local = torch.einsum("pij,pi->pj", turn, direction)
+        gain = self.array.pattern.gain(local)
+        lit = gain > 0  # a root of zero has no derivative
+        strength = torch.where(lit, torch.where(lit, gain, 1.0).sqrt(), 0.0)
+        own = polarisations(local, torch.tensor(_UP, dtype=torch.float64))
+        basis = polarisations(direction, torch.tensor(_VERTICAL, dtype=torch.float64))
+        change = torch.einsum("pwi,pij,pbj->pwb", basis, turn, own).to(torch.complex128)
+        jones = self.array.jones
+        mixed = jones.towards(local).expand(len(local), -1, -1)
+        weights = torch.einsum("pwb,ek,pkb->pew", change, jones.mixtures, mixed)
+        return strength[:, None, None] * weights
+
+    def advances(
+        self, direction: Float64[Tensor, "path 3"], place: Int64[Tensor, " path"]
+    ) -> Float64[Tensor, "path element"]:
+        """How much shorter the path is for each element than for the place itself [m].
+
+        Args:
+            direction: Unit vectors in the world, away from the terminal.
+            place: Its number.
+        """
+        offsets = torch.einsum("pij,ej->pei", self._turns(place), self.array.positions)
+        return torch.einsum("pei,pi->pe", offsets, direction)
+
+    def _turns(self, place: Tensor) -> Tensor:
+        if self.rotations.ndim == 2:
+            return self.rotations.expand(len(place), 3, 3)
+        if len(place) and int(place.max()) >= len(self.rotations):
+            raise InputError(
+                f"expected a rotation for each of {int(place.max()) + 1} places or more, got "
+                f"{len(self.rotations)}; give one for all, or one for each"
+            )
+        return self.rotations[place]
+
+
+_DEFAULT = Terminals()
+
+
+def path_amplitudes(
+    paths: RayPaths, tx: Terminals = _DEFAULT, rx: Terminals = _DEFAULT
+) -> tuple[Complex128[Tensor, "path rx_ant tx_ant"], Float64[Tensor, "path rx_ant tx_ant"]]:
+    """Coefficient and delay [s] of every path between every two elements.
+
+    Args:
+        paths: From ``trace_paths``.
+        tx: At the transmitters.
+        rx: At the receivers.
+    """
+    sent = tx.weights(paths.departure, paths.tx)
+    received = rx.weights(paths.arrival, paths.rx)
+    amplitude = torch.einsum("pri,pij,ptj->prt", received, paths.coefficient, sent)
+    ahead = rx.advances(paths.arrival, paths.rx)[:, :, None]
+    ahead = ahead + tx.advances(paths.departure, paths.tx)[:, None]
+    return amplitude, paths.delay[:, None, None] - ahead / SPEED_OF_LIGHT
+
+
+def frequency_response(
+    paths: RayPaths,
+    frequencies: ArrayLike,
+    *,
+    tx: Terminals = _DEFAULT,
+    rx: Terminals = _DEFAULT,
+) -> Complex128[Tensor, "rx rx_ant tx tx_ant frequency"]:
+    """H(f) = Σ a exp(−j2πfτ) between all elements; zero where no path leads.
+
+    Delays are exact at all frequencies, coefficients are those of ``paths.frequency``: over a wide
+    band, trace again at some frequencies.
+
+    Args:
+        paths: From ``trace_paths``.
+        frequencies: One or several, in any order [Hz].
+        tx: At the transmitters.
+        rx: At the receivers.
+
+    Raises:
+        InputError: No frequency, or one that is not finite.
+    """
+    swept = torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64))
+    swept = checked_tensor(swept, (None,), "frequencies [Hz]", "give one or several")
+    return _responses(paths, swept, torch.zeros(1, dtype=torch.float64), tx, rx)[..., 0, :]
+
+
+def ofdm_channel(
+    paths: RayPaths,
+    *,
+    subcarriers: int,
+    spacing: float,
+    symbols: int = 1,
+    cyclic_prefix: float = 0.0,
+    tx: Terminals = _DEFAULT,
+    rx: Terminals = _DEFAULT,
+) -> Complex128[Tensor, "rx rx_ant tx tx_ant symbol subcarrier"]:
+    """The channel of every symbol and subcarrier of OFDM.
+
+    Subcarriers are centred: number k has the frequency ``paths.frequency + (k − N//2) · spacing``.
+    Symbols follow each other after 1/spacing plus the cyclic prefix, which is taken as long enough
+    for all paths. Within a symbol paths stand still; from one to the next phases turn by Doppler
+    shifts, in proportion to each subcarrier's frequency.
+
+    Args:
+        paths: From ``trace_paths``.
+        subcarriers: Their number N.
+        spacing: Of subcarriers [Hz].
+        symbols: Their number.
+        cyclic_prefix: [s].
+        tx: At the transmitters.
+        rx: At the receivers.
+
+    Raises:
+        InputError: A number out of range.
+    """
+    count = checked_count(subcarriers, "subcarriers", 1)
+    step = checked_number(spacing, "subcarrier spacing [Hz]", 0.0, open_low=True)
+    prefix = checked_number(cyclic_prefix, "cyclic prefix [s]", 0.0)
+    instants = checked_count(symbols, "symbols", 1)
+    _require(paths, count * instants, tx, rx)
+    number = torch.arange(instants, dtype=torch.float64)
+    grid = torch.arange(count, dtype=torch.float64) - count // 2
+    return _responses(paths, paths.frequency + grid * step, number * (1 / step + prefix), tx, rx)
+
+
+def impulse_response(
+    paths: RayPaths,
+    *,
+    bandwidth: float,
+    taps: int,
+    start: float = 0.0,
+    tx: Terminals = _DEFAULT,
+    rx: Terminals = _DEFAULT,
+) -> Complex128[Tensor, "rx rx_ant tx tx_ant tap"]:
+    """The impulse response in a band about the carrier: h_n = Σ a exp(−j2πf₀τ) sinc(B(τ − t_n)).
+
+    Taps are at t_n = start + n/B. Without a band a path is its delay and amplitude
+    (``path_amplitudes``).
+
+    Args:
+        paths: From ``trace_paths``.
+        bandwidth: B [Hz].
+        taps: Their number.
+        start: Delay of the first one [s].
+        tx: At the transmitters.
+        rx: At the receivers.
+
+    Raises:
+        InputError: A number out of range.
+    """
+    band = checked_number(bandwidth, "bandwidth [Hz]", 0.0, open_low=True)
+    count = checked_count(taps, "taps", 1)
+    first = checked_number(start, "start [s]", -math.inf)
+    amplitude, delay = path_amplitudes(paths, tx, rx)
+    turned = amplitude * _turn(-paths.frequency * delay)
+    shape = (len(paths), *amplitude.shape[1:], count)
+    require_memory(16.0 * math.prod(shape), "an impulse response", "ask for fewer taps", "taps")
+    times = first + torch.arange(count, dtype=torch.float64) / band
+    values = turned[..., None] * torch.sinc(band * (delay[..., None] - times))
+    return _by_link(paths, values)
+
+
+def _responses(
+    paths: RayPaths, frequencies: Tensor, times: Tensor, tx: Terminals, rx: Terminals
+) -> Tensor:
+    """H over [rx, rx_ant, tx, tx_ant, time, frequency]."""
+    if not len(frequencies):
+        raise InputError("expected at least one frequency, got none; give one or several [Hz]")
+    amplitude, delay = path_amplitudes(paths, tx, rx)
+    _require(paths, len(times) * len(frequencies), tx, rx)
+    pairs = amplitude.shape[1] * amplitude.shape[2]
+    # Delays change with time: a Doppler shift ν of the carrier f₀ is dτ/dt = −ν/f₀.
+    rate = -paths.doppler / paths.frequency
+    parts = []
+    for some in frequencies.split(
+        max(1, _VALUES_AT_ONCE // max(1, len(paths) * pairs * len(times)))
+    ):
+        moved = times[:, None] * rate[:, None, None, None, None]
+        turn = _turn(-some * (delay[..., None, None] + moved))
+        parts.append(_by_link(paths, amplitude[..., None, None] * turn))
+    return torch.cat(parts, -1)
+
+
+def _require(paths: RayPaths, count: int, tx: Terminals, rx: Terminals) -> None:
+    """Refuse a channel that does not fit into the memory."""
+    elements = len(tx.array.positions) * len(rx.array.positions)
+    values = float(paths.counts[0] * paths.counts[1] * elements) * count
+    # Parts of 16 bytes each, and all of them once more when they are joined.
+    require_memory(32 * values, "a channel", "ask for fewer frequencies, symbols or elements")
+
+
+def _by_link(paths: RayPaths, values: Tensor) -> Tensor:
+    """Sums over the paths of each link: [rx, rx_ant, tx, tx_ant, ...]."""
+    sent, received = paths.counts
+    total = torch.zeros(sent * received, *values.shape[1:], dtype=values.dtype)
+    total = total.index_add(0, paths.link, values).unflatten(0, (sent, received))
+    return total.movedim((1, 2, 0, 3), (0, 1, 2, 3))
+
+
+def _turn(cycles: Tensor) -> Tensor:
+    """exp(j2π cycles), of whole cycles less."""
+    angle = 2 * math.pi * (cycles - cycles.detach().round())
+    return torch.polar(torch.ones_like(angle), angle)

@@ -1,0 +1,109 @@
+"""How power is spread over delays and directions."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.channel import KINDS, RayPaths
+from invertwin.errors import InputError
+from invertwin.links.responses import Terminals, path_amplitudes
+
+_DEFAULT = Terminals()
+
+
+def delay_spread(
+    paths: RayPaths, tx: Terminals = _DEFAULT, rx: Terminals = _DEFAULT
+) -> Float64[Tensor, "rx tx"]:
+    """Root mean square spread of the delays by power [s]; 0 of links of one path or none.
+
+    Args:
+        paths: From ``trace_paths``.
+        tx: At the transmitters.
+        rx: At the receivers.
+    """
+    power = _powers(paths, tx, rx)
+    total = _sums(paths, power)
+    mean = _sums(paths, power * paths.delay) / _safe(total)
+    offset = paths.delay - mean[paths.rx, paths.tx]
+    return _root(_sums(paths, power * offset**2) / _safe(total))
+
+
+def angle_spread(
+    paths: RayPaths,
+    end: Literal["departure", "arrival"] = "arrival",
+    tx: Terminals = _DEFAULT,
+    rx: Terminals = _DEFAULT,
+) -> Float64[Tensor, "rx tx"]:
+    """Spread of the directions by power, √(1 − |u|²) with u the mean unit vector.
+
+    From 0 of one direction to 1 of all alike; of directions close together it is their root mean
+    square angle [rad]. It does not depend on axes.
+
+    Args:
+        paths: From ``trace_paths``.
+        end: Of the paths.
+        tx: At the transmitters.
+        rx: At the receivers.
+
+    Raises:
+        InputError: Another end.
+
+    Source: Fleury, "First- and second-order characterization of direction dispersion and space
+    selectivity in the radio channel", IEEE Trans. Information Theory 46, 2000.
+    """
+    if end not in ("departure", "arrival"):
+        raise InputError(f"expected end as departure or arrival, got {end!r}; choose one of them")
+    power = _powers(paths, tx, rx)
+    total = _safe(_sums(paths, power))
+    direction: Tensor = getattr(paths, end)
+    mean = torch.stack([_sums(paths, power * x) for x in direction.unbind(1)], -1)
+    mean = mean / total[..., None]
+    # The mean square distance from the mean, which does not cancel as 1 − |u|² does.
+    offset = (direction - mean[paths.rx, paths.tx]).square().sum(1)
+    return _root(_sums(paths, power * offset) / total)
+
+
+def rician_factor(
+    paths: RayPaths, tx: Terminals = _DEFAULT, rx: Terminals = _DEFAULT
+) -> Float64[Tensor, "rx tx"]:
+    """Power of the straight path over that of all others; also where it passes through sheets.
+
+    It is 0 without a straight path, and infinite without others.
+
+    Args:
+        paths: From ``trace_paths``.
+        tx: At the transmitters.
+        rx: At the receivers.
+    """
+    power = _powers(paths, tx, rx)
+    passing = (paths.kinds == 0) | (paths.kinds == KINDS.index("transmission"))
+    straight = passing.all(1)
+    direct = _sums(paths, torch.where(straight, power, 0.0))
+    others = _sums(paths, torch.where(straight, 0.0, power))
+    ratio = direct / _safe(others)
+    alone = torch.where(direct > 0, torch.inf, 0.0)
+    return torch.where(others > 0, ratio, alone)
+
+
+def _powers(paths: RayPaths, tx: Terminals, rx: Terminals) -> Tensor:
+    """Received over sent power of each path, mean of all pairs of elements."""
+    amplitude, _ = path_amplitudes(paths, tx, rx)
+    return torch.view_as_real(amplitude).square().sum(-1).mean((1, 2))
+
+
+def _sums(paths: RayPaths, values: Tensor) -> Tensor:
+    """Sums over the paths of each link, [rx, tx]."""
+    total = torch.zeros(paths.counts[0] * paths.counts[1], dtype=torch.float64)
+    return total.index_add(0, paths.link, values).view(paths.counts).T
+
+
+def _safe(total: Tensor) -> Tensor:
+    return torch.where(total > 0, total, 1.0)
+
+
+def _root(square: Tensor) -> Tensor:
+    """A root without the infinite derivative at zero."""
+    some = square > 0
+    return torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
