@@ -1,5 +1,6 @@
 """Callbacks: rows are complete, watching changes nothing, a fit goes on in a new process."""
 
+import math
 import os
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from invertwin.inversion import (
     Watch,
     reconstruct,
 )
+from invertwin.inversion.fit import _restore
 from invertwin.inversion.regularization import Laplacian
 from invertwin.models import SurrogateMap
 from invertwin.scene import RoughDielectric
@@ -230,3 +232,26 @@ def test_a_loss_of_ones_own_goes_on_in_a_new_process(case, tmp_path):
     )
     assert float(whole.norm()) > 0.02
     assert torch.allclose(cut, whole, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("step", torch.tensor(-1.0)),
+        ("step", torch.tensor(math.inf)),
+        ("step", torch.tensor(True)),
+        ("step", torch.ones(3)),
+        ("exp_avg", torch.tensor(0.0, dtype=torch.float64)),
+        ("exp_avg", torch.zeros(3, dtype=torch.complex128)),
+    ],
+)
+def test_what_no_optimizer_has_left_is_not_taken_for_its_state(name, value):
+    parameter = torch.nn.Parameter(torch.zeros(3, dtype=torch.float64))
+    optimizer = torch.optim.Adam([parameter])
+    parameter.grad = torch.ones(3, dtype=torch.float64)
+    optimizer.step()
+    state = optimizer.state_dict()
+    _restore(torch.optim.Adam([parameter]), state)
+    state["state"][0][name] = value
+    with pytest.raises(ValueError, match="optimiser of another fit"):
+        _restore(torch.optim.Adam([parameter]), state)

@@ -433,11 +433,19 @@ def _restore(optimizer: torch.optim.Optimizer | GaussNewton, state: dict[str, An
     if isinstance(optimizer, GaussNewton):
         optimizer.load_state_dict(state)
         return
+    if any(value.is_complex() for known in state["state"].values() for value in known.values()):
+        raise ValueError("an optimiser of another fit")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": state["state"]})
     names = _REMEMBERED[type(optimizer)]
     for parameter, known in optimizer.state.items():
-        shapes = [value.shape for value in known.values()]
-        if known.keys() != names or not {*shapes} <= {parameter.shape, torch.Size([])}:
+        step = known.get("step", torch.zeros(()))
+        counted = step.shape == () and step.is_floating_point() and 0 <= float(step) < math.inf
+        alike = [
+            value.shape == parameter.shape and value.dtype == parameter.dtype
+            for name, value in known.items()
+            if name != "step"
+        ]
+        if known.keys() != names or not (counted and all(alike)):
             raise ValueError("an optimiser of another fit")
 
 
