@@ -152,7 +152,7 @@ def of_signature(run: RunFile, scene: Scene) -> Estimate:
     """
     table = need(run, "rcs", run.task)
     sizes = {n: count_of(getattr(table, n)) for n in ("frequencies", "theta_deg", "phi_deg")}
-    values = sizes["frequencies"] * max(sizes["theta_deg"], sizes["phi_deg"])
+    values = sizes["frequencies"] * table.aspect_count
     largest = max(sizes, key=lambda name: sizes[name])
     parts = [
         _triangles(run, scene),

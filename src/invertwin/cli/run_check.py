@@ -16,7 +16,6 @@ from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import chirp_train, exact
 from invertwin.cli.running import time_left
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.cli.schema.signature import count_of
 from invertwin.cli.shape_tables import Mover
 from invertwin.memory import free_memory, gigabytes
 from invertwin.models import SurrogateMap
@@ -62,7 +61,7 @@ def _of_signature(run: RunFile) -> tuple[list[Table], str]:
     table, scene = need(run, "rcs", run.task), build.scene(run)
     found = of_signature(run, scene)
     found.require()
-    count = max(count_of(table.theta_deg), count_of(table.phi_deg))
+    count = table.aspect_count
 
     def traced(aspects: int) -> float:
         chosen = torch.linspace(0, count - 1, aspects).round().long().tolist()

@@ -130,13 +130,17 @@ class Rcs(Table):
             fail(f"expected one angle or as many as theta_deg ({theta}), got {phi}", "phi_deg")
         return self
 
+    @property
+    def aspect_count(self) -> int:
+        """How many directions are swept."""
+        return max(count_of(self.theta_deg), count_of(self.phi_deg))
+
     def at(self, aspects: list[int]) -> "Rcs":
         """The same of some aspects, and nothing to compare them with."""
-        count = max(count_of(self.theta_deg), count_of(self.phi_deg))
 
         def chosen(section: Any) -> dict[str, list[float]]:
             return {
-                name: swept(getattr(section, name)).expand(count)[aspects].tolist()
+                name: swept(getattr(section, name)).expand(self.aspect_count)[aspects].tolist()
                 for name in ("theta_deg", "phi_deg")
             }
 
