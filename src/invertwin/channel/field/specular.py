@@ -34,6 +34,7 @@ from invertwin.channel.field.sequences import (
 from invertwin.channel.field.waves import dot, mirrored, plane_of_incidence, polarisations
 from invertwin.channel.ray_paths import DIFFRACTION, REFLECTION, TRANSMISSION, RayPaths, joined
 from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.geometry import vertex_velocities
 from invertwin.channel.rays.scene import Occluders
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.constants import SPEED_OF_LIGHT
@@ -193,9 +194,7 @@ def _staged(
     vertices = [item.vertices for item in objects]
     velocities = None
     if any(item.velocity is not None for item in objects):
-        still = [torch.zeros_like(place) for place in vertices]
-        moved = [0.0 if item.velocity is None else item.velocity for item in objects]
-        velocities = torch.cat([zero + v for zero, v in zip(still, moved, strict=True)])
+        velocities = torch.cat([vertex_velocities(item) for item in objects])
     return _Stage(
         scene,
         topology_of([item.mesh for item in objects]),

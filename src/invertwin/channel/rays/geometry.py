@@ -193,7 +193,7 @@ def flatten(
         moving=tuple(map(differentiated, placed)),
         deforming=tuple(differentiated(item.mesh.vertices) for item in objects),
         topology=topology,
-        velocities=torch.cat([_velocities(item) for item in objects]) if moving else None,
+        velocities=torch.cat([vertex_velocities(item) for item in objects]) if moving else None,
     )
 
 
@@ -270,7 +270,11 @@ def _moves(item: Object) -> bool:
     return item.velocity is not None and bool(item.velocity.any())
 
 
-def _velocities(item: Object) -> Tensor:
-    """World velocity of every vertex [m/s]."""
+def vertex_velocities(item: Object) -> Float64[Tensor, "v 3"]:
+    """World velocity of every vertex [m/s].
+
+    Args:
+        item: the object; zero at rest.
+    """
     still = torch.zeros(len(item.mesh.vertices), 3, dtype=torch.float64)
     return still if item.velocity is None else still + item.velocity
