@@ -164,7 +164,8 @@ def chains_between(
             target, sequence = screen.passed(targets[begin : begin + block])
             target = target + begin
             chosen = some[sequence]
-            good, faces = _verified(walls, chosen, source, targets[target])
+            start = source.expand(len(chosen), 3)
+            good, faces = clear_ways(walls, chosen, start, targets[target])
             found.append(
                 Chains(
                     torch.full((int(good.sum()),), number),
@@ -280,17 +281,59 @@ class _Segments:
     plane: Tensor
 
 
-def _verified(
-    walls: Walls, steps: Tensor, source: Tensor, targets: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Which paths there are, and the triangles that they meet."""
+def reaching(
+    walls: Walls,
+    steps: Int64[Tensor, "row step"],
+    seen: list[Float64[Tensor, "row 3"]],
+    target: Float64[Tensor, "row 3"],
+) -> Bool[Tensor, " row"]:
+    """Whether lines to the images cut the planes inside of their rectangles, in the right order.
+
+    Args:
+        walls: The scene.
+        steps: Sequences, see ``sequences``.
+        seen: From ``images``, about the scene's origin.
+        target: Places about it.
+    """
+    planes, place = walls.planes, target
+    near = _EXACT * walls.size
+    ok = torch.ones(len(target), dtype=torch.bool)
+    for step in reversed(range(steps.shape[1])):
+        plane, through = steps[:, step] >> 1, (steps[:, step] & 1).bool()
+        point, normal, way = planes.point[plane], planes.normal[plane], seen[step + 1] - place
+        falls = dot(way, normal)
+        ok &= falls != 0
+        share = dot(point - place, normal) / torch.where(falls == 0, torch.ones_like(falls), falls)
+        reach = way.norm(dim=1)
+        # A receiver on a mirror has a reflection; one on a sheet is not behind it.
+        ok &= share * reach > torch.where(through, near, -near)
+        ok &= share * reach < reach - near
+        place = place + share[:, None] * way
+        at = torch.einsum("rx,rax->ra", place - point, planes.axes[plane])
+        ok &= (at >= planes.low[plane] - walls.margin).all(1)
+        ok &= (at <= planes.high[plane] + walls.margin).all(1)
+    return ok
+
+
+def clear_ways(
+    walls: Walls,
+    steps: Int64[Tensor, "row step"],
+    source: Float64[Tensor, "row 3"],
+    targets: Float64[Tensor, "row 3"],
+) -> tuple[Bool[Tensor, " row"], Int64[Tensor, "row step"]]:
+    """Which ways by given planes are free, and the triangles that they meet.
+
+    Args:
+        walls: The scene.
+        steps: Sequences, see ``sequences``.
+        source, targets: World positions [m].
+    """
     count, length = steps.shape
     if not count:
         return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps)
     planes, plane = walls.planes, steps >> 1
     point, normal = planes.point[plane], planes.normal[plane]
-    place = (source - walls.origin).expand(count, 3)
-    target = targets - walls.origin
+    place, target = source - walls.origin, targets - walls.origin
     seen = images(place, point, normal, (steps & 1).bool())
     nodes = torch.stack([place, *corners_of(target, seen, point, normal), target], 1)
     none = torch.full((count, 1), -1)
