@@ -74,6 +74,16 @@ class Walls(Occluders):
         return tables | {"of_face": to_index(planes.face_plane.clamp_min(0))}
 
 
+    @cached_property
+    def device_rims(self) -> Any:
+        """How near to their sides rays may have missed triangles: share of the least height."""
+        corners = self.exact_vertices[self.topology.faces]
+        sides = corners.roll(-1, 1) - corners
+        area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1)
+        height = area / sides.norm(dim=2).amax(1).clamp_min(1e-300)
+        return to_float(self.margin / height.clamp_min(1e-300))
+
+
 @dataclass(frozen=True)
 class Chains:
     """Specular paths of one number of steps, as triangles that they meet; detached.
@@ -238,7 +248,10 @@ class _Screen:
     def _clear(
         self, row: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
     ) -> Any:
-        """Whether one ray a segment meets nothing, or what it should; seams let rays through."""
+        """Whether one ray a segment meets nothing, or what it should; seams let rays through.
+
+        What it meets at a triangle's rim is left to the exact test.
+        """
         walls = self.walls
         margin, scene = opaque(walls.margin, "Float64"), walls.scene
         start = dr.gather(mi.Vector3d, self.images, row * (self.length + 1))
@@ -248,8 +261,8 @@ class _Screen:
             unit = way / dr.maximum(length, 1e-300)
             begin = start
             if step:
-                normal = normals[step - 1]
-                begin = start + normal * dr.mulsign(margin, dr.dot(unit, normal))
+                # Along the way: aside of it, rays would see other edges.
+                begin = start + unit * (margin / dr.maximum(dr.abs(dr.dot(unit, normals[step - 1])), 0.1))
             last = step == self.length
             over = -margin
             if not last:
@@ -258,10 +271,15 @@ class _Screen:
             ray = mi.Ray3f(mi.Point3f(begin), mi.Vector3f(unit), mi.Float(far), 0.0, [])
             hit = scene.ray_intersect_preliminary(ray, active=ok)
             valid = hit.is_valid() & ok
-            if last:
-                return ok & ~valid
+            u, v = hit.prim_uv.x, hit.prim_uv.y
+            rim = dr.gather(mi.Float, walls.device_rims, hit.prim_index, valid)
+            deep = valid & (dr.minimum(dr.minimum(u, v), 1 - u - v) > rim)
             plane = dr.gather(mi.UInt32, walls.device_planes["of_face"], hit.prim_index, valid)
-            ok &= ~valid | ((plane == planes[step]) & (hit.t > mi.Float(length - over)))
+            if step:
+                deep &= plane != planes[step - 1]
+            if last:
+                return ok & ~deep
+            ok &= ~deep | ((plane == planes[step]) & (hit.t > mi.Float(length - over)))
             start = end
         return ok
 
