@@ -133,7 +133,7 @@ def hand_over(kind: str, path: str, variable: str, handed: str, memory: str, sec
     try:
         import numpy as np
 
-        np.savez(handed, allow_pickle=False, **_packed(_READERS[kind](path, variable)))
+        np.savez(handed, **_packed(_READERS[kind](path, variable)))
     except MemoryError:
         sys.exit(_LARGE)
     except KeyError as error:

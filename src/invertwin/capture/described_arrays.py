@@ -165,7 +165,7 @@ def write_chirps(
         if target.suffix == ".npy":
             np.save(part, array)
         elif target.suffix == ".npz":
-            np.savez(part, allow_pickle=False, adc=array)
+            np.savez(part, adc=array)
         elif target.suffix == ".mat":
             scipy.io.savemat(part, {"adc": array})
         else:
