@@ -5,18 +5,17 @@ So a child process reads them within limits of time and memory and hands over pl
 files that the user trusts are read in this process.
 """
 
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from invertwin.errors import InputError
-from invertwin.untrusted import read_arrays
 
 if TYPE_CHECKING:  # a child process starts without what it does not need
     import numpy as np
@@ -79,30 +78,27 @@ def read_apart(
         return _READERS[kind](os.fspath(path), variable)
     size = path.stat().st_size
     seconds, memory = _SECONDS + size / _BYTES_PER_SECOND, _MEMORY + 4 * size
-    with tempfile.TemporaryDirectory() as folder:
-        handed = Path(folder) / "arrays.npz"
-        limits = [str(memory), str(int(seconds))]
-        # -P: the reader's libraries are those of this process, not what lies in the folder.
-        call = [sys.executable, "-P", "-c", _CHILD, kind, os.fspath(path), variable]
-        known = os.environ | {"PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
-        try:
-            ended = subprocess.run(
-                [*call, str(handed), *limits],
-                capture_output=True,
-                timeout=_WAITING * seconds,
-                env=known,
-            )
-            code, said = ended.returncode, ended.stdout.decode(errors="replace")
-        except subprocess.TimeoutExpired:
-            code, said = _SLOW, ""
-        if not code:
-            return _unpacked(read_arrays(handed, "read it again"))
+    # -P: the reader's libraries are those of this process, not what lies in the folder.
+    call = [sys.executable, "-P", "-c", _CHILD, kind, os.fspath(path), variable]
+    known = os.environ | {"PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
+    try:
+        ended = subprocess.run(
+            [*call, str(memory), str(int(seconds))],
+            capture_output=True,
+            timeout=_WAITING * seconds,
+            env=known,
+        )
+        code, said = ended.returncode, ended.stdout
+    except subprocess.TimeoutExpired:
+        code, said = _SLOW, b""
+    if not code:
+        return _unpacked(said)
     if code == _MISSING:
         raise KeyError(variable)
     told = {
         _SLOW: f"one that takes its reader more than {seconds:.0f} s",
         _LARGE: f"one that asks for more than {memory / 1e9:.1f} GB",
-        _REFUSED: f"one that its reader refuses ({' '.join(said.split())[:200]})",
+        _REFUSED: f"one that its reader refuses ({said.decode(errors='replace').strip()})",
     }
     crash = f"one that crashes its reader ({signal.Signals(-code).name if code < 0 else code})"
     raise InputError(
@@ -111,43 +107,39 @@ def read_apart(
     )
 
 
-def hand_over(kind: str, path: str, variable: str, handed: str, memory: str, seconds: str) -> None:
+def hand_over(kind: str, path: str, variable: str, memory: str, seconds: str) -> None:
     """What the child process does: read a file within limits, and write what it holds.
 
     Args:
         kind: Of the file.
         path: The file.
         variable: Which is read.
-        handed: The NumPy file that gets the arrays.
         memory: Address space [bytes].
         seconds: Processor time [s].
     """
     try:
         import resource
-    except ImportError:  # Windows has no such limits; the time is limited by the parent
+    except ImportError:  # Windows has no such limits; the parent limits the time
         pass
     else:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 1))
-    try:
-        import numpy as np
+    # What libraries print must not be among the arrays.
+    with os.fdopen(os.dup(1), "wb") as handed:
+        os.dup2(2, 1)
+        try:
+            import numpy as np
 
-        np.savez(handed, **_packed(_READERS[kind](path, variable)))
-    except MemoryError:
-        sys.exit(_LARGE)
-    except KeyError as error:
-        if error.args == (variable,):
-            sys.exit(_MISSING)
-        _refuse(error)
-    # Whatever a library raises for a damaged file, the parent tells it in one line.
-    except Exception as error:
-        _refuse(error)
-
-
-def _refuse(error: Exception) -> None:
-    print(ascii(f"{type(error).__name__}: {error}"[:400])[1:-1])
-    sys.exit(_REFUSED)
+            np.savez(handed, *_packed(_READERS[kind](path, variable)))
+        except MemoryError:
+            sys.exit(_LARGE)
+        # Whatever a library raises for a damaged file, the parent tells it in one line.
+        except Exception as error:
+            if isinstance(error, KeyError) and error.args == (variable,):
+                sys.exit(_MISSING)
+            handed.write(ascii(f"{type(error).__name__}: {error}"[:200])[1:-1].encode())
+            sys.exit(_REFUSED)
 
 
 def _netcdf(path: str, _variable: str) -> StoredArrays:
@@ -198,8 +190,8 @@ _READERS: dict[str, Callable[[str, str], StoredArrays]] = {
 }
 
 
-def _packed(stored: StoredArrays) -> "dict[str, np.ndarray]":
-    """Plain arrays by number, and the names as text."""
+def _packed(stored: StoredArrays) -> "list[np.ndarray]":
+    """Plain arrays; the last is text that names the others by their number."""
     import numpy as np
 
     arrays: list[np.ndarray] = []
@@ -221,14 +213,18 @@ def _packed(stored: StoredArrays) -> "dict[str, np.ndarray]":
         ],
         "attributes": put_all(stored.attributes),
     }
-    return {"names": np.asarray(json.dumps(names)), **{str(k): a for k, a in enumerate(arrays)}}
+    return [*arrays, np.asarray(json.dumps(names))]
 
 
-def _unpacked(packed: "dict[str, np.ndarray]") -> StoredArrays:
-    names = json.loads(packed["names"].item())
+def _unpacked(handed: bytes) -> StoredArrays:
+    import numpy as np
+
+    with np.load(io.BytesIO(handed), allow_pickle=False) as archive:
+        *packed, text = archive.values()
+    names = json.loads(text.item())
 
     def attributes(numbers: dict[str, int]) -> dict[str, Any]:
-        found = {name: packed[str(number)] for name, number in numbers.items()}
+        found = {name: packed[number] for name, number in numbers.items()}
         # A number of NumPy stays one; text of NumPy is text.
         return {
             name: value.item() if value.ndim == 0 and value.dtype.kind == "U" else value[()]
@@ -236,7 +232,7 @@ def _unpacked(packed: "dict[str, np.ndarray]") -> StoredArrays:
         }
 
     arrays = {
-        name: StoredArray(tuple(dimensions), packed[str(number)], attributes(own))
+        name: StoredArray(tuple(dimensions), packed[number], attributes(own))
         for name, dimensions, number, own in names["arrays"]
     }
     return StoredArrays(arrays, attributes(names["attributes"]))
