@@ -103,8 +103,8 @@ def read_apart(
     }
     crash = f"one that crashes its reader ({signal.Signals(-code).name if code < 0 else code})"
     raise InputError(
-        f"expected a whole {_NAMES[kind]} file, got {path}, {told.get(code, crash)}; it is damaged or of "
-        "another kind: copy or record it again. If you trust it, say trusted = True"
+        f"expected a whole {_NAMES[kind]} file, got {path}, {told.get(code, crash)}; it is "
+        "damaged or of another kind: copy or record it again. If you trust it, say trusted = True"
     )
 
 
