@@ -9,7 +9,17 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
 FOUNDATION = {
-    *("constants", "errors", "limits", "seeds", "folders", "memory", "untrusted", "progress"),
+    *(
+        "constants",
+        "errors",
+        "limits",
+        "seeds",
+        "folders",
+        "memory",
+        "untrusted",
+        "apart",
+        "progress",
+    ),
 }
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "threads", "channel"}
@@ -18,7 +28,7 @@ LINKS = CHANNEL - {"doctor", "threads"} | {"links"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
 SIGNATURES = CHANNEL | {"signatures"}
-MODELS = SIMULATION | CAPTURE | {"signatures", "models"}
+MODELS = SIMULATION | CAPTURE | LINKS | {"signatures", "models"}
 INVERSION = MODELS | {"inversion"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
@@ -30,6 +40,7 @@ ALLOWED = {
     "folders": {"errors"},
     "memory": {"errors"},
     "untrusted": {"errors"},
+    "apart": {"errors"},
     "progress": set(),
     "threads": set(),
     "doctor": FOUNDATION,
@@ -47,7 +58,7 @@ ALLOWED = {
     "registry": FOUNDATION | {"registry"},
     "cli": INVERSION | SIGNATURES | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
-    "__init__": INVERSION | LINKS | SIGNATURES | {"doctor", "threads"},
+    "__init__": INVERSION | SIGNATURES | {"doctor", "threads"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}
 KNOW_THE_RAY_TRACER = {"channel"}
