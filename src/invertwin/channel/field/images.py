@@ -73,7 +73,6 @@ class Walls(Occluders):
         tables = {name: to_double(value) for name, value in (vectors | ends).items()}
         return tables | {"of_face": to_index(planes.face_plane.clamp_min(0))}
 
-
     @cached_property
     def device_rims(self) -> Any:
         """How near to their sides rays may have missed triangles: share of the least height."""
@@ -262,7 +261,9 @@ class _Screen:
             begin = start
             if step:
                 # Along the way: aside of it, rays would see other edges.
-                begin = start + unit * (margin / dr.maximum(dr.abs(dr.dot(unit, normals[step - 1])), 0.1))
+                begin = start + unit * (
+                    margin / dr.maximum(dr.abs(dr.dot(unit, normals[step - 1])), 0.1)
+                )
             last = step == self.length
             over = -margin
             if not last:

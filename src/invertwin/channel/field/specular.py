@@ -308,7 +308,9 @@ def _bent_columns(stage: _Stage, around: EdgedScene, bends: Bends) -> tuple[Tens
     up = torch.tensor(_UP, dtype=torch.float64)
     sent, received = (polarisations(way, up).to(found.transfer) for way in (departure, arrival))
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
-    rate = _approach(stage, bends.tx, bends.rx, list(found.ways.unbind(1)), found.points, found.faces)
+    rate = _approach(
+        stage, bends.tx, bends.rx, list(found.ways.unbind(1)), found.points, found.faces
+    )
     return (
         found.length / SPEED_OF_LIGHT,
         matrix * (SPEED_OF_LIGHT / stage.frequency / (4 * math.pi)),

@@ -20,7 +20,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.waves import cross, dot
-from invertwin.scene.checks import plain
 
 LEAST_ANGLE = math.radians(10.0)
 """Nearer to grazing, or to the edge itself, fringe currents are not valid."""
@@ -170,18 +169,18 @@ def joined_wedges(wedges: Wedges) -> Wedges:
     if not len(wedges.start):
         return wedges
     # Both orders of the faces are one edge: the first one leans more to some direction.
-    lean = plain(wedges.inwards + wedges.normals * math.sqrt(3)) @ _ANYWHERE
+    lean = (wedges.inwards + wedges.normals * math.sqrt(3)).detach() @ _ANYWHERE
     order = torch.where((lean[:, :1] < lean[:, 1:]), _SECOND_FIRST, _SECOND_FIRST.flip(0))
     rows = torch.arange(len(order))[:, None]
     inwards, normals = wedges.inwards[rows, order], wedges.normals[rows, order]
-    axis = plain(cross(inwards[:, 0], normals[:, 0]))
-    against = (dot(axis, plain(wedges.end - wedges.start)) < 0)[:, None]
+    axis = cross(inwards[:, 0], normals[:, 0]).detach()
+    against = (dot(axis, wedges.end - wedges.start) < 0)[:, None]
     start = torch.where(against, wedges.end, wedges.start)
     end = torch.where(against, wedges.start, wedges.end)
-    low, high = dot(axis, plain(start)), dot(axis, plain(end))
+    low, high = dot(axis, start.detach()), dot(axis, end.detach())
     size = float(torch.maximum(low.abs(), high.abs()).amax()) + float((high - low).amax())
-    aside = (plain(start) - low[:, None] * axis) / size
-    key = torch.cat([aside, plain(inwards.flatten(1)), plain(normals.flatten(1))], 1)
+    aside = (start.detach() - low[:, None] * axis) / size
+    key = torch.cat([aside, inwards.flatten(1), normals.flatten(1)], 1).detach()
     # Adding zero makes negative zeros positive.
     rounded = (key / _ALIKE).round().numpy() + 0.0
     line = np.unique(rounded, axis=0, return_inverse=True)[1].ravel()
