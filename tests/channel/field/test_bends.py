@@ -116,6 +116,7 @@ def step_at(
 LOW, UP = float64([0.5, 5.3, 2.5]), float64([0.02, 0.05, 0.9])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("around", "steps"),
     [
@@ -130,6 +131,7 @@ def test_mirrored_waves_end_at_edges_without_a_jump(around, steps):
     assert whole < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [1, 2])
 def test_what_is_mirrored_once_more_ends_at_edges_without_a_jump(depth):
     """From the floor by the wall; with one surface, edges behind the floor mirror nothing."""

@@ -7,6 +7,10 @@ of the edge, since the end itself then sends. Nothing therefore jumps where a ra
 edge, and sums over the edges of a plate have no jump at its corners.
 
 Source: derivations §9.
+
+Differs from the source: where a path has as many surfaces as it may, its edge's faces neither
+mirror nor let through. Waves of one surface more are not followed, and what makes up for their ends
+would jump.
 """
 
 from collections.abc import Iterator
@@ -175,8 +179,13 @@ class _Reach:
 
     def rows(self, index: Tensor) -> "_Reach":
         """Some rows."""
-        columns = (self.antenna, self.edge, self.steps, self.image)
-        return _Reach(*(column[index] for column in columns), self.places)
+        return _Reach(
+            self.antenna[index],
+            self.edge[index],
+            self.steps[index],
+            self.image[index],
+            self.places,
+        )
 
     @property
     def start(self) -> Tensor:

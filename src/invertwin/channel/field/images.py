@@ -258,12 +258,12 @@ class _Screen:
             way = end - start
             length = dr.norm(way)
             unit = way / dr.maximum(length, 1e-300)
-            begin = start
+            # Along the way: aside of it, rays would see other edges.
+            lift = mi.Float64(0.0)
             if step:
-                # Along the way: aside of it, rays would see other edges.
-                begin = start + unit * (
-                    margin / dr.maximum(dr.abs(dr.dot(unit, normals[step - 1])), 0.1)
-                )
+                lift = margin / dr.maximum(dr.abs(dr.dot(unit, normals[step - 1])), 0.1)
+            length -= lift
+            begin = start + unit * lift
             last = step == self.length
             over = -margin
             if not last:

@@ -116,15 +116,16 @@ def trace_paths(
         rx: Receivers, [3] or [rx, 3] [m].
         frequency: Of the coefficients [Hz].
         depth: Most surfaces that a path meets, 0 to 6; a sheet that it passes counts as one.
-        edges: Most edges that a path goes round, 0 to 2; such paths meet no mirrors or sheets.
-        rays: Shot from each antenna of the side with fewer; None tries every sequence.
+        edges: Most edges that a path goes round, 0 to 2. Paths round one edge also meet up to
+            ``depth`` surfaces; round two, none.
+        rays: Shot from each antenna of the side with fewer, and from all edges together; None tries
+            every sequence.
         seed: Of the rays' directions.
         tx_velocity: Of the transmitters, one or one for each [m/s].
         rx_velocity: Of the receivers [m/s].
 
     Raises:
-        InputError: Wrong shapes or numbers, a cloud, too many sequences to try one by one, or edges
-            in a scene with objects in motion.
+        InputError: Wrong shapes or numbers, a cloud, or too many sequences to try one by one.
 
     Source: derivations §9 and §10.
     """
