@@ -100,7 +100,8 @@ def trace_coverage(
         width: Numbers that a path adds.
         depth: Most surfaces that a path meets.
         rays: Shot from each transmitter to find sequences of surfaces; None tries every one.
-        boundary_samples: Points on edges, for each transmitter; 0 leaves boundary paths out.
+        boundary_samples: Points on edges, for each transmitter; 0 leaves boundary paths out. Only
+            derivatives by places use them.
         seed: Of rays and edge points.
     """
     stage = _staged(scene, tx, points, frequency, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -108,10 +109,10 @@ def trace_coverage(
         trace = _Trace(stage, screen, measure, width, depth, rays, seed)
         amount = trace.amounts(stage, trace.chains(plain(stage.rx)))
         crossings: list[Crossing] = []
-        if boundary_samples:
+        moved = differentiated(stage.vertices)
+        if boundary_samples and (moved or differentiated(stage.tx)):
             crossings += trace.rims(stage, boundary_samples, seed)
-            if differentiated(stage.vertices):
-                crossings.append(trace.cuts(stage, boundary_samples, seed))
+            crossings += [trace.cuts(stage, boundary_samples, seed)] if moved else []
     return Lit(amount, tuple(crossings))
 
 

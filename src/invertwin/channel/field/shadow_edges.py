@@ -166,7 +166,7 @@ def rim_points(
         if not len(edges.along):
             continue
         ends = [walls.exact_vertices[vertex] for vertex in (edges.first, edges.second)]
-        y = torch.lerp(*ends, edges.along[:, None])
+        y = torch.lerp(ends[0], ends[1], edges.along[:, None])
         chains = [
             some
             for steps in (torch.zeros(1, 0, dtype=torch.int64), *sequences)
