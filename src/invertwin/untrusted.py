@@ -1,19 +1,13 @@
 """Files from strangers: every reader works in here, and what it cannot read is one line.
 
-Some libraries read a damaged file for ever, or end the whole process: one wrong byte is enough in
-HDF5, NetCDF and MATLAB files. So these are read by a child process first, within limits of time
-and memory, unless the user trusts them.
+What can hang or crash its reader is read by a child process: `apart.py`.
 """
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from zipfile import ZipFile
 
 from invertwin.errors import InputError
@@ -24,34 +18,6 @@ if TYPE_CHECKING:  # the command line starts without NumPy
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 _DAMAGED = "it is damaged or of another kind; copy or export it again"
-_SECONDS, _BYTES_PER_SECOND = 8.0, 10e6  # of processor time, that of importing a reader with it
-_WAITING = 10.0  # times as long on a busy machine
-_MEMORY = 2 << 30  # beside four times the size of the file
-_READERS = {
-    "netcdf": "import xarray; xarray.load_dataset(path, engine='h5netcdf', decode_cf=False)",
-    "hdf5": "import h5py; h5py.File(path)[variable][()]",
-    "matlab": "import scipy.io; scipy.io.loadmat(path, variable_names=[variable])",
-}
-_LARGE = 77  # exit code of the child
-_SLOW = -getattr(signal, "SIGXCPU", 0) or 78
-# An error of a reader is told by it again where the result is wanted.
-_CHILD = """
-import sys
-path, variable, memory, seconds = sys.argv[1:]
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
-    resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 1))
-except ImportError:
-    pass
-try:
-    {reader}
-except MemoryError:
-    sys.exit(77)
-except Exception:
-    pass
-"""
 
 
 @contextmanager
@@ -192,41 +158,3 @@ def _check_header(opened: Any, size: int) -> None:
     if prod(shape) * kind.itemsize > size:
         raise ValueError(f"a header that says {shape} numbers of {kind}, more than the file holds")
     opened.seek(0)
-
-
-def try_apart(
-    path: Path, kind: Literal["netcdf", "hdf5", "matlab"], variable: str | None = None
-) -> None:
-    """Let a child process read a file first: one that hangs or crashes it is refused.
-
-    What the reader raises is no matter here: it raises it again when the file is read.
-
-    Args:
-        path: The file.
-        kind: Who reads it.
-        variable: Which is read; NetCDF files are read as a whole.
-
-    Raises:
-        InputError: The reader did not end in time, crashed, or asked for too much memory.
-    """
-    size = path.stat().st_size
-    seconds, memory = _SECONDS + size / _BYTES_PER_SECOND, _MEMORY + 4 * size
-    script = _CHILD.format(reader=_READERS[kind])
-    limits = [str(memory), str(int(seconds))]
-    call = [sys.executable, "-c", script, os.fspath(path), variable or "", *limits]
-    try:
-        code = subprocess.run(call, capture_output=True, timeout=_WAITING * seconds).returncode
-    except subprocess.TimeoutExpired:
-        code = _SLOW
-    if not code:
-        return
-    if code == _SLOW:
-        what = f"one that takes its reader more than {seconds:.0f} s"
-    elif code == _LARGE:
-        what = f"one that asks for more than {memory / 1e9:.1f} GB"
-    else:
-        what = f"one that crashes its reader ({signal.Signals(-code).name if code < 0 else code})"
-    raise InputError(
-        f"expected a whole {kind} file, got {path}, {what}; it is damaged: copy or record it "
-        "again. If you trust it, say trusted = True"
-    )

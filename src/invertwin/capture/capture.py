@@ -134,7 +134,7 @@ class Capture:
 
         Args:
             path: file.
-            trusted: read it at once.
+            trusted: read it in this process, not in a child process.
 
         Raises:
             InputError: no such file, a truncated file, or one that holds no capture.

@@ -11,6 +11,7 @@ import scipy.io
 import tomli_w
 import torch
 
+from invertwin.apart import read_apart
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
 from invertwin.errors import InputError
 from invertwin.folders import replacing
@@ -23,7 +24,6 @@ from invertwin.untrusted import (
     read_npy,
     reader,
     reading,
-    try_apart,
 )
 
 # The data tell these settings by their shape and kind.
@@ -102,7 +102,7 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
 
     Args:
         path: the description.
-        trusted: read the data at once.
+        trusted: read the data in this process, not in a child process.
 
     Raises:
         InputError: no file, a damaged one, unknown or missing keys, or dimensions that do not fit.
@@ -165,7 +165,7 @@ def write_chirps(
         if target.suffix == ".npy":
             np.save(part, array)
         elif target.suffix == ".npz":
-            np.savez(part, allow_pickle=False, adc=array)
+            np.savez(part, adc=array)
         elif target.suffix == ".mat":
             scipy.io.savemat(part, {"adc": array})
         else:
@@ -241,15 +241,10 @@ def _loaded(path: Path, ending: str, variable: str | None, *, trusted: bool) -> 
         return read_npy(path)
     if ending == ".npz":
         return read_arrays(path, "it is damaged or of another kind", [str(variable)])[str(variable)]
-    matlab = ending == ".mat" and not h5py.is_hdf5(path)
-    if not trusted:
-        try_apart(path, "matlab" if matlab else "hdf5", str(variable))
-    if matlab:
-        return np.asarray(scipy.io.loadmat(path, variable_names=[str(variable)])[str(variable)])
-    with h5py.File(path, "r") as opened:
-        array = np.asarray(opened[str(variable)])
-    # MATLAB stores the first dimension fastest.
-    return array.T if ending == ".mat" else array
+    stored = read_apart(
+        path, "matlab" if ending == ".mat" else "hdf5", str(variable), trusted=trusted
+    )
+    return stored.arrays[str(variable)].values
 
 
 def _arranged(array: np.ndarray, order: Any, transmitters: int | None) -> np.ndarray:

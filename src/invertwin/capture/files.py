@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import xarray as xr
 
+from invertwin.apart import read_apart
 from invertwin.errors import InputError
 from invertwin.folders import replacing
-from invertwin.untrusted import existing_file, reading, try_apart
+from invertwin.untrusted import existing_file, reading
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
@@ -33,20 +33,15 @@ def read_dataset(path: Path, *, trusted: bool = False) -> xr.Dataset:
 
     Args:
         path: file.
-        trusted: do not let a child process try it first.
+        trusted: read it in this process, not in a child process.
 
     Raises:
         InputError: no such file, or one that is damaged or no NetCDF.
     """
     existing_file(path, "a capture file")
-    if not trusted:
-        try_apart(path, "netcdf")
     with reading(path, "a whole NetCDF file"):
-        # Where this fails, h5netcdf breaks off half made, and complains when it is thrown away.
-        with h5py.File(path) as file:
-            file.attrs.get("_nc3_strict")
-        # Nothing is decoded: seconds stay numbers, and every bit stays what it was.
-        return _joined(xr.load_dataset(path, engine="h5netcdf", decode_cf=False))
+        stored = read_apart(path, "netcdf", trusted=trusted)
+        return _joined(xr.Dataset(stored.arrays, attrs=stored.attributes))
 
 
 def _split(dataset: xr.Dataset) -> xr.Dataset:

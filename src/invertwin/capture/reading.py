@@ -30,7 +30,7 @@ def read(
         board: whose elements recorded, or (transmitters, receivers), see `ChirpData.recorded`;
             None = as the description says.
         lanes: lanes of the LVDS link, where the settings do not say.
-        trusted: do not let a child process try HDF5, NetCDF and MATLAB files first.
+        trusted: read HDF5, NetCDF and MATLAB files in this process, not in a child process.
 
     Returns:
         One signal per frame and channel, or every chirp of the frames: `ChirpCapture.capture`

@@ -95,7 +95,7 @@ def saved(file: InputPath, trusted: bool = False) -> Capture:
 
     Args:
         file: path, from the run file's folder.
-        trusted: true reads it at once, without a child process that tries whether it is damaged.
+        trusted: true reads it in this process, not in a child process.
     """
     for name in registry.names("waveform"):
         kind = registry.table("waveform", name).made_by
@@ -130,7 +130,7 @@ def arrays(file: InputPath, board: Mounting | None = None, trusted: bool = False
     Args:
         file: the description.
         board: whose elements recorded; without it what the description says.
-        trusted: true reads it at once, without a child process that tries whether it is damaged.
+        trusted: true reads it in this process, not in a child process.
     """
     with about("file"):
         chirps = described_arrays.read_chirps(file, trusted=trusted)

@@ -1,0 +1,238 @@
+"""Files that can hang or crash their reader are read by a child process.
+
+One wrong byte makes libraries of HDF5, NetCDF and MATLAB files read for ever or end the process.
+So a child process reads them within limits of time and memory and hands over plain arrays. Only
+files that the user trusts are read in this process.
+"""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from invertwin.errors import InputError
+
+if TYPE_CHECKING:  # a child process starts without what it does not need
+    import numpy as np
+
+_SECONDS, _BYTES_PER_SECOND = 8.0, 10e6  # of processor time, that of importing a reader with it
+_WAITING = 10.0  # times as long on a busy machine
+_MEMORY = 2 << 30  # beside four times the size of the file
+_LARGE, _REFUSED, _MISSING = 77, 76, 75  # exit codes of the child
+_SLOW = -getattr(signal, "SIGXCPU", 0) or 78
+_CHILD = "import sys; from invertwin.apart import hand_over; hand_over(*sys.argv[1:])"
+
+
+class StoredArray(NamedTuple):
+    """An array as a file holds it.
+
+    Attributes:
+        dimensions: Their names; none where the format has none.
+        values: Numbers or text, never objects.
+        attributes: Numbers, text and arrays of them by name.
+    """
+
+    dimensions: tuple[str, ...]
+    values: "np.ndarray"
+    attributes: dict[str, Any]
+
+
+class StoredArrays(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        arrays: By name.
+        attributes: Of the file.
+    """
+
+    arrays: dict[str, StoredArray]
+    attributes: dict[str, Any]
+
+
+def read_apart(
+    path: Path,
+    kind: Literal["netcdf", "hdf5", "matlab"],
+    variable: str = "",
+    *,
+    trusted: bool = False,
+) -> StoredArrays:
+    """Read a file of HDF5, NetCDF or MATLAB by a child process.
+
+    Args:
+        path: The file.
+        kind: What it should be. Files of MATLAB 7.3 are HDF5 inside.
+        variable: Which is read; NetCDF files are read as a whole.
+        trusted: Read it in this process, which is faster by about a second.
+
+    Raises:
+        InputError: The reader did not end in time, crashed, asked for too much memory, or
+            refused the file.
+        KeyError: No such variable.
+    """
+    if trusted:
+        return _READERS[kind](os.fspath(path), variable)
+    size = path.stat().st_size
+    seconds, memory = _SECONDS + size / _BYTES_PER_SECOND, _MEMORY + 4 * size
+    # -P: the reader's libraries are those of this process, not what lies in the folder.
+    call = [sys.executable, "-P", "-c", _CHILD, kind, os.fspath(path), variable]
+    known = os.environ | {"PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
+    try:
+        ended = subprocess.run(
+            [*call, str(memory), str(int(seconds))],
+            capture_output=True,
+            timeout=_WAITING * seconds,
+            env=known,
+        )
+        code, said = ended.returncode, ended.stdout
+    except subprocess.TimeoutExpired:
+        code, said = _SLOW, b""
+    if not code:
+        return _unpacked(said)
+    if code == _MISSING:
+        raise KeyError(variable)
+    told = {
+        _SLOW: f"one that takes its reader more than {seconds:.0f} s",
+        _LARGE: f"one that asks for more than {memory / 1e9:.1f} GB",
+        _REFUSED: f"one that its reader refuses ({said.decode(errors='replace').strip()})",
+    }
+    crash = f"one that crashes its reader ({signal.Signals(-code).name if code < 0 else code})"
+    raise InputError(
+        f"expected a whole {kind} file, got {path}, {told.get(code, crash)}; it is damaged or of "
+        "another kind: copy or record it again. If you trust it, say trusted = True"
+    )
+
+
+def hand_over(kind: str, path: str, variable: str, memory: str, seconds: str) -> None:
+    """What the child process does: read a file within limits, and write what it holds.
+
+    Args:
+        kind: Of the file.
+        path: The file.
+        variable: Which is read.
+        memory: Address space [bytes].
+        seconds: Processor time [s].
+    """
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits; the parent limits the time
+        pass
+    else:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
+        resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 1))
+    # What libraries print must not be among the arrays.
+    with os.fdopen(os.dup(1), "wb") as handed:
+        os.dup2(2, 1)
+        try:
+            import numpy as np
+
+            np.savez(handed, *_packed(_READERS[kind](path, variable)))
+        except MemoryError:
+            sys.exit(_LARGE)
+        # Whatever a library raises for a damaged file, the parent tells it in one line.
+        except Exception as error:
+            if isinstance(error, KeyError) and error.args == (variable,):
+                sys.exit(_MISSING)
+            handed.write(ascii(f"{type(error).__name__}: {error}"[:200])[1:-1].encode())
+            sys.exit(_REFUSED)
+
+
+def _netcdf(path: str, _variable: str) -> StoredArrays:
+    import h5py
+    import xarray
+
+    # Where this fails, h5netcdf breaks off half made, and complains when it is thrown away.
+    with h5py.File(path) as file:
+        file.attrs.get("_nc3_strict")
+    # Nothing is decoded: seconds stay numbers, and every bit stays what it was.
+    whole = xarray.load_dataset(path, engine="h5netcdf", decode_cf=False)
+    arrays = {
+        str(name): StoredArray(tuple(map(str, array.dims)), array.values, dict(array.attrs))
+        for name, array in whole.variables.items()
+    }
+    return StoredArrays(arrays, dict(whole.attrs))
+
+
+def _hdf5(path: str, variable: str) -> StoredArrays:
+    import h5py
+    import numpy as np
+
+    with h5py.File(path, "r") as opened:
+        if variable not in opened:
+            raise KeyError(variable)
+        return StoredArrays({variable: StoredArray((), np.asarray(opened[variable]), {})}, {})
+
+
+def _matlab(path: str, variable: str) -> StoredArrays:
+    import h5py
+    import numpy as np
+    import scipy.io
+
+    if h5py.is_hdf5(path):
+        array = _hdf5(path, variable).arrays[variable]
+        # MATLAB stores the first dimension fastest.
+        return StoredArrays({variable: array._replace(values=array.values.T)}, {})
+    found = scipy.io.loadmat(path, variable_names=[variable])
+    if variable not in found:
+        raise KeyError(variable)
+    return StoredArrays({variable: StoredArray((), np.asarray(found[variable]), {})}, {})
+
+
+_READERS: dict[str, Callable[[str, str], StoredArrays]] = {
+    "netcdf": _netcdf,
+    "hdf5": _hdf5,
+    "matlab": _matlab,
+}
+
+
+def _packed(stored: StoredArrays) -> "list[np.ndarray]":
+    """Plain arrays; the last is text that names the others by their number."""
+    import numpy as np
+
+    arrays: list[np.ndarray] = []
+
+    def put(name: str, value: Any) -> int:
+        array = np.asarray(value)
+        if array.dtype.hasobject:
+            raise ValueError(f"{name} holds objects, not numbers or text")
+        arrays.append(array)
+        return len(arrays) - 1
+
+    def put_all(values: dict[str, Any]) -> dict[str, int]:
+        return {name: put(name, value) for name, value in values.items()}
+
+    names = {
+        "arrays": [
+            [name, array.dimensions, put(name, array.values), put_all(array.attributes)]
+            for name, array in stored.arrays.items()
+        ],
+        "attributes": put_all(stored.attributes),
+    }
+    return [*arrays, np.asarray(json.dumps(names))]
+
+
+def _unpacked(handed: bytes) -> StoredArrays:
+    import numpy as np
+
+    with np.load(io.BytesIO(handed), allow_pickle=False) as archive:
+        *packed, text = archive.values()
+    names = json.loads(text.item())
+
+    def attributes(numbers: dict[str, int]) -> dict[str, Any]:
+        found = {name: packed[number] for name, number in numbers.items()}
+        # A number of NumPy stays one; text of NumPy is text.
+        return {
+            name: value.item() if value.ndim == 0 and value.dtype.kind == "U" else value[()]
+            for name, value in found.items()
+        }
+
+    arrays = {
+        name: StoredArray(tuple(dimensions), packed[number], attributes(own))
+        for name, dimensions, number, own in names["arrays"]
+    }
+    return StoredArrays(arrays, attributes(names["attributes"]))
