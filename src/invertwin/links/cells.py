@@ -9,6 +9,7 @@ sweep over the cells, count (derivations §11).
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -29,7 +30,7 @@ from invertwin.scene.scene import Scene
 
 
 @dataclass(frozen=True)
-class Spread:
+class CellSampling:
     """How many points a map of cells takes.
 
     Attributes:
@@ -58,10 +59,30 @@ class Cells(Places):
     """Cells of a surface, which hides nothing and is at rest.
 
     Attributes:
-        spread: How many points.
+        sampling: How many points.
     """
 
-    spread: Spread
+    sampling: CellSampling
+    random: ClassVar[bool] = True
+
+    @abstractmethod
+    def sampled(self, sampling: CellSampling) -> "Cells":
+        """The same cells with other numbers of points.
+
+        Args:
+            sampling: How many points.
+        """
+
+    def finer(self, samples: int) -> "Cells":
+        """The same cells with so many points in all. See ``Places.finer``."""
+        points = max(1, samples // len(self.areas))
+        return self.sampled(replace(self.sampling, points=points))
+
+    def fixed_visibility(self) -> "Cells | None":
+        """The same cells without boundary paths. See ``Places.fixed_visibility``."""
+        if not self.sampling.boundary:
+            return None
+        return self.sampled(replace(self.sampling, boundary=False))
 
     @abstractmethod
     def surface(self) -> Mesh:
@@ -126,7 +147,7 @@ class Cells(Places):
             3,
             depth=reception.depth,
             rays=reception.rays,
-            boundary_samples=self.spread.edge_points if self.spread.boundary else 0,
+            boundary_samples=self.sampling.edge_points if self.sampling.boundary else 0,
             seed=seed,
         )
         mean = lit.amount.unflatten(1, points.shape[:2]).mean(2)
@@ -150,7 +171,7 @@ class MapPlane(Cells):
         corner: [m].
         first, second: Sides, from the corner on [m].
         count: Cells along them.
-        spread: How many points.
+        sampling: How many points.
 
     Raises:
         InputError: Wrong shapes, NaN, sides without an area between them, or no cell.
@@ -160,7 +181,7 @@ class MapPlane(Cells):
     first: Float64[Tensor, "3"]
     second: Float64[Tensor, "3"]
     count: tuple[int, int]
-    spread: Spread = Spread()
+    sampling: CellSampling = CellSampling()
 
     def __post_init__(self) -> None:
         for name in ("corner", "first", "second"):
@@ -185,7 +206,7 @@ class MapPlane(Cells):
         high: ArrayLike,
         height: float,
         cell: float,
-        spread: Spread = Spread(),
+        sampling: CellSampling = CellSampling(),
     ) -> "MapPlane":
         """Cells over x and y at one height z.
 
@@ -194,7 +215,7 @@ class MapPlane(Cells):
             high: Greatest x and y [m].
             height: z [m].
             cell: Length of a cell's sides; the nearest that divides the sides of the map [m].
-            spread: How many points.
+            sampling: How many points.
 
         Raises:
             InputError: Wrong shapes or numbers, or a map without an area.
@@ -210,7 +231,13 @@ class MapPlane(Cells):
         if not (x > 0 and y > 0):
             raise InputError("expected high beyond low in x and y; exchange them")
         count = max(1, round(x / size)), max(1, round(y / size))
-        return cls([*ends[0].tolist(), z], [x, 0.0, 0.0], [0.0, y, 0.0], count, spread)  # type: ignore[arg-type]
+        corner = torch.cat([ends[0], torch.tensor([z], dtype=torch.float64)])
+        sides = torch.tensor([[x, 0.0, 0.0], [0.0, y, 0.0]], dtype=torch.float64)
+        return cls(corner, sides[0], sides[1], count, sampling)
+
+    def sampled(self, sampling: CellSampling) -> "MapPlane":
+        """The same cells with other numbers of points. See ``Cells.sampled``."""
+        return replace(self, sampling=sampling)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -236,7 +263,7 @@ class MapPlane(Cells):
 
     def drawn(self, numbers: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
         """One point at random in each square of a finer grid. See ``Cells.drawn``."""
-        side = self.spread.side
+        side = self.sampling.side
         lattice = [side * n for n in self.count]
         jitter = torch.from_numpy(numbers.random((2, *lattice)))
         s = (torch.arange(lattice[0])[:, None] + jitter[0]) / lattice[0]
@@ -272,14 +299,14 @@ class MapMesh(Cells):
 
     Attributes:
         mesh: In the world [m]. Where it covers a surface of the scene, keep some millimetres off.
-        spread: How many points.
+        sampling: How many points.
 
     Raises:
         InputError: A triangle without area.
     """
 
     mesh: Mesh
-    spread: Spread = Spread()
+    sampling: CellSampling = CellSampling()
 
     def __post_init__(self) -> None:
         mesh = replace(self.mesh, vertices=plain(self.mesh.vertices))
@@ -288,6 +315,10 @@ class MapMesh(Cells):
             raise InputError(
                 "expected triangles with an area for the cells of a map, got one without; remove it"
             )
+
+    def sampled(self, sampling: CellSampling) -> "MapMesh":
+        """The same cells with other numbers of points. See ``Cells.sampled``."""
+        return replace(self, sampling=sampling)
 
     @property
     def shape(self) -> tuple[int]:
@@ -306,7 +337,7 @@ class MapMesh(Cells):
 
     def drawn(self, numbers: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
         """One point at random in each of equal parts of the triangles. See ``Cells.drawn``."""
-        side, cells = self.spread.side, len(self.mesh.faces)
+        side, cells = self.sampling.side, len(self.mesh.faces)
         jitter = torch.from_numpy(numbers.random((2, cells, side, side)))
         steps = torch.arange(side, dtype=torch.float64)
         # A square, of which the root of one side makes a triangle of even density.

@@ -112,7 +112,7 @@ def trace_coverage(
         moved = differentiated(stage.vertices)
         if boundary_samples and (moved or differentiated(stage.tx)):
             crossings += trace.rims(stage, boundary_samples, seed)
-            crossings += [trace.cuts(stage, boundary_samples, seed)] if moved else []
+            crossings += trace.cuts(stage, boundary_samples, seed) if moved else []
     return Lit(amount, tuple(crossings))
 
 
@@ -206,11 +206,13 @@ class _Trace:
             )
         return crossings
 
-    def cuts(self, stage: _Stage, samples: int, seed: int) -> Crossing:
+    def cuts(self, stage: _Stage, samples: int, seed: int) -> list[Crossing]:
         """Boundary paths where the scene cuts the screen: the jump of power, times the rate."""
         with _DisableFuncTorch():
             both = topology_of(self.meshes)
             cuts = cut_points(self.walls, self.screen, both, samples, seed)
+            if not len(cuts.face):
+                return []
             away = ASIDE * self.walls.margin * cuts.aside
             points = torch.cat([cuts.place + away, cuts.place - away])
         with torch.no_grad():
@@ -218,12 +220,14 @@ class _Trace:
             beside, behind = plain(self.amounts(here, self.chains(points))).chunk(2, 1)
         rate = cut_rates(self.walls, cuts, stage.vertices)
         count = len(self.tx)
-        return Crossing(
-            torch.arange(count).repeat_interleave(len(rate)),
-            cuts.place.repeat(count, 1),
-            cuts.on_screen.repeat(count),
-            ((behind - beside) * rate[:, None]).flatten(0, 1),
-        )
+        return [
+            Crossing(
+                torch.arange(count).repeat_interleave(len(rate)),
+                cuts.place.repeat(count, 1),
+                cuts.on_screen.repeat(count),
+                ((behind - beside) * rate[:, None]).flatten(0, 1),
+            )
+        ]
 
 
 def _fixed(stage: _Stage, points: Tensor) -> _Stage:
