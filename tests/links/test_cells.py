@@ -221,7 +221,7 @@ def test_a_mesh_of_cells_is_a_plane_of_cells():
 
 def test_a_box_that_stands_through_the_map_moves():
     # Closed, with floor and ceiling: nothing arrives inside of it.
-    cells = MapPlane.horizontal([-0.7, -1.3], [2.3, 1.7], 1.0, 1.0, CellSampling(points=1600))
+    cells = MapPlane.horizontal([-0.7, -1.15], [2.3, 1.85], 1.0, 1.0, CellSampling(points=1600))
 
     def scene(theta: Tensor) -> Scene:
         turn = rotation_from_vector(float64([0.0, 0.0, 0.4]))
