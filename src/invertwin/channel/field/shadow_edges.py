@@ -141,7 +141,7 @@ def rim_points(
     walls: Walls,
     screen: Screen,
     tx: Float64[Tensor, "tx 3"],
-    sequences: tuple[Int64[Tensor, "sequence step"], ...],
+    sequences: tuple[Tensor, ...],
     powers: Powers,
     *,
     depth: int,
