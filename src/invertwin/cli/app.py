@@ -250,7 +250,10 @@ def _each(
 
 
 def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
-    runs = load_runs([file], options, "reconstruct", ("reconstruct", "data", "grid", "parameters"))
+    def sections(run: Any) -> Sequence[str]:
+        return ("reconstruct", "data", "grid" if run.map is None else "transmitter", "parameters")
+
+    runs = load_runs([file], options, "reconstruct", sections)
     with run_folder(options, default, runs) as folder:
         if folder.complete:
             return

@@ -23,6 +23,7 @@ from invertwin.cli.schema.fits import (
     Variant,
 )
 from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTable
 from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.shape_tables import LearnedTable
@@ -128,6 +129,11 @@ class _RunFile(Section):
     impairments: AnyImpairments | None = key("what the front end of simulated data adds", None)
     raw: Raw | None = key("raw files that simulate writes beside the capture", None)
     data: AnyData | None = key("what is fitted", None)
+    transmitter: TransmitterTable | None = key("what sends, with [map]", None)
+    map: AnyMap | None = key("what receivers at known places get of [transmitter]", None)
+    transmitter_starts: TransmitterStarts | None = key(
+        "where fits of the first transmitter start; without it where [transmitter] says", None
+    )
     observations: dict[str, ObservationTable] = key(
         "[observations.<name>]: several sensors, each with its own data", {}
     )
