@@ -172,6 +172,8 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
 
 
 def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
+    if run.map is not None:
+        return ("gradcheck", "map", "transmitter")
     return ("gradcheck",) if run.rcs is not None else ("gradcheck", "radar", "grid")
 
 

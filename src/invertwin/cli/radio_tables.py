@@ -5,14 +5,22 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from annotated_types import Ge, MinLen
+from annotated_types import Ge, Len, MinLen
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.limits import Count, NonNegative
-from invertwin.links import Places, Points, TransmitterPosition
+from invertwin.limits import Count, NonNegative, Positive
+from invertwin.links import (
+    CellSampling,
+    MapMesh,
+    MapPlane,
+    Places,
+    Points,
+    TransmitterPosition,
+)
 from invertwin.registry.kinds import Group, Registry
 from invertwin.registry.section import InputPath, Section, Seed, Vector, about, key
+from invertwin.scene import load_mesh
 
 
 class ReceivedData(Section):
@@ -56,6 +64,8 @@ def register(registry: Registry) -> None:
     registry.add("places", "points", Points)
     registry.add("places", "random", random_points)
     registry.add("places", "file", points_file, untagged=True)
+    registry.add("places", "plane", plane_cells)
+    registry.add("places", "mesh", mesh_cells)
     registry.add("data", "received", ReceivedData)
     registry.add("data", "received_file", ReceivedFile)
     registry.add("parameter", "transmitter", TransmitterPosition, without=("initial", "number"))
@@ -86,6 +96,39 @@ def points_file(file: InputPath) -> Points:
     """
     with about("file"):
         return Points(_rows(file, 3)[:, :3])
+
+
+def plane_cells(
+    low: Annotated[Sequence[float], Len(2, 2)],
+    high: Annotated[Sequence[float], Len(2, 2)],
+    height: float,
+    cell: Positive,
+    points: Count = 16,
+    edge_points: Count = 20_000,
+) -> MapPlane:
+    """Means over the cells of a horizontal rectangle.
+
+    Args:
+        low: least x and y [m].
+        high: greatest x and y [m].
+        height: z [m].
+        cell: length of a cell's sides; the nearest that divides the sides of the map [m].
+        points: in a cell, at least.
+        edge_points: on edges of the scene, for each transmitter; they serve derivatives alone.
+    """
+    return MapPlane.horizontal(low, high, height, cell, CellSampling(points, edge_points))
+
+
+def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000) -> MapMesh:
+    """Means over the triangles of a mesh.
+
+    Args:
+        file: PLY, OBJ, STL or GLB, in metres; path, from the run file's folder.
+        points: in a triangle, at least.
+        edge_points: on edges of the scene, for each transmitter; they serve derivatives alone.
+    """
+    with about("file"):
+        return MapMesh(load_mesh(file), CellSampling(points, edge_points))
 
 
 def _rows(file: str, least: int) -> Tensor:

@@ -180,7 +180,13 @@ class _RunFile(Section):
 
     @model_validator(mode="after")
     def _a_signature_is_differentiated_alone(self) -> "_RunFile":
-        if self.gradcheck is None or self.rcs is None:
+        if self.gradcheck is None or (self.rcs is None and self.map is None):
+            return self
+        if self.map is not None:
+            own = ("depth", "samples", "boundary_samples", "scheme")
+            given = [f"gradcheck.{n}" for n in own if n in self.gradcheck.model_fields_set]
+            for path in [*given, *(n for n in ("radar", "grid", "rcs") if getattr(self, n))]:
+                fail("expected nothing with [map], which has its own, got a value; remove it", path)
             return self
         if self.gradcheck.of == "sensor":
             fail(
