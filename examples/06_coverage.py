@@ -48,7 +48,9 @@ def slope(sampling: CellSampling) -> tuple[torch.Tensor, torch.Tensor]:
     """The gain and its derivative by the shift."""
     with forward_ad.dual_level():
         shift = forward_ad.make_dual(torch.zeros(()).double(), torch.ones(()).double())
-        return forward_ad.unpack_dual(gain(shift, sampling))
+        value, rate = forward_ad.unpack_dual(gain(shift, sampling))
+        assert rate is not None
+        return value, rate
 
 
 sampling = CellSampling(points=16, edge_points=100_000)
