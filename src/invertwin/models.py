@@ -7,7 +7,7 @@ recording to a map of the same shape; a loss compares the two. A model of one's 
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -609,6 +609,8 @@ class RadioMap(ForwardModel):
         noise_dbm: Of a receiver, for ``sinr`` [dBm].
         scatter: Standard deviation of data about the map, in its unit, where it is known. Error
             bars and verdicts draw from it; None = as large as what a fit leaves unexplained.
+        without: Names of objects that the model leaves out. In a first, coarse stage of a fit, what
+            hides a transmitter would keep it from where it belongs.
 
     Raises:
         InputError: An unknown quantity, or a number out of range.
@@ -622,6 +624,7 @@ class RadioMap(ForwardModel):
     floor_db: float = -200.0
     noise_dbm: float = -100.0
     scatter: float | None = None
+    without: Sequence[str] = ()
 
     redraws: ClassVar[bool] = False
     fields: ClassVar[bool] = True
@@ -644,7 +647,20 @@ class RadioMap(ForwardModel):
             scene: What is in the way.
             sensor: What sends.
             seed: Of the rays that find paths.
+
+        Raises:
+            InputError: No object of a name that is left out.
         """
+        if self.without:
+            unknown = sorted(set(self.without) - set(scene.names))
+            if unknown:
+                raise InputError(
+                    f"expected names of objects ({', '.join(scene.names)}), got {unknown[0]}; "
+                    "correct it",
+                    "without",
+                )
+            kept = {n: o for n, o in scene.objects.items() if n not in self.without}
+            scene = replace(scene, objects=kept)
         return self.places.received(scene, sensor, self.reception, seed)
 
     def predict(self, scene: Scene, sensor: Transmitters, seed: int) -> Float64[Tensor, "tx *map"]:
@@ -677,7 +693,15 @@ class RadioMap(ForwardModel):
         self, scene: Scene, sensor: Transmitters, seed: int
     ) -> Callable[[int, float], Tensor]:
         """The map with other errors of measurement each time."""
-        return _scattered(self.predict(scene, sensor, seed), self.scatter)
+        return self.looks_about(self.predict(scene, sensor, seed))
+
+    def looks_about(self, mean: Float64[Tensor, "tx *map"]) -> Callable[[int, float], Tensor]:
+        """A map with other errors of measurement each time, see ``ForwardModel.looks``.
+
+        Args:
+            mean: The map without errors.
+        """
+        return _scattered(mean, self.scatter)
 
     def best_server(self, scene: Scene, sensor: Transmitters, seed: int) -> Int64[Tensor, "*map"]:
         """Number of the transmitter of which most power arrives; −1 where none arrives.

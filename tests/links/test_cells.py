@@ -260,6 +260,15 @@ def test_rims_on_the_border_of_a_map_count_in_its_cells():
     assert corner.tolist() == [0, 1]
 
 
+def test_where_no_path_has_so_many_steps():
+    cells = MapPlane.horizontal([-1.1, -2.3], [4.9, 1.7], 0.4, 2.0, CellSampling(points=10))
+    scene = panel_scene(METAL, False)
+    found = [
+        slope(gains(cells, scene, Reception(FREQUENCY, depth=depth, rays=1000))) for depth in (1, 3)
+    ]
+    torch.testing.assert_close(found[0], found[1])
+
+
 def test_the_same_seed_gives_the_same_map():
     cells = MapPlane.horizontal([-1.1, -2.3], [4.9, 1.7], 0.4, 2.0, CellSampling(points=10))
     scene = panel_scene(METAL, True)(torch.zeros(()).double())

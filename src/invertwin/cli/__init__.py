@@ -9,4 +9,5 @@ registry.built_in = (
     "invertwin.cli.recordings",
     "invertwin.cli.fit_tables",
     "invertwin.cli.cross_sections",
+    "invertwin.cli.radio_tables",
 )

@@ -172,6 +172,8 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
 
 
 def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
+    if run.map is not None:
+        return ("gradcheck", "map", "transmitter")
     return ("gradcheck",) if run.rcs is not None else ("gradcheck", "radar", "grid")
 
 
@@ -250,7 +252,10 @@ def _each(
 
 
 def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
-    runs = load_runs([file], options, "reconstruct", ("reconstruct", "data", "grid", "parameters"))
+    def sections(run: Any) -> Sequence[str]:
+        return ("reconstruct", "data", "grid" if run.map is None else "transmitter", "parameters")
+
+    runs = load_runs([file], options, "reconstruct", sections)
     with run_folder(options, default, runs) as folder:
         if folder.complete:
             return

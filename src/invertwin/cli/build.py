@@ -144,7 +144,11 @@ def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, Change]]:
         scene: At θ = 0.
     """
     table = need(run, "gradcheck", "a gradient check")
-    module = _module(table.parameter, "gradcheck.parameter", run.scene, scene)
+    if table.parameter.kind == "transmitter":
+        sensor = need(run, "transmitter", "a transmitter that moves").build()
+        module: nn.Module = table.parameter.build(None, initial=sensor.positions[0])
+    else:
+        module = _module(table.parameter, "gradcheck.parameter", run.scene, scene)
     changes = {n: c.build() if isinstance(c, Table) else c for n, c in table.tangent.items()}
     with about("gradcheck.tangent"):
         changes_of(module, changes)

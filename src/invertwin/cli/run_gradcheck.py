@@ -22,6 +22,7 @@ from invertwin.cli.schema.signature import swept
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
+from invertwin.links import MapPlane, Transmitters
 from invertwin.models import ForwardModel, SignatureMap, SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.runs import RunFolder
@@ -39,6 +40,7 @@ _KEPT = (
 # Units of a derivative with respect to θ, by the value that θ changes; angles are told apart.
 _UNITS = {
     **dict.fromkeys(("translation", "offsets", "value"), "1/m"),
+    "place": "1/m",
     "log_scale": "per relative size",
     "log_density": "per relative density",
 }
@@ -132,6 +134,12 @@ class _Seen:
     model: ForwardModel
     device: tuple[Radar, Grid] | None
     draw: Callable[[GradientReport], Figure]
+    transmitters: Transmitters | None = None
+
+    @property
+    def sensor(self) -> Radar | Transmitters | None:
+        """What sees the scene."""
+        return self.device[0] if self.device else self.transmitters
 
 
 def _signature(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
@@ -159,6 +167,32 @@ def _signature(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
     return _Seen(SignatureMap(signature), None, draw)
 
 
+def _radio_map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+    """The gain over the cells of `[map]`."""
+    with about("map"):
+        model = need(run, "map", "gradcheck").build()
+    sensor = need(run, "transmitter", "gradcheck").build()
+    plane = model.places
+    if not isinstance(plane, MapPlane) or len(sensor.positions) > 1 or model.quantity != "gain":
+        raise InputError(
+            'map: expected quantity = "gain", places of kind "plane" and one transmitter, got '
+            "others; gradient checks compare and draw these"
+        )
+
+    def draw(report: GradientReport) -> Figure:
+        peak = float(report.value.max())
+        return plotting.coverage(
+            {},
+            plane,
+            derivatives={name: values[0] / peak for name, values in _derivatives(report).items()},
+            scene=scene,
+            transmitters=sensor,
+            derivative_label=f"∂ gain [peaks, {_unit(settings)}]",
+        )
+
+    return _Seen(model, None, draw, sensor)
+
+
 def _map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
     """The smooth map of `[radar]`, `[grid]` and `[surrogate]`."""
     if run.surrogate.exact:
@@ -180,11 +214,12 @@ def _check(
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
     scene = build.scene(run)
-    seen = _map(run, settings, scene) if run.rcs is None else _signature(run, settings, scene)
+    kind = _map if run.rcs is None else _signature
+    seen = (kind if run.map is None else _radio_map)(run, settings, scene)
     module, tangent = build.tangent(run, scene)
     for key in _studies(run):
         if seen.device is None:
-            raise InputError(f"{key}: expected [radar] and [grid] with it, got [rcs]; remove it")
+            raise InputError(f"{key}: expected [radar] and [grid] with it, got others; remove it")
         if settings.parameter.kind not in _MOVES:
             raise InputError(
                 f"{key}: expected a parameter that moves something, got one of a shape; remove it"
@@ -196,7 +231,7 @@ def _check(
         module,
         tangent,
         scene=scene,
-        sensor=radar,
+        sensor=seen.sensor,
         of=settings.of,
         check=check,
         seed=run.seed,

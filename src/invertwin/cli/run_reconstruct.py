@@ -21,6 +21,7 @@ from invertwin.cli.fits.problem import (
     starts_of,
     varied,
 )
+from invertwin.cli.fits.radio import run_radio
 from invertwin.cli.fits.scores import (
     agreement,
     heldout,
@@ -50,6 +51,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     """
     if isinstance(next(iter(run.parameters), None), Mover):
         return run_mover(run, folder, console)
+    if run.map is not None:
+        return run_radio(run, folder, console)
     begin = time.perf_counter()
     settings_of(run)
     problem, calibration = calibrated(problem_of(run, console), folder, console)

@@ -139,12 +139,14 @@ class _Trace:
             meshes = [item.mesh for item in stage.scene.objects.values()]
             self.meshes = [*meshes, screen]
             planes = self.walls.planes
-            self.sequences: tuple[Tensor, ...] = ()
+            found: tuple[Tensor, ...] = ()
             if depth and rays is None:
-                self.sequences = every_sequence(planes, self.powers, depth).steps
+                found = every_sequence(planes, self.powers, depth).steps
             elif depth and rays:
-                found = shot_sequences(self.walls, planes, self.powers, self.tx, depth, rays, seed)
-                self.sequences = found.steps
+                found = shot_sequences(
+                    self.walls, planes, self.powers, self.tx, depth, rays, seed
+                ).steps
+            self.sequences = tuple(steps for steps in found if len(steps))
 
     def chains(self, points: Tensor) -> list[_Some]:
         """The paths to points, some of the points at a time."""

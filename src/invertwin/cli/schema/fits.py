@@ -86,6 +86,7 @@ class Part(Section):
         "what differs from [surrogate], or a name that replaces it", None
     )
     model: AnyTable | None = key("what differs from [model]; another `kind` replaces it", None)
+    map: AnyTable | None = key("what differs from [map]", None)
 
     def changes(self) -> dict[str, Any]:
         """What is merged over the run; a part has no stages."""

@@ -40,7 +40,7 @@ class Gradcheck(Table):
     @property
     def of(self) -> Literal["scene", "sensor"]:
         """What changes with θ."""
-        return "sensor" if self.parameter.kind == "radar_pose" else "scene"
+        return "sensor" if self.parameter.kind in ("radar_pose", "transmitter") else "scene"
 
     @property
     def turns(self) -> bool:

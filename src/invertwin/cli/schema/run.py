@@ -23,6 +23,7 @@ from invertwin.cli.schema.fits import (
     Variant,
 )
 from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTable
 from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.shape_tables import LearnedTable
@@ -128,6 +129,11 @@ class _RunFile(Section):
     impairments: AnyImpairments | None = key("what the front end of simulated data adds", None)
     raw: Raw | None = key("raw files that simulate writes beside the capture", None)
     data: AnyData | None = key("what is fitted", None)
+    transmitter: TransmitterTable | None = key("what sends, with [map]", None)
+    map: AnyMap | None = key("what receivers at known places get of [transmitter]", None)
+    transmitter_starts: TransmitterStarts | None = key(
+        "where fits of the first transmitter start; without it where [transmitter] says", None
+    )
     observations: dict[str, ObservationTable] = key(
         "[observations.<name>]: several sensors, each with its own data", {}
     )
@@ -174,7 +180,13 @@ class _RunFile(Section):
 
     @model_validator(mode="after")
     def _a_signature_is_differentiated_alone(self) -> "_RunFile":
-        if self.gradcheck is None or self.rcs is None:
+        if self.gradcheck is None or (self.rcs is None and self.map is None):
+            return self
+        if self.map is not None:
+            own = ("depth", "samples", "boundary_samples", "scheme")
+            given = [f"gradcheck.{n}" for n in own if n in self.gradcheck.model_fields_set]
+            for path in [*given, *(n for n in ("radar", "grid", "rcs") if getattr(self, n))]:
+                fail("expected nothing with [map], which has its own, got a value; remove it", path)
             return self
         if self.gradcheck.of == "sensor":
             fail(

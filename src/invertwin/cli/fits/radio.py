@@ -1,0 +1,403 @@
+"""`invertwin reconstruct` with `[map]`: transmitters and materials from received levels."""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import Tensor, nn
+
+from invertwin import plotting
+from invertwin.channel import trace_paths
+from invertwin.cli import build
+from invertwin.cli.fits.certainty import certainty_table
+from invertwin.cli.fits.fitting import watched
+from invertwin.cli.fits.problem import FULL, settings_of, stages_of, varied_run
+from invertwin.cli.radio_tables import ReceivedData, ReceivedFile
+from invertwin.cli.report import Table, finish, picture, quantities, texts
+from invertwin.cli.run_file import about, need
+from invertwin.cli.running import progress
+from invertwin.cli.schema import RunFile
+from invertwin.cli.shape_tables import given_for
+from invertwin.errors import InputError
+from invertwin.folders import PARTS
+from invertwin.inversion import (
+    Checkpoint,
+    Observation,
+    Reconstruction,
+    SpectrumLoss,
+    Stage,
+    Unknown,
+    reconstruct,
+)
+from invertwin.inversion.certainty import certainty
+from invertwin.inversion.rivals import REJECTED, score
+from invertwin.links import Points, Transmitters
+from invertwin.models import RadioMap
+from invertwin.runs import RunFolder
+from invertwin.scene import Scene
+from invertwin.seeds import derived_seed
+
+_TRANSMITTER = "transmitter"  # kind of its parameter
+_FOREIGN = (
+    *("radar", "grid", "chirps", "starts", "search", "initial", "calibration", "landscape"),
+    *("measures", "model"),
+)
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a fit needs, built from the run file.
+
+    Attributes:
+        run: The run file.
+        scene: As known.
+        truth: As it is, where the run file knows that.
+        sensor: Transmitters as known.
+        true_sensor: As they are; None where that is not known.
+        levels: Measured [tx, place].
+        places: In place of those of ``[map]``, where the data bring their own.
+    """
+
+    run: RunFile
+    scene: Scene
+    truth: Scene
+    sensor: Transmitters
+    true_sensor: Transmitters | None
+    levels: Tensor
+    places: Points | None
+
+    def model(self, run: RunFile) -> RadioMap:
+        """The forward model of a way to fit, or of a stage of one.
+
+        Args:
+            run: Its run file.
+        """
+        with about("map"):
+            found = need(run, "map", "received levels").build()
+        return found if self.places is None else replace(found, places=self.places)
+
+
+def run_radio(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
+    """Fit from every start, write the folder; return the tables to print and the outcome.
+
+    Starts that an interrupted run has finished are not fitted again.
+    """
+    begin = time.perf_counter()
+    heard = _heard(run, console)
+    starts = _starts(heard)
+    modes = [FULL, *run.variants]
+    rows: dict[str, list[dict[str, Any]]] = {}
+    again: list[Callable[[], Reconstruction]] = []
+    for mode in modes:
+        rows[mode] = []
+        for number, start in enumerate(starts):
+            row, outcome = _fitted(heard, start, number, mode, folder, console)
+            rows[mode].append(row)
+            again += [outcome] if mode == FULL else []
+    order = sorted(range(len(starts)), key=lambda k: _rank(rows[FULL][k]))
+    best, found = rows[FULL][order[0]], again[order[0]]()
+    with progress(console):
+        believed = certainty(found, {})
+        others = _others(heard, found, [(rows[FULL][k], again[k]) for k in order[1:]])
+    metrics: dict[str, Any] = {
+        "task": run.task,
+        "starts_count": len(starts),
+        **_scores(heard, rows, modes, best),
+        **believed,
+        **others,
+        **{key: best[key] for key in ("status", "steps", "loss", "start")},
+        "parameters": best["values"],
+        **_line_of_sight(heard, found),
+        "starts": rows[FULL],
+        **{f"starts_{mode}": rows[mode] for mode in modes[1:]},
+    }
+    if others and metrics["verdict"] == "consistent":
+        metrics["verdict"] = "ambiguous"
+    metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
+    metrics["wall_seconds"] = time.perf_counter() - begin
+    losses = {name: [row["losses"] for row in fits] for name, fits in rows.items()}
+    drawn = [picture(folder, "loss", plotting.convergence(losses))]
+    parts = [*_tables(heard, metrics, rows), *drawn]
+    title, outcome = run.title or "Received levels", _outcome(run, metrics)
+    return finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note), (
+        outcome
+    )
+
+
+def _heard(run: RunFile, console: Console) -> Heard:
+    """The problem of a run file; simulated levels are simulated here."""
+    settings_of(run)
+    for name in _FOREIGN:
+        if getattr(run, name):
+            raise InputError(f"{name}: expected no such section with [map], got one; remove it")
+    need(run, "parameters", "reconstruct")
+    scene, truth = build.scene(run), build.true_scene(run)
+    with about("transmitter"):
+        sensor = need(run, "transmitter", "[map]").build()
+    data = need(run, "data", "reconstruct")
+    if isinstance(data, ReceivedFile):
+        with about("data"):
+            places, levels = data.read()
+        if len(levels) != len(sensor.positions):
+            raise InputError(
+                f"data.file: expected a column of levels for each of {len(sensor.positions)} "
+                f"transmitters, got {len(levels)}; see [transmitter]"
+            )
+        return Heard(run, scene, truth, sensor, None, levels, places)
+    if not isinstance(data, ReceivedData):
+        raise InputError(
+            f"data.kind: expected received or received_file with [map], got {data.kind}; choose one"
+        )
+    with about("data"):
+        real = sensor if data.positions is None else _moved(sensor, data.positions)
+    heard = Heard(run, scene, truth, sensor, real, torch.zeros(0), None)
+    console.print("simulating the levels of the true scene")
+    model, seed = heard.model(run), run.seed if data.seed is None else data.seed
+    given = {name: getattr(data, name) for name in ("bandwidth", "depth", "edges", "rays")}
+    richer = {name: value for name, value in given.items() if value is not None}
+    with about("data"), torch.no_grad():
+        model = replace(model, reception=replace(model.reception, **richer))
+        mean = model.predict(truth, real, derived_seed(seed, 0))
+    look = replace(model, scatter=data.noise).looks_about(mean)
+    return replace(heard, levels=look(derived_seed(seed, 1), 0.0))
+
+
+def _moved(sensor: Transmitters, positions: Sequence[Sequence[float]]) -> Transmitters:
+    places = torch.tensor(positions, dtype=torch.float64)
+    if places.shape != sensor.positions.shape:
+        raise InputError(
+            f"expected {len(sensor.positions)} positions, got {len(places)}; give one for each "
+            "transmitter",
+            "positions",
+        )
+    return replace(sensor, positions=places)
+
+
+def _starts(heard: Heard) -> list[Tensor]:
+    """Where the first transmitter is at the start of each fit."""
+    table = heard.run.transmitter_starts
+    if table is None:
+        return [heard.sensor.positions[0]]
+    with about("transmitter_starts"):
+        return [*table.places(heard.scene, heard.run.seed)]
+
+
+def _stages(heard: Heard, run: RunFile) -> list[Stage]:
+    names = build.named(run.parameters)
+    return [
+        Stage(
+            **vars(settings_of(own).build()),
+            unknowns=tuple(n for n in table.parameters if n in names),
+            optimizer=build.made(own, "optimizer"),
+            models=[heard.model(own)],
+        )
+        for table, own in stages_of(run)
+    ]
+
+
+def _fitted(
+    heard: Heard, start: Tensor, number: int, mode: str, folder: RunFolder, console: Console
+) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
+    """The row of a fit, or what an interrupted run has kept of it, and what gives its outcome."""
+    run = varied_run(heard.run, mode)
+    stages, part = _stages(heard, run), f"{PARTS}/{mode}_{number:02d}"
+    again = partial(_fit, heard, run, stages, start, number, folder, f"{part}.pt")
+    kept = folder.read_json(f"{part}.json")
+    if kept is not None:
+        return kept, again
+    begin = time.perf_counter()
+    name = f"start {number + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
+    with watched(console, name, sum(stage.steps for stage in stages)) as shown:
+        found = again(shown)
+    place = found.sensors[0].positions[0].detach()
+    row: dict[str, Any] = {
+        "start": number,
+        "start_position": start.tolist(),
+        "loss": found.loss,
+        "status": found.status,
+        "steps": found.steps,
+        "seconds": time.perf_counter() - begin,
+        "values": _values(found.parameters),
+        "losses": [step["loss"] for step in found.history],
+    }
+    if heard.true_sensor is not None and _located(run):
+        real = heard.true_sensor.positions[0]
+        row |= {"start_error_m": float((start - real).norm())}
+        row |= {"position_error_m": float((place - real).norm())}
+        row["success"] = row["position_error_m"] <= settings_of(run).position_limit
+    folder.write_json(f"{part}.json", row)
+    return row, lambda: found
+
+
+def _fit(
+    heard: Heard,
+    run: RunFile,
+    stages: Sequence[Stage],
+    start: Tensor,
+    number: int,
+    folder: RunFolder,
+    checkpoint: str,
+    shown: Sequence[Any] = (),
+) -> Reconstruction:
+    own: dict[str, nn.Module | Unknown] = {}
+    makers = build.builders(run.parameters, run.scene)
+    unknowns: dict[str, nn.Module | Unknown] = {}
+    for name, table in build.named(run.parameters).items():
+        if table.kind == _TRANSMITTER:
+            with about(f"parameters.{name}"):
+                own[name] = Unknown(table.build(None, initial=start), table.rate)
+        else:
+            unknowns[name] = Unknown(makers[name], table.rate)
+    places = torch.cat([start[None], heard.sensor.positions[1:]])
+    sensor = replace(heard.sensor, positions=places)
+    return reconstruct(
+        heard.scene,
+        Observation(stages[-1].models[0], sensor, heard.levels, parameters=own),
+        unknowns,
+        loss=_loss(run),
+        schedule=stages,
+        callbacks=[
+            *shown,
+            Checkpoint(folder.file(checkpoint), settings_of(run).checkpoint_every, resume=True),
+        ],
+        seed=derived_seed(run.seed, number),
+    )
+
+
+def _loss(run: RunFile) -> SpectrumLoss:
+    """How levels are compared: decibels have no gain, and no coarse resolution."""
+    if "loss" in run.model_fields_set:
+        return build.made(run, "loss")
+    return SpectrumLoss(levels=1, gain="one")
+
+
+def _located(run: RunFile) -> bool:
+    return any(table.kind == _TRANSMITTER for table in run.parameters)
+
+
+def _values(modules: nn.ModuleList) -> dict[str, Any]:
+    rows: dict[str, Any] = {}
+    for module in modules:
+        found: dict[str, Tensor] = getattr(module, "values", dict)()
+        rows |= {name: value.tolist() for name, value in found.items()}
+    return rows
+
+
+def _rank(row: Mapping[str, Any]) -> tuple[bool, float]:
+    loss = row["loss"]
+    value = math.inf if loss is None or not math.isfinite(loss) else float(loss)
+    return row["status"] == "diverged", value
+
+
+def _others(
+    heard: Heard,
+    best: Reconstruction,
+    ends: Sequence[tuple[dict[str, Any], Callable[[], Reconstruction]]],
+) -> dict[str, Any]:
+    """Ends elsewhere that the data do not reject, beside the best one."""
+    if not _located(heard.run):
+        return {}
+    limit = settings_of(heard.run).position_limit
+    kept, told = [best.sensors[0].positions[0].detach()], []
+    for _, again in ends:
+        end = again()
+        place = end.sensors[0].positions[0].detach()
+        if min(float((place - other).norm()) for other in kept) <= limit:
+            continue
+        kept.append(place)
+        found = score(best.end, end.end)
+        if found is not None and found < REJECTED:
+            where = ", ".join(f"{x:.2f}" for x in place.tolist())
+            told.append(f"a transmitter at {where} m explains the data as well: z = {found:.1f}")
+    return {"ambiguities": told} if told else {}
+
+
+def _scores(
+    heard: Heard, rows: dict[str, list[dict[str, Any]]], modes: list[str], best: dict[str, Any]
+) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    if "success" in best:
+        for mode in modes:
+            tail = "" if mode == FULL else f"_{mode}"
+            found[f"successes{tail}"] = sum(row["success"] for row in rows[mode])
+            found[f"errors_m{tail}"] = [row["position_error_m"] for row in rows[mode]]
+        found["start_errors_m"] = [row["start_error_m"] for row in rows[FULL]]
+        found |= {"position_error_m": best["position_error_m"], "success": best["success"]}
+    materials = _materials(heard)
+    if materials:
+        found["true_values"] = materials
+        for mode in modes:
+            tail = "" if mode == FULL else f"_{mode}"
+            values = min(rows[mode], key=_rank)["values"]
+            found[f"relative_errors{tail}"] = {
+                name: abs(values[name] / value - 1) for name, value in materials.items()
+            }
+    return found
+
+
+def _materials(heard: Heard) -> dict[str, float]:
+    """True values of the materials that are fitted, where the run file knows them."""
+    if heard.true_sensor is None:
+        return {}
+    found: dict[str, float] = {}
+    for table in heard.run.parameters:
+        if table.kind == "material":
+            module = table.build(given_for(table.object, heard.truth, heard.run.scene))
+            found |= {n: float(v) for n, v in module.values().items() if v.numel() == 1}
+    return found
+
+
+def _line_of_sight(heard: Heard, found: Reconstruction) -> dict[str, Any]:
+    """The share of links whose line of sight is blocked, at the truth or else at the twin."""
+    places = heard.places or heard.model(heard.run).places
+    if not isinstance(places, Points):
+        return {}
+    sensor = heard.true_sensor or found.sensors[0]
+    scene = heard.truth if heard.true_sensor else found.scene
+    frequency = heard.model(heard.run).reception.frequency
+    ends = sensor.positions.detach(), places.positions
+    with torch.no_grad():
+        count = len(trace_paths(scene, *ends, frequency, depth=0))
+    return {"blocked_share": 1 - count / (len(ends[0]) * len(ends[1]))}
+
+
+def _outcome(run: RunFile, metrics: Mapping[str, Any]) -> str:
+    ended = texts("outcomes")[metrics["status"]].format(steps=metrics["steps"])
+    believed = texts("verdicts")[metrics["verdict"]]
+    count = metrics["starts_count"]
+    which = f"Best of {count} starts: " if count > 1 else ""
+    if "successes" in metrics:
+        limit = settings_of(run).position_limit
+        return (
+            f"{which}{metrics['position_error_m']:.3f} m from the truth; {ended}. "
+            f"{metrics['successes']} of {count} starts end within {limit:g} m. {believed}"
+        )
+    return f"{which}{ended}. {believed}"
+
+
+def _tables(
+    heard: Heard, metrics: Mapping[str, Any], rows: Mapping[str, list[dict[str, Any]]]
+) -> list[Table]:
+    result = quantities("Result", metrics)
+    true = metrics.get("true_values", {})
+    if heard.true_sensor is not None and _located(heard.run):
+        true = {**true, "transmitter.position": heard.true_sensor.positions[0].tolist()}
+    cells = [[name, value, true.get(name)] for name, value in metrics["parameters"].items()]
+    tables = [result, Table("Parameters", ["parameter", "result", "truth"], cells)]
+    tables.append(certainty_table(dict(metrics)))
+    if "successes" in metrics:
+        heads = ["fit", "successes", "median error [m]", "largest error [m]"]
+        cells = []
+        for mode in rows:
+            tail = "" if mode == FULL else f"_{mode}"
+            errors = sorted(metrics[f"errors_m{tail}"])
+            name = "full" if mode == FULL else mode.replace("_", " ")
+            middle = errors[len(errors) // 2]
+            cells.append([name, metrics[f"successes{tail}"], middle, errors[-1]])
+        tables.append(Table("Ways to fit", heads, cells))
+    return tables

@@ -1,0 +1,144 @@
+"""Radio maps of run files: places, and what is measured there."""
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from annotated_types import Ge, Len, MinLen
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.limits import Count, NonNegative, Positive
+from invertwin.links import (
+    CellSampling,
+    MapMesh,
+    MapPlane,
+    Places,
+    Points,
+    TransmitterPosition,
+)
+from invertwin.registry.kinds import Group, Registry
+from invertwin.registry.section import InputPath, Section, Seed, Vector, about, key
+from invertwin.scene import load_mesh
+
+
+class ReceivedData(Section):
+    """Levels that receivers would get in the true scene, with errors; what differs from [map]."""
+
+    kind: Literal["received"]
+    positions: Annotated[list[Vector], MinLen(1)] | None = key(
+        "m, where the transmitters really are; without it those of [transmitter]", None
+    )
+    noise: NonNegative = key("standard deviation of the errors, in the unit of the map", 0.0)
+    bandwidth: NonNegative | None = key("without it that of [map]", None)
+    depth: Annotated[int, Ge(0)] | None = key("without it that of [map]", None)
+    edges: Annotated[int, Ge(0)] | None = key("without it that of [map]", None)
+    rays: Count | None = key("without it those of [map]", None)
+    seed: Seed | None = key("of errors and rays; without it the run's", None)
+
+
+class ReceivedFile(Section):
+    """Measured levels: rows of x, y, z and one level for each transmitter, with one line of heads.
+
+    The places of the rows stand in for those of [map].
+    """
+
+    kind: Literal["received_file"]
+    file: InputPath = key("CSV: x,y,z [m], then the levels")
+
+    def read(self) -> tuple[Points, Tensor]:
+        """Places, and levels [tx, place].
+
+        Raises:
+            InputError: No such file, or no numbers.
+        """
+        with about("file"):
+            rows = _rows(self.file, 4)
+        return Points(rows[:, :3]), rows[:, 3:].T
+
+
+def register(registry: Registry) -> None:
+    """Add places of radio maps, and data of received levels."""
+    registry.groups["places"] = Group(product=Places, default="points")
+    registry.add("places", "points", Points)
+    registry.add("places", "random", random_points)
+    registry.add("places", "file", points_file, untagged=True)
+    registry.add("places", "plane", plane_cells)
+    registry.add("places", "mesh", mesh_cells)
+    registry.add("data", "received", ReceivedData)
+    registry.add("data", "received_file", ReceivedFile)
+    registry.add("parameter", "transmitter", TransmitterPosition, without=("initial", "number"))
+
+
+def random_points(
+    low: Sequence[float], high: Sequence[float], count: Count, seed: Annotated[int, Ge(0)] = 0
+) -> Points:
+    """Random points in a box, evenly spread.
+
+    Args:
+        low: corner of the box [m].
+        high: the opposite corner [m].
+        count: how many.
+        seed: of the points.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    ends = [torch.tensor(corner, dtype=torch.float64) for corner in (low, high)]
+    share = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    return Points(ends[0] + share * (ends[1] - ends[0]))
+
+
+def points_file(file: InputPath) -> Points:
+    """Points of a CSV file with one line of heads: x,y,z [m].
+
+    Args:
+        file: path, from the run file's folder.
+    """
+    with about("file"):
+        return Points(_rows(file, 3)[:, :3])
+
+
+def plane_cells(
+    low: Annotated[Sequence[float], Len(2, 2)],
+    high: Annotated[Sequence[float], Len(2, 2)],
+    height: float,
+    cell: Positive,
+    points: Count = 16,
+    edge_points: Count = 20_000,
+) -> MapPlane:
+    """Means over the cells of a horizontal rectangle.
+
+    Args:
+        low: least x and y [m].
+        high: greatest x and y [m].
+        height: z [m].
+        cell: length of a cell's sides; the nearest that divides the sides of the map [m].
+        points: in a cell, at least.
+        edge_points: on edges of the scene, for each transmitter; they serve derivatives alone.
+    """
+    return MapPlane.horizontal(low, high, height, cell, CellSampling(points, edge_points))
+
+
+def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000) -> MapMesh:
+    """Means over the triangles of a mesh.
+
+    Args:
+        file: PLY, OBJ, STL or GLB, in metres; path, from the run file's folder.
+        points: in a triangle, at least.
+        edge_points: on edges of the scene, for each transmitter; they serve derivatives alone.
+    """
+    with about("file"):
+        return MapMesh(load_mesh(file), CellSampling(points, edge_points))
+
+
+def _rows(file: str, least: int) -> Tensor:
+    try:
+        rows = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
+    except (OSError, ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"expected rows of numbers apart by commas, got {error}") from None
+    if rows.shape[1] < least or not len(rows) or not np.isfinite(rows).all():
+        raise InputError(
+            f"expected rows of at least {least} finite numbers below a line of heads, got "
+            f"{rows.shape[0]} rows of {rows.shape[1]}; see docs/run_files.md"
+        )
+    return torch.from_numpy(rows)

@@ -1,0 +1,129 @@
+"""The tables of radio maps: transmitters, receivers, and where fits start."""
+
+from typing import Annotated, Any
+
+import torch
+from annotated_types import MinLen
+from torch import Tensor
+
+from invertwin.cli.sensors import LookAt, Orientation, Polarised, Turned
+from invertwin.errors import InputError
+from invertwin.limits import Count, NonNegative
+from invertwin.links import Reception, Terminals, Transmitters
+from invertwin.models import RadioMap
+from invertwin.registry.kinds import OneOf, TableOf, registry
+from invertwin.registry.section import Section, Seed, Vector, about, key
+from invertwin.scene import AntennaArray, Mesh, Scene, look_at, rotation_from_vector
+from invertwin.scene.geometry.distance import signed_distance
+
+_TRIES = 10_000  # places that are drawn, before that is given up
+
+
+class AntennaTable(Section):
+    """An antenna of one element."""
+
+    pattern: Annotated[Any, OneOf("pattern")] | None = key("without it isotropic", None)
+    polarisation: Polarised = key('"V", "H", "circular" (right-hand) or two numbers (V, H)', "V")
+    orientation: Orientation | None = key(
+        "look_at or rotation_deg of its axes (x right, y up, z ahead); without it y is the world's "
+        "z axis and it looks along x",
+        None,
+    )
+
+    def terminals(self, places: Tensor) -> Terminals:
+        """The antenna at places.
+
+        Args:
+            places: [place, 3] [m].
+        """
+        pattern = {} if self.pattern is None else {"pattern": self.pattern.build()}
+        element = torch.zeros(1, 3, dtype=torch.float64)
+        array = AntennaArray(element, polarisation=self.polarisation, **pattern)
+        if self.orientation is None:
+            return Terminals(array)
+        if isinstance(self.orientation, LookAt):
+            with about("orientation.look_at"):
+                return Terminals(array, look_at(places, self.orientation.look_at))
+        assert isinstance(self.orientation, Turned)
+        turn = torch.tensor(self.orientation.rotation_deg, dtype=torch.float64).deg2rad()
+        return Terminals(array, rotation_from_vector(turn))
+
+
+class TransmitterTable(AntennaTable):
+    """What sends: one transmitter or several, all with the same antenna."""
+
+    positions: Annotated[list[Vector], MinLen(1)] = key(
+        "m, of each; where a fit of it starts, unless [transmitter_starts] says otherwise"
+    )
+    power_dbm: float = key("sent by each [dBm]", 0.0)
+
+    def build(self) -> Transmitters:
+        """The transmitters."""
+        places = torch.tensor(self.positions, dtype=torch.float64)
+        return Transmitters(places, self.terminals(places), self.power_dbm)
+
+
+RECEPTION: Any = registry.table_of(Reception, "Reception", without=("receivers",))
+
+
+class MapTable(registry.table_of(RadioMap, "RadioMap", RECEPTION, without=("reception",))):
+    """What receivers at known places get of the transmitters."""
+
+    antenna: AntennaTable = key("of every receiver", AntennaTable())
+
+    def build(self, given: Any = None, /, **more: Any) -> RadioMap:
+        """The forward model."""
+        how = {name: getattr(self, name) for name in RECEPTION.made_from}
+        with about("places"):
+            places = self.places.build()
+        receivers = self.antenna.terminals(getattr(places, "positions", torch.zeros(1, 3)))
+        reception = Reception(**how, receivers=receivers)
+        return super().build(given, places=places, reception=reception, **more)
+
+
+class TransmitterStarts(Section):
+    """Random places of the first transmitter in a box, outside of solid objects."""
+
+    low: Vector = key("corner of the box [m]")
+    high: Vector = key("the opposite corner [m]")
+    count: Count = key("fits", 10)
+    clear: NonNegative = key("least distance to all surfaces [m]", 0.1)
+    seed: Seed | None = key("without it the run's", None)
+
+    def places(self, scene: Scene, seed: int) -> Tensor:
+        """Where fits start [start, 3].
+
+        Args:
+            scene: As known.
+            seed: Unless the table has one.
+
+        Raises:
+            InputError: No room in the box.
+        """
+        generator = torch.Generator().manual_seed(seed if self.seed is None else self.seed)
+        low, high = (torch.tensor(c, dtype=torch.float64) for c in (self.low, self.high))
+        return _free_places(scene, (low, high), self.count, self.clear, generator)
+
+
+AnyMap = Annotated[Any, TableOf(RadioMap, MapTable, ("reception",), checked=False)]
+
+
+def _free_places(
+    scene: Scene, box: tuple[Tensor, Tensor], count: int, clear: float, chance: torch.Generator
+) -> Tensor:
+    found: list[Tensor] = []
+    meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
+    # The room is no solid object: it holds the whole box.
+    around = [bool((signed_distance(mesh, torch.stack(box)) < 0).all()) for mesh in meshes]
+    for _ in range(_TRIES):
+        share = torch.rand(1, 3, generator=chance, dtype=torch.float64)
+        place = box[0] + share * (box[1] - box[0])
+        off = [float(signed_distance(mesh, place)) for mesh in meshes]
+        if all(abs(d) >= clear and (d > 0 or held) for d, held in zip(off, around, strict=True)):
+            found.append(place)
+        if len(found) == count:
+            return torch.cat(found)
+    raise InputError(
+        f"expected room for {count} starts in the box, found {len(found)}; widen the box, or lower "
+        "`clear`"
+    )

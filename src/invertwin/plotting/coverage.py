@@ -1,0 +1,135 @@
+"""Figures of coverage maps: levels and derivatives of cells over the floor plan."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.links import MapPlane, Transmitters
+from invertwin.plotting.figures import legible, numbers
+from invertwin.plotting.triangles import sharp_edges
+from invertwin.scene import Scene
+
+_SHARE = 0.995  # of the cells that the colours of a derivative reach; the brightest stick out
+
+
+def coverage(
+    levels: Mapping[str, Float[Tensor, "first second"]],
+    plane: MapPlane,
+    *,
+    derivatives: Mapping[str, Float[Tensor, "first second"]] | None = None,
+    scene: Scene | None = None,
+    transmitters: Transmitters | None = None,
+    label: str = "path gain [dB]",
+    derivative_label: str = "∂ path gain [dB/m]",
+    dynamic_range: float = 60.0,
+) -> Figure:
+    """Maps over the cells of a plane side by side: levels, then derivatives.
+
+    The sharp edges of the scene's objects are drawn as the plane's normal sees them: the floor plan
+    of a horizontal map. Transmitters are triangles. Levels share one scale of colours, as do
+    derivatives: what grows is red, what falls is blue.
+
+    Args:
+        levels: Maps by title, such as one of a ``RadioMap`` of one transmitter.
+        plane: Their cells.
+        derivatives: Maps by title.
+        scene: Whose edges are drawn.
+        transmitters: What sends.
+        label: Of the levels, with its unit.
+        derivative_label: Of the derivatives, with its unit.
+        dynamic_range: Level of the brightest colour above the darkest.
+
+    Raises:
+        InputError: No map, or one of other cells.
+    """
+    rates = derivatives or {}
+    if not levels and not rates:
+        raise InputError("expected at least one map, got none; give levels or derivatives")
+    for title, values in [*levels.items(), *rates.items()]:
+        if tuple(values.shape) != plane.shape:
+            raise InputError(
+                f"expected a map {list(plane.shape)} of the plane's cells for {title!r}, got "
+                f"{list(values.shape)}; give one of a single transmitter"
+            )
+    count = len(levels) + len(rates)
+    grid = _flat(plane, _corners(plane))
+    width, height = np.ptp(grid[..., 0]), np.ptp(grid[..., 1])
+    tall = min(max(3.4 * height / width, 1.6), 5.0)
+    figure = Figure(figsize=(1.4 + 3.4 * count, tall + 0.9), layout="constrained")
+    cells = figure.subplots(1, count, squeeze=False, sharey=True)[0]
+    lines = [] if scene is None else _plan(scene, plane)
+    marks = None if transmitters is None else _flat(plane, transmitters.positions)
+    split = len(levels)
+    top = max((float(v.detach().amax()) for v in levels.values()), default=0.0)
+    known = [numbers(v) for v in rates.values()]
+    limit = max((float(np.quantile(np.abs(v), _SHARE)) for v in known), default=1.0) or 1.0
+    for part, maps, style, name in (
+        (cells[:split], levels, {"vmin": top - dynamic_range, "vmax": top}, label),
+        (cells[split:], rates, {"vmin": -limit, "vmax": limit, "cmap": "RdBu_r"}, derivative_label),
+    ):
+        image = None
+        for axes, (title, values) in zip(part, maps.items(), strict=True):
+            image = axes.pcolormesh(grid[..., 0], grid[..., 1], numbers(values), **style)
+            _dress(axes, title, plane, lines, marks)
+        if image is not None:
+            bar = figure.colorbar(image, ax=[*part], shrink=0.85)
+            bar.set_label(name, fontsize=8)
+            bar.ax.tick_params(labelsize=7)
+    cells[0].set_ylabel(_names(plane)[1], fontsize=8)
+    return figure
+
+
+def _corners(plane: MapPlane) -> Tensor:
+    """Corners of all cells [m]."""
+    s, t = (torch.linspace(0, 1, n + 1, dtype=torch.float64) for n in plane.count)
+    return plane.corner + s[:, None, None] * plane.first + t[:, None] * plane.second
+
+
+def _axes(plane: MapPlane) -> Tensor:
+    """Unit vectors along the first side, and across it in the plane."""
+    right = plane.first / plane.first.norm()
+    up = plane.second - (plane.second @ right) * right
+    return torch.stack([right, up / up.norm()])
+
+
+def _flat(plane: MapPlane, points: Tensor) -> NDArray[Any]:
+    """World points in the plane, about the world's origin [m]."""
+    return numbers(points.detach() @ _axes(plane).T)
+
+
+def _names(plane: MapPlane) -> list[str]:
+    """Of both axes."""
+    found = []
+    for axis, words in zip(_axes(plane), ("along the first side", "across it"), strict=True):
+        world = [
+            n for n, e in zip("xyz", torch.eye(3).double(), strict=True) if axis @ e > 1 - 1e-9
+        ]
+        found.append(f"{world[0] if world else words} [m]")
+    return found
+
+
+def _plan(scene: Scene, plane: MapPlane) -> list[NDArray[Any]]:
+    """Sharp edges of all objects, in the plane."""
+    lines: list[NDArray[Any]] = []
+    for item in scene.objects.values():
+        edges = sharp_edges(numbers(item.vertices), numbers(item.mesh.faces))
+        lines += [*_flat(plane, item.vertices[torch.from_numpy(edges)])]
+    return lines
+
+
+def _dress(axes: Any, title: str, plane: MapPlane, lines: Any, marks: Any) -> None:
+    axes.add_collection(LineCollection(lines, colors="black", linewidths=0.6))
+    if marks is not None:
+        axes.plot(marks[:, 0], marks[:, 1], "^", color="#c0143c", markeredgecolor="white")
+    axes.set_aspect("equal")
+    axes.set_title(legible(title), fontsize=9)
+    axes.set_xlabel(_names(plane)[0], fontsize=8)
+    axes.tick_params(labelsize=7)

@@ -1,0 +1,39 @@
+"""Derivatives of coverage maps by run files, with fewer points than these ask for."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from invertwin.cli import build
+from invertwin.cli.run_file import load_run
+from invertwin.inversion.gradcheck import Check, gradcheck
+
+FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "waves"
+NAMES = ("coverage_occluder", "coverage_panel", "coverage_transmitter")
+
+
+def test_all_run_files_are_here():
+    assert {file.stem for file in FOLDER.glob("coverage_*.toml")} == set(NAMES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_shadows_and_beams_that_sweep_over_cells(name):
+    run = load_run(FOLDER / f"{name}.toml")
+    assert run.gradcheck is not None
+    scene, model = build.scene(run), run.map.build()
+    sampling = replace(model.places.sampling, points=64, edge_points=10_000)
+    model = replace(model, places=model.places.sampled(sampling))
+    module, tangent = build.tangent(run, scene)
+    report = gradcheck(
+        model,
+        module,
+        tangent,
+        scene=scene,
+        sensor=run.transmitter.build(),
+        of=run.gradcheck.of,
+        check=Check(repeats=1, step=0.03, difference_samples=100_000, noise=0.05, max_pairs=4),
+    )
+    assert report.full.relative_l1 < 0.08
+    assert report.interior.relative_l1 > 0.3
