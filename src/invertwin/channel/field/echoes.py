@@ -68,10 +68,12 @@ def trace_echoes(
             f"expected targets with cross-sections >= 0 m², got {sizes.tolist()}; give some"
         )
     frequency = SPEED_OF_LIGHT / link.wavelength
-    how = {"depth": depth, "rays": rays, "seed": seed}
-    forth = trace_paths(scene, link.tx, places, frequency, **how)
-    same = torch.equal(link.tx, link.rx)
-    back = forth if same else trace_paths(scene, link.rx, places, frequency, **how)
+
+    def legs(antennas: Tensor) -> RayPaths:
+        return trace_paths(scene, antennas, places, frequency, depth=depth, rays=rays, seed=seed)
+
+    forth = legs(link.tx)
+    back = forth if torch.equal(link.tx, link.rx) else legs(link.rx)
     strength = (4 * math.pi * sizes).sqrt() / link.wavelength
     parts = []
     for frame in range(link.frame_count):
