@@ -4,12 +4,15 @@ import ast
 import re
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
 from invertwin.cli import build
+from invertwin.cli.fits.problem import stages_of
+from invertwin.cli.radio_tables import ReceivedData
 from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import SimulatedData
 from invertwin.errors import InputError
@@ -81,6 +84,9 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if run.data is None:
         assert run.task not in ("reconstruct", "demo")
         return
+    if isinstance(run.data, ReceivedData):
+        check_levels(run)
+        return
     if not isinstance(run.data, SimulatedData):
         assert run.data.kind in ("capture", "rail_sar", "openradar", "dca1000", "arrays")
         return
@@ -106,6 +112,16 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             simulated = partial(run_simulate.chirp_train, run, scene, device, chirps)
         with pytest.raises(FieldsTracedError):
             simulated()
+
+
+def check_levels(run: Any) -> None:
+    """Simulated levels know paths that no stage of any fit knows, and other rays."""
+    ways = [run, *(run.varied(variant) for variant in run.variants.values())]
+    fitted = [own.map for way in ways for _, own in stages_of(way)]
+    assert run.data.depth > max(table.depth for table in fitted)
+    assert (run.data.edges or 0) > max(table.edges for table in fitted) or not run.data.edges
+    assert run.data.rays > max(table.rays for table in fitted)
+    assert run.data.seed not in (None, run.seed)
 
 
 @pytest.mark.parametrize("name", SOURCES)

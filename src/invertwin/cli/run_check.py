@@ -17,6 +17,7 @@ from invertwin.cli.run_simulate import chirp_train, exact
 from invertwin.cli.running import time_left
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
+from invertwin.errors import InputError
 from invertwin.memory import free_memory, gigabytes
 from invertwin.models import SurrogateMap
 from invertwin.scene import Scene, Translation
@@ -34,6 +35,11 @@ def run_check(run: RunFile) -> tuple[list[Table], str]:
     """
     if run.rcs is not None:
         return _of_signature(run)
+    if run.map is not None:
+        raise InputError(
+            "map: expected a run of a radar to estimate, got a radio map, whose memory is bounded; "
+            "run it"
+        )
     truth, sensors = build.true_scene(run), _sensors(run)
     build.parameters(
         [table for table in run.parameters if not isinstance(table, Mover)],

@@ -91,8 +91,8 @@ class SpectrumLoss:
 
     def __call__(
         self,
-        simulated: Float[Tensor, "frame range u v"],
-        measured: Float[Tensor, "frame range u v"],
+        simulated: Float[Tensor, "frame *map"],
+        measured: Float[Tensor, "frame *map"],
     ) -> Float[Tensor, ""]:
         """The loss: 0 for equal maps, 1 for an empty simulated map under ``mse``.
 
@@ -111,9 +111,9 @@ class SpectrumLoss:
 
     def curvature(
         self,
-        simulated: Float[Tensor, "frame range u v"],
-        measured: Float[Tensor, "frame range u v"],
-        tangents: Float[Tensor, "p frame range u v"],
+        simulated: Float[Tensor, "frame *map"],
+        measured: Float[Tensor, "frame *map"],
+        tangents: Float[Tensor, "p frame *map"],
     ) -> Float[Tensor, "p p"]:
         """The Gauss–Newton matrix of the loss: its second derivatives but for those of the map.
 

@@ -70,8 +70,8 @@ class Transmitters:
 class TransmitterPosition(nn.Module):
     """Places one transmitter: a module Transmitters → Transmitters that a fit moves.
 
-    With a box the place stays inside of it, such as the room: it is the box's low corner plus its
-    size times the logistic function of a free number, along every axis.
+    With a box the place stays inside of it, such as the room: a step that leads out of it ends on
+    its border.
 
     Args:
         initial: [m].
@@ -81,7 +81,7 @@ class TransmitterPosition(nn.Module):
         number: Of the transmitter.
 
     Attributes:
-        place: parameter [3]: metres, or free numbers where there is a box.
+        place: parameter [3], metres.
 
     Raises:
         InputError: Not three numbers, an unknown axis, one corner alone, or a start outside.
@@ -102,26 +102,27 @@ class TransmitterPosition(nn.Module):
         self._axes, self._number = axes_mask(axes), number
         if (low is None) != (high is None):
             raise InputError("expected both corners of the box, got one; give low and high")
-        self._low = self._size = None
+        self._box = None
         if low is not None and high is not None:
-            self._low = checked_tensor(low, (3,), "low corner of the box [m]", do)
-            self._size = checked_tensor(high, (3,), "high corner of the box [m]", do) - self._low
-            begun = (begun - self._low) / self._size
-            if not bool(((begun > 0) & (begun < 1)).all()):
+            ends = (
+                checked_tensor(corner, (3,), f"{name} corner of the box [m]", do)
+                for name, corner in (("low", low), ("high", high))
+            )
+            self._box = torch.stack([*ends])
+            if not bool(((begun > self._box[0]) & (begun < self._box[1])).all()):
                 raise InputError(
                     "expected an initial place inside the box, got one outside or on its border; "
                     "choose another start or a larger box"
                 )
-            begun = begun.logit()
         self.place = nn.Parameter(begun)
 
     @property
     def position(self) -> Float64[Tensor, "3"]:
         """Where the transmitter is [m]."""
-        free = free_part(self.place, self._axes)
-        if self._low is None or self._size is None:
-            return free
-        return self._low + self._size * free.sigmoid()
+        if self._box is not None:
+            with torch.no_grad():
+                self.place.data.clamp_(*self._box)
+        return free_part(self.place, self._axes)
 
     def forward(self, sensor: Transmitters) -> Transmitters:
         """The transmitters with this one placed."""
@@ -134,20 +135,16 @@ class TransmitterPosition(nn.Module):
 
     def coordinates(self) -> list[Coordinate]:
         """x, y and z of the transmitter, as far as they are free."""
-        slope = torch.ones(3, dtype=torch.float64)
-        if self._size is not None:
-            share = self.place.detach().sigmoid()
-            slope = self._size * share * (1 - share)
         return [
-            Coordinate(f"transmitter.{axis}", "m", {"place": along / slope}, _PLACE)
+            Coordinate(f"transmitter.{axis}", "m", {"place": along}, _PLACE)
             for axis, along, free in zip("xyz", torch.eye(3).double(), self._axes, strict=True)
             if free
         ]
 
     def at_bounds(self) -> list[str]:
-        """Names of coordinates next to the box."""
-        if self._size is None:
+        """Names of coordinates on the border of the box."""
+        if self._box is None:
             return []
-        share = self.place.detach().sigmoid()
-        near = (share * (1 - share) < 0.01).tolist()
+        place = self.place.detach()
+        near = ((place <= self._box[0]) | (place >= self._box[1])).tolist()
         return [f"transmitter.{axis}" for axis, at in zip("xyz", near, strict=True) if at]

@@ -1,0 +1,159 @@
+"""`invertwin reconstruct` of received levels, in small."""
+
+import tomllib
+
+import pytest
+import torch
+
+from cli.small import call, read_metrics
+from invertwin.cli import build
+from invertwin.cli.run_file import validate
+from invertwin.errors import InputError
+from invertwin.links import Points
+
+RUN = """
+task = "reconstruct"
+seed = 4
+
+[scene.room]
+shape = "box"
+size = [5.0, 4.0, 3.0]
+material = { kind = "dielectric", permittivity = 4.0, conductivity = 0.05, scattering = 0.0 }
+
+[scene.pillar]
+shape = "box"
+size = [0.4, 0.4, 2.0]
+material = { kind = "perfect_conductor" }
+
+[transmitter]
+positions = [[1.0, 0.8, 0.2]]
+power_dbm = 10.0
+
+[map]
+places = { kind = "random", low = [-2.3, -1.8, -1.2], high = [2.3, 1.8, 1.2], count = 20 }
+frequency = 2.4e9
+depth = 1
+scatter = 0.5
+
+[data]
+kind = "received"
+positions = [[1.5, -0.9, 0.3]]
+noise = 0.5
+depth = 2
+rays = 200_000
+seed = 9
+
+[[parameters]]
+kind = "transmitter"
+low = [-2.4, -1.9, -1.4]
+high = [2.4, 1.9, 1.4]
+
+[optimizer]
+kind = "gauss_newton"
+rate = 0.5
+
+[reconstruct]
+steps = 6
+position_limit = 0.5
+
+[variants.bare]
+map = { without = ["pillar"] }
+"""
+STARTS = """
+[transmitter_starts]
+low = [-2.2, -1.7, -1.0]
+high = [2.2, 1.7, 1.0]
+count = 2
+"""
+
+
+def file_of(folder, text):
+    file = folder / "small.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def loaded(folder, text):
+    return validate(tomllib.loads(text), folder / "small.toml")
+
+
+def test_a_transmitter_is_located(tmp_path, monkeypatch):
+    file, out = file_of(tmp_path, RUN + STARTS), tmp_path / "found"
+    assert call(monkeypatch, "reconstruct", file, "--out", out) == 0
+    found = read_metrics(out)
+    assert found["starts_count"] == 2
+    assert len(found["errors_m"]) == len(found["errors_m_bare"]) == 2
+    assert found["successes"] == sum(error <= 0.5 for error in found["errors_m"])
+    assert found["position_error_m"] < 0.5
+    assert found["position_error_m"] == min(found["errors_m"])
+    assert set(found["standard_deviations"]) == {f"transmitter.{axis}" for axis in "xyz"}
+    assert found["verdict"] in ("consistent", "inconsistent", "ambiguous")
+    assert 0 < found["blocked_share"] < 1
+    for name in ("report.html", "loss.png", "metrics.json"):
+        assert (out / name).stat().st_size > 0
+
+
+def test_levels_of_a_file(tmp_path, monkeypatch):
+    run = loaded(tmp_path, RUN)
+    model, scene = run.map.build(), build.scene(run)
+    sensor = run.transmitter.build()
+    assert isinstance(model.places, Points)
+    level = model.predict(scene, sensor, 0)
+    rows = torch.cat([model.places.positions, level.T], 1)
+    lines = ["x,y,z,dBm", *(",".join(str(x) for x in row) for row in rows.tolist())]
+    (tmp_path / "powers.csv").write_text("\n".join(lines))
+    start = RUN.index("[data]"), RUN.index("[[parameters]]")
+    data = '[data]\nkind = "received_file"\nfile = "powers.csv"\n\n'
+    text = RUN[: start[0]] + data + RUN[start[1] : RUN.index("[variants")]
+    text = text.replace("positions = [[1.0, 0.8, 0.2]]", "positions = [[1.1, 0.7, 0.25]]")
+    out = tmp_path / "found"
+    assert call(monkeypatch, "reconstruct", file_of(tmp_path, text), "--out", out) == 0
+    found = read_metrics(out)
+    assert "errors_m" not in found
+    place = found["parameters"]["transmitter.position"]
+    assert place == pytest.approx([1.0, 0.8, 0.2], abs=0.02)
+
+
+def test_starts_are_in_free_space(tmp_path):
+    wide = STARTS.replace("count = 2", "count = 200\nclear = 0.2")
+    run = loaded(tmp_path, RUN + wide)
+    places = run.transmitter_starts.places(build.scene(run), 0)
+    assert places.shape == (200, 3)
+    off = places.abs() - torch.tensor([0.2, 0.2, 1.0])
+    assert float(off.amax(1).min()) > 0.1  # outside the pillar
+    narrow = wide.replace("[-2.2, -1.7, -1.0]", "[-0.1, -0.1, -0.1]")
+    narrow = narrow.replace("[2.2, 1.7, 1.0]", "[0.1, 0.1, 0.1]")
+    run, scene = loaded(tmp_path, RUN + narrow), build.scene(run)
+    with pytest.raises(InputError, match="expected room for 200 starts in the box"):
+        run.transmitter_starts.places(scene, 0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("[data]", "[radar]\nboard = { name = 'IWR1443' }\n[data]", "radar"),
+        ('kind = "received"', 'kind = "capture"\nfile = "x.nc"', "data"),
+        ("[[1.5, -0.9, 0.3]]", "[[1.5, -0.9, 0.3], [0.0, 0.0, 0.0]]", "data.positions"),
+        ('"pillar"]', '"pilar"]', "without"),
+        ("frequency = 2.4e9", "frequency = 2.4e9\nedges = 1", "map"),
+    ],
+)
+def test_what_does_not_fit_is_told(tmp_path, monkeypatch, capsys, before, after, said):
+    assert before in RUN
+    file = file_of(tmp_path, RUN.replace(before, after, 1))
+    assert call(monkeypatch, "reconstruct", file, "--out", tmp_path / "found") == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert said in lines[-1]
+    assert len(lines) == 1
+
+
+def test_antennas_are_turned(tmp_path):
+    antenna = (
+        "\npattern = { kind = 'cosine', exponent = 2.0 }\norientation = { look_at = [0, 0, 0] }"
+    )
+    antenna = antenna.replace("[0, 0, 0]", "[0.0, 0.0, 0.0]")
+    text = RUN.replace("power_dbm = 10.0", "power_dbm = 10.0" + antenna)
+    sensor = loaded(tmp_path, text).transmitter.build()
+    ahead = -sensor.positions[0] / sensor.positions[0].norm()
+    torch.testing.assert_close(sensor.terminals.rotations[0, :, 2], ahead)
+    assert sensor.powers.tolist() == [10.0]
