@@ -18,7 +18,7 @@ LINKS = CHANNEL - {"doctor", "threads"} | {"links"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
 SIGNATURES = CHANNEL | {"signatures"}
-MODELS = SIMULATION | CAPTURE | {"signatures", "models"}
+MODELS = SIMULATION | CAPTURE | LINKS | {"signatures", "models"}
 INVERSION = MODELS | {"inversion"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
@@ -47,7 +47,7 @@ ALLOWED = {
     "registry": FOUNDATION | {"registry"},
     "cli": INVERSION | SIGNATURES | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
-    "__init__": INVERSION | LINKS | SIGNATURES | {"doctor", "threads"},
+    "__init__": INVERSION | SIGNATURES | {"doctor", "threads"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}
 KNOW_THE_RAY_TRACER = {"channel"}

@@ -5,21 +5,34 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from invertwin.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.channel import Sampling
+from invertwin.channel import Sampling, trace_paths
 from invertwin.errors import InputError
+from invertwin.links import Points, Reception, Transmitters, frequency_response
 from invertwin.models import (
     ChainField,
     ChainMap,
     ExactMap,
     MotionMap,
+    RadioMap,
+    ResponseMap,
     SurrogateMap,
     surrogate_correlation,
 )
 from invertwin.radar import Chirps, Radar, Surrogate, velocity_axis
-from invertwin.scene import PerfectConductor, Scene, plate, trihedral
+from invertwin.scene import (
+    Dielectric,
+    Object,
+    PerfectConductor,
+    Scene,
+    box,
+    plate,
+    rigid,
+    trihedral,
+)
 from invertwin.simulation import simulate, simulate_chirps
 from scenes import float64, occluder, radar, relative, thing
 
@@ -264,3 +277,96 @@ def test_looks_at_chain_fields_have_the_noise_that_is_asked_for():
     # How strong noise is in a map is known from one draw of it.
     assert float(found.square().mean()) == pytest.approx(noise, rel=0.3)
     assert abs(float(found.mean())) < 0.1 * noise**0.5
+
+
+HALL = Scene({"hall": Object(box((6.0, 5.0, 3.0)), Dielectric(5.0, 0.1, scattering=0.0))})
+SPOTS = Points(float64([[2.0, 1.0, 0.3], [-1.0, 1.5, -0.4], [0.3, -2.0, 0.8]]))
+MAST = Transmitters(float64([[-2.0, -1.0, 0.5], [1.5, 2.0, 0.2]]), power_dbm=float64([10.0, 13.0]))
+
+
+def test_levels_of_a_radio_map():
+    reception = Reception(2.4e9, 1e8, depth=2)
+    shown = {
+        name: RadioMap(SPOTS, reception, name).predict(HALL, MAST, 0)  # type: ignore[arg-type]
+        for name in ("path_gain", "received_power", "sinr", "delay_spread")
+    }
+    assert all(power.shape == (2, 3) for power in shown.values())
+    found = RadioMap(SPOTS, reception).received(HALL, MAST, 0)
+    torch.testing.assert_close(shown["path_gain"], 10 * found.gain.log10(), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        shown["received_power"] - shown["path_gain"], float64([[10.0] * 3, [13.0] * 3])
+    )
+    power = 10 ** (shown["received_power"] / 10)
+    ratio = power / (power.flip(0) + 1e-10)
+    torch.testing.assert_close(shown["sinr"], 10 * ratio.log10())
+    assert torch.equal(shown["delay_spread"], found.delay_spread)
+
+
+def test_derivatives_of_a_radio_map_are_differences():
+    model = RadioMap(SPOTS, Reception(2.4e9, 1e8, depth=2, edges=1))
+    scene = Scene(
+        {**HALL.objects, "cup": Object(box((0.5, 0.9, 1.7)), Dielectric(3.0, 0.02), rigid())}
+    )
+    place = float64([-2.0, -1.0, 0.5])
+
+    def shown(x: Tensor) -> Tensor:
+        return model.predict(scene, Transmitters(place + float64([x, 0.7 * x, -0.4 * x])), 0)
+
+    step = 1e-5
+    expected = (shown(float64(step)) - shown(float64(-step))) / (2 * step)
+    x = torch.zeros((), dtype=torch.float64)
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(x, torch.ones_like(x))
+        way = float64([1.0, 0.7, -0.4])
+        found = model.predict(scene, Transmitters(place + dual * way), 0)
+        forward = torch.autograd.forward_ad.unpack_dual(found).tangent
+    torch.testing.assert_close(forward, expected, rtol=1e-5, atol=1e-5)
+    back = torch.autograd.functional.jacobian(
+        lambda x: model.predict(scene, Transmitters(place + x * way), 0), x
+    )
+    torch.testing.assert_close(back, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_unreached_points_have_finite_levels_and_derivatives():
+    sealed = HALL.replace("hall", material=PerfectConductor())
+    place = torch.tensor([9.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    model = RadioMap(SPOTS, Reception(2.4e9, 0.0), floor_db=-150.0)
+    level = model.predict(sealed, Transmitters(place), 0)
+    torch.testing.assert_close(level.detach(), torch.full((1, 3), -150.0).double())
+    mixed = (level + place.sum()).sum()
+    assert bool(torch.isfinite(torch.autograd.grad(mixed, place)[0]).all())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_measured_levels_have_the_shape_of_the_map():
+    model = RadioMap(SPOTS, Reception(2.4e9))
+    assert model.observe([-50.0, -60.0, -70.0]).shape == (1, 3)
+    assert model.observe([[-50.0, -60.0, -70.0]] * 2).shape == (2, 3)
+    with pytest.raises(InputError, match="measured received power"):
+        model.observe([-50.0, -60.0])
+    with pytest.raises(InputError, match="quantity among received_power"):
+        RadioMap(SPOTS, Reception(2.4e9), "rssi")  # type: ignore[arg-type]
+
+
+def test_looks_of_a_radio_map_scatter_as_told():
+    known = RadioMap(SPOTS, Reception(2.4e9), scatter=2.0)
+    open_ = replace(known, scatter=None)
+    mean = known.predict(HALL, MAST, 0)
+    for model, deviation in ((known, 2.0), (open_, 0.5)):
+        look = model.looks(HALL, MAST, 0)
+        drawn = torch.stack([look(number, 0.25) for number in range(200)]) - mean
+        assert float(drawn.std()) == pytest.approx(deviation, rel=0.1)
+        assert torch.equal(look(3, 0.25), look(3, 0.25))
+
+
+def test_responses_are_those_of_the_paths():
+    swept = float64([2.39e9, 2.4e9, 2.41e9])
+    model = ResponseMap(SPOTS.positions, swept, Reception(2.4e9, depth=2))
+    found = model.predict(HALL, MAST, 0)
+    assert found.shape == (2, 3, 3, 2)
+    paths = trace_paths(HALL, MAST.positions, SPOTS.positions, 2.4e9, depth=2, rays=100_000)
+    expected = frequency_response(paths, swept)[:, 0, :, 0].transpose(0, 1)
+    torch.testing.assert_close(torch.view_as_complex(found.contiguous()), expected)
+    assert torch.equal(model.observe(expected), torch.view_as_real(expected))
+    with pytest.raises(InputError, match="measured responses"):
+        model.observe(expected[:, :2])

@@ -32,6 +32,7 @@ _MENU = {
     "MotionMap": "models",
     "Observation": "inversion.observation",
     "Radar": "radar.radar",
+    "RadioMap": "models",
     "Sampling": "channel",
     "Scene": "scene.scene",
     "SpectrumLoss": "inversion.loss",

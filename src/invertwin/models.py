@@ -28,6 +28,9 @@ from invertwin.channel import (
     trace_power,
 )
 from invertwin.errors import InputError
+from invertwin.links.places import Places
+from invertwin.links.received import Received, Reception
+from invertwin.links.transmitters import Transmitters
 from invertwin.radar.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.looks import Looks
 from invertwin.radar.motion import Chirps
@@ -37,6 +40,7 @@ from invertwin.radar.range_profile import beat_signal, range_profile
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate, surrogate_spectrum
 from invertwin.radar.waveform import SampledWaveform
+from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derived_seed
 from invertwin.signatures import Signature
@@ -581,6 +585,175 @@ class SignatureMap(ForwardModel):
     def ablations(self) -> dict[str, ForwardModel]:
         """The model at fixed visibility. See ``ForwardModel.ablations``."""
         return {"boundary": replace(self, boundary=False)} if self.boundary else {}
+
+
+QUANTITIES = ("received_power", "path_gain", "sinr", "delay_spread")
+"""What a ``RadioMap`` may show."""
+
+
+@dataclass(frozen=True, eq=False)
+class RadioMap(ForwardModel):
+    """What receivers at known places get of transmitters: a map for each of these.
+
+    Levels are in decibels; compare them by ``SpectrumLoss(levels=1, gain="one")``, with
+    ``background="level"`` where the sent power is not known. A floor is added to every gain, so
+    that levels and derivatives are finite where no path leads.
+
+    Attributes:
+        places: Where receivers are.
+        reception: How paths are found, and how they add up.
+        quantity: ``received_power`` [dBm], ``path_gain`` [dB], ``sinr`` [dB]: received power of a
+            transmitter over that of all others and noise, or ``delay_spread`` [s].
+        floor_db: Path gain that is added to every one [dB].
+        noise_dbm: Of a receiver, for ``sinr`` [dBm].
+        scatter: Standard deviation of data about the map, in its unit, where it is known. Error
+            bars and verdicts draw from it; None = as large as what a fit leaves unexplained.
+
+    Raises:
+        InputError: An unknown quantity, or a number out of range.
+    """
+
+    places: Places
+    reception: Reception
+    quantity: Literal["received_power", "path_gain", "sinr", "delay_spread"] = "received_power"
+    floor_db: float = -200.0
+    noise_dbm: float = -100.0
+    scatter: float | None = None
+
+    redraws: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+    fields: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.quantity not in QUANTITIES:
+            raise InputError(
+                f"expected a quantity among {', '.join(QUANTITIES)}, got {self.quantity!r}; "
+                "choose one"
+            )
+        checked_number(self.floor_db, "floor [dB]", -math.inf)
+        checked_number(self.noise_dbm, "noise [dBm]", -math.inf)
+        if self.scatter is not None:
+            checked_number(self.scatter, "scatter of data", 0.0)
+
+    def received(self, scene: Scene, sensor: Transmitters, seed: int) -> Received:
+        """Gain and delay spread, before any decibels.
+
+        Args:
+            scene: What is in the way.
+            sensor: What sends.
+            seed: Of the rays that find paths.
+        """
+        return self.places.received(scene, sensor, self.reception, seed)
+
+    def predict(self, scene: Scene, sensor: Transmitters, seed: int) -> Float64[Tensor, "tx *map"]:
+        """The quantity of every transmitter. See ``ForwardModel.predict``."""
+        found = self.received(scene, sensor, seed)
+        if self.quantity == "delay_spread":
+            return found.delay_spread
+        gain = found.gain + 10 ** (self.floor_db / 10)
+        if self.quantity == "path_gain":
+            return 10 * gain.log10()
+        power = gain * sensor.powers.reshape(-1, *[1] * (gain.ndim - 1))
+        if self.quantity == "sinr":
+            power = power / (power.sum(0) - power + 10 ** (self.noise_dbm / 10))
+        return 10 * power.log10()
+
+    def observe(self, recording: ArrayLike) -> Float64[Tensor, "tx *map"]:
+        """Measured values [tx, …], or those of a single transmitter […].
+
+        Raises:
+            InputError: Another shape, or NaN.
+        """
+        shape, given = self.places.shape, torch.as_tensor(recording, dtype=torch.float64)
+        given = given[None] if given.ndim == len(shape) else given
+        what = f"measured {self.quantity.replace('_', ' ')}"
+        return checked_tensor(given, (None, *shape), what, "give a map for each transmitter")
+
+    def looks(
+        self, scene: Scene, sensor: Transmitters, seed: int
+    ) -> Callable[[int, float], Tensor]:
+        """The map with other errors of measurement each time."""
+        return _scattered(self.predict(scene, sensor, seed), self.scatter)
+
+    def ablations(self) -> dict[str, ForwardModel]:
+        """The model without diffraction: visibility is then fixed in its derivative."""
+        if not self.reception.edges:
+            return {}
+        return {"boundary": replace(self, reception=replace(self.reception, edges=0))}
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseMap(ForwardModel):
+    """Complex responses H(f) between transmitters and receivers at known places.
+
+    Their phase tells the length of paths to parts of a wavelength, so that the loss has a minimum
+    every half wavelength of a place. Materials, which hardly turn phases, are found from anywhere.
+    Maps hold real and imaginary parts; compare them by ``SpectrumLoss(levels=1, gain="one")``.
+
+    Attributes:
+        positions: Of the receivers, [place, 3] [m].
+        frequencies: Of the responses [Hz].
+        reception: How paths are found; its bandwidth does not count.
+        scatter: Standard deviation of data about the map, of each part; None = as large as what a
+            fit leaves unexplained.
+    """
+
+    positions: Float64[Tensor, "place 3"]
+    frequencies: Float64[Tensor, " frequency"]
+    reception: Reception
+    scatter: float | None = None
+
+    redraws: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+    fields: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        do = "give a row of x, y, z for each"
+        places = checked_tensor(self.positions, (None, 3), "positions of receivers [m]", do)
+        swept = checked_tensor(
+            torch.atleast_1d(torch.as_tensor(self.frequencies, dtype=torch.float64)),
+            (None,),
+            "frequencies [Hz]",
+            "give one or several",
+        )
+        object.__setattr__(self, "positions", places)
+        object.__setattr__(self, "frequencies", swept)
+
+    def predict(
+        self, scene: Scene, sensor: Transmitters, seed: int
+    ) -> Float64[Tensor, "tx place frequency part"]:
+        """The responses of the first elements. See ``ForwardModel.predict``."""
+        found = self.reception.responses(scene, sensor, self.positions, self.frequencies, seed)
+        return torch.view_as_real(found)
+
+    def observe(self, recording: Tensor) -> Float64[Tensor, "tx place frequency part"]:
+        """Measured complex responses [tx, place, frequency].
+
+        Raises:
+            InputError: Another shape, or NaN.
+        """
+        given = torch.as_tensor(recording, dtype=torch.complex128)
+        shape = (None, len(self.positions), len(self.frequencies), 2)
+        do = "give complex numbers [tx, place, frequency]"
+        return checked_tensor(torch.view_as_real(given), shape, "measured responses", do)
+
+    def looks(
+        self, scene: Scene, sensor: Transmitters, seed: int
+    ) -> Callable[[int, float], Tensor]:
+        """The responses with other noise each time."""
+        return _scattered(self.predict(scene, sensor, seed), self.scatter)
+
+
+def _scattered(mean: Tensor, scatter: float | None) -> Callable[[int, float], Tensor]:
+    """Looks at a map with white errors: of a known deviation, or of the mean square asked for."""
+    mean = mean.detach()
+
+    def look(number: int, noise: float) -> Tensor:
+        generator = torch.Generator().manual_seed(number)
+        errors = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)
+        return mean + (noise**0.5 if scatter is None else scatter) * errors
+
+    return look
 
 
 def surrogate_correlation(

@@ -222,7 +222,7 @@ def impulse_response(
     count = checked_count(taps, "taps", 1)
     first = checked_number(start, "start [s]", -math.inf)
     amplitude, delay = path_amplitudes(paths, tx, rx)
-    turned = amplitude * _turn(-paths.frequency * delay)
+    turned = amplitude * phasors(-paths.frequency * delay)
     shape = (len(paths), *amplitude.shape[1:], count)
     require_memory(16.0 * math.prod(shape), "an impulse response", "ask for fewer taps", "taps")
     times = first + torch.arange(count, dtype=torch.float64) / band
@@ -246,7 +246,7 @@ def _responses(
         max(1, _VALUES_AT_ONCE // max(1, len(paths) * pairs * len(times)))
     ):
         moved = times[:, None] * rate[:, None, None, None, None]
-        turn = _turn(-some * (delay[..., None, None] + moved))
+        turn = phasors(-some * (delay[..., None, None] + moved))
         parts.append(_by_link(paths, amplitude[..., None, None] * turn))
     return torch.cat(parts, -1)
 
@@ -267,7 +267,11 @@ def _by_link(paths: RayPaths, values: Tensor) -> Tensor:
     return total.movedim((1, 2, 0, 3), (0, 1, 2, 3))
 
 
-def _turn(cycles: Tensor) -> Tensor:
-    """exp(j2π cycles), of whole cycles less."""
+def phasors(cycles: Float64[Tensor, "*any"]) -> Complex128[Tensor, "*any"]:
+    """exp(j2π cycles), of whole cycles less.
+
+    Args:
+        cycles: Phases over 2π.
+    """
     angle = 2 * math.pi * (cycles - cycles.detach().round())
     return torch.polar(torch.ones_like(angle), angle)

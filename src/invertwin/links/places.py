@@ -1,0 +1,67 @@
+"""Where a radio map is asked for, as one value: points."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.links.received import Received, Reception
+from invertwin.links.transmitters import Transmitters
+from invertwin.scene.checks import checked_tensor
+from invertwin.scene.scene import Scene
+
+
+class Places(ABC):
+    """Where a ``RadioMap`` is asked for."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Of a map of one transmitter."""
+
+    @abstractmethod
+    def received(
+        self, scene: Scene, sensor: Transmitters, reception: Reception, seed: int
+    ) -> Received:
+        """What arrives there.
+
+        Args:
+            scene: What is in the way.
+            sensor: What sends.
+            reception: How paths are found, and how they add up.
+            seed: Of all that is drawn.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Points(Places):
+    """Single points.
+
+    Attributes:
+        positions: [place, 3] in the world [m]. Differentiable.
+
+    Raises:
+        InputError: Wrong shapes, NaN, or no point.
+    """
+
+    positions: Float64[Tensor, "place 3"]
+
+    def __post_init__(self) -> None:
+        do = "give a row of x, y, z for each"
+        places = checked_tensor(self.positions, (None, 3), "positions of receivers [m]", do)
+        if not len(places):
+            raise InputError(f"expected at least one point of a map, got none; {do}")
+        object.__setattr__(self, "positions", places)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(number of points,)."""
+        return (len(self.positions),)
+
+    def received(
+        self, scene: Scene, sensor: Transmitters, reception: Reception, seed: int
+    ) -> Received:
+        """What arrives at the points. See ``Places.received``."""
+        return reception.at(scene, sensor, self.positions, seed)

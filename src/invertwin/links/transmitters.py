@@ -1,0 +1,153 @@
+"""What sends: transmitters with their places, antennas and powers, and modules that move them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor, nn
+
+from invertwin.errors import InputError
+from invertwin.limits import Axes
+from invertwin.links.responses import Terminals
+from invertwin.scene.checks import ArrayLike, checked_tensor
+from invertwin.scene.parameters import Coordinate, axes_mask, free_part
+
+_PLACE = 0.1  # m: an error that matters
+
+
+@dataclass(frozen=True, eq=False)
+class Transmitters:
+    """The sensor of a ``RadioMap``: one or several transmitters, all with the same antenna.
+
+    Attributes:
+        positions: [tx, 3] in the world [m]; one may be given as [3]. Differentiable.
+        terminals: Antenna and axes at each place; of several elements the mean power counts.
+        power_dbm: Sent by each [dBm], one for all or one each.
+
+    Raises:
+        InputError: Wrong shapes, NaN, or no transmitter.
+    """
+
+    positions: Float64[Tensor, "*tx 3"]
+    terminals: Terminals = field(default_factory=Terminals)
+    power_dbm: float | Float64[Tensor, " tx"] = 0.0
+
+    def __post_init__(self) -> None:
+        do = "give x, y, z, or a row of them for each"
+        given = torch.as_tensor(self.positions, dtype=torch.float64)
+        shape = (3,) if given.ndim == 1 else (None, 3)
+        places = checked_tensor(given, shape, "positions of transmitters [m]", do).reshape(-1, 3)
+        if not len(places):
+            raise InputError(f"expected at least one transmitter, got none; {do}")
+        power = torch.as_tensor(self.power_dbm, dtype=torch.float64)
+        power = power.expand(len(places)) if power.ndim == 0 else power
+        power = checked_tensor(
+            power, (len(places),), "powers of transmitters [dBm]", "give one for all, or one each"
+        )
+        object.__setattr__(self, "positions", places)
+        object.__setattr__(self, "power_dbm", power)
+
+    @property
+    def powers(self) -> Float64[Tensor, " tx"]:
+        """Sent by each [mW]."""
+        return 10.0 ** (torch.as_tensor(self.power_dbm) / 10)
+
+    def frames(self, chosen: Sequence[int]) -> "Transmitters":
+        """Only some of the transmitters.
+
+        Args:
+            chosen: Their numbers.
+        """
+        rows = torch.as_tensor(chosen)
+        terminals = self.terminals
+        if terminals.rotations.ndim == 3:
+            terminals = replace(terminals, rotations=terminals.rotations[rows])
+        power = torch.as_tensor(self.power_dbm)[rows]
+        return Transmitters(self.positions[rows], terminals, power)
+
+
+class TransmitterPosition(nn.Module):
+    """Places one transmitter: a module Transmitters → Transmitters that a fit moves.
+
+    With a box the place stays inside of it, such as the room: it is the box's low corner plus its
+    size times the logistic function of a free number, along every axis.
+
+    Args:
+        initial: [m].
+        low: A corner of the box [m]; None = no box.
+        high: The opposite corner.
+        axes: World axes along which the fit may move it; the others keep their values.
+        number: Of the transmitter.
+
+    Attributes:
+        place: parameter [3]: metres, or free numbers where there is a box.
+
+    Raises:
+        InputError: Not three numbers, an unknown axis, one corner alone, or a start outside.
+    """
+
+    def __init__(
+        self,
+        initial: ArrayLike,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        axes: Axes = "xyz",
+        number: int = 0,
+    ) -> None:
+        super().__init__()
+        do = "give x, y, z"
+        begun = checked_tensor(initial, (3,), "initial place of a transmitter [m]", do)
+        begun = begun.detach().clone()
+        self._axes, self._number = axes_mask(axes), number
+        if (low is None) != (high is None):
+            raise InputError("expected both corners of the box, got one; give low and high")
+        self._low = self._size = None
+        if low is not None and high is not None:
+            self._low = checked_tensor(low, (3,), "low corner of the box [m]", do)
+            self._size = checked_tensor(high, (3,), "high corner of the box [m]", do) - self._low
+            begun = (begun - self._low) / self._size
+            if not bool(((begun > 0) & (begun < 1)).all()):
+                raise InputError(
+                    "expected an initial place inside the box, got one outside or on its border; "
+                    "choose another start or a larger box"
+                )
+            begun = begun.logit()
+        self.place = nn.Parameter(begun)
+
+    @property
+    def position(self) -> Float64[Tensor, "3"]:
+        """Where the transmitter is [m]."""
+        free = free_part(self.place, self._axes)
+        if self._low is None or self._size is None:
+            return free
+        return self._low + self._size * free.sigmoid()
+
+    def forward(self, sensor: Transmitters) -> Transmitters:
+        """The transmitters with this one placed."""
+        own = (torch.arange(len(sensor.positions)) == self._number)[:, None]
+        return replace(sensor, positions=torch.where(own, self.position, sensor.positions))
+
+    def values(self) -> dict[str, Tensor]:
+        """The place [m] by name, for progress and reports."""
+        return {"transmitter.position": self.position.detach().clone()}
+
+    def coordinates(self) -> list[Coordinate]:
+        """x, y and z of the transmitter, as far as they are free."""
+        slope = torch.ones(3, dtype=torch.float64)
+        if self._size is not None:
+            share = self.place.detach().sigmoid()
+            slope = self._size * share * (1 - share)
+        return [
+            Coordinate(f"transmitter.{axis}", "m", {"place": along / slope}, _PLACE)
+            for axis, along, free in zip("xyz", torch.eye(3).double(), self._axes, strict=True)
+            if free
+        ]
+
+    def at_bounds(self) -> list[str]:
+        """Names of coordinates next to the box."""
+        if self._size is None:
+            return []
+        share = self.place.detach().sigmoid()
+        near = (share * (1 - share) < 0.01).tolist()
+        return [f"transmitter.{axis}" for axis, at in zip("xyz", near, strict=True) if at]
