@@ -172,7 +172,8 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
 
 
 def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
-    return ("gradcheck",) if run.rcs is not None else ("gradcheck", "radar", "grid")
+    alone = run.rcs is not None or run.placement is not None
+    return ("gradcheck",) if alone else ("gradcheck", "radar", "grid")
 
 
 @app.command()
@@ -250,7 +251,7 @@ def _each(
 
 
 def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
-    runs = load_runs([file], options, "reconstruct", ("reconstruct", "data", "grid", "parameters"))
+    runs = load_runs([file], options, "reconstruct", _needs_of_reconstruct)
     with run_folder(options, default, runs) as folder:
         if folder.complete:
             return
@@ -260,6 +261,10 @@ def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
             tables, outcome = run_reconstruct(runs[file.stem], folder, console)
         print_tables(tables)
         console.print(outcome, markup=False, soft_wrap=True)
+
+
+def _needs_of_reconstruct(run: Any) -> tuple[str, ...]:
+    return () if run.placement is not None else ("reconstruct", "data", "grid", "parameters")
 
 
 def _demo_file() -> Path:

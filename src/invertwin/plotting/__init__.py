@@ -5,6 +5,8 @@ changes: save it with ``figure.savefig(path)`` or show it in a notebook. The tur
 animation and comes as the bytes of a GIF.
 """
 
+from invertwin.plotting.coverage import floor_plan as floor_plan
+from invertwin.plotting.coverage import placements as placements
 from invertwin.plotting.curves import convergence as convergence
 from invertwin.plotting.curves import count_minima as count_minima
 from invertwin.plotting.curves import landscape as landscape

@@ -1,0 +1,198 @@
+"""`invertwin reconstruct` with `[placement]`: a metasurface finds its place in a room."""
+
+import math
+import statistics
+import time
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from invertwin import plotting
+from invertwin.cli import build
+from invertwin.cli.report import Table, finish, picture, texts
+from invertwin.cli.running import progress
+from invertwin.cli.schema import RunFile
+from invertwin.cli.schema.placement import Placement
+from invertwin.inversion.placement import Coverage, Found, Placing, evaluations_until
+from invertwin.progress import told
+from invertwin.runs import RunFolder
+from invertwin.seeds import derived_seed
+
+_AS_GOOD = 0.95
+_CELLS = 2500  # of a drawn map
+_FLOOR = 1e-16
+
+
+def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
+    """Place the panel from every start, beside the grid and annealing; write the folder.
+
+    Args:
+        run: With `[placement]`.
+        folder: Of the run.
+        console: Where progress is shown.
+    """
+    begin = time.perf_counter()
+    table, scene = run.placement, build.scene(run)
+    assert table is not None
+    placing, _ = build.placing(run, scene)
+    scored = table.coverage(scene, run.seed, scored=True)
+    with progress(console):
+        trials, levels = _grid(table, placing)
+        exhaustive = _polished(table, placing, trials, levels)
+        rows = [
+            _start(table, placing, scored, exhaustive, derived_seed(run.seed, 2, number))
+            for number in told(range(table.starts), "start")
+        ]
+    best = max((row for row in rows), key=lambda row: row["level_db"])
+    metrics = _metrics(run, placing, scored, rows, exhaustive)
+    state = best["found"].state
+    pictures = [
+        picture(
+            folder, "landscape", _landscape(table, placing, trials, levels, rows), note="placement"
+        ),
+        picture(folder, "coverage", _maps(run, table, placing, state), note="placement_coverage"),
+    ]
+    metrics["wall_seconds"] = time.perf_counter() - begin
+    columns = ("start", "found / exhaustive", "interior only", "annealing", "evaluations ratio")
+    shown = [
+        [
+            number,
+            row["found_over_exhaustive"],
+            row["interior_over_exhaustive"],
+            row["annealing_over_exhaustive"],
+            row["evaluations_ratio"],
+        ]
+        for number, row in enumerate(rows)
+    ]
+    notes = texts("notes")
+    parts = [Table("Starts", columns, shown, notes["placement_starts"]), *pictures]
+    status = (
+        f"{metrics['successes']} of {table.starts} starts reach {_AS_GOOD:g} of the best of the "
+        f"grid; the worst {table.share:.0%} of receivers gain {metrics['gain_db']:.1f} dB"
+    )
+    title = run.title or "Placement of a metasurface"
+    tables = finish(folder, metrics, title, status, parts, again="reconstruct", note=run.note)
+    return tables, status
+
+
+def _grid(table: Placement, placing: Placing) -> tuple[list[Any], Tensor]:
+    grid = table.grid
+    return placing.exhaustive(grid.places, grid.yaws, [math.radians(a) for a in grid.spread_deg])
+
+
+def _polished(table: Placement, placing: Placing, trials: list[Any], levels: Tensor) -> Found:
+    """The best of the grid, with place and phases then fitted as a search does at its end."""
+    settings = table.descent.build()
+    module = placing.make(*trials[int(levels.argmax())])
+    placing.descend(module, settings.steps, settings, width=0.0)
+    state = {name: value.clone() for name, value in module.state_dict().items()}
+    return Found(state, placing.level(module), len(trials) + 3 * settings.steps)
+
+
+def _start(
+    table: Placement, placing: Placing, scored: Coverage, exhaustive: Found, seed: int
+) -> dict[str, Any]:
+    """One search, with what it is compared with; ratios are of path gains of the worst."""
+    settings = table.descent.build()
+    found = placing.by_gradient(settings, seed)
+    interior = placing.by_gradient(settings, seed, boundary=False)
+    enough = found.level + 10 * math.log10(_AS_GOOD)
+    most = table.annealing * found.evaluations
+    annealed = placing.annealed(most, seed, enough)
+    reached = evaluations_until(annealed.history, enough)
+    truth = placing.level(placing.module(exhaustive.state), scored)
+
+    def ratio(one: Found) -> float:
+        return 10 ** ((placing.level(placing.module(one.state), scored) - truth) / 10)
+
+    return {
+        "found": found,
+        "level_db": found.level,
+        "along_m": float(found.state["along"]),
+        "yaw_deg": math.degrees(float(found.state["yaw"])),
+        "found_over_exhaustive": ratio(found),
+        "interior_over_exhaustive": ratio(interior),
+        "annealing_over_exhaustive": ratio(annealed),
+        "evaluations": found.evaluations,
+        "annealing_evaluations": reached or annealed.evaluations,
+        "annealing_reached": reached is not None,
+        "evaluations_ratio": found.evaluations / (reached or annealed.evaluations),
+    }
+
+
+def _metrics(
+    run: RunFile, placing: Placing, scored: Coverage, rows: list[dict[str, Any]], exhaustive: Found
+) -> dict[str, Any]:
+    def middle(key: str) -> float:
+        return statistics.median(row[key] for row in rows)
+
+    def successes(key: str) -> int:
+        return sum(row[key] >= _AS_GOOD for row in rows)
+
+    best = max(rows, key=lambda row: row["level_db"])["found"]
+    after = placing.level(placing.module(best.state), scored)
+    before = float(scored.worst(scored.direct))
+    return {
+        "task": run.task,
+        "successes": successes("found_over_exhaustive"),
+        "successes_interior": successes("interior_over_exhaustive"),
+        "successes_annealing": successes("annealing_over_exhaustive"),
+        "found_over_exhaustive": middle("found_over_exhaustive"),
+        "interior_over_exhaustive": middle("interior_over_exhaustive"),
+        "annealing_over_exhaustive": middle("annealing_over_exhaustive"),
+        "evaluations_ratio": middle("evaluations_ratio"),
+        "evaluations": rows[0]["evaluations"],
+        "evaluations_exhaustive": exhaustive.evaluations,
+        "annealing_reached": sum(row["annealing_reached"] for row in rows),
+        "worst_before_db": before,
+        "worst_after_db": after,
+        "worst_exhaustive_db": placing.level(placing.module(exhaustive.state), scored),
+        "gain_db": after - before,
+        "starts": [{k: v for k, v in row.items() if k != "found"} for row in rows],
+    }
+
+
+def _landscape(
+    table: Placement,
+    placing: Placing,
+    trials: list[Any],
+    levels: Tensor,
+    rows: list[dict[str, Any]],
+) -> Any:
+    places = table.grid.places
+    best = levels.view(places, -1).amax(1)
+    along = torch.tensor([trial[0] for trial in trials], dtype=torch.float64).view(places, -1)[:, 0]
+    length = placing.make(0.0, 0.0, (0.0, 0.0)).path.length
+    ends = torch.tensor([[row["along_m"] % length, row["level_db"]] for row in rows])
+    return plotting.placements(along, best, ends)
+
+
+def _maps(run: RunFile, table: Placement, placing: Placing, state: dict[str, Tensor]) -> Any:
+    """Path gain over the floor plan, without the panel and with it."""
+    low, high = (torch.tensor(end, dtype=torch.float64) for end in (table.receivers.low, table.receivers.high))
+    side = (high - low)[:2]
+    step = float((side.prod() / _CELLS).sqrt())
+    counts = [max(2, round(float(s) / step)) for s in side]
+    axes = [torch.linspace(float(low[k]), float(high[k]), counts[k]).double() for k in range(2)]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    height = 0.5 * (table.receivers.low[2] + table.receivers.high[2])
+    places = torch.cat([grid, torch.full((len(grid), 1), height)], 1)
+    module = placing.module(state)
+    with torch.no_grad():
+        panel = module(placing.panel)
+        aim = Coverage.of(
+            placing.coverage.scene,
+            placing.coverage.tx,
+            places,
+            table.frequency,
+            depth=table.depth,
+            edges=table.edges,
+            seed=run.seed,
+        )
+        maps = {"without": aim.direct, "with the panel": aim.gain(panel)}
+    shown = {n: 10 * g.clamp_min(_FLOOR).log10().view(*counts) for n, g in maps.items()}
+    return plotting.floor_plan(
+        shown, (low, high), placing.coverage.scene, height, placing.coverage.tx, panel.position
+    )
