@@ -609,8 +609,9 @@ class PanelMap(ForwardModel):
 
     def predict(self, scene: Scene, sensor: Metasurface, seed: int) -> Float64[Tensor, "1 rx"]:
         """|Σ|² of the elements. See ``panel_response``."""
-        ends = (self.tx[None], self.receivers)
-        found = panel_response(scene, sensor, *ends, self.frequency, boundary=self.boundary)
+        found = panel_response(
+            scene, sensor, self.tx[None], self.receivers, self.frequency, boundary=self.boundary
+        )
         return found.real.square() + found.imag.square()
 
     def observe(self, recording: Tensor) -> Float64[Tensor, "1 rx"]:

@@ -61,7 +61,8 @@ def _tables(found: Estimate, scene: Scene, seconds: float, work: str) -> tuple[l
 def _of_placement(run: RunFile) -> tuple[list[Table], str]:
     """The same of `[placement]`: its time is that of one evaluation, and of one derivative."""
     placing, module = build.placing(run, build.scene(run))
-    table, settings = run.placement, run.placement.descent.build()
+    table = need(run, "placement", run.task)
+    settings = table.descent.build()
     once = _timed(lambda: placing.level(module))
     step = _timed(lambda: placing.descend(module, 1, settings, width=0.0))
     steps = settings.tracks * settings.track_steps + settings.steps

@@ -3,6 +3,7 @@
 import math
 import statistics
 import time
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -12,10 +13,12 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.cli import build
 from invertwin.cli.report import Table, finish, picture, texts
+from invertwin.cli.run_file import need
 from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.placement import Placement
-from invertwin.inversion.placement import Coverage, Found, Placing, evaluations_until
+from invertwin.folders import PARTS
+from invertwin.inversion.placement import Coverage, Found, Placing, Trial, evaluations_until
 from invertwin.progress import told
 from invertwin.runs import RunFolder
 from invertwin.seeds import derived_seed
@@ -34,20 +37,26 @@ def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
         console: Where progress is shown.
     """
     begin = time.perf_counter()
-    table, scene = run.placement, build.scene(run)
-    assert table is not None
+    table, scene = need(run, "placement", "reconstruct"), build.scene(run)
+    grid = table.grid
     placing, _ = build.placing(run, scene)
     scored = table.coverage(scene, run.seed, scored=True)
     with progress(console):
-        trials, levels = _grid(table, placing)
-        exhaustive = _polished(table, placing, trials, levels)
+        trials = placing.trials(grid.places, grid.yaws, [math.radians(a) for a in grid.spread_deg])
+        tried = _kept(folder, "grid", lambda: _exhaustive(table, placing, trials))
         rows = [
-            _start(table, placing, scored, exhaustive, derived_seed(run.seed, 2, number))
+            _kept(
+                folder,
+                f"start_{number}",
+                lambda seed=derived_seed(run.seed, 2, number): _start(
+                    table, placing, scored, tried, seed
+                ),
+            )
             for number in told(range(table.starts), "start")
         ]
-    best = max((row for row in rows), key=lambda row: row["level_db"])
-    metrics = _metrics(run, placing, scored, rows, exhaustive)
-    state = best["found"].state
+    levels = torch.tensor(tried["levels_db"], dtype=torch.float64)
+    metrics = _metrics(run, placing, scored, rows, tried)
+    state = _state(max(rows, key=lambda row: row["level_db"]))
     pictures = [
         picture(
             folder, "landscape", _landscape(table, placing, trials, levels, rows), note="placement"
@@ -77,22 +86,36 @@ def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
     return tables, status
 
 
-def _grid(table: Placement, placing: Placing) -> tuple[list[Any], Tensor]:
-    grid = table.grid
-    return placing.exhaustive(grid.places, grid.yaws, [math.radians(a) for a in grid.spread_deg])
+def _kept(folder: RunFolder, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What was computed before the run was interrupted, or is now."""
+    part = f"{PARTS}/{name}.json"
+    found = folder.read_json(part)
+    if found is None:
+        found = compute()
+        folder.write_json(part, found)
+    return found
 
 
-def _polished(table: Placement, placing: Placing, trials: list[Any], levels: Tensor) -> Found:
-    """The best of the grid, with place and phases then fitted as a search does at its end."""
-    settings = table.descent.build()
+def _lists(found: Found) -> dict[str, Any]:
+    return {name: value.tolist() for name, value in found.state.items()}
+
+
+def _state(row: dict[str, Any]) -> dict[str, Tensor]:
+    return {n: torch.tensor(v, dtype=torch.float64) for n, v in row["state"].items()}
+
+
+def _exhaustive(table: Placement, placing: Placing, trials: list[Trial]) -> dict[str, Any]:
+    """The grid, and its best, whose place and phases are then fitted as at the end of a search."""
+    settings, levels = table.descent.build(), placing.exhaustive(trials)
     module = placing.make(*trials[int(levels.argmax())])
     placing.descend(module, settings.steps, settings, width=0.0)
     state = {name: value.clone() for name, value in module.state_dict().items()}
-    return Found(state, placing.level(module), len(trials) + 3 * settings.steps)
+    found = Found(state, placing.level(module))
+    return {"levels_db": levels.tolist(), "level_db": found.level, "state": _lists(found)}
 
 
 def _start(
-    table: Placement, placing: Placing, scored: Coverage, exhaustive: Found, seed: int
+    table: Placement, placing: Placing, scored: Coverage, tried: dict[str, Any], seed: int
 ) -> dict[str, Any]:
     """One search, with what it is compared with; ratios are of path gains of the worst."""
     settings = table.descent.build()
@@ -102,13 +125,13 @@ def _start(
     most = table.annealing * found.evaluations
     annealed = placing.annealed(most, seed, enough)
     reached = evaluations_until(annealed.history, enough)
-    truth = placing.level(placing.module(exhaustive.state), scored)
+    truth = placing.level(placing.module(_state(tried)), scored)
 
     def ratio(one: Found) -> float:
         return 10 ** ((placing.level(placing.module(one.state), scored) - truth) / 10)
 
     return {
-        "found": found,
+        "state": _lists(found),
         "level_db": found.level,
         "along_m": float(found.state["along"]),
         "yaw_deg": math.degrees(float(found.state["yaw"])),
@@ -123,7 +146,11 @@ def _start(
 
 
 def _metrics(
-    run: RunFile, placing: Placing, scored: Coverage, rows: list[dict[str, Any]], exhaustive: Found
+    run: RunFile,
+    placing: Placing,
+    scored: Coverage,
+    rows: list[dict[str, Any]],
+    tried: dict[str, Any],
 ) -> dict[str, Any]:
     def middle(key: str) -> float:
         return statistics.median(row[key] for row in rows)
@@ -131,8 +158,8 @@ def _metrics(
     def successes(key: str) -> int:
         return sum(row[key] >= _AS_GOOD for row in rows)
 
-    best = max(rows, key=lambda row: row["level_db"])["found"]
-    after = placing.level(placing.module(best.state), scored)
+    best = max(rows, key=lambda row: row["level_db"])
+    after = placing.level(placing.module(_state(best)), scored)
     before = float(scored.worst(scored.direct))
     return {
         "task": run.task,
@@ -144,20 +171,20 @@ def _metrics(
         "annealing_over_exhaustive": middle("annealing_over_exhaustive"),
         "evaluations_ratio": middle("evaluations_ratio"),
         "evaluations": rows[0]["evaluations"],
-        "evaluations_exhaustive": exhaustive.evaluations,
+        "evaluations_exhaustive": len(tried["levels_db"]),
         "annealing_reached": sum(row["annealing_reached"] for row in rows),
         "worst_before_db": before,
         "worst_after_db": after,
-        "worst_exhaustive_db": placing.level(placing.module(exhaustive.state), scored),
+        "worst_exhaustive_db": placing.level(placing.module(_state(tried)), scored),
         "gain_db": after - before,
-        "starts": [{k: v for k, v in row.items() if k != "found"} for row in rows],
+        "starts": [{k: v for k, v in row.items() if k != "state"} for row in rows],
     }
 
 
 def _landscape(
     table: Placement,
     placing: Placing,
-    trials: list[Any],
+    trials: list[Trial],
     levels: Tensor,
     rows: list[dict[str, Any]],
 ) -> Any:
@@ -171,7 +198,10 @@ def _landscape(
 
 def _maps(run: RunFile, table: Placement, placing: Placing, state: dict[str, Tensor]) -> Any:
     """Path gain over the floor plan, without the panel and with it."""
-    low, high = (torch.tensor(end, dtype=torch.float64) for end in (table.receivers.low, table.receivers.high))
+    low, high = (
+        torch.tensor(end, dtype=torch.float64)
+        for end in (table.receivers.low, table.receivers.high)
+    )
     side = (high - low)[:2]
     step = float((side.prod() / _CELLS).sqrt())
     counts = [max(2, round(float(s) / step)) for s in side]

@@ -19,14 +19,15 @@ from invertwin.links.responses import frequency_response
 from invertwin.progress import told
 from invertwin.scene import Scene
 
+Trial = tuple[float, float, tuple[float, float]]
+"""Place on the path [m], yaw and spread [rad]."""
+
 _FLOOR = 1e-20  # path gain that is added, so that decibels stay finite
 BACKWARD = 2
 """Evaluations that a derivative by all unknowns counts for, beside the one of its value."""
 
 
-def soft_quantile(
-    values: Float64[Tensor, " n"], share: float, width: float
-) -> Float64[Tensor, ""]:
+def soft_quantile(values: Float64[Tensor, " n"], share: float, width: float) -> Float64[Tensor, ""]:
     """The level that a share of values is below, smooth in all of them.
 
     It solves mean σ((q − v)/width) = share; width 0 gives the quantile itself.
@@ -100,7 +101,7 @@ class Coverage:
             paths = trace_paths(
                 scene, tx, receivers, frequency, depth=depth, edges=edges, rays=20_000, seed=seed
             )
-            gain = frequency_response(paths, frequency).abs().square().reshape(len(receivers))
+            gain = frequency_response(paths, [frequency]).abs().square().reshape(len(receivers))
         return cls(scene, tx, receivers, frequency, gain, share)
 
     def gain(
@@ -148,10 +149,10 @@ class Descent:
         rates: Of place [m], yaw and spread [rad], and phases [rad] in a step.
     """
 
-    scouts: Count = 24
+    scouts: Count = 16
     tracks: Count = 3
-    track_steps: Count = 15
-    steps: Count = 60
+    track_steps: Count = 12
+    steps: Count = 50
     edge_width: NonNegative = 0.3
     softness: Positive = 3.0
     rates: tuple[Positive, Positive, Positive] = (0.1, 0.04, 0.15)
@@ -289,7 +290,9 @@ class Placing:
                 boundary=boundary,
             )
         best = max(tracks, key=self.level)
-        self.descend(best, settings.steps, settings, width=settings.edge_width / 3, boundary=boundary)
+        self.descend(
+            best, settings.steps, settings, width=settings.edge_width / 3, boundary=boundary
+        )
         state = {name: value.clone() for name, value in best.state_dict().items()}
         return Found(state, self.level(best), settings.evaluations)
 
@@ -329,22 +332,20 @@ class Placing:
         u = torch.randn(8, generator=generator, dtype=torch.float64)
         with torch.no_grad():
             if torch.rand((), generator=generator) < 0.5:
-                module.along += 0.3 * size * module.path.length * u[0]
-                module.yaw += size * self.yaw_limit * u[1]
-                module.spread += size * self.spread_limit * u[2:4]
+                module.along.add_(0.3 * size * module.path.length * u[0])
+                module.yaw.add_(size * self.yaw_limit * u[1])
+                module.spread.add_(size * self.spread_limit * u[2:4])
             else:
                 counts = module.shift.shape
                 across = [torch.linspace(-1, 1, n, dtype=torch.float64) for n in counts]
                 wave = torch.cos(
                     3 * u[4] * across[0][:, None] + 3 * u[5] * across[1] + math.pi * u[6]
                 )
-                module.shift += size * u[7] * wave
+                module.shift.add_(size * u[7] * wave)
         self.keep_inside(module)
 
-    def exhaustive(
-        self, places: int, yaws: int, spreads: Sequence[float]
-    ) -> tuple[list[tuple[float, float, tuple[float, float]]], Float64[Tensor, " trial"]]:
-        """Every place, yaw and spread of a grid, and the aim of each [dB].
+    def trials(self, places: int, yaws: int, spreads: Sequence[float]) -> list[Trial]:
+        """Places, yaws and spreads on a grid; places run slowest.
 
         Args:
             places: On the path.
@@ -352,17 +353,21 @@ class Placing:
             spreads: Half widths of the beam, of which every pair is tried [rad].
         """
         path = self._example.path
-        stops = [path.length * n / (places if path.closed else places - 1) for n in range(places)]
-        turns = torch.linspace(-self.yaw_limit, self.yaw_limit, yaws).tolist() if yaws > 1 else [0]
-        trials = [
-            (along, yaw, (a, b))
-            for along in stops
+        step = path.length / (places if path.closed else places - 1)
+        turns = torch.linspace(-self.yaw_limit, self.yaw_limit, yaws).tolist()
+        turns = turns if yaws > 1 else [0.0]
+        return [
+            (number * step, yaw, (across, up))
+            for number in range(places)
             for yaw in turns
-            for a in spreads
-            for b in spreads
+            for across in spreads
+            for up in spreads
         ]
+
+    def exhaustive(self, trials: Sequence[Trial]) -> Float64[Tensor, " trial"]:
+        """The aim of every trial [dB]."""
         levels = [self.level(self.make(*trial)) for trial in told(trials, "exhaustive grid")]
-        return trials, torch.tensor(levels, dtype=torch.float64)
+        return torch.tensor(levels, dtype=torch.float64)
 
 
 def evaluations_until(history: Iterable[tuple[int, float]], level: float) -> int | None:

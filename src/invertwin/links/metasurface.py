@@ -156,8 +156,10 @@ def panel_response(
     sent = _waves(panel, cells, tx, lit[: len(tx)], k, far)
     weights = panel.response
     scale = panel.spacing**2 * k / (2 * math.pi)
-    found: list[Tensor] = []
-    heavy = len(rx) * len(weights) > _VALUES_AT_ONCE
+    seen = (lit[len(tx) :] > 0).any(1) & bool((lit[: len(tx)] > 0).any())
+    live = torch.nonzero(seen)[:, 0]
+    heavy = len(live) * len(weights) > _VALUES_AT_ONCE
+    found = [torch.zeros(len(tx), 0, dtype=torch.complex128)]
 
     def total(places: Tensor, lit: Tensor) -> Tensor:
         wave, cosine = _waves(panel, cells, places, lit, k, far)
@@ -167,31 +169,35 @@ def panel_response(
         half = (first * sent[1]) @ (wave * (cosine > 0)).T
         return 0.5 * (half + (first * (sent[1] > 0)) @ (wave * cosine).T)
 
-    for some in torch.arange(len(rx)).split(max(1, _VALUES_AT_ONCE // len(weights))):
+    for some in live.split(max(1, _VALUES_AT_ONCE // len(weights))):
         rows = rx[some], lit[len(tx) + some]
         found.append(checkpoint(total, *rows, use_reentrant=False) if heavy else total(*rows))
-    return -1j / (2 * k) * scale * torch.cat(found, 1)
+    sums = torch.zeros(len(tx), len(rx), dtype=torch.complex128)
+    return sums.index_copy(1, live, -1j / (2 * k) * scale * torch.cat(found, 1))
 
 
 def _waves(
     panel: Metasurface, cells: Cells, places: Tensor, lit: Tensor, k: float, far: bool
 ) -> tuple[Complex128[Tensor, "place element"], Float64[Tensor, "place element"]]:
     """Wave of each place at each element, over its phase at the centre, and its obliquity."""
-    whole = places - panel.position
+    whole = (places - panel.position) @ panel.axes
     reach = whole.norm(dim=1, keepdim=True)
+    shift = -whole[:, :2] @ cells.offsets.T
     if far:
-        local = (whole / reach) @ panel.axes
-        later = -local[:, :2] @ cells.offsets.T
-        local, length = local[:, None].expand(-1, len(cells.offsets), -1), reach
+        later, length = shift / reach, reach.expand_as(shift)
     else:
-        offset = places[:, None] - cells.places
-        length = offset.norm(dim=2)
-        later = length - reach
-        local = (offset / length[..., None]) @ panel.axes
+        # The difference of squares is exact where that of lengths would cancel.
+        squares = 2 * shift + cells.offsets.square().sum(1)
+        length = (reach.square() + squares).sqrt()
+        later = squares / (length + reach)
     if panel.pattern is None:
-        obliquity = local[..., 2].clamp_min(0)
+        obliquity = whole[:, 2:].clamp_min(0) / length
     else:
-        gain = panel.pattern.gain(local)
+        aside = whole[:, None, :2] - (0 if far else cells.offsets)
+        up = whole[:, None, 2:].expand(-1, len(cells.offsets), 1)
+        gain = panel.pattern.gain(
+            torch.cat([aside.expand(*up.shape[:2], 2), up], 2) / length[..., None]
+        )
         some = gain > 0  # a root of zero has no derivative
         # Of a cell of λ/2, π is the gain that takes all of what falls on it.
         obliquity = torch.where(some, torch.where(some, gain, 1.0) / math.pi, 0.0).sqrt()
@@ -236,17 +242,19 @@ def panel_paths(
     checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
     checked_number(width, "width of shadows [m]", 0.0)
     counts = len(ends[0]), len(ends[1])
-    k, up = 2 * math.pi * frequency / SPEED_OF_LIGHT, torch.tensor(_UP, dtype=torch.float64)
+    up = torch.tensor(_UP, dtype=torch.float64)
     source = torch.arange(counts[0]).repeat_interleave(counts[1])
     target = torch.arange(counts[1]).repeat(counts[0])
     rows: list[RayPaths] = []
     for panel in several:
         _require_off(panel, torch.cat(ends))
         total = panel_response(
-            scene, panel, *ends, frequency, width=width, boundary=boundary, far=far
+            scene, panel, ends[0], ends[1], frequency, width=width, boundary=boundary, far=far
         ).ravel()
         link = torch.nonzero(total.detach() != 0)[:, 0]
-        ways = [panel.position - end[at[link]] for end, at in zip(ends, (source, target), strict=True)]
+        ways = [
+            panel.position - end[at[link]] for end, at in zip(ends, (source, target), strict=True)
+        ]
         length = ways[0].norm(dim=1) + ways[1].norm(dim=1)
         units = [normalize(way, dim=1) for way in ways]
         sent, received = (polarisations(unit, up) for unit in units)

@@ -32,7 +32,7 @@ class WallPath:
     """A level path along walls, with the room on its left; corners are rounded.
 
     Args:
-        corners: Of the walls' plan, moved off the walls by as much as a panel needs [corner, 2] [m].
+        corners: Of the walls' plan, [corner, 2], off the walls by as much as a panel needs [m].
         height: z of the path [m].
         radius: Of round corners [m].
         closed: Whether the last corner leads back to the first.
@@ -62,9 +62,7 @@ class WallPath:
         self._pieces = _pieces(points, bow, closed)
         self.length = self._pieces[-1].begin + self._pieces[-1].length
 
-    def at(
-        self, along: Float64[Tensor, ""]
-    ) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+    def at(self, along: Float64[Tensor, ""]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
         """Position [m], and the unit vector into the room.
 
         Args:
@@ -162,9 +160,10 @@ class PlacedPanel(nn.Module):
         self._tx = checked_tensor(tx, (3,), "place of a transmitter [m]", do)
         self._target = checked_tensor(target, (3,), "target of a focus [m]", do)
         self._frequency = checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-        for name, value in (("along", along), ("yaw", yaw)):
-            number = checked_number(value, f"{name} of a panel", -math.inf)
-            setattr(self, name, nn.Parameter(torch.tensor(number, dtype=torch.float64)))
+        place = checked_number(along, "place of a panel [m]", -math.inf)
+        turn = checked_number(yaw, "yaw of a panel [rad]", -math.inf)
+        self.along = nn.Parameter(torch.tensor(place, dtype=torch.float64))
+        self.yaw = nn.Parameter(torch.tensor(turn, dtype=torch.float64))
         widths = checked_tensor(spread, (2,), "spread of a beam [rad]", "give two half widths")
         self.spread = nn.Parameter(widths.clone())
         self.shift = nn.Parameter(torch.zeros(*counts, dtype=torch.float64))

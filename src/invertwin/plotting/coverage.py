@@ -1,6 +1,7 @@
 """Figures of coverage: path gain over a floor plan, and the landscape of a panel's place."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float64
@@ -35,7 +36,7 @@ def floor_plan(
     cells = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
     low, high = (numbers(corner) for corner in corners)
     top = max(float(value.max()) for value in levels.values())
-    image = None
+    image: Any = None
     for axes, (title, value) in zip(cells, levels.items(), strict=True):
         image = axes.imshow(
             numbers(value).T,

@@ -216,9 +216,7 @@ def _distances(
     return torch.where(past, sign * far, aside), across
 
 
-def _seen(
-    rays: Occluders, vertices: Tensor, places: Tensor, cells: Cells, edges: _Edges
-) -> _Edges:
+def _seen(rays: Occluders, vertices: Tensor, places: Tensor, cells: Cells, edges: _Edges) -> _Edges:
     """Edges that nothing hides from their places, where their shadows are nearest to the panel.
 
     On the panel itself nothing else may shade the lit side of the line.
