@@ -67,7 +67,9 @@ def _of_placement(run: RunFile) -> tuple[list[Table], str]:
     step = _timed(lambda: placing.descend(module, 1, settings, width=0.0))
     steps = settings.tracks * settings.track_steps + settings.steps
     grid = table.grid.places * table.grid.yaws * len(table.grid.spread_deg) ** 2
-    levels = grid + table.starts * (2 * settings.scouts + table.annealing * settings.evaluations)
+    levels = grid + 2 * table.starts * settings.scouts
+    annealed = min(table.starts, table.annealed_starts)
+    levels += annealed * table.annealing * settings.evaluations
     descents = (2 * table.starts + 1) * steps
     count = table.panel.counts[0] * table.panel.counts[1]
     rows = [

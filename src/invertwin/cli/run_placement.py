@@ -4,6 +4,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -44,16 +45,12 @@ def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
     with progress(console):
         trials = placing.trials(grid.places, grid.yaws, [math.radians(a) for a in grid.spread_deg])
         tried = _kept(folder, "grid", lambda: _exhaustive(table, placing, trials))
-        rows = [
-            _kept(
-                folder,
-                f"start_{number}",
-                lambda seed=derived_seed(run.seed, 2, number): _start(
-                    table, placing, scored, tried, seed
-                ),
-            )
-            for number in told(range(table.starts), "start")
-        ]
+        rows: list[dict[str, Any]] = []
+        for number in told(range(table.starts), "start"):
+            seed = derived_seed(run.seed, 2, number)
+            also = number < table.annealed_starts
+            search = partial(_start, table, placing, scored, tried, seed, annealed=also)
+            rows.append(_kept(folder, f"start_{number}", search))
     levels = torch.tensor(tried["levels_db"], dtype=torch.float64)
     metrics = _metrics(run, placing, scored, rows, tried)
     state = _state(max(rows, key=lambda row: row["level_db"]))
@@ -70,8 +67,8 @@ def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
             number,
             row["found_over_exhaustive"],
             row["interior_over_exhaustive"],
-            row["annealing_over_exhaustive"],
-            row["evaluations_ratio"],
+            row.get("annealing_over_exhaustive"),
+            row.get("evaluations_ratio"),
         ]
         for number, row in enumerate(rows)
     ]
@@ -115,33 +112,42 @@ def _exhaustive(table: Placement, placing: Placing, trials: list[Trial]) -> dict
 
 
 def _start(
-    table: Placement, placing: Placing, scored: Coverage, tried: dict[str, Any], seed: int
+    table: Placement,
+    placing: Placing,
+    scored: Coverage,
+    tried: dict[str, Any],
+    seed: int,
+    *,
+    annealed: bool,
 ) -> dict[str, Any]:
     """One search, with what it is compared with; ratios are of path gains of the worst."""
     settings = table.descent.build()
     found = placing.by_gradient(settings, seed)
     interior = placing.by_gradient(settings, seed, boundary=False)
-    enough = found.level + 10 * math.log10(_AS_GOOD)
-    most = table.annealing * found.evaluations
-    annealed = placing.annealed(most, seed, enough)
-    reached = evaluations_until(annealed.history, enough)
     truth = placing.level(placing.module(_state(tried)), scored)
 
     def ratio(one: Found) -> float:
         return 10 ** ((placing.level(placing.module(one.state), scored) - truth) / 10)
 
-    return {
+    row = {
         "state": _lists(found),
         "level_db": found.level,
         "along_m": float(found.state["along"]),
         "yaw_deg": math.degrees(float(found.state["yaw"])),
         "found_over_exhaustive": ratio(found),
         "interior_over_exhaustive": ratio(interior),
-        "annealing_over_exhaustive": ratio(annealed),
         "evaluations": found.evaluations,
-        "annealing_evaluations": reached or annealed.evaluations,
+    }
+    if not annealed:
+        return row
+    enough = found.level + 10 * math.log10(_AS_GOOD)
+    other = placing.annealed(table.annealing * found.evaluations, seed, enough)
+    reached = evaluations_until(other.history, enough)
+    return row | {
+        "annealing_over_exhaustive": ratio(other),
+        "annealing_evaluations": reached or other.evaluations,
         "annealing_reached": reached is not None,
-        "evaluations_ratio": found.evaluations / (reached or annealed.evaluations),
+        "evaluations_ratio": found.evaluations / (reached or other.evaluations),
     }
 
 
@@ -152,11 +158,12 @@ def _metrics(
     rows: list[dict[str, Any]],
     tried: dict[str, Any],
 ) -> dict[str, Any]:
-    def middle(key: str) -> float:
-        return statistics.median(row[key] for row in rows)
+    def middle(key: str) -> float | None:
+        found = [row[key] for row in rows if key in row]
+        return statistics.median(found) if found else None
 
     def successes(key: str) -> int:
-        return sum(row[key] >= _AS_GOOD for row in rows)
+        return sum(row[key] >= _AS_GOOD for row in rows if key in row)
 
     best = max(rows, key=lambda row: row["level_db"])
     after = placing.level(placing.module(_state(best)), scored)
@@ -172,7 +179,7 @@ def _metrics(
         "evaluations_ratio": middle("evaluations_ratio"),
         "evaluations": rows[0]["evaluations"],
         "evaluations_exhaustive": len(tried["levels_db"]),
-        "annealing_reached": sum(row["annealing_reached"] for row in rows),
+        "annealing_reached": sum(row.get("annealing_reached", False) for row in rows),
         "worst_before_db": before,
         "worst_after_db": after,
         "worst_exhaustive_db": placing.level(placing.module(_state(tried)), scored),
@@ -192,7 +199,8 @@ def _landscape(
     best = levels.view(places, -1).amax(1)
     along = torch.tensor([trial[0] for trial in trials], dtype=torch.float64).view(places, -1)[:, 0]
     length = placing.make(0.0, 0.0, (0.0, 0.0)).path.length
-    ends = torch.tensor([[row["along_m"] % length, row["level_db"]] for row in rows])
+    found = [[row["along_m"] % length, row["level_db"]] for row in rows]
+    ends = torch.tensor(found, dtype=torch.float64)
     return plotting.placements(along, best, ends)
 
 

@@ -5,7 +5,7 @@ Beside it stand what it is compared with: every place of a grid, and simulated a
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float64
@@ -22,6 +22,7 @@ from invertwin.scene import Scene
 Trial = tuple[float, float, tuple[float, float]]
 """Place on the path [m], yaw and spread [rad]."""
 
+_WEAK = 4.0  # times the share of the worst: receivers to which the panel matters
 _FLOOR = 1e-20  # path gain that is added, so that decibels stay finite
 BACKWARD = 2
 """Evaluations that a derivative by all unknowns counts for, beside the one of its value."""
@@ -125,6 +126,28 @@ class Coverage:
         )[0]
         return self.direct + over.real.square() + over.imag.square()
 
+    def part(self, rows: Tensor | slice) -> "Coverage":
+        """Some of the receivers.
+
+        Args:
+            rows: Their numbers.
+        """
+        return replace(self, receivers=self.receivers[rows], direct=self.direct[rows])
+
+    def aim(
+        self, panel: Metasurface, width: float = 0.0, boundary: bool = True, softness: float = 0.0
+    ) -> Float64[Tensor, ""]:
+        """``worst`` of ``gain``; receivers that get much without the panel stay without.
+
+        Args:
+            panel: The metasurface.
+            width, boundary: See ``gain``.
+            softness: See ``soft_quantile`` [dB].
+        """
+        weak = self.direct <= torch.quantile(self.direct, min(1.0, _WEAK * self.share))
+        gain = self.part(weak).gain(panel, width, boundary)
+        return self.worst(self.direct.masked_scatter(weak, gain), softness)
+
     def worst(self, gain: Tensor, softness: float = 0.0) -> Float64[Tensor, ""]:
         """The level that the worst share of receivers is below [dB].
 
@@ -152,7 +175,7 @@ class Descent:
     scouts: Count = 16
     tracks: Count = 3
     track_steps: Count = 12
-    steps: Count = 50
+    steps: Count = 80
     edge_width: NonNegative = 0.3
     softness: Positive = 3.0
     rates: tuple[Positive, Positive, Positive] = (0.1, 0.04, 0.15)
@@ -191,6 +214,8 @@ class Placing:
         make: A module at the start of a search: place [m], yaw [rad], spread [2] [rad].
         yaw_limit: Largest turn away from the wall's normal [rad].
         spread_limit: Largest half width of the beam [rad].
+        batch: Receivers that one evaluation looks at: the first ones, or some at random in a step
+            by gradient.
     """
 
     coverage: Coverage
@@ -198,6 +223,7 @@ class Placing:
     make: Callable[[float, float, Sequence[float]], PlacedPanel]
     yaw_limit: Angle
     spread_limit: Angle
+    batch: int
 
     def level(self, module: PlacedPanel, coverage: Coverage | None = None) -> float:
         """The aim of a placed panel [dB].
@@ -206,9 +232,9 @@ class Placing:
             module: Where the panel stands.
             coverage: Other receivers, to score it.
         """
-        aim = coverage or self.coverage
+        aim = coverage or self.coverage.part(slice(0, self.batch))
         with torch.no_grad():
-            return float(aim.worst(aim.gain(module(self.panel))))
+            return float(aim.aim(module(self.panel)))
 
     def module(self, state: dict[str, Tensor]) -> PlacedPanel:
         """A module with the values of a search's end."""
@@ -257,15 +283,17 @@ class Placing:
         groups = [([module.along], place), ([module.yaw, module.spread], turn)]
         groups.append(([module.shift], phase))
         optimizer = torch.optim.Adam([{"params": p, "lr": r} for p, r in groups])
+        # Other receivers in every step: phases must not learn single ones.
+        drawn, count = torch.Generator().manual_seed(steps), len(self.coverage.receivers)
         for step in range(steps):
             part = step / steps
             for group, (_, rate) in zip(optimizer.param_groups, groups, strict=True):
                 group["lr"] = rate * (0.5 * (1 + math.cos(math.pi * part)) + 0.02)
             optimizer.zero_grad()
-            gain = self.coverage.gain(
-                module(self.panel), width * max(0.0, 1 - 1.5 * part), boundary
-            )
-            (-self.coverage.worst(gain, settings.softness * 0.1**part)).backward()
+            aim = self.coverage.part(torch.randperm(count, generator=drawn)[: self.batch])
+            edge = width * max(0.0, 1 - 1.5 * part)
+            softness = settings.softness * 0.1**part
+            (-aim.aim(module(self.panel), edge, boundary, softness)).backward()
             optimizer.step()
             self.keep_inside(module)
 

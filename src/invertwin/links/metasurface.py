@@ -54,7 +54,7 @@ class Metasurface:
     axes: Float64[Tensor, "3 3"]
     phase: Float64[Tensor, "x y"]
     spacing: float
-    amplitude: float | Float64[Tensor, "x y"] = 1.0
+    amplitude: float | Float64[Tensor, "_ _"] = 1.0
     bits: int | None = None
     pattern: Pattern | None = None
 

@@ -27,8 +27,9 @@ class Receivers(Section):
 
     low: Vector = key("m, a corner of the box")
     high: Vector = key("m, the opposite corner")
-    count: Several = key("those that the search sees", 120)
-    scored: Several = key("others, of another seed, that score what was found", 400)
+    count: Several = key("those that the search sees", 1200)
+    batch: Several = key("of them, in one evaluation", 300)
+    scored: Several = key("others, of another seed, that score what was found", 800)
 
     def drawn(self, count: int, seed: int) -> Tensor:
         """Places [count, 3] [m]."""
@@ -88,6 +89,7 @@ class Placement(Section):
     edges: Annotated[int, Ge(0)] = key("most edges that a path without the panel goes round", 1)
     starts: Count = key("searches, of seeds one after another", 10)
     annealing: Count = key("most evaluations of simulated annealing, times those of a search", 10)
+    annealed_starts: Annotated[int, Ge(0)] = key("of the starts, that annealing is tried from", 3)
     descent: Annotated[Any, TableOf(Descent)] = key("the search", {}, validate_default=True)
     grid: Grid = key("the exhaustive search", Grid())
     seed: Seed | None = key("of the receivers; without it the run's", None)
@@ -125,7 +127,9 @@ class Placement(Section):
             path = WallPath(walls.corners, walls.height, walls.radius, walls.closed)
         with about("placement.panel"):
             none = torch.zeros(*table.counts, dtype=torch.float64)
-            panel = Metasurface(torch.zeros(3), torch.eye(3), none, table.spacing)
+            place = torch.zeros(3, dtype=torch.float64)
+            axes = torch.eye(3, dtype=torch.float64)
+            panel = Metasurface(place, axes, none, table.spacing)
             pattern = table.pattern and table.pattern.build()
             panel = replace(panel, bits=table.bits, pattern=pattern)
         target = self.focus(coverage)
@@ -143,7 +147,7 @@ class Placement(Section):
             )
 
         limits = math.radians(self.yaw_limit_deg), math.radians(self.spread_limit_deg)
-        return Placing(coverage, panel, make, *limits)
+        return Placing(coverage, panel, make, *limits, self.receivers.batch)
 
     def focus(self, coverage: Coverage) -> Tensor:
         """On what the panel is focused [m]."""
