@@ -83,15 +83,19 @@ def test_strong_receivers_may_be_left_out():
         assert float(whole) > float(own.coverage.worst(own.coverage.direct)) + 0.5
 
 
-def test_shadows_pull_a_panel_out_of_the_dark():
-    """Only a derivative that holds the motion of shadows knows where the light is."""
-    own, settings = placing(), Descent(rates=(0.1, 0.0, 0.0))
-    ends = []
-    for boundary in (True, False):
-        module = own.make(2.0, 0.0, (0.2, 0.1))
-        own.descend(module, 25, settings, width=1.0, boundary=boundary)
-        ends.append(own.level(module))
-    assert ends[0] > ends[1] + 3.0
+def test_the_aim_knows_how_shadows_move():
+    own = placing()
+
+    def aim(along: float, *, boundary: bool = True) -> tuple[float, float]:
+        module = own.make(along, 0.0, (0.2, 0.1))
+        level = own.coverage.aim(module(own.panel), 1.0, boundary, 2.0)
+        level.backward()
+        assert module.along.grad is not None
+        return level.item(), module.along.grad.item()
+
+    truth = (aim(0.8 + 1e-6)[0] - aim(0.8 - 1e-6)[0]) / 2e-6
+    assert aim(0.8)[1] == pytest.approx(truth, rel=1e-4)
+    assert abs(aim(0.8, boundary=False)[1] - truth) > 0.1 * abs(truth)
 
 
 def test_searches_reach_the_best_of_the_grid():

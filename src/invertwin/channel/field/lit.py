@@ -18,6 +18,7 @@ from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.errors import InputError
 from invertwin.scene import Scene
 from invertwin.scene.checks import plain
 
@@ -95,7 +96,15 @@ def lit_fractions(
         cells: of the panel.
         width: added to the width over which shadows end [m]; 0 = that of a cell.
         boundary: False leaves out of derivatives that shadows move.
+
+    Raises:
+        InputError: a cloud among the objects.
     """
+    clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
+    if clouds:
+        raise InputError(
+            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
+        )
     items = list(scene.objects.values())
     topology = topology_of([item.mesh for item in items])
     vertices = torch.cat([item.vertices for item in items])
