@@ -40,14 +40,18 @@ from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel.field.diffracted import EdgedScene, diffracted_paths
+from invertwin.channel.field.bends import find_bends
+from invertwin.channel.field.diffracted import DiffractedPaths, diffracted_paths
 from invertwin.channel.field.diffraction import Faces, Turn, conductor, diffraction_dyad
 from invertwin.channel.field.edge_paths import Edge, over_edges, slope_transfer
+from invertwin.channel.field.edged import EdgedScene
+from invertwin.channel.field.images import Walls
+from invertwin.channel.field.sequences import Powers
 from invertwin.channel.field.transition import transition
 from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
 from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene import Occluders, visible
+from invertwin.channel.rays.scene import visible
 from invertwin.channel.rays.topology import topology_of
 from invertwin.channel.reference.wedges import (
     half_plane_of_plane_wave,
@@ -384,17 +388,17 @@ class Cube:
     def __init__(self, side: float) -> None:
         mesh = box((side, side, side))
         topology = topology_of([mesh])
-        rays = Occluders(mesh.vertices, topology, torch.zeros(3, dtype=torch.float64))
+        walls = Walls(mesh.vertices, topology, torch.tensor(PLACES, dtype=torch.float64))
         self.half = side / 2
         self.around = EdgedScene(
-            mesh.vertices, topology, rays, lambda _, cosine: conductor(0, cosine)
+            mesh.vertices, topology, walls, lambda _, cosine: conductor(0, cosine)
         )
 
     def optics(self, tx: Tensor, rx: Tensor) -> tuple[Tensor, Tensor]:
         """Straight and mirrored waves [row, 3, 3], and which of the seven there are [row, 7]."""
         length, way = _leg(tx, rx)
         eye = torch.eye(3, dtype=torch.float64)
-        lit = [visible(self.around.occluders, tx, rx)]
+        lit = [visible(self.around.walls, tx, rx)]
         total = lit[0][:, None, None] * _across_dyad(way) * _wave(WAVE_NUMBER, length)
         for axis in range(3):
             others = [other for other in range(3) if other != axis]
@@ -411,16 +415,22 @@ class Cube:
                 total = total + lit[-1][:, None, None] * sent * _wave(WAVE_NUMBER, length)
         return total, torch.stack(lit, 1)
 
+    def diffracted(self, tx: Tensor, rx: Tensor, order: int) -> list[DiffractedPaths]:
+        """Paths round its edges."""
+        none = torch.zeros(len(self.around.topology.faces), dtype=torch.bool)
+        found = find_bends(self.around, Powers(none, none), tx, rx, order, 0, None, 0)
+        return [diffracted_paths(self.around, some, tx, rx, WAVE_NUMBER) for some in found]
+
     def field(self, tx: Tensor, rx: Tensor, order: int) -> tuple[Tensor, list[frozenset[Any]]]:
-        """The field [row, 3, 3], and which paths make it."""
+        """The field of one transmitter [row, 3, 3], and which paths make it."""
         with tracing():
             total, lit = self.optics(tx, rx)
-            found = diffracted_paths(self.around, tx, rx, WAVE_NUMBER, order) if order else []
+            found = self.diffracted(tx[:1], rx, order) if order else []
         paths: list[set[Any]] = [set(torch.nonzero(row)[:, 0].tolist()) for row in lit]
         for part in found:
             turn = torch.polar(torch.ones_like(part.length), -WAVE_NUMBER * part.length)
-            total = total.index_add(0, part.link, part.transfer * turn[:, None, None])
-            for link, edges in zip(part.link.tolist(), part.edge.tolist(), strict=True):
+            total = total.index_add(0, part.rx, part.transfer * turn[:, None, None])
+            for link, edges in zip(part.rx.tolist(), part.edge.tolist(), strict=True):
                 paths[link].add(tuple(edges))
         return total, list(map(frozenset, paths))
 

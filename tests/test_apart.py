@@ -123,6 +123,6 @@ def test_a_file_that_hangs_its_reader_is_an_error(tmp_path):
 
 def test_what_the_reader_itself_refuses_is_told(tmp_path):
     shutil.copy(__file__, tmp_path / "a.nc")
-    for trusted, said in ((False, "netcdf file, got .*refuses"), (True, "NetCDF file, got")):
+    for trusted, said in ((False, "NetCDF file, got .*refuses"), (True, "NetCDF file, got")):
         with pytest.raises(InputError, match=rf"expected a whole {said}.*OSError"):
             Capture.load(tmp_path / "a.nc", trusted=trusted)

@@ -9,7 +9,17 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
 FOUNDATION = {
-    *("constants", "errors", "limits", "seeds", "folders", "memory", "untrusted", "progress"),
+    *(
+        "constants",
+        "errors",
+        "limits",
+        "seeds",
+        "folders",
+        "memory",
+        "untrusted",
+        "apart",
+        "progress",
+    ),
 }
 SCENE = FOUNDATION | {"scene"}
 CHANNEL = SCENE | {"doctor", "threads", "channel"}
@@ -30,6 +40,7 @@ ALLOWED = {
     "folders": {"errors"},
     "memory": {"errors"},
     "untrusted": {"errors"},
+    "apart": {"errors"},
     "progress": set(),
     "threads": set(),
     "doctor": FOUNDATION,

@@ -204,7 +204,13 @@ def test_a_file_that_appears_during_a_run_stays_and_the_run_too(tmp_path):
     assert (tmp_path / "own.txt").read_text() == "result"
 
 
-@pytest.mark.parametrize("name", ["../victim", "/victim", "a/../../victim", "", "link/victim"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("../victim", "/victim", "a/../../victim", "", "link/victim"),
+        *("parts/start0.json" + "n" * 300, "\ud800"),
+    ],
+)
 @pytest.mark.parametrize("where", ["files", "unfinished"])
 def test_a_manifest_of_strangers_reaches_nothing_outside(tmp_path, name, where):
     victim, out = tmp_path / "victim", tmp_path / "out"

@@ -25,6 +25,7 @@ _WAITING = 10.0  # times as long on a busy machine
 _MEMORY = 2 << 30  # beside four times the size of the file
 _LARGE, _REFUSED, _MISSING = 77, 76, 75  # exit codes of the child
 _SLOW = -getattr(signal, "SIGXCPU", 0) or 78
+_NAMES = {"netcdf": "NetCDF", "hdf5": "HDF5", "matlab": "MATLAB"}
 _CHILD = "import sys; from invertwin.apart import hand_over; hand_over(*sys.argv[1:])"
 
 
@@ -102,8 +103,8 @@ def read_apart(
     }
     crash = f"one that crashes its reader ({signal.Signals(-code).name if code < 0 else code})"
     raise InputError(
-        f"expected a whole {kind} file, got {path}, {told.get(code, crash)}; it is damaged or of "
-        "another kind: copy or record it again. If you trust it, say trusted = True"
+        f"expected a whole {_NAMES[kind]} file, got {path}, {told.get(code, crash)}; it is "
+        "damaged or of another kind: copy or record it again. If you trust it, say trusted = True"
     )
 
 

@@ -150,13 +150,26 @@ def place_in(path: Path, name: str) -> Path:
     """
     parts = PurePosixPath(name).parts
     above = (path.joinpath(*parts[:k]) for k in range(1, len(parts)))
-    if not parts or parts[0] == "/" or {"..", LOCK, MANIFEST} & {*parts} or "\0" in name:
+    outside = not parts or parts[0] == "/" or {"..", LOCK, MANIFEST} & {*parts} or "\0" in name
+    if outside or not _possible(path.joinpath(*parts)):
         raise InputError(
-            f"expected names of files in {path} in its {MANIFEST}, got {name!r}; choose another -o"
+            f"expected names of files in {path} in its {MANIFEST}, got {name[:100]!r}; "
+            "choose another -o"
         )
     if any(folder.is_symlink() for folder in above):
         raise not_ours(path, name)
     return path.joinpath(*parts)
+
+
+def _possible(place: Path) -> bool:
+    """Whether a file of this name can be, such as one that is not too long."""
+    try:
+        place.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except (OSError, ValueError):  # too long, or letters that no name has
+        return False
+    return True
 
 
 def require_free(path: Path, name: str, own: Iterable[str]) -> None:

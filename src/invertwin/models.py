@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
@@ -623,7 +623,7 @@ class PanelMap(ForwardModel):
         return {"boundary": replace(self, boundary=False)} if self.boundary else {}
 
 
-QUANTITIES = ("received_power", "path_gain", "sinr", "delay_spread")
+QUANTITIES = ("received_power", "path_gain", "gain", "sinr", "delay_spread")
 """What a ``RadioMap`` may show."""
 
 
@@ -638,8 +638,9 @@ class RadioMap(ForwardModel):
     Attributes:
         places: Where receivers are.
         reception: How paths are found, and how they add up.
-        quantity: ``received_power`` [dBm], ``path_gain`` [dB], ``sinr`` [dB]: received power of a
-            transmitter over that of all others and noise, or ``delay_spread`` [s].
+        quantity: ``received_power`` [dBm], ``path_gain`` [dB], ``gain``: the same as a ratio
+            without a floor, ``sinr`` [dB]: received power of a transmitter over that of all others
+            and noise, or ``delay_spread`` [s].
         floor_db: Path gain that is added to every one [dB].
         noise_dbm: Of a receiver, for ``sinr`` [dBm].
         scatter: Standard deviation of data about the map, in its unit, where it is known. Error
@@ -651,13 +652,14 @@ class RadioMap(ForwardModel):
 
     places: Places
     reception: Reception
-    quantity: Literal["received_power", "path_gain", "sinr", "delay_spread"] = "received_power"
+    quantity: Literal["received_power", "path_gain", "gain", "sinr", "delay_spread"] = (
+        "received_power"
+    )
     floor_db: float = -200.0
     noise_dbm: float = -100.0
     scatter: float | None = None
 
     redraws: ClassVar[bool] = False
-    random: ClassVar[bool] = False
     fields: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -686,6 +688,8 @@ class RadioMap(ForwardModel):
         found = self.received(scene, sensor, seed)
         if self.quantity == "delay_spread":
             return found.delay_spread
+        if self.quantity == "gain":
+            return found.gain
         gain = found.gain + 10 ** (self.floor_db / 10)
         if self.quantity == "path_gain":
             return 10 * gain.log10()
@@ -711,8 +715,37 @@ class RadioMap(ForwardModel):
         """The map with other errors of measurement each time."""
         return _scattered(self.predict(scene, sensor, seed), self.scatter)
 
+    def best_server(self, scene: Scene, sensor: Transmitters, seed: int) -> Int64[Tensor, "*map"]:
+        """Number of the transmitter of which most power arrives; −1 where none arrives.
+
+        Args:
+            scene: What is in the way.
+            sensor: What sends.
+            seed: As for ``predict``.
+        """
+        gain = self.received(scene, sensor, seed).gain
+        most, number = (gain * sensor.powers.reshape(-1, *[1] * (gain.ndim - 1))).max(0)
+        return torch.where(most > 0, number, -1)
+
+    @property
+    def random(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether points are drawn, as those of cells are."""
+        return self.places.random
+
+    def for_differences(
+        self, scene: Scene, sensor: Transmitters, samples: int, scheme: Literal["rays", "area"]
+    ) -> "RadioMap":
+        """The model with so many points on the cells."""
+        return replace(self, places=self.places.finer(samples))
+
     def ablations(self) -> dict[str, ForwardModel]:
-        """The model without diffraction: visibility is then fixed in its derivative."""
+        """The model at fixed visibility: without diffraction, or without boundary paths of cells.
+
+        See ``ForwardModel.ablations``.
+        """
+        fixed = self.places.fixed_visibility()
+        if fixed is not None:
+            return {"boundary": replace(self, places=fixed)}
         if not self.reception.edges:
             return {}
         return {"boundary": replace(self, reception=replace(self.reception, edges=0))}

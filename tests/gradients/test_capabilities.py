@@ -28,6 +28,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check, gradcheck
 from invertwin.inversion.lines import line_of
+from invertwin.links import CellSampling, MapPlane, Reception, Transmitters
 from invertwin.models import SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum, surrogate_spectrum
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
@@ -64,6 +65,7 @@ MECHANISMS = {
     "rough field": "rough",
     "signature": "signature",
     "paths between antennas": "antennas",
+    "coverage maps": "coverage",
     "chains": "chains",
 }
 ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
@@ -355,6 +357,49 @@ def antenna_case(parameter: str) -> Found:
     return Found(found, found, (up - down) / 2e-5, 0.0)
 
 
+# Cells between occluder and wall, where the occluder's shadow lies.
+CELLS_BEHIND = MapPlane(
+    float64([-0.47, -0.55, 1.7]), float64([1.2, 0, 0]), float64([0, 1.2, 0]), (2, 2)
+)
+
+
+def covered(scene: Scene, place: Tensor, sampling: CellSampling, seed: int = 0) -> Tensor:
+    """Mean power in cells, seen directly and by the mirror of the wall."""
+    cells = replace(CELLS_BEHIND, sampling=sampling)
+    mast = Transmitters(place + float64([-0.07, 0.04, 0.19]))
+    return cells.received(scene, mast, Reception(1e9, depth=1, rays=None), seed).gain
+
+
+def coverage_case(parameter: str) -> Found:
+    wall = METAL if parameter in GEOMETRY else COATED
+    scene, radar = occluder(wall=wall, occluder=METAL), power_radar()
+    if parameter == "thickness":
+        scene = scene.replace("wall", material=BOARD)
+
+    def value(theta: Tensor, sampling: CellSampling, seed: int = 0) -> Tensor:
+        if parameter == "object velocity":
+            moved = scene.replace("wall", velocity=theta * float64([0.3, 0.2, 1.0]))
+            return covered(moved, radar.positions[0], sampling, seed)
+        changed = MOVES[parameter](scene, radar, theta)
+        return covered(changed[0], changed[1].positions[0], sampling, seed)
+
+    # Where no shadow moves, few points are as smooth as their derivative.
+    moves = parameter in GEOMETRY or parameter == "radar position"
+    step, side, seeds = (0.02, 120, 3) if moves else (1e-4, 20, 1)
+    fine, parts = CellSampling(side**2), []
+    for seed in range(seeds):
+        ends = [value(torch.tensor(sign * step).double(), fine, seed) for sign in (1, -1)]
+        parts.append((ends[0] - ends[1]) / (2 * step))
+    own = CellSampling(900 if moves else side**2)
+    full = pushed(lambda theta: value(theta, own))
+    return Found(
+        full,
+        pushed(lambda theta: value(theta, replace(own, boundary=False))),
+        torch.stack(parts).mean(0),
+        0.0,
+    )
+
+
 def chain_case(parameter: str) -> Found:
     """Chains between two plates, one of which hides the other; no random numbers."""
     scene, radar, moves = occluder(wall=METAL, occluder=METAL), field_radar(0.3), MOVES[parameter]
@@ -382,6 +427,8 @@ def case(parameter: str, mechanism: str) -> Found:
         return antenna_case(parameter)
     if mechanism == "chains":
         return chain_case(parameter)
+    if mechanism == "coverage":
+        return coverage_case(parameter)
     if parameter not in _power:
         _power[parameter] = bias_case() if parameter == "range bias" else power_case(parameter)
     return _power[parameter]
@@ -437,6 +484,9 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
         return
     if mechanism == "antennas":
         between(scene, radar.positions[0])
+        return
+    if mechanism == "coverage":
+        covered(scene, radar.positions[0], CellSampling(1))
         return
     if mechanism == "chains":
         exact_spectrum(

@@ -1,6 +1,7 @@
 """From a scene to propagation paths: the only room that knows the ray tracer."""
 
 from invertwin.channel.field.chains import trace_chains as trace_chains
+from invertwin.channel.field.coverage import trace_coverage as trace_coverage
 from invertwin.channel.field.field import trace_field as trace_field
 from invertwin.channel.field.lit import Cells as Cells
 from invertwin.channel.field.lit import lit_fractions as lit_fractions

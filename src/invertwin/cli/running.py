@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -125,21 +126,22 @@ def counted(shown: Console, name: str, total: int) -> Iterator[Callable[[], None
     Yields:
         A function to be called after each of them.
     """
-    begin, done = time.monotonic(), 0
-    say = now_and_then(shown, begin)
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=shown, disable=not shown.is_terminal) as bar:
-        task = bar.add_task("", total=total)
+    if not shown.is_terminal:
+        begin, done = time.monotonic(), 0
+        say = now_and_then(shown, begin)
 
-        def advance() -> None:
+        def tell() -> None:
             nonlocal done
             done += 1
-            bar.update(task, completed=done)
-            if not shown.is_terminal:
-                left = time_left((time.monotonic() - begin) / done * (total - done))
-                say(f"{name}: {done} of {total}, {left} left")
+            left = time_left((time.monotonic() - begin) / done * (total - done))
+            say(f"{name}: {done} of {total}, {left} left")
 
-        yield advance
+        yield tell
+        return
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=shown) as bar:
+        task = bar.add_task("", total=total)
+        yield partial(bar.advance, task)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ Trial = tuple[float, float, tuple[float, float]]
 """Place on the path [m], yaw and spread [rad]."""
 
 _WEAK = 4.0  # times the share of the worst: receivers to which the panel matters
+_APART = 0.08  # of the path: scouts that stand nearer to each other are one track
 _FLOOR = 1e-20  # path gain that is added, so that decibels stay finite
 BACKWARD = 2
 """Evaluations that a derivative by all unknowns counts for, beside the one of its value."""
@@ -164,7 +165,7 @@ class Descent:
 
     Attributes:
         scouts: Places that are tried before, at random.
-        tracks: The best of them, from which short descents start.
+        tracks: The best of them that stand apart, from which short descents start.
         track_steps: Of each short descent.
         steps: Of the last one, from the best end.
         edge_width: Added to the width of shadows at the start [m]; it shrinks to none.
@@ -308,7 +309,10 @@ class Placing:
         generator = torch.Generator().manual_seed(seed)
         scouts = [self.drawn(generator) for _ in range(settings.scouts)]
         scouts.sort(key=self.level, reverse=True)
-        tracks = scouts[: settings.tracks]
+        tracks: list[PlacedPanel] = []
+        for scout in scouts:
+            if len(tracks) < settings.tracks and all(self._apart(scout, own) for own in tracks):
+                tracks.append(scout)
         for module in tracks:
             self.descend(
                 module,
@@ -323,6 +327,12 @@ class Placing:
         )
         state = {name: value.clone() for name, value in best.state_dict().items()}
         return Found(state, self.level(best), settings.evaluations)
+
+    def _apart(self, first: PlacedPanel, second: PlacedPanel) -> bool:
+        """Whether two panels stand at places that are tracks of their own."""
+        length = first.path.length
+        gap = abs(float(first.along.detach() - second.along.detach()))
+        return min(gap, length - gap if first.path.closed else gap) > _APART * length
 
     def annealed(self, evaluations: int, seed: int, enough: float = math.inf) -> Found:
         """Simulated annealing over the same unknowns, from a random start.

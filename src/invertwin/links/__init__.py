@@ -1,5 +1,8 @@
 """What paths between antennas add up to: responses, OFDM channels, spreads, radio maps."""
 
+from invertwin.links.cells import CellSampling as CellSampling
+from invertwin.links.cells import MapMesh as MapMesh
+from invertwin.links.cells import MapPlane as MapPlane
 from invertwin.links.conversion import ray_paths_of as ray_paths_of
 from invertwin.links.listing import path_table as path_table
 from invertwin.links.metasurface import Metasurface as Metasurface

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -14,7 +15,13 @@ from invertwin.scene.scene import Scene
 
 
 class Places(ABC):
-    """Where a ``RadioMap`` is asked for."""
+    """Where a ``RadioMap`` is asked for.
+
+    Attributes:
+        random: Whether a seed draws points.
+    """
+
+    random: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -33,6 +40,18 @@ class Places(ABC):
             reception: How paths are found, and how they add up.
             seed: Of all that is drawn.
         """
+
+    def finer(self, samples: int) -> "Places":
+        """The same places with so many points in all, where points are drawn.
+
+        Args:
+            samples: Their number.
+        """
+        return self
+
+    def fixed_visibility(self) -> "Places | None":
+        """The same places without boundary paths, for ablation; None where there are none."""
+        return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,11 +23,11 @@ def delay_spread(
         tx: At the transmitters.
         rx: At the receivers.
     """
-    power = _powers(paths, tx, rx)
+    power = path_powers(paths, tx, rx)
     total = _sums(paths, power)
     mean = _sums(paths, power * paths.delay) / _safe(total)
     offset = paths.delay - mean[paths.rx, paths.tx]
-    return _root(_sums(paths, power * offset**2) / _safe(total))
+    return root(_sums(paths, power * offset**2) / _safe(total))
 
 
 def angle_spread(
@@ -55,14 +55,14 @@ def angle_spread(
     """
     if end not in ("departure", "arrival"):
         raise InputError(f"expected end as departure or arrival, got {end!r}; choose one of them")
-    power = _powers(paths, tx, rx)
+    power = path_powers(paths, tx, rx)
     total = _safe(_sums(paths, power))
     direction: Tensor = getattr(paths, end)
     mean = torch.stack([_sums(paths, power * x) for x in direction.unbind(1)], -1)
     mean = mean / total[..., None]
     # The mean square distance from the mean, which does not cancel as 1 − |u|² does.
     offset = (direction - mean[paths.rx, paths.tx]).square().sum(1)
-    return _root(_sums(paths, power * offset) / total)
+    return root(_sums(paths, power * offset) / total)
 
 
 def rician_factor(
@@ -77,7 +77,7 @@ def rician_factor(
         tx: At the transmitters.
         rx: At the receivers.
     """
-    power = _powers(paths, tx, rx)
+    power = path_powers(paths, tx, rx)
     passing = (paths.kinds == 0) | (paths.kinds == KINDS.index("transmission"))
     straight = passing.all(1)
     direct = _sums(paths, torch.where(straight, power, 0.0))
@@ -87,8 +87,14 @@ def rician_factor(
     return torch.where(others > 0, ratio, alone)
 
 
-def _powers(paths: RayPaths, tx: Terminals, rx: Terminals) -> Tensor:
-    """Received over sent power of each path, mean of all pairs of elements."""
+def path_powers(paths: RayPaths, tx: Terminals, rx: Terminals) -> Float64[Tensor, " path"]:
+    """Received over sent power of each path, mean of all pairs of elements.
+
+    Args:
+        paths: From ``trace_paths``.
+        tx: At the transmitters.
+        rx: At the receivers.
+    """
     amplitude, _ = path_amplitudes(paths, tx, rx)
     return torch.view_as_real(amplitude).square().sum(-1).mean((1, 2))
 
@@ -103,7 +109,11 @@ def _safe(total: Tensor) -> Tensor:
     return torch.where(total > 0, total, 1.0)
 
 
-def _root(square: Tensor) -> Tensor:
-    """A root without the infinite derivative at zero."""
+def root(square: Tensor) -> Tensor:
+    """A root without the infinite derivative at zero.
+
+    Args:
+        square: Of which the root is taken; below zero it is zero.
+    """
     some = square > 0
     return torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)

@@ -5,10 +5,14 @@ import math
 import pytest
 import torch
 
-from invertwin.channel.field.diffracted import EdgedScene, diffracted_paths
+from invertwin.channel.field.bends import find_bends
+from invertwin.channel.field.diffracted import diffracted_paths
 from invertwin.channel.field.diffraction import conductor
+from invertwin.channel.field.edged import EdgedScene
+from invertwin.channel.field.images import Walls
+from invertwin.channel.field.sequences import Powers
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene import Occluders, visible
+from invertwin.channel.rays.scene import visible
 from invertwin.channel.rays.topology import topology_of
 from invertwin.scene import Mesh, box, plate
 
@@ -20,22 +24,29 @@ def surroundings(*meshes, scale=1.0):
     """Conductors; a wavelength is a metre."""
     vertices = torch.cat([mesh.vertices for mesh in meshes]) * scale
     topology = topology_of(list(meshes))
-    rays = Occluders(vertices, topology, torch.zeros(3, dtype=torch.float64))
-    return EdgedScene(vertices, topology, rays, lambda _, cosine: conductor(0, cosine))
+    walls = Walls(vertices.detach(), topology, TX[None])
+    return EdgedScene(vertices, topology, walls, lambda _, cosine: conductor(0, cosine))
+
+
+def sent_by(around, tx, rx, order=1):
+    """What edges alone send, by their number from one to order."""
+    none = torch.zeros(len(around.topology.faces), dtype=torch.bool)
+    found = find_bends(around, Powers(none, none), tx, rx, order, 0, None, 0)
+    return [diffracted_paths(around, some, tx, rx, K) for some in found]
 
 
 def behind(around, rx):
     """The field behind a sheet: the straight wave, and what its edges send."""
     tx = TX.expand(len(rx), 3)
     with tracing():
-        lit = visible(around.occluders, tx, rx)
-        (sent,) = diffracted_paths(around, tx, rx, K)
+        lit = visible(around.walls, tx, rx)
+        (sent,) = sent_by(around, TX[None], rx)
     length = (rx - tx).norm(dim=1)
     way = (rx - tx) / length[:, None]
     across = torch.eye(3, dtype=torch.complex128) - way[:, :, None] * way[:, None]
     total = torch.polar(lit / length, -K * length)[:, None, None] * across
     turn = torch.polar(torch.ones_like(sent.length), -K * sent.length)
-    return total.index_add(0, sent.link, sent.transfer * turn[:, None, None]), lit
+    return total.index_add(0, sent.rx, sent.transfer * turn[:, None, None]), lit
 
 
 def kirchhoff(side, rx):
@@ -108,9 +119,9 @@ def test_what_stands_before_an_edge_hides_it():
         plate(1.0, 12.0).faces,
     )
     with tracing():
-        (free,) = diffracted_paths(surroundings(screen), TX[None], rx, K)
-        (hidden,) = diffracted_paths(surroundings(screen, moved), TX[None], rx, K)
-    assert len(free.link) == 4
+        (free,) = sent_by(surroundings(screen), TX[None], rx)
+        (hidden,) = sent_by(surroundings(screen, moved), TX[None], rx)
+    assert len(free.rx) == 4
     on_right = (hidden.points[:, 0, 0] - 3.0).abs() < 1e-9
     on_screen = hidden.points[:, 0, 2].abs() < 1e-9
     assert not bool((on_right & on_screen).any())
@@ -123,14 +134,12 @@ def test_solids_and_order():
     tx = torch.tensor([[9.0, 1.0, 0.5]], dtype=torch.float64)
     rx = torch.tensor([[-9.0, 1.4, 0.2]], dtype=torch.float64)
     with tracing():
-        first, second = diffracted_paths(cube, tx, rx, K, 2)
         # Face to face no single edge is seen from both sides.
-        assert len(first.link) == 0
-        assert first.points.shape == (0, 1, 3)
-        assert len(second.link) >= 4
+        (second,) = sent_by(cube, tx, rx, 2)
+        assert second.edge.shape[1] == 2
+        assert len(second.rx) >= 4
         inside = torch.zeros(1, 3, dtype=torch.float64)
-        for part in diffracted_paths(cube, inside, rx, K, 2):
-            assert len(part.link) == 0
+        assert not sent_by(cube, inside, rx, 2)
     # Over the two edges of a side: front to back.
     over = second.points[:, :, 0]
     straight = (over[:, 0] - 2.5).abs() + (over[:, 1] + 2.5).abs() < 1e-9
@@ -143,5 +152,5 @@ def test_solids_and_order():
 def test_an_antenna_on_the_line_of_an_edge_gets_finite_fields(order):
     on_line = torch.tensor([[5.0, 1.0, 0.0]], dtype=torch.float64)
     with tracing():
-        found = diffracted_paths(surroundings(plate(2.0, 2.0)), on_line, on_line + 1.0, K, order)
+        found = sent_by(surroundings(plate(2.0, 2.0)), on_line, on_line + 1.0, order)
     assert all(torch.isfinite(part.transfer.abs()).all() for part in found)

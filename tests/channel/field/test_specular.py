@@ -542,10 +542,7 @@ def test_the_size_of_a_plate_has_a_derivative_with_diffraction():
     assert not (value(zero + 1e-3, 0) - value(zero, 0)).any()
 
 
-def test_edges_of_objects_in_motion_are_refused():
-    moving = GROUND.replace("ground", velocity=float64([0.0, 0.0, 1.0]))
-    with pytest.raises(InputError, match="a scene at rest for diffracted paths"):
-        trace(moving, *HEIGHTS, edges=1)
+def test_three_edges_are_too_many():
     with pytest.raises(InputError, match="at most 2 edges"):
         trace(GROUND, *HEIGHTS, edges=3)
 

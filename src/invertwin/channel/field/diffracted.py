@@ -1,302 +1,160 @@
-"""Diffracted paths of a scene: which edges carry a wave between antennas, and how much of it.
+"""Fields of diffracted paths of a scene, differentiable.
 
-Every sharp edge sends at every receiver whose way over it is free: also one whose ray would pass
-the end of the edge, since the end itself then sends. Nothing therefore jumps where a ray slides off
-an edge, and sums over the edges of a plate have no jump at its corners. What is in the way is found
-by rays and is detached; the field is differentiable.
+Which paths there are is found by rays and is detached (``bends``). What they are worth is computed
+here from the vertices of the edges and of the triangles that they meet: diffraction between the
+images of the antennas, and the field, turned at every surface before and after.
 
-Source: derivations §9.
+Source: derivations §9 and §10.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import pairwise
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Complex128, Float64, Int64
+from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.edge_paths import Edge, EdgePaths, over_edges
-from invertwin.channel.field.waves import dot
-from invertwin.channel.field.wedges import (
-    Wedges,
-    azimuth,
-    edge_axis,
-    find_wedges,
-    joined_wedges,
-)
-from invertwin.channel.rays.scene import Occluders, visible
-from invertwin.channel.rays.topology import Topology
-from invertwin.scene.material.fresnel import FieldCoefficients
-
-Coefficients = Callable[[Int64[Tensor, " n"], Float64[Tensor, " n"]], FieldCoefficients]
-"""What triangles reflect and let through at cosines of the angle of incidence, about the mesh."""
-
-_ROWS_AT_ONCE = 1 << 16
-_OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
-_GRAZING = 1e-9  # rad; and share of the scene's size within which two faces lie in one plane
-_ONE_PLANE = 1e-6
-
-
-@dataclass(frozen=True)
-class EdgedScene:
-    """A scene as diffraction sees it.
-
-    Attributes:
-        vertices: of all objects [m].
-        topology: their triangles.
-        occluders: what rays meet.
-        coefficients: of the triangles.
-    """
-
-    vertices: Float64[Tensor, "v 3"]
-    topology: Topology
-    occluders: Occluders
-    coefficients: Coefficients
-
-    @cached_property
-    def wedges(self) -> Wedges:
-        """Sharp edges, each as long as it goes straight on."""
-        corners = self.vertices[self.topology.faces]
-        ends = self.vertices[self.topology.edges]
-        return joined_wedges(find_wedges(corners, ends, self.topology.beside))
-
-    @cached_property
-    def size(self) -> float:
-        """Of all together [m]."""
-        plain = self.vertices.detach()
-        return float((plain.amax(0) - plain.amin(0)).norm())
-
-    def edge(self, row: Tensor, known: tuple[Tensor | None, Tensor | None] = (None, None)) -> Edge:
-        """Edges on paths' ways.
-
-        Args:
-            row: numbers of wedges.
-            known: azimuths of incidence and of departure, where a path runs along a face.
-        """
-        wedges = self.wedges.rows(row)
-
-        def faces(face: int, cosine: Tensor) -> FieldCoefficients:
-            return self.coefficients(wedges.faces[:, face], cosine)
-
-        return Edge(wedges, faces, *known)
+from invertwin.channel.field.bends import Bends, Legs, along_faces
+from invertwin.channel.field.edge_paths import over_edges
+from invertwin.channel.field.edged import EdgedScene, on_edge
+from invertwin.channel.field.images import corners_of, images
+from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.ray_paths import DIFFRACTION
 
 
 @dataclass(frozen=True)
 class DiffractedPaths:
-    """Paths over the same number of edges, one row each.
+    """Diffracted paths with the same number of vertices, one row each.
 
     Attributes:
-        link: number of the pair of antennas.
+        tx, rx: numbers of the antennas.
         edge: numbers of the edges, from the transmitter on.
-        points: where paths turn: a point of the edge, its end where they turn past it [m].
+        points: where paths meet surfaces and edges: a point of the edge, its end where they turn
+            past it [m].
+        kinds: what happens there, by ``KINDS``.
+        faces: triangles; of an edge, that of its first face.
+        ways: unit vectors of the legs, from the transmitter on.
         length: of the path by these points [m].
         transfer: E at the receiver of E at 1 m from the transmitter, without the phase of
             ``length`` [1/m]; world coordinates, receive × transmit.
     """
 
-    link: Int64[Tensor, " row"]
+    tx: Int64[Tensor, " row"]
+    rx: Int64[Tensor, " row"]
     edge: Int64[Tensor, "row order"]
-    points: Float64[Tensor, "row order 3"]
+    points: Float64[Tensor, "row vertex 3"]
+    kinds: Int64[Tensor, "row vertex"]
+    faces: Int64[Tensor, "row vertex"]
+    ways: Float64[Tensor, "row leg 3"]
     length: Float64[Tensor, " row"]
     transfer: Complex128[Tensor, "row 3 3"]
 
 
 def diffracted_paths(
     around: EdgedScene,
-    tx: Float64[Tensor, "link 3"],
-    rx: Float64[Tensor, "link 3"],
+    bends: Bends,
+    tx: Float64[Tensor, "tx 3"],
+    rx: Float64[Tensor, "rx 3"],
     wave_number: float,
-    order: int = 1,
-) -> list[DiffractedPaths]:
-    """Diffracted paths between pairs of antennas, over one edge, and over two.
+) -> DiffractedPaths:
+    """What paths round edges are worth.
 
     Args:
         around: the scene.
-        tx, rx: one row a link [m].
+        bends: the paths, see ``find_bends``.
+        tx, rx: antennas [m].
         wave_number: k [1/m].
-        order: most edges of a path, 1 or 2.
     """
-    found = [_joined(list(_once(around, tx, rx, wave_number)), 1)]
-    if order > 1:
-        found.append(_joined(list(_twice(around, tx, rx, wave_number)), 2))
-    return found
-
-
-def _joined(parts: list[DiffractedPaths], order: int) -> DiffractedPaths:
-    if not parts:
-        none = torch.zeros(0, dtype=torch.float64)
-        return DiffractedPaths(
-            torch.zeros(0, dtype=torch.int64),
-            torch.zeros(0, order, dtype=torch.int64),
-            none.reshape(0, 1).expand(0, order)[..., None].expand(0, order, 3),
-            none,
-            torch.zeros(0, 3, 3, dtype=torch.complex128),
-        )
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return DiffractedPaths(*(torch.cat(column) for column in columns))
-
-
-def exterior(wedges: Wedges, places: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
-    """Which places lie outside of wedges that go on for ever; on a face is outside.
-
-    Args:
-        wedges: one row each.
-        places: [m].
-    """
-    offset = (places - wedges.start).detach()
-    angle = azimuth(wedges, offset, 0).detach()
-    inside = (angle > wedges.opening.detach() * torch.pi + _GRAZING) & (
-        angle < 2 * torch.pi - _GRAZING
-    )
-    axis = edge_axis(wedges).detach()
-    aside = offset - dot(offset, axis)[:, None] * axis
-    return ~inside & (aside.norm(dim=1) > 0)
-
-
-def _once(
-    around: EdgedScene, tx: Tensor, rx: Tensor, wave_number: float
-) -> Iterator[DiffractedPaths]:
-    """Paths over one edge."""
-    count = len(around.wedges.start)
-    for some in torch.arange(len(tx)).split(max(1, _ROWS_AT_ONCE // max(1, count))):
-        sees = _sees(around, tx[some]) & _sees(around, rx[some])
-        link, row = torch.nonzero(sees).T
-        link = some[link]
-        if not len(link):
-            continue
-
-        def send(chosen: Tensor, link: Tensor = link, row: Tensor = row) -> EdgePaths:
-            ends = tx[link[chosen]], rx[link[chosen]]
-            return over_edges([around.edge(row[chosen])], *ends, wave_number)
-
-        yield from _seen(around, wave_number, link, row[:, None], (tx, rx), send)
-
-
-def _twice(
-    around: EdgedScene, tx: Tensor, rx: Tensor, wave_number: float
-) -> Iterator[DiffractedPaths]:
-    """Paths over two edges."""
-    pairs, between = _pairs(around)
-    for some in torch.arange(len(tx)).split(max(1, _ROWS_AT_ONCE // max(1, len(pairs)))):
-        sees = _sees(around, tx[some])[:, pairs[:, 0]] & _sees(around, rx[some])[:, pairs[:, 1]]
-        link, pair = torch.nonzero(sees).T
-        link, row, face = some[link], pairs[pair], between[pair]
-        if not len(link):
-            continue
-        opening = around.wedges.opening[row]
-        angles = torch.where(face < 0, torch.nan, face * opening * torch.pi)
-
-        def send(
-            chosen: Tensor,
-            link: Tensor = link,
-            row: Tensor = row,
-            angles: Tensor = angles,
-            apart: Tensor = face[:, 0] < 0,
-        ) -> EdgePaths:
-            edges = [
-                around.edge(row[chosen, 0], (None, angles[chosen, 0])),
-                around.edge(row[chosen, 1], (angles[chosen, 1], None)),
-            ]
-            sent = over_edges(edges, tx[link[chosen]], rx[link[chosen]], wave_number)
-            # Where no face lies between two edges, each must see the other's point.
-            for one, other in ((0, 1), (1, 0)):
-                outside = exterior(edges[one].wedges, sent.points[:, other])
-                sent = replace(sent, stationary=sent.stationary & (outside | ~apart[chosen]))
-            return sent
-
-        yield from _seen(around, wave_number, link, row, (tx, rx), send)
-
-
-def _sees(around: EdgedScene, places: Tensor) -> Bool[Tensor, "place edge"]:
-    """Which wedges places are outside of."""
-    count, edges = len(places), len(around.wedges.start)
-    row = torch.arange(edges).repeat(count)
-    outside = exterior(around.wedges.rows(row), places.repeat_interleave(edges, 0))
-    return outside.reshape(count, edges)
-
-
-def _pairs(around: EdgedScene) -> tuple[Int64[Tensor, "pair 2"], Int64[Tensor, "pair 2"]]:
-    """Edges that may follow one another, and which of their faces lies between them (−1: none).
-
-    Two edges with a face between them have one path along each side that both have in common.
-    """
-    wedges = Wedges(*(column.detach() for column in vars(around.wedges).values()))
-    count = len(wedges.start)
-    first, second = torch.nonzero(~torch.eye(count, dtype=torch.bool)).T
-    way = (wedges.start + wedges.end)[second] - (wedges.start + wedges.end)[first]
-    rows, faces, shared = [], [], torch.zeros(len(first), dtype=torch.bool)
-    for one in (0, 1):
-        for other in (0, 1):
-            normal = wedges.normals[first, one]
-            alike = dot(normal, wedges.normals[second, other]) > 1 - _ONE_PLANE**2
-            flat = dot(normal, way).abs() < _ONE_PLANE * around.size
-            over = dot(way, wedges.inwards[first, one]) > 0
-            back = dot(way, wedges.inwards[second, other]) < 0
-            chosen = torch.nonzero(alike & flat & over & back)[:, 0]
-            shared[chosen] = True
-            rows.append(torch.stack([first[chosen], second[chosen]], 1))
-            faces.append(torch.tensor([[one, other]]).expand(len(chosen), 2))
-    # The others: at least one end of each lies outside of the other.
-    free = ~shared
-    for near, far in ((first, second), (second, first)):
-        outside = [exterior(wedges.rows(near), end[far]) for end in (wedges.start, wedges.end)]
-        free &= outside[0] | outside[1]
-    rows.append(torch.stack([first[free], second[free]], 1))
-    faces.append(torch.full((int(free.sum()), 2), -1))
-    return torch.cat(rows), torch.cat(faces)
-
-
-def _seen(
-    around: EdgedScene,
-    wave_number: float,
-    link: Tensor,
-    edge: Tensor,
-    ends: tuple[Tensor, Tensor],
-    send: Callable[[Tensor], EdgePaths],
-) -> Iterator[DiffractedPaths]:
-    """The paths between whose points nothing lies.
-
-    They are computed again for these rows alone: others may be singular, and would spoil
-    derivatives.
-    """
-    tx, rx = ends
-    with torch.no_grad():
-        sent = send(torch.arange(len(link)))
-    wedges = [around.wedges.rows(column) for column in edge.T]
-    places = [on_edge(at, sent.points[:, number]) for number, at in enumerate(wedges)]
-    aside = [
-        place.detach() + _OFF * around.size * normalize((at.normals - at.inwards).sum(1), dim=1)
-        for place, at in zip(places, wedges, strict=True)
+    source, target = tx[bends.tx], rx[bends.rx]
+    legs = [_Mirrors(around, bends.before, source), _Mirrors(around, _back(bends.after), target)]
+    angles = along_faces(around, bends)
+    alone = bends.edge.shape[1] == 1
+    known = [(None, None)] if alone else [(None, angles[:, 0]), (angles[:, 1], None)]
+    edges = [
+        around.edge(row, pair, absorbs=bends.absorbs)
+        for row, pair in zip(bends.edge.T, known, strict=True)
     ]
-    clear = sent.stationary
-    stops = [tx[link], *aside, rx[link]]
-    for start, end in pairwise(stops):
-        rows = torch.nonzero(clear)[:, 0]
-        clear[rows] = visible(around.occluders, start[rows], end[rows])
-    rows = torch.nonzero(clear)[:, 0]
-    if len(rows):
-        sent = send(rows)
-        wedges = [around.wedges.rows(column) for column in edge[rows].T]
-        places = [on_edge(at, sent.points[:, number]) for number, at in enumerate(wedges)]
-        points = torch.stack(places, 1)
-        stops = torch.cat([tx[link[rows], None], points, rx[link[rows], None]], 1)
-        length = (stops[:, 1:] - stops[:, :-1]).norm(dim=2).sum(1)
-        # What the end of an edge sends has the delay of the path over that end.
-        later = wave_number * (length - sent.length)
-        turn = torch.polar(torch.ones_like(later), later)[:, None, None]
-        yield DiffractedPaths(link[rows], edge[rows], points, length, sent.transfer * turn)
+    sent = over_edges(edges, legs[0].image, legs[1].image, wave_number)
+    places = [on_edge(edge.wedges, sent.points[:, n]) for n, edge in enumerate(edges)]
+    stops = torch.stack([legs[0].image, *places, legs[1].image], 1)
+    pieces = stops[:, 1:] - stops[:, :-1]
+    length = pieces.norm(dim=2).sum(1)
+    # What the end of an edge sends has the delay of the path over that end.
+    later = wave_number * (length - sent.length)
+    turn = torch.polar(torch.ones_like(later), later)[:, None, None]
+    arriving = legs[0].dyad(sent.points[:, 0])
+    # Reciprocity: on its way out a wave is turned as one that comes in.
+    leaving = legs[1].dyad(sent.points[:, -1]).mT
+    ways = [normalize(pieces, dim=2)[:, 1:-1]]
+    ways.insert(0, torch.stack(legs[0].ways(places[0]), 1))
+    ways.append(-torch.stack(legs[1].ways(places[-1]), 1).flip(1))
+    points = [legs[0].corners(places[0]), torch.stack(places, 1)]
+    points.append(legs[1].corners(places[-1]).flip(1))
+    kinds = [bends.before.kinds, torch.full_like(bends.edge, DIFFRACTION), bends.after.kinds]
+    first = around.plain.faces[bends.edge, 0]
+    return DiffractedPaths(
+        bends.tx,
+        bends.rx,
+        bends.edge,
+        torch.cat(points, 1),
+        torch.cat(kinds, 1),
+        torch.cat([bends.before.faces, first, bends.after.faces], 1),
+        torch.cat(ways, 1),
+        length,
+        leaving @ (sent.transfer * turn) @ arriving,
+    )
 
 
-def on_edge(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:
-    """The nearest points of edges to points on their lines.
+def _back(legs: Legs) -> Legs:
+    return Legs(legs.faces.flip(1), legs.through.flip(1))
 
-    Args:
-        wedges: one row each.
-        points: [m].
-    """
-    side = wedges.end - wedges.start
-    share = dot(points - wedges.start, side) / dot(side, side)
-    return wedges.start + share.clamp(0, 1)[:, None] * side
+
+class _Mirrors:
+    """Surfaces between an antenna and an edge, in this order, differentiable."""
+
+    def __init__(self, around: EdgedScene, legs: Legs, place: Tensor) -> None:
+        corners = around.vertices[around.topology.faces[legs.faces]]
+        self.around = around
+        self.legs = legs
+        self.normal = normalize(
+            cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]),
+            dim=-1,
+        )
+        self.point = corners[..., 0, :]
+        self.seen = images(place, self.point, self.normal, legs.through)
+
+    @property
+    def image(self) -> Float64[Tensor, "row 3"]:
+        """Of the antenna, as the edge sees it."""
+        return self.seen[-1]
+
+    def corners(self, point: Tensor) -> Float64[Tensor, "row step 3"]:
+        """Where the way to a point meets the surfaces."""
+        found = corners_of(point, self.seen, self.point, self.normal)
+        return torch.stack(found, 1) if found else self.point
+
+    def ways(self, point: Tensor) -> list[Tensor]:
+        """Unit vectors of the way to a point, from the antenna on."""
+        found = [normalize(point - self.image, dim=1)]
+        for step in reversed(range(self.normal.shape[1])):
+            turned = mirrored(found[0], self.normal[:, step])
+            found.insert(0, torch.where(self.legs.through[:, step, None], found[0], turned))
+        return found
+
+    def dyad(self, point: Tensor) -> Complex128[Tensor, "row 3 3"]:
+        """E that arrives at a point, of E that leaves the antenna."""
+        ways = self.ways(point)
+        total = torch.eye(3, dtype=torch.complex128).expand(len(point), 3, 3)
+        for step, through in enumerate(self.legs.through.unbind(1)):
+            normal, way = self.normal[:, step], ways[step]
+            law = self.around.coefficients(self.legs.faces[:, step], dot(normal, way).abs())
+            s, before, after = (v[:, 0] for v in plane_of_incidence(normal, way))
+            passing = through[:, None]
+            both = torch.where(passing, before, after)
+            strength_s = torch.where(through, law.transmission_s, law.reflection_s)
+            strength_p = torch.where(through, law.transmission_p, law.reflection_p)
+            across = s[:, :, None] * s[:, None]
+            inside = both[:, :, None] * before[:, None]
+            step_dyad = strength_s[:, None, None] * across + strength_p[:, None, None] * inside
+            total = step_dyad @ total
+        return total

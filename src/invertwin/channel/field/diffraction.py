@@ -69,6 +69,7 @@ class Turn:
         parameter: distance parameter L, of a spherical wave s s′ sin²β/(s + s′) [m].
         faces: what the wedges' faces do to waves.
         ends: by how much longer, as √phase, paths over the edge's ends are; None = no ends.
+        absorbs: whether faces neither mirror nor let through, whatever they are.
     """
 
     wedges: Wedges
@@ -79,6 +80,7 @@ class Turn:
     parameter: Float64[Tensor, " row"]
     faces: Faces = conductor
     ends: Float64[Tensor, "row 2"] | None = None
+    absorbs: bool = False
 
     def reversed(self) -> "Turn":
         """The same waves on their way back."""
@@ -108,7 +110,7 @@ def diffraction_dyad(turn: Turn, wave_number: float, order: Order = "value") -> 
         order: the dyad, or its derivative by an azimuth.
     """
     there = _one_way(turn, wave_number, order)
-    if turn.faces is conductor:
+    if turn.faces is conductor or turn.absorbs:
         return there
     flipped: dict[Order, Order] = {"value": "value", "in": "out", "out": "in"}
     back = _one_way(turn.reversed(), wave_number, flipped[order])
@@ -117,6 +119,11 @@ def diffraction_dyad(turn: Turn, wave_number: float, order: Order = "value") -> 
 
 def _one_way(turn: Turn, wave_number: float, order: Order) -> Tensor:
     weights = _terms(turn, wave_number, order)
+    if turn.absorbs:
+        along = edge_axis(turn.wedges)
+        bases = _basis(along, turn.towards), _basis(along, turn.direction)
+        same = torch.eye(3, dtype=torch.complex128)
+        return (weights[0] + weights[1])[:, None, None] * _turned(*bases, same)
     straight, last, first = _carried(turn)
     whole = (weights[0] + weights[1])[:, None, None] * straight
     return whole + weights[2][:, None, None] * last + weights[3][:, None, None] * first
@@ -127,7 +134,7 @@ def _terms(turn: Turn, wave_number: float, order: Order) -> list[Complex128[Tens
     scale = -_TURN / (2 * turn.wedges.opening * math.sqrt(2 * math.pi * wave_number) * turn.sine)
     root = torch.sqrt(2 * wave_number * turn.parameter)
     found = []
-    for other, sign in _SIGNS:
+    for other, sign in _SIGNS[:2] if turn.absorbs else _SIGNS:
         beta = turn.azimuth + other * turn.azimuth_in
         value, slope = _cotangent(turn, beta, sign, root, order != "value")
         if order != "value":

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel.field.diffraction import (
@@ -39,6 +39,7 @@ class Edge:
         faces: what these do to waves.
         azimuth_in, azimuth: φ′ and φ where they are known, NaN elsewhere [rad]; None = nowhere.
         endless: take the edges as infinitely long.
+        absorbs: take the faces as such that neither mirror nor let through.
     """
 
     wedges: Wedges
@@ -46,6 +47,7 @@ class Edge:
     azimuth_in: Float64[Tensor, " row"] | None = None
     azimuth: Float64[Tensor, " row"] | None = None
     endless: bool = False
+    absorbs: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,21 @@ def over_edges(
     return EdgePaths(
         route.points, route.legs.sum(1), transfer * amplitude[:, None, None], route.stationary
     )
+
+
+def turning_points(
+    wedges: Wedges, tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
+) -> tuple[Float64[Tensor, "row 3"], Bool[Tensor, " row"]]:
+    """Where paths over one edge turn, on its line, and whether such a path exists.
+
+    Args:
+        wedges: one row each.
+        tx, rx: the antennas, or their images [m].
+    """
+    axis = _unit(wedges.end - wedges.start)
+    points = wedges.start + _between(wedges.start, axis, tx, rx)[:, None] * axis
+    before, after = (points - tx).norm(dim=1), (rx - points).norm(dim=1)
+    return points, torch.minimum(before, after) > _LEAST * (before + after)
 
 
 def slope_transfer(
@@ -168,6 +185,7 @@ class _Route:
                 self._parameter(number, legs, way),
                 edge.faces,
                 None if edge.endless else self.ends(number, wave_number),
+                edge.absorbs,
             )
             found.append(turn)
         return found

@@ -73,6 +73,15 @@ class Walls(Occluders):
         tables = {name: to_double(value) for name, value in (vectors | ends).items()}
         return tables | {"of_face": to_index(planes.face_plane.clamp_min(0))}
 
+    @cached_property
+    def device_rims(self) -> Any:
+        """How near to their sides rays may have missed triangles: share of the least height."""
+        corners = self.exact_vertices[self.topology.faces]
+        sides = corners.roll(-1, 1) - corners
+        area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1)
+        height = area / sides.norm(dim=2).amax(1).clamp_min(1e-300)
+        return to_float(self.margin / height.clamp_min(1e-300))
+
 
 @dataclass(frozen=True)
 class Chains:
@@ -164,7 +173,8 @@ def chains_between(
             target, sequence = screen.passed(targets[begin : begin + block])
             target = target + begin
             chosen = some[sequence]
-            good, faces = _verified(walls, chosen, source, targets[target])
+            start = source.expand(len(chosen), 3)
+            good, faces = clear_ways(walls, chosen, start, targets[target])
             found.append(
                 Chains(
                     torch.full((int(good.sum()),), number),
@@ -237,7 +247,10 @@ class _Screen:
     def _clear(
         self, row: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
     ) -> Any:
-        """Whether one ray a segment meets nothing, or what it should; seams let rays through."""
+        """Whether one ray a segment meets nothing, or what it should; seams let rays through.
+
+        What it meets at a triangle's rim is left to the exact test.
+        """
         walls = self.walls
         margin, scene = opaque(walls.margin, "Float64"), walls.scene
         start = dr.gather(mi.Vector3d, self.images, row * (self.length + 1))
@@ -245,10 +258,12 @@ class _Screen:
             way = end - start
             length = dr.norm(way)
             unit = way / dr.maximum(length, 1e-300)
-            begin = start
+            # Along the way: aside of it, rays would see other edges.
+            lift = mi.Float64(0.0)
             if step:
-                normal = normals[step - 1]
-                begin = start + normal * dr.mulsign(margin, dr.dot(unit, normal))
+                lift = margin / dr.maximum(dr.abs(dr.dot(unit, normals[step - 1])), 0.1)
+            length -= lift
+            begin = start + unit * lift
             last = step == self.length
             over = -margin
             if not last:
@@ -257,10 +272,15 @@ class _Screen:
             ray = mi.Ray3f(mi.Point3f(begin), mi.Vector3f(unit), mi.Float(far), 0.0, [])
             hit = scene.ray_intersect_preliminary(ray, active=ok)
             valid = hit.is_valid() & ok
-            if last:
-                return ok & ~valid
+            u, v = hit.prim_uv.x, hit.prim_uv.y
+            rim = dr.gather(mi.Float, walls.device_rims, hit.prim_index, valid)
+            deep = valid & (dr.minimum(dr.minimum(u, v), 1 - u - v) > rim)
             plane = dr.gather(mi.UInt32, walls.device_planes["of_face"], hit.prim_index, valid)
-            ok &= ~valid | ((plane == planes[step]) & (hit.t > mi.Float(length - over)))
+            if step:
+                deep &= plane != planes[step - 1]
+            if last:
+                return ok & ~deep
+            ok &= ~deep | ((plane == planes[step]) & (hit.t > mi.Float(length - over)))
             start = end
         return ok
 
@@ -280,17 +300,59 @@ class _Segments:
     plane: Tensor
 
 
-def _verified(
-    walls: Walls, steps: Tensor, source: Tensor, targets: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Which paths there are, and the triangles that they meet."""
+def reaching(
+    walls: Walls,
+    steps: Int64[Tensor, "row step"],
+    seen: list[Float64[Tensor, "row 3"]],
+    target: Float64[Tensor, "row 3"],
+) -> Bool[Tensor, " row"]:
+    """Whether lines to the images cut the planes inside of their rectangles, in the right order.
+
+    Args:
+        walls: The scene.
+        steps: Sequences, see ``sequences``.
+        seen: From ``images``, about the scene's origin.
+        target: Places about it.
+    """
+    planes, place = walls.planes, target
+    near = _EXACT * walls.size
+    ok = torch.ones(len(target), dtype=torch.bool)
+    for step in reversed(range(steps.shape[1])):
+        plane, through = steps[:, step] >> 1, (steps[:, step] & 1).bool()
+        point, normal, way = planes.point[plane], planes.normal[plane], seen[step + 1] - place
+        falls = dot(way, normal)
+        ok &= falls != 0
+        share = dot(point - place, normal) / torch.where(falls == 0, torch.ones_like(falls), falls)
+        reach = way.norm(dim=1)
+        # A receiver on a mirror has a reflection; one on a sheet is not behind it.
+        ok &= share * reach > torch.where(through, near, -near)
+        ok &= share * reach < reach - near
+        place = place + share[:, None] * way
+        at = torch.einsum("rx,rax->ra", place - point, planes.axes[plane])
+        ok &= (at >= planes.low[plane] - walls.margin).all(1)
+        ok &= (at <= planes.high[plane] + walls.margin).all(1)
+    return ok
+
+
+def clear_ways(
+    walls: Walls,
+    steps: Int64[Tensor, "row step"],
+    source: Float64[Tensor, "row 3"],
+    targets: Float64[Tensor, "row 3"],
+) -> tuple[Bool[Tensor, " row"], Int64[Tensor, "row step"]]:
+    """Which ways by given planes are free, and the triangles that they meet.
+
+    Args:
+        walls: The scene.
+        steps: Sequences, see ``sequences``.
+        source, targets: World positions [m].
+    """
     count, length = steps.shape
     if not count:
         return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps)
     planes, plane = walls.planes, steps >> 1
     point, normal = planes.point[plane], planes.normal[plane]
-    place = (source - walls.origin).expand(count, 3)
-    target = targets - walls.origin
+    place, target = source - walls.origin, targets - walls.origin
     seen = images(place, point, normal, (steps & 1).bool())
     nodes = torch.stack([place, *corners_of(target, seen, point, normal), target], 1)
     none = torch.full((count, 1), -1)

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from invertwin.channel.field.planes import Planes
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch
@@ -121,12 +122,14 @@ def shot_sequences(
     chunk = max(1, _LANES // parts)
     leaves = torch.zeros(0, depth, dtype=torch.int64)
     count = torch.zeros(0, dtype=torch.int64)
+    none = torch.zeros(1, 0, dtype=torch.int64)
     for number, place in enumerate(places):
         turn = _random_turn(seed, number)
         for start in range(0, rays, chunk):
             index = torch.arange(start, min(start + chunk, rays))
             directions = _spiral(index, rays) @ turn.T
-            row, times = tables.followed(place, directions, depth)
+            alike = torch.zeros(len(index), dtype=torch.int64)
+            row, times = tables.followed(place, directions, depth, none, alike)
             leaves, count = _merged(torch.cat([leaves, row]), torch.cat([count, times]))
     found: list[Tensor] = []
     for length in range(1, depth + 1):
@@ -134,6 +137,42 @@ def shot_sequences(
         found.append(some.unique(dim=0) if len(some) else some)
     missed = min(1.0, float((count == 1).sum()) / (rays * len(places)))
     return Sequences(tuple(found), missed)
+
+
+def sequences_from_edges(
+    occluders: Occluders,
+    planes: Planes,
+    powers: Powers,
+    places: Float64[Tensor, "ray 3"],
+    edge: Int64[Tensor, " ray"],
+    depth: int,
+    seed: int,
+) -> list[Int64[Tensor, "sequence column"]]:
+    """The sequences that rays from edges follow: number of the edge, then steps; by length from 1.
+
+    Args:
+        occluders: The scene.
+        planes: Of the scene, about the same origin.
+        powers: Of the triangles.
+        places: Where rays start; their directions are random [m].
+        edge: Numbers of the edges there, from zero without gaps.
+        depth: Most steps.
+        seed: Of the directions.
+    """
+    tables = _Tables(occluders, planes, powers)
+    parts = 2 ** (depth if bool(powers.transmit.any()) else 0)
+    draws = np.random.default_rng(seed).standard_normal((len(places), 3))
+    directions = normalize(torch.from_numpy(draws), dim=1)
+    prefix = torch.arange(int(edge.max()) + 1)[:, None]
+    leaves = torch.zeros(0, depth + 1, dtype=torch.int64)
+    for some in torch.arange(len(places)).split(max(1, _LANES // parts)):
+        rows, _ = tables.followed(places[some], directions[some], depth, prefix, edge[some])
+        leaves = torch.cat([leaves, rows]).unique(dim=0)
+    found: list[Tensor] = []
+    for length in range(1, depth + 1):
+        some = leaves[leaves[:, length] >= 0, : length + 1]
+        found.append(some.unique(dim=0) if len(some) else some)
+    return found
 
 
 def _merged(rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,15 +204,19 @@ class _Tables:
         self.normal = to_float(planes.normal)
         self.face_plane = to_index(planes.face_plane.clamp_min(0))
 
-    def followed(self, place: Tensor, directions: Tensor, depth: int) -> tuple[Tensor, Tensor]:
-        """Sequences of rays from a place, filled up with −1, and how many rays follow each."""
+    def followed(
+        self, place: Tensor, directions: Tensor, depth: int, known: Tensor, number: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Sequences of rays, filled up with −1, and how many rays follow each.
+
+        They start from one place, or each from its own, with the rows ``number`` of ``known``.
+        """
         local = (place - self.occluders.origin).to(torch.float32)
         origin = local.expand(len(directions), 3)
         direction = directions.to(torch.float32)
         # Sequences share their beginnings: each is the number of its parent, and one more step.
-        number = torch.zeros(len(directions), dtype=torch.int64)
         ended: list[tuple[Tensor, Tensor]] = []
-        known = torch.zeros(1, 0, dtype=torch.int64)
+        width = known.shape[1] + depth
         for step in range(depth):
             if step:
                 origin = origin + self.occluders.margin * direction
@@ -204,7 +247,7 @@ class _Tables:
         rows, counts = [], []
         for table, number in ended:
             some, count = number.unique(return_counts=True)
-            rows.append(torch.nn.functional.pad(table[some], (0, depth - table.shape[1]), value=-1))
+            rows.append(torch.nn.functional.pad(table[some], (0, width - table.shape[1]), value=-1))
             counts.append(count)
         return torch.cat(rows), torch.cat(counts)
 

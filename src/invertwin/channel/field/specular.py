@@ -17,7 +17,9 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel.field.diffracted import EdgedScene, diffracted_paths
+from invertwin.channel.field.bends import Bends, find_bends
+from invertwin.channel.field.diffracted import diffracted_paths
+from invertwin.channel.field.edged import EdgedScene
 from invertwin.channel.field.images import (
     Chains,
     Walls,
@@ -32,10 +34,9 @@ from invertwin.channel.field.sequences import (
     shot_sequences,
 )
 from invertwin.channel.field.waves import dot, mirrored, plane_of_incidence, polarisations
-from invertwin.channel.ray_paths import DIFFRACTION, REFLECTION, TRANSMISSION, RayPaths, joined
+from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION, RayPaths, joined
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import vertex_velocities
-from invertwin.channel.rays.scene import Occluders
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -52,6 +53,7 @@ from invertwin.scene.scene import Scene
 
 _DEEPEST, _MOST_EDGES = 6, 2
 _ROWS_AT_ONCE = 1 << 15
+_BENT_AT_ONCE = 1 << 13  # paths round edges, which hold more
 _UP = (0.0, 0.0, 1.0)
 _STILL = "give one vector, or one per antenna"
 
@@ -114,15 +116,16 @@ def trace_paths(
         rx: Receivers, [3] or [rx, 3] [m].
         frequency: Of the coefficients [Hz].
         depth: Most surfaces that a path meets, 0 to 6; a sheet that it passes counts as one.
-        edges: Most edges that a path goes round, 0 to 2; such paths meet no mirrors or sheets.
-        rays: Shot from each antenna of the side with fewer; None tries every sequence.
+        edges: Most edges that a path goes round, 0 to 2. Paths round one edge also meet up to
+            ``depth`` surfaces; round two, none.
+        rays: Shot from each antenna of the side with fewer, and from all edges together; None tries
+            every sequence.
         seed: Of the rays' directions.
         tx_velocity: Of the transmitters, one or one for each [m/s].
         rx_velocity: Of the receivers [m/s].
 
     Raises:
-        InputError: Wrong shapes or numbers, a cloud, too many sequences to try one by one, or edges
-            in a scene with objects in motion.
+        InputError: Wrong shapes or numbers, a cloud, or too many sequences to try one by one.
 
     Source: derivations §9 and §10.
     """
@@ -134,31 +137,48 @@ def trace_paths(
         )
     if checked_count(edges, "edges", 0) > _MOST_EDGES:
         raise InputError(f"expected at most {_MOST_EDGES} edges on a path, got {edges}")
-    if edges and stage.velocities is not None:
-        raise InputError(
-            "expected a scene at rest for diffracted paths, got objects with velocities; their "
-            "Doppler shifts are not computed: use edges=0, or scene.at(time)"
-        )
     if rays is not None and not 1 <= checked_count(rays, "rays", 1) <= MOST:
         raise InputError(f"expected at most {MOST:,} rays, got {rays}; shoot fewer")
     with tracing():
         powers = _powers(stage)
         # Discrete: to `torch.func`, tensors made on the way would be its own.
         with _DisableFuncTorch():
-            found, missed = _searched(stage, powers, most, rays, seed)
+            walls = _walls(stage)
+            found, missed = _searched(stage, walls, powers, most, rays, seed)
+            bends = _bends(stage, walls, powers, edges, most, rays, seed) if edges else []
         parts = [part for chains in found for part in _computed(stage, chains)]
-        parts += _diffracted(stage, edges) if edges else []
+        around = _around(stage, walls)
+        parts += [part for some in bends for part in _bent(stage, around, some)]
     return replace(joined(parts), missed=missed)
 
 
+def _walls(stage: _Stage) -> Walls:
+    antennas = torch.cat([plain(stage.tx), plain(stage.rx)])
+    return Walls(plain(stage.vertices), stage.topology, antennas)
+
+
+def _bends(
+    stage: _Stage,
+    walls: Walls,
+    powers: Powers,
+    edges: int,
+    depth: int,
+    rays: int | None,
+    seed: int,
+) -> list[Bends]:
+    """Which paths go round edges."""
+    bare = replace(_around(stage, walls), vertices=plain(stage.vertices))
+    ends = plain(stage.tx), plain(stage.rx)
+    return list(find_bends(bare, powers, *ends, edges, depth, rays, seed))
+
+
 def _searched(
-    stage: _Stage, powers: Powers, depth: int, rays: int | None, seed: int
+    stage: _Stage, walls: Walls, powers: Powers, depth: int, rays: int | None, seed: int
 ) -> tuple[list[Chains], float | None]:
     """Which paths there are, and the share of directions that was missed."""
     tx, rx = plain(stage.tx), plain(stage.rx)
     swapped = len(rx) < len(tx)
     sources, targets = (rx, tx) if swapped else (tx, rx)
-    walls = Walls(plain(stage.vertices), stage.topology, torch.cat([sources, targets]))
     if not depth:
         sequences = Sequences((), None)
     elif rays is None:
@@ -237,52 +257,89 @@ def _powers(stage: _Stage) -> Powers:
     return Powers(torch.cat(reflect), torch.cat(transmit))
 
 
-def _diffracted(stage: _Stage, edges: int) -> list[RayPaths]:
-    """Paths round edges."""
-    vertices = plain(stage.vertices)
-    scene = EdgedScene(
+def _around(stage: _Stage, walls: Walls) -> EdgedScene:
+    return EdgedScene(
         stage.vertices,
         stage.topology,
-        Occluders(vertices, stage.topology, vertices.mean(0)),
+        walls,
         lambda faces, cosine: _coefficients(stage, faces, cosine),
     )
-    if not len(scene.wedges.start):
-        return []
-    count = len(stage.tx), len(stage.rx)
-    source = torch.arange(count[0]).repeat_interleave(count[1])
-    target = torch.arange(count[1]).repeat(count[0])
-    k = 2 * math.pi * stage.frequency / SPEED_OF_LIGHT
-    up = torch.tensor(_UP, dtype=torch.float64)
-    found: list[RayPaths] = []
-    for part in diffracted_paths(scene, stage.tx[source], stage.rx[target], k, edges):
-        tx, rx = source[part.link], target[part.link]
-        departure = normalize(part.points[:, 0] - stage.tx[tx], dim=1)
-        arrival = normalize(part.points[:, -1] - stage.rx[rx], dim=1)
-        sent, received = polarisations(departure, up), polarisations(arrival, up)
-        matrix = torch.einsum(
-            "pri,pij,ptj->prt", received.to(part.transfer), part.transfer, sent.to(part.transfer)
-        )
-        faces = scene.wedges.faces[part.edge, 0]
-        rate = dot(departure, stage.tx_velocity[tx]) + dot(arrival, stage.rx_velocity[rx])
-        found.append(
+
+
+def _bent(stage: _Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
+    """Paths round edges in pieces, as in ``_computed``."""
+    rows = torch.arange(len(found.tx))
+    some = (stage.vertices, stage.tx, stage.rx)
+    heavy = len(rows) > _BENT_AT_ONCE and any(value.requires_grad for value in some)
+    parts: list[RayPaths] = []
+    for row in rows.split(_BENT_AT_ONCE):
+        part = found.rows(row)
+
+        def columns(part: Bends = part) -> tuple[Tensor, ...]:
+            return _bent_columns(stage, around, part)
+
+        values = checkpoint(columns, use_reentrant=False) if heavy else columns()
+        delay, coefficient, departure, arrival, vertices, doppler, kinds, faces = values
+        parts.append(
             RayPaths(
-                count,
+                (len(stage.tx), len(stage.rx)),
                 stage.frequency,
-                tx,
-                rx,
-                part.length / SPEED_OF_LIGHT,
-                matrix * (SPEED_OF_LIGHT / stage.frequency / (4 * math.pi)),
+                part.tx,
+                part.rx,
+                delay,
+                coefficient,
                 departure,
                 arrival,
-                part.points,
-                torch.full_like(part.edge, DIFFRACTION),
+                vertices,
+                kinds,
                 faces,
                 stage.topology.face_object[faces],
                 stage.scene.names,
-                stage.frequency / SPEED_OF_LIGHT * rate,
+                doppler,
             )
         )
-    return found
+    return parts
+
+
+def _bent_columns(stage: _Stage, around: EdgedScene, bends: Bends) -> tuple[Tensor, ...]:
+    """As ``_columns``, and kinds and faces, of paths round edges."""
+    k = 2 * math.pi * stage.frequency / SPEED_OF_LIGHT
+    found = diffracted_paths(around, bends, stage.tx, stage.rx, k)
+    departure, arrival = found.ways[:, 0], -found.ways[:, -1]
+    up = torch.tensor(_UP, dtype=torch.float64)
+    sent, received = (polarisations(way, up).to(found.transfer) for way in (departure, arrival))
+    matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
+    rate = _approach(
+        stage, bends.tx, bends.rx, list(found.ways.unbind(1)), found.points, found.faces
+    )
+    return (
+        found.length / SPEED_OF_LIGHT,
+        matrix * (SPEED_OF_LIGHT / stage.frequency / (4 * math.pi)),
+        departure,
+        arrival,
+        found.points,
+        stage.frequency / SPEED_OF_LIGHT * rate,
+        found.kinds,
+        found.faces,
+    )
+
+
+def _approach(
+    stage: _Stage,
+    tx: Tensor,
+    rx: Tensor,
+    ways: list[Tensor],
+    vertices: Float64[Tensor, "path vertex 3"],
+    faces: Int64[Tensor, "path vertex"],
+) -> Float64[Tensor, " path"]:
+    """How fast paths get shorter [m/s]."""
+    rate = dot(ways[0], stage.tx_velocity[tx]) - dot(ways[-1], stage.rx_velocity[rx])
+    if stage.velocities is not None and faces.shape[1]:
+        triangles = stage.topology.faces[faces]
+        moved = _at_points(stage.velocities[triangles], stage.vertices[triangles], vertices)
+        for step in range(faces.shape[1]):
+            rate = rate + dot(ways[step + 1] - ways[step], moved[:, step])
+    return rate
 
 
 def _computed(stage: _Stage, chains: Chains) -> list[RayPaths]:
@@ -342,13 +399,7 @@ def _columns(stage: _Stage, chains: Chains) -> tuple[Tensor, ...]:
     spread = SPEED_OF_LIGHT / stage.frequency / (4 * math.pi) / distance
     nodes = corners_of(rx, seen, point, normal)
     vertices = torch.stack(nodes, 1) if nodes else torch.zeros(count, 0, 3, dtype=torch.float64)
-    # How fast the path gets shorter.
-    rate = dot(ways[0], stage.tx_velocity[chains.source])
-    rate = rate - dot(ways[-1], stage.rx_velocity[chains.target])
-    if stage.velocities is not None and length:
-        moved = _at_points(stage.velocities[stage.topology.faces[chains.faces]], corners, vertices)
-        for step in range(length):
-            rate = rate + dot(ways[step + 1] - ways[step], moved[:, step])
+    rate = _approach(stage, chains.source, chains.target, ways, vertices, chains.faces)
     return (
         distance / SPEED_OF_LIGHT,
         field * spread[:, None, None],

@@ -104,7 +104,7 @@ def contacts_of(rays: RayScene) -> Contacts | None:
         met = pairs[geometry.face_object[first], geometry.face_object[second]]
         corners = topology.welded[first], topology.welded[second]
         met &= ~(corners[0][:, :, None] == corners[1][:, None]).flatten(1).any(1)
-        found = _common(points, topology, first[met], second[met])
+        found = common_segments(points, topology, first[met], second[met])
         parts.append(found)
         if not len(found.first):
             break
@@ -155,13 +155,19 @@ def _passed(
     return torch.cat(rows), torch.cat(faces)
 
 
-def _common(
+def common_segments(
     points: Float64[Tensor, "v 3"],
     topology: Topology,
     first: Int64[Tensor, " n"],
     second: Int64[Tensor, " n"],
 ) -> Contacts:
-    """What pairs of triangles have in common, where it is a segment."""
+    """What pairs of triangles have in common, where it is a segment.
+
+    Args:
+        points: World positions of all vertices [m].
+        topology: Their triangles.
+        first, second: The triangles of each pair.
+    """
     faces = first, second
     triangles = [points[topology.welded[face]] for face in faces]
     normals = [_unit(torch.linalg.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])) for t in triangles]

@@ -1,0 +1,391 @@
+"""Which paths go round edges, detached: over one edge with mirrors and sheets before and after it.
+
+A path over one edge is one between two images: that of the transmitter in the planes before the
+edge, and that of the receiver in those after it. It exists where both of its legs are free. Every
+sharp edge sends at every receiver whose way over it is free: also one whose ray would pass the end
+of the edge, since the end itself then sends. Nothing therefore jumps where a ray slides off an
+edge, and sums over the edges of a plate have no jump at its corners.
+
+Source: derivations §9.
+
+Differs from the source: where a path has as many surfaces as it may, its edge's faces neither
+mirror nor let through. Waves of one surface more are not followed, and what makes up for their ends
+would jump.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.field.edge_paths import Edge, over_edges, turning_points
+from invertwin.channel.field.edged import EdgedScene, exterior
+from invertwin.channel.field.images import clear_ways, images, reaching
+from invertwin.channel.field.sequences import (
+    Powers,
+    every_sequence,
+    sequences_from_edges,
+)
+from invertwin.channel.field.waves import dot
+from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION
+
+_ROWS_AT_ONCE = 1 << 16
+_ONE_PLANE = 1e-6  # of the scene's size, or rad
+
+
+@dataclass(frozen=True)
+class Legs:
+    """Surfaces on the ways from the transmitter to the edge, or from the edge on; detached.
+
+    Attributes:
+        faces: triangles, in the order of the path.
+        through: whether the path goes through them instead of being mirrored.
+    """
+
+    faces: Int64[Tensor, "row step"]
+    through: Bool[Tensor, "row step"]
+
+    @property
+    def kinds(self) -> Int64[Tensor, "row step"]:
+        """What happens there, by ``KINDS``."""
+        return torch.where(self.through, TRANSMISSION, REFLECTION)
+
+    def rows(self, index: Tensor) -> "Legs":
+        """Some rows."""
+        return Legs(self.faces[index], self.through[index])
+
+
+@dataclass(frozen=True)
+class Bends:
+    """Paths over as many edges, one row each; detached.
+
+    Attributes:
+        tx, rx: numbers of the antennas.
+        edge: numbers of the edges, from the transmitter on.
+        before, after: surfaces on the way to the first edge and from the last.
+        between: of two edges, which of their faces lies between them (−1: none).
+        absorbs: leave out what the edge's faces mirror and let through: one surface too many.
+    """
+
+    tx: Int64[Tensor, " row"]
+    rx: Int64[Tensor, " row"]
+    edge: Int64[Tensor, "row order"]
+    before: Legs
+    after: Legs
+    between: Int64[Tensor, "row order"]
+    absorbs: bool = False
+
+    def rows(self, index: Tensor) -> "Bends":
+        """Some rows."""
+        return Bends(
+            self.tx[index],
+            self.rx[index],
+            self.edge[index],
+            self.before.rows(index),
+            self.after.rows(index),
+            self.between[index],
+            self.absorbs,
+        )
+
+
+def find_bends(
+    around: EdgedScene,
+    powers: Powers,
+    tx: Float64[Tensor, "tx 3"],
+    rx: Float64[Tensor, "rx 3"],
+    order: int,
+    depth: int,
+    rays: int | None,
+    seed: int,
+) -> Iterator[Bends]:
+    """Paths over one edge with up to ``depth`` surfaces, and over two edges alone.
+
+    Args:
+        around: the scene.
+        powers: what triangles do to rays.
+        tx, rx: antennas [m].
+        order: most edges of a path, 1 or 2.
+        depth: most surfaces of a path over one edge.
+        rays: shot from all edges together, for candidates; None = every sequence.
+        seed: of these rays.
+    """
+    if not len(around.plain.start):
+        return
+    tables = _tables(around, powers, depth, rays, seed)
+    sides = [[_reach(around, table, places) for table in tables] for places in (tx, rx)]
+    for surfaces in range(len(tables)):
+        for before in range(surfaces + 1):
+            yield from _once(around, sides[0][before], sides[1][surfaces - before], depth)
+    if order > 1:
+        yield from _twice(around, tx, rx)
+
+
+def _tables(
+    around: EdgedScene, powers: Powers, depth: int, rays: int | None, seed: int
+) -> list[Int64[Tensor, "row column"]]:
+    """Edges and sequences that begin there, by length: number of the edge, then steps."""
+    walls, count = around.walls, len(around.plain.start)
+    alone = torch.arange(count)
+    tables = [alone[:, None]]
+    if not depth:
+        return tables
+    if rays is None:
+        for steps in every_sequence(walls.planes, powers, depth).steps:
+            edge = alone.repeat_interleave(len(steps))
+            tables.append(torch.cat([edge[:, None], steps.repeat(count, 1)], 1))
+    else:
+        edge = alone.repeat_interleave(-(-rays // count))
+        share = np.random.default_rng(np.random.SeedSequence([seed, 1])).random(len(edge))
+        wedges = around.plain.rows(edge)
+        places = wedges.start + torch.from_numpy(share)[:, None] * (wedges.end - wedges.start)
+        places = around.beside(edge, places)
+        tables += sequences_from_edges(walls, walls.planes, powers, places, edge, depth, seed)
+    # Planes through the edge itself are its faces.
+    return [tables[0]] + [
+        table[~_in_plane(around, table[:, 0], table[:, 1] >> 1)] for table in tables[1:]
+    ]
+
+
+def _in_plane(around: EdgedScene, edge: Tensor, plane: Tensor) -> Bool[Tensor, " row"]:
+    """Whether edges lie in planes."""
+    walls = around.walls
+    point, normal = walls.planes.point[plane] + walls.origin, walls.planes.normal[plane]
+    wedges = around.plain
+    low = dot(wedges.start[edge] - point, normal).abs()
+    high = dot(wedges.end[edge] - point, normal).abs()
+    return torch.maximum(low, high) < _ONE_PLANE * walls.size
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """Sequences by which antennas may see edges, in the order of the edges.
+
+    Attributes:
+        antenna, edge: numbers.
+        steps: from the edge to the antenna.
+        image: of the antenna in these planes, as the edge sees it [m].
+        places: of all antennas [m].
+    """
+
+    antenna: Tensor
+    edge: Tensor
+    steps: Tensor
+    image: Float64[Tensor, "row 3"]
+    places: Float64[Tensor, "antenna 3"]
+
+    def rows(self, index: Tensor) -> "_Reach":
+        """Some rows."""
+        return _Reach(
+            self.antenna[index],
+            self.edge[index],
+            self.steps[index],
+            self.image[index],
+            self.places,
+        )
+
+    @property
+    def start(self) -> Tensor:
+        """Places of the antennas."""
+        return self.places[self.antenna]
+
+
+def _reach(around: EdgedScene, table: Tensor, places: Tensor) -> _Reach:
+    """Antennas whose images lie outside the wedges and see some of the edges, each by a sequence.
+
+    Between the ends of an edge, the line to the image moves over a plane on a straight line.
+    """
+    walls, wedges = around.walls, around.plain
+    parts: list[tuple[Tensor, ...]] = []
+    total = len(places) * len(table)
+    for some in torch.arange(total).split(_ROWS_AT_ONCE):
+        antenna, row = some // len(table), some % len(table)
+        edge, steps = table[row, 0], table[row, 1:]
+        seen = _seen_from(around, places[antenna], steps.flip(1))
+        image = seen[-1] + walls.origin
+        keep = exterior(wedges.rows(edge), image)
+        if steps.shape[1]:
+            ends = [end[edge] - walls.origin for end in (wedges.start, wedges.end)]
+            keep &= _may_cross(around, steps.flip(1), seen, ends)
+        parts.append((antenna[keep], edge[keep], steps[keep], image[keep]))
+    if not parts:
+        none = torch.zeros(0, dtype=torch.int64)
+        return _Reach(none, none, table[:0, 1:], places[:0], places)
+    antenna, edge, steps, image = (torch.cat(column) for column in zip(*parts, strict=True))
+    return _Reach(antenna, edge, steps, image, places).rows(edge.argsort(stable=True))
+
+
+def _seen_from(around: EdgedScene, places: Tensor, steps: Tensor) -> list[Tensor]:
+    """Images of places about the scene's origin."""
+    walls, plane = around.walls, steps >> 1
+    point, normal = walls.planes.point[plane], walls.planes.normal[plane]
+    return images(places - walls.origin, point, normal, (steps & 1).bool())
+
+
+def _may_cross(
+    around: EdgedScene, steps: Tensor, seen: list[Tensor], ends: list[Tensor]
+) -> Bool[Tensor, " row"]:
+    """False where no line from an edge to the images can cut all planes in their rectangles."""
+    planes, wide = around.walls.planes, around.walls.margin
+    keep, sure = torch.ones(2, len(steps), dtype=torch.bool).unbind(0)
+    at = list(ends)
+    for step in reversed(range(steps.shape[1])):
+        plane = steps[:, step] >> 1
+        point, normal = planes.point[plane], planes.normal[plane]
+        there, valid = [], []
+        for number, end in enumerate(at):
+            way = seen[step + 1] - end
+            falls = dot(way, normal)
+            safe = torch.where(falls == 0, torch.ones_like(falls), falls)
+            share = dot(point - end, normal) / safe
+            valid.append((falls != 0) & (share > -_ONE_PLANE) & (share < 1 + _ONE_PLANE))
+            at[number] = end + share[:, None] * way
+            there.append(torch.einsum("rx,rax->ra", at[number] - point, planes.axes[plane]))
+        both = valid[0] & valid[1]
+        below = torch.maximum(*there) < planes.low[plane] - wide
+        above = torch.minimum(*there) > planes.high[plane] + wide
+        keep &= ~sure | valid[0] | valid[1]
+        # Where one end is out of sight the rest is not looked at.
+        sure &= both
+        keep &= ~(sure & (below | above).any(1))
+    return keep
+
+
+def _once(around: EdgedScene, one: _Reach, other: _Reach, depth: int) -> Iterator[Bends]:
+    """Paths over one edge."""
+    surfaces = one.steps.shape[1] + other.steps.shape[1]
+    for first, last in _pairs(one, other, len(around.plain.start)):
+        some, rest = one.rows(first), other.rows(last)
+        points, good = turning_points(around.plain.rows(some.edge), some.image, rest.image)
+        good &= around.free(some.edge, points)
+        beside = around.beside(some.edge, points)
+        for side in (some, rest):
+            forth = side.steps.flip(1)
+            rows = torch.nonzero(good)[:, 0]
+            seen = _seen_from(around, side.start[rows], forth[rows])
+            good[rows] = reaching(
+                around.walls, forth[rows], seen, beside[rows] - around.walls.origin
+            )
+        faces = [torch.full_like(side.steps, -1) for side in (some, rest)]
+        for side, met in zip((some, rest), faces, strict=True):
+            rows = torch.nonzero(good)[:, 0]
+            good[rows], met[rows] = clear_ways(
+                around.walls, side.steps[rows].flip(1), side.start[rows], beside[rows]
+            )
+        if bool(good.any()):
+            found = Bends(
+                some.antenna,
+                rest.antenna,
+                some.edge[:, None],
+                Legs(faces[0], (some.steps.flip(1) & 1).bool()),
+                Legs(faces[1].flip(1), (rest.steps & 1).bool()),
+                torch.full((len(some.edge), 1), -1),
+                absorbs=surfaces == depth > 0,
+            )
+            yield found.rows(torch.nonzero(good)[:, 0])
+
+
+def _pairs(one: _Reach, other: _Reach, count: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Rows of both that have an edge in common, in pieces."""
+    number = torch.bincount(other.edge, minlength=count)
+    begin = number.cumsum(0) - number
+    partners = number[one.edge]
+    piece = (partners.cumsum(0) - 1).clamp_min(0) // _ROWS_AT_ONCE
+    for rows in torch.arange(len(one.edge)).split(torch.bincount(piece).tolist()):
+        some = partners[rows]
+        first = rows.repeat_interleave(some)
+        within = torch.arange(len(first)) - (some.cumsum(0) - some).repeat_interleave(some)
+        if len(first):
+            yield first, begin[one.edge[first]] + within
+
+
+def _twice(around: EdgedScene, tx: Tensor, rx: Tensor) -> Iterator[Bends]:
+    """Paths over two edges, on free legs."""
+    pairs, between = _edge_pairs(around)
+    if not len(pairs):
+        return
+    alone = torch.arange(len(around.plain.start))[:, None]
+    sees = []
+    for places in (tx, rx):
+        found = _reach(around, alone, places)
+        table = torch.zeros(len(places), len(alone), dtype=torch.bool)
+        table[found.antenna, found.edge] = True
+        sees.append(table)
+    links = torch.cartesian_prod(torch.arange(len(tx)), torch.arange(len(rx)))
+    for some in links.split(max(1, _ROWS_AT_ONCE // len(pairs))):
+        both = sees[0][some[:, 0]][:, pairs[:, 0]] & sees[1][some[:, 1]][:, pairs[:, 1]]
+        link, pair = torch.nonzero(both).T
+        if not len(link):
+            continue
+        none = torch.zeros(len(link), 0, dtype=torch.int64)
+        legs = Legs(none, none.bool())
+        source, target = some[link].unbind(1)
+        found = Bends(source, target, pairs[pair], legs, legs, between[pair])
+        angles = along_faces(around, found)
+        row = [around.plain.rows(column) for column in found.edge.T]
+        edges = [
+            Edge(row[0], azimuth=angles[:, 0]),
+            Edge(row[1], azimuth_in=angles[:, 1]),
+        ]
+        sent = over_edges(edges, tx[source], rx[target], 1.0)
+        good = sent.stationary
+        # Where no face lies between two edges, each must see the other's point.
+        for first, second in ((0, 1), (1, 0)):
+            outside = exterior(around.plain.rows(found.edge[:, first]), sent.points[:, second])
+            good &= outside | (found.between[:, 0] >= 0)
+        stops = [tx[source]]
+        for number in (0, 1):
+            edge, points = found.edge[:, number], sent.points[:, number]
+            good &= around.free(edge, points)
+            stops.append(around.beside(edge, points))
+        stops.append(rx[target])
+        for start, end in pairwise(stops):
+            rows = torch.nonzero(good)[:, 0]
+            good[rows], _ = clear_ways(around.walls, none[rows], start[rows], end[rows])
+        if bool(good.any()):
+            yield found.rows(torch.nonzero(good)[:, 0])
+
+
+def along_faces(around: EdgedScene, bends: Bends) -> Float64[Tensor, "row order"]:
+    """Azimuths of paths over two edges that run along a face between these, NaN of the others.
+
+    Args:
+        around: the scene.
+        bends: the paths.
+    """
+    opening = around.plain.opening[bends.edge]
+    return torch.where(bends.between < 0, torch.nan, bends.between * opening * torch.pi)
+
+
+def _edge_pairs(around: EdgedScene) -> tuple[Int64[Tensor, "pair 2"], Int64[Tensor, "pair 2"]]:
+    """Edges that may follow one another, and which of their faces lies between them (−1: none).
+
+    Two edges with a face between them have one path along each side that both have in common.
+    """
+    wedges = around.plain
+    count = len(wedges.start)
+    first, second = torch.nonzero(~torch.eye(count, dtype=torch.bool)).T
+    way = (wedges.start + wedges.end)[second] - (wedges.start + wedges.end)[first]
+    rows, faces, shared = [], [], torch.zeros(len(first), dtype=torch.bool)
+    for one in (0, 1):
+        for other in (0, 1):
+            normal = wedges.normals[first, one]
+            alike = dot(normal, wedges.normals[second, other]) > 1 - _ONE_PLANE**2
+            flat = dot(normal, way).abs() < _ONE_PLANE * around.walls.size
+            over = dot(way, wedges.inwards[first, one]) > 0
+            back = dot(way, wedges.inwards[second, other]) < 0
+            chosen = torch.nonzero(alike & flat & over & back)[:, 0]
+            shared[chosen] = True
+            rows.append(torch.stack([first[chosen], second[chosen]], 1))
+            faces.append(torch.tensor([[one, other]]).expand(len(chosen), 2))
+    # The others: at least one end of each lies outside of the other.
+    free = ~shared
+    for near, far in ((first, second), (second, first)):
+        outside = [exterior(wedges.rows(near), end[far]) for end in (wedges.start, wedges.end)]
+        free &= outside[0] | outside[1]
+    rows.append(torch.stack([first[free], second[free]], 1))
+    faces.append(torch.full((int(free.sum()), 2), -1))
+    return torch.cat(rows), torch.cat(faces)

@@ -1,0 +1,242 @@
+"""Specular power on a surface: at points of it, and what moves where beams end on it.
+
+The mean over an area is that of points spread over it, plus boundary paths: zero in value, with the
+derivative that the moving rims of lit regions have (``shadow_edges``).
+
+Source: derivations §10 and §11.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+from torch._C import _DisableFuncTorch
+from torch.utils.checkpoint import checkpoint
+
+from invertwin.channel.field.cuts import cut_points, cut_rates
+from invertwin.channel.field.images import Chains, Walls, chains_between
+from invertwin.channel.field.sequences import every_sequence, shot_sequences
+from invertwin.channel.field.shadow_edges import ASIDE, Screen, rim_points, rims
+from invertwin.channel.field.specular import _computed, _powers, _Stage, _staged
+from invertwin.channel.ray_paths import RayPaths, joined
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.geometry import differentiated
+from invertwin.channel.rays.topology import topology_of
+from invertwin.scene.checks import ArrayLike, plain
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Scene
+
+_AT_ONCE = 1 << 13  # points
+
+#: Takes paths and the places of their transmitters and receivers; returns what each path adds,
+#: ``[path, amount]``.
+Measure = Callable[[RayPaths, Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Boundary paths that end on the surface.
+
+    Attributes:
+        tx: Transmitters.
+        place: Where on the surface [m].
+        face: Triangle of the surface.
+        amount: What each adds to the integral over the surface; zero in value.
+    """
+
+    tx: Int64[Tensor, " row"]
+    place: Float64[Tensor, "row 3"]
+    face: Int64[Tensor, " row"]
+    amount: Float64[Tensor, "row amount"]
+
+
+@dataclass(frozen=True)
+class Lit:
+    """What specular paths bring to a surface.
+
+    Attributes:
+        amount: At the points.
+        crossings: Boundary paths.
+    """
+
+    amount: Float64[Tensor, "tx point amount"]
+    crossings: tuple[Crossing, ...]
+
+
+@dataclass(frozen=True)
+class _Some:
+    """Paths to some points: the first point, how many, and chains."""
+
+    begin: int
+    count: int
+    chains: list[Chains]
+
+
+def trace_coverage(
+    scene: Scene,
+    tx: ArrayLike,
+    screen: Mesh,
+    points: Float64[Tensor, "point 3"],
+    frequency: float,
+    measure: Measure,
+    width: int,
+    *,
+    depth: int,
+    rays: int | None,
+    boundary_samples: int,
+    seed: int,
+) -> Lit:
+    """What specular paths bring to points of a surface, and to the rims of lit regions on it.
+
+    Args:
+        scene: What is in the way.
+        tx: Transmitters [tx, 3] in the world [m].
+        screen: The surface, in the world; it hides nothing.
+        points: On the surface [m].
+        frequency: Of the coefficients [Hz].
+        measure: What a path adds.
+        width: Numbers that a path adds.
+        depth: Most surfaces that a path meets.
+        rays: Shot from each transmitter to find sequences of surfaces; None tries every one.
+        boundary_samples: Points on edges, for each transmitter; 0 leaves boundary paths out. Only
+            derivatives by places use them.
+        seed: Of rays and edge points.
+    """
+    stage = _staged(scene, tx, points, frequency, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    with tracing():
+        trace = _Trace(stage, screen, measure, width, depth, rays, seed)
+        amount = trace.amounts(stage, trace.chains(plain(stage.rx)))
+        crossings: list[Crossing] = []
+        moved = differentiated(stage.vertices)
+        if boundary_samples and (moved or differentiated(stage.tx)):
+            crossings += trace.rims(stage, boundary_samples, seed)
+            crossings += trace.cuts(stage, boundary_samples, seed) if moved else []
+    return Lit(amount, tuple(crossings))
+
+
+class _Trace:
+    """Which paths there are, and what they are worth."""
+
+    def __init__(
+        self,
+        stage: _Stage,
+        screen: Mesh,
+        measure: Measure,
+        width: int,
+        depth: int,
+        rays: int | None,
+        seed: int,
+    ) -> None:
+        self.measure, self.width, self.depth = measure, width, depth
+        self.tx, self.powers = plain(stage.tx), _powers(stage)
+        # Discrete: to `torch.func`, tensors made on the way would be its own.
+        with _DisableFuncTorch():
+            places = plain(screen.vertices)
+            self.walls = Walls(plain(stage.vertices), stage.topology, torch.cat([self.tx, places]))
+            self.screen = Screen(places, topology_of([screen]), self.walls.origin)
+            meshes = [item.mesh for item in stage.scene.objects.values()]
+            self.meshes = [*meshes, screen]
+            planes = self.walls.planes
+            self.sequences: tuple[Tensor, ...] = ()
+            if depth and rays is None:
+                self.sequences = every_sequence(planes, self.powers, depth).steps
+            elif depth and rays:
+                found = shot_sequences(self.walls, planes, self.powers, self.tx, depth, rays, seed)
+                self.sequences = found.steps
+
+    def chains(self, points: Tensor) -> list[_Some]:
+        """The paths to points, some of the points at a time."""
+        every = (torch.zeros(1, 0, dtype=torch.int64), *self.sequences)
+        with _DisableFuncTorch():
+            return [
+                _Some(
+                    begin,
+                    len(points),
+                    [
+                        part
+                        for steps in every
+                        for number, source in enumerate(self.tx)
+                        for part in chains_between(self.walls, steps, source, points, number)
+                        if len(part.source)
+                    ],
+                )
+                for begin, points in zip(
+                    range(0, len(points), _AT_ONCE), points.split(_AT_ONCE), strict=True
+                )
+            ]
+
+    def amounts(self, stage: _Stage, parts: list[_Some]) -> Float64[Tensor, "tx point amount"]:
+        """What paths bring to points; a derivative computes the paths again, and keeps none."""
+        again = stage.vertices.requires_grad or stage.tx.requires_grad
+        found: list[Tensor] = []
+        for some in parts:
+            rx = stage.rx[some.begin : some.begin + some.count]
+            here = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
+
+            def total(here: _Stage = here, some: _Some = some) -> Tensor:
+                sums = torch.zeros(len(self.tx) * some.count, self.width, dtype=torch.float64)
+                for part in some.chains:
+                    paths = joined(_computed(here, part))
+                    sums = sums.index_add(0, paths.link, self.measure(paths, here.tx, here.rx))
+                return sums.unflatten(0, (len(self.tx), some.count))
+
+            found.append(checkpoint(total, use_reentrant=False) if again else total())
+        return torch.cat(found, 1)
+
+    def rims(self, stage: _Stage, samples: int, seed: int) -> list[Crossing]:
+        """Boundary paths to rims: what each path would bring, times the rim's rate."""
+        with _DisableFuncTorch():
+            met = rim_points(
+                self.walls, self.screen, self.tx, self.sequences, self.powers,
+                depth=self.depth, samples=samples, seed=seed,
+            )  # fmt: skip
+        crossings: list[Crossing] = []
+        for some in met:
+            found = rims(self.walls, self.screen, some, stage.tx, stage.vertices)
+            here = _fixed(stage, found.place)
+            with torch.no_grad():
+                paths = joined(_computed(here, found.chains))
+                brought = plain(self.measure(paths, here.tx, here.rx))
+            # One path a row, in another order.
+            amount = torch.zeros_like(brought).index_copy(0, paths.rx, brought)
+            crossings.append(
+                Crossing(found.chains.source, found.place, found.face, amount * found.rate[:, None])
+            )
+        return crossings
+
+    def cuts(self, stage: _Stage, samples: int, seed: int) -> list[Crossing]:
+        """Boundary paths where the scene cuts the screen: the jump of power, times the rate."""
+        with _DisableFuncTorch():
+            both = topology_of(self.meshes)
+            cuts = cut_points(self.walls, self.screen, both, samples, seed)
+            if not len(cuts.face):
+                return []
+            away = ASIDE * self.walls.margin * cuts.aside
+            points = torch.cat([cuts.place + away, cuts.place - away])
+        with torch.no_grad():
+            here = _fixed(stage, points)
+            beside, behind = plain(self.amounts(here, self.chains(points))).chunk(2, 1)
+        rate = cut_rates(self.walls, cuts, stage.vertices)
+        count = len(self.tx)
+        return [
+            Crossing(
+                torch.arange(count).repeat_interleave(len(rate)),
+                cuts.place.repeat(count, 1),
+                cuts.on_screen.repeat(count),
+                ((behind - beside) * rate[:, None]).flatten(0, 1),
+            )
+        ]
+
+
+def _fixed(stage: _Stage, points: Tensor) -> _Stage:
+    """The stage without derivatives of places, with other receivers."""
+    return replace(
+        stage,
+        vertices=plain(stage.vertices),
+        velocities=None,
+        tx=plain(stage.tx),
+        rx=points,
+        rx_velocity=torch.zeros_like(points),
+    )

@@ -1,0 +1,353 @@
+"""Means over cells of a surface: where a coverage map is asked for.
+
+A cell holds the mean power of a receiver that may stand anywhere in it. Powers of paths add, as
+they do in the mean over places some wavelengths apart. The mean is that over points spread over the
+cell. Derivatives hold boundary paths, so that the edges of shadows and of mirrored beams, which
+sweep over the cells, count (derivations §11).
+"""
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from invertwin.channel import RayPaths, trace_coverage
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.limits import Count
+from invertwin.links.places import Places
+from invertwin.links.received import Received, Reception
+from invertwin.links.spreads import path_powers, root
+from invertwin.links.transmitters import Transmitters
+from invertwin.scene.checks import ArrayLike, check_fields, checked_number, checked_tensor, plain
+from invertwin.scene.mesh import Mesh
+from invertwin.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class CellSampling:
+    """How many points a map of cells takes.
+
+    Attributes:
+        points: In a cell, at least; a cell has the next square number of them.
+        edge_points: On edges of the scene, for each transmitter; they serve derivatives alone.
+        boundary: False leaves boundary paths out: derivatives at fixed visibility, for ablation.
+
+    Raises:
+        InputError: A number out of range, or boundary paths without edge points.
+    """
+
+    points: Count = 16
+    edge_points: Count = 20_000
+    boundary: bool = True
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @property
+    def side(self) -> int:
+        """Points along each side of a cell."""
+        return math.isqrt(self.points - 1) + 1
+
+
+class Cells(Places):
+    """Cells of a surface, which hides nothing and is at rest.
+
+    Attributes:
+        sampling: How many points.
+    """
+
+    sampling: CellSampling
+    random: ClassVar[bool] = True
+
+    @abstractmethod
+    def sampled(self, sampling: CellSampling) -> "Cells":
+        """The same cells with other numbers of points.
+
+        Args:
+            sampling: How many points.
+        """
+
+    def finer(self, samples: int) -> "Cells":
+        """The same cells with so many points in all. See ``Places.finer``."""
+        points = max(1, samples // len(self.areas))
+        return self.sampled(replace(self.sampling, points=points))
+
+    def fixed_visibility(self) -> "Cells | None":
+        """The same cells without boundary paths. See ``Places.fixed_visibility``."""
+        if not self.sampling.boundary:
+            return None
+        return self.sampled(replace(self.sampling, boundary=False))
+
+    @abstractmethod
+    def surface(self) -> Mesh:
+        """The surface, in the world [m]."""
+
+    @abstractmethod
+    def drawn(self, numbers: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
+        """Points spread evenly over every cell [m].
+
+        Args:
+            numbers: What draws them.
+        """
+
+    @abstractmethod
+    def cell_of(
+        self, place: Float64[Tensor, "row 3"], face: Int64[Tensor, " row"]
+    ) -> Int64[Tensor, " row"]:
+        """Cells that hold points of the surface.
+
+        Args:
+            place: The points [m].
+            face: Their triangles.
+        """
+
+    @property
+    @abstractmethod
+    def areas(self) -> Float64[Tensor, " cell"]:
+        """Of the cells [m²]."""
+
+    def received(
+        self, scene: Scene, sensor: Transmitters, reception: Reception, seed: int
+    ) -> Received:
+        """Means over the cells. See ``Places.received``.
+
+        The delay spread of a cell is that of the powers over excess delays: those of paths less
+        that of the straight line to the same point.
+
+        Raises:
+            InputError: A reception whose fields add, or with edges.
+        """
+        if reception.bandwidth is not None or reception.edges:
+            raise InputError(
+                "expected a reception with bandwidth None and edges 0 for cells, got bandwidth "
+                f"{reception.bandwidth} and edges {reception.edges}; cells are means of powers: "
+                "use Points for fields and diffraction"
+            )
+        numbers = np.random.default_rng(np.random.SeedSequence([seed, 1]))
+        points = self.drawn(numbers)
+
+        def measure(paths: RayPaths, tx: Tensor, rx: Tensor) -> Tensor:
+            power = path_powers(paths, sensor.terminals, reception.receivers)
+            excess = paths.delay - (rx[paths.rx] - tx[paths.tx]).norm(dim=1) / SPEED_OF_LIGHT
+            return torch.stack([power, power * excess, power * excess**2], 1)
+
+        lit = trace_coverage(
+            scene,
+            sensor.positions,
+            self.surface(),
+            points.flatten(0, 1),
+            reception.frequency,
+            measure,
+            3,
+            depth=reception.depth,
+            rays=reception.rays,
+            boundary_samples=self.sampling.edge_points if self.sampling.boundary else 0,
+            seed=seed,
+        )
+        mean = lit.amount.unflatten(1, points.shape[:2]).mean(2)
+        for part in lit.crossings:
+            cell = self.cell_of(part.place, part.face)
+            row = part.tx * mean.shape[1] + cell
+            density = part.amount / self.areas[cell, None]
+            mean = mean.flatten(0, 1).index_add(0, row, density).view(mean.shape)
+        power, first, second = mean.unbind(2)
+        safe = torch.where(power > 0, power, 1.0)
+        spread = root(second / safe - (first / safe) ** 2)
+        shape = (len(mean), *self.shape)
+        return Received(power.reshape(shape), spread.reshape(shape))
+
+
+@dataclass(frozen=True, eq=False)
+class MapPlane(Cells):
+    """Equal cells of a parallelogram.
+
+    Attributes:
+        corner: [m].
+        first, second: Sides, from the corner on [m].
+        count: Cells along them.
+        sampling: How many points.
+
+    Raises:
+        InputError: Wrong shapes, NaN, sides without an area between them, or no cell.
+    """
+
+    corner: Float64[Tensor, "3"]
+    first: Float64[Tensor, "3"]
+    second: Float64[Tensor, "3"]
+    count: tuple[int, int]
+    sampling: CellSampling = CellSampling()
+
+    def __post_init__(self) -> None:
+        for name in ("corner", "first", "second"):
+            value = checked_tensor(
+                getattr(self, name), (3,), f"{name} of a map [m]", "give x, y, z"
+            )
+            object.__setattr__(self, name, plain(value))
+        if not float(self._normal.norm()) > 0:
+            raise InputError(
+                "expected sides of a map that span an area, got parallel ones or none; give two "
+                "directions"
+            )
+        if len(self.count) != 2 or any(not isinstance(n, int) or n < 1 for n in self.count):
+            raise InputError(
+                f"expected two counts of cells >= 1, got {self.count!r}; give one for each side"
+            )
+
+    @classmethod
+    def horizontal(
+        cls,
+        low: ArrayLike,
+        high: ArrayLike,
+        height: float,
+        cell: float,
+        sampling: CellSampling = CellSampling(),
+    ) -> "MapPlane":
+        """Cells over x and y at one height z.
+
+        Args:
+            low: Least x and y [m].
+            high: Greatest x and y [m].
+            height: z [m].
+            cell: Length of a cell's sides; the nearest that divides the sides of the map [m].
+            sampling: How many points.
+
+        Raises:
+            InputError: Wrong shapes or numbers, or a map without an area.
+        """
+        do = "give x and y"
+        ends = [
+            checked_tensor(v, (2,), f"{n} of a map [m]", do)
+            for n, v in (("low", low), ("high", high))
+        ]
+        z = checked_number(height, "height of a map [m]", -math.inf)
+        size = checked_number(cell, "size of cells [m]", 0.0, open_low=True)
+        x, y = (ends[1] - ends[0]).tolist()
+        if not (x > 0 and y > 0):
+            raise InputError("expected high beyond low in x and y; exchange them")
+        count = max(1, round(x / size)), max(1, round(y / size))
+        corner = torch.cat([ends[0], torch.tensor([z], dtype=torch.float64)])
+        sides = torch.tensor([[x, 0.0, 0.0], [0.0, y, 0.0]], dtype=torch.float64)
+        return cls(corner, sides[0], sides[1], count, sampling)
+
+    def sampled(self, sampling: CellSampling) -> "MapPlane":
+        """The same cells with other numbers of points. See ``Cells.sampled``."""
+        return replace(self, sampling=sampling)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Cells along the first and the second side."""
+        return self.count
+
+    @property
+    def centres(self) -> Float64[Tensor, "first second 3"]:
+        """Middles of the cells [m]."""
+        at = [(torch.arange(n, dtype=torch.float64) + 0.5) / n for n in self.count]
+        return self._at(at[0][:, None], at[1][None])
+
+    @property
+    def areas(self) -> Float64[Tensor, " cell"]:
+        """Of the cells [m²]."""
+        cells = self.count[0] * self.count[1]
+        return (self._normal.norm() / cells).expand(cells)
+
+    def surface(self) -> Mesh:
+        """Two triangles. See ``Cells.surface``."""
+        a, u, v = self.corner, self.first, self.second
+        return Mesh(torch.stack([a, a + u, a + u + v, a + v]), _HALVES)
+
+    def drawn(self, numbers: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
+        """One point at random in each square of a finer grid. See ``Cells.drawn``."""
+        side = self.sampling.side
+        lattice = [side * n for n in self.count]
+        jitter = torch.from_numpy(numbers.random((2, *lattice)))
+        s = (torch.arange(lattice[0])[:, None] + jitter[0]) / lattice[0]
+        t = (torch.arange(lattice[1]) + jitter[1]) / lattice[1]
+        points = self._at(s, t).view(self.count[0], side, self.count[1], side, 3)
+        return points.transpose(1, 2).reshape(-1, side * side, 3)
+
+    def cell_of(
+        self, place: Float64[Tensor, "row 3"], face: Int64[Tensor, " row"]
+    ) -> Int64[Tensor, " row"]:
+        """Cells that hold points of the plane. See ``Cells.cell_of``."""
+        offset, n = place - self.corner, self._normal
+        n = n / n.square().sum()
+        i = (torch.linalg.cross(offset, self.second.expand_as(offset)) @ n * self.count[0]).floor()
+        j = (torch.linalg.cross(self.first.expand_as(offset), offset) @ n * self.count[1]).floor()
+        i = i.long().clamp(0, self.count[0] - 1)
+        return i * self.count[1] + j.long().clamp(0, self.count[1] - 1)
+
+    @property
+    def _normal(self) -> Tensor:
+        return torch.linalg.cross(self.first, self.second)
+
+    def _at(self, s: Tensor, t: Tensor) -> Tensor:
+        return self.corner + s[..., None] * self.first + t[..., None] * self.second
+
+
+_HALVES = torch.tensor([[0, 1, 2], [0, 2, 3]])
+
+
+@dataclass(frozen=True, eq=False)
+class MapMesh(Cells):
+    """The triangles of a mesh, each a cell.
+
+    Attributes:
+        mesh: In the world [m]. Where it covers a surface of the scene, keep some millimetres off.
+        sampling: How many points.
+
+    Raises:
+        InputError: A triangle without area.
+    """
+
+    mesh: Mesh
+    sampling: CellSampling = CellSampling()
+
+    def __post_init__(self) -> None:
+        mesh = replace(self.mesh, vertices=plain(self.mesh.vertices))
+        object.__setattr__(self, "mesh", mesh)
+        if not bool((self.areas > 0).all()):
+            raise InputError(
+                "expected triangles with an area for the cells of a map, got one without; remove it"
+            )
+
+    def sampled(self, sampling: CellSampling) -> "MapMesh":
+        """The same cells with other numbers of points. See ``Cells.sampled``."""
+        return replace(self, sampling=sampling)
+
+    @property
+    def shape(self) -> tuple[int]:
+        """(number of triangles,)."""
+        return (len(self.mesh.faces),)
+
+    @property
+    def areas(self) -> Float64[Tensor, " cell"]:
+        """Of the cells [m²]."""
+        a, b, c = self.mesh.vertices[self.mesh.faces].unbind(1)
+        return torch.linalg.cross(b - a, c - a).norm(dim=1) / 2
+
+    def surface(self) -> Mesh:
+        """The mesh. See ``Cells.surface``."""
+        return self.mesh
+
+    def drawn(self, numbers: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
+        """One point at random in each of equal parts of the triangles. See ``Cells.drawn``."""
+        side, cells = self.sampling.side, len(self.mesh.faces)
+        jitter = torch.from_numpy(numbers.random((2, cells, side, side)))
+        steps = torch.arange(side, dtype=torch.float64)
+        # A square, of which the root of one side makes a triangle of even density.
+        far = ((steps[:, None] + jitter[0]) / side).sqrt().flatten(1)[..., None]
+        across = ((steps + jitter[1]) / side).flatten(1)[..., None]
+        a, b, c = (corner[:, None] for corner in self.mesh.vertices[self.mesh.faces].unbind(1))
+        return a + far * (b - a + across * (c - b))
+
+    def cell_of(
+        self, place: Float64[Tensor, "row 3"], face: Int64[Tensor, " row"]
+    ) -> Int64[Tensor, " row"]:
+        """The triangles. See ``Cells.cell_of``."""
+        return face
