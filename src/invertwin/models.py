@@ -28,6 +28,7 @@ from invertwin.channel import (
     trace_power,
 )
 from invertwin.errors import InputError
+from invertwin.links.metasurface import Metasurface, panel_response
 from invertwin.links.places import Places
 from invertwin.links.received import Received, Reception
 from invertwin.links.transmitters import Transmitters
@@ -584,6 +585,41 @@ class SignatureMap(ForwardModel):
 
     def ablations(self) -> dict[str, ForwardModel]:
         """The model at fixed visibility. See ``ForwardModel.ablations``."""
+        return {"boundary": replace(self, boundary=False)} if self.boundary else {}
+
+
+@dataclass(frozen=True, eq=False)
+class PanelMap(ForwardModel):
+    """The path gain of receivers over a metasurface alone; the sensor is the metasurface.
+
+    Attributes:
+        tx: The transmitter [m].
+        receivers: [rx, 3] [m].
+        frequency: [Hz].
+        boundary: False leaves out of derivatives that shadows move over the panel.
+    """
+
+    tx: Float64[Tensor, "3"]
+    receivers: Float64[Tensor, "rx 3"]
+    frequency: float
+    boundary: bool = True
+
+    redraws: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+
+    def predict(self, scene: Scene, sensor: Metasurface, seed: int) -> Float64[Tensor, "1 rx"]:
+        """|Σ|² of the elements. See ``panel_response``."""
+        found = panel_response(
+            scene, sensor, self.tx[None], self.receivers, self.frequency, boundary=self.boundary
+        )
+        return found.real.square() + found.imag.square()
+
+    def observe(self, recording: Tensor) -> Float64[Tensor, "1 rx"]:
+        """Measured path gains, over the panel alone."""
+        return recording.reshape(1, -1)
+
+    def ablations(self) -> dict[str, ForwardModel]:
+        """The model at fixed shadows. See ``ForwardModel.ablations``."""
         return {"boundary": replace(self, boundary=False)} if self.boundary else {}
 
 

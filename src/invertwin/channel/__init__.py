@@ -4,6 +4,8 @@ from invertwin.channel.field.chains import trace_chains as trace_chains
 from invertwin.channel.field.coverage import trace_coverage as trace_coverage
 from invertwin.channel.field.echoes import trace_echoes as trace_echoes
 from invertwin.channel.field.field import trace_field as trace_field
+from invertwin.channel.field.lit import Cells as Cells
+from invertwin.channel.field.lit import lit_fractions as lit_fractions
 from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle
 from invertwin.channel.field.speckle import draw_speckle as draw_speckle
@@ -16,6 +18,7 @@ from invertwin.channel.paths import Pattern as Pattern
 from invertwin.channel.power.clouds import deposit_density as deposit_density
 from invertwin.channel.power.deposit import deposit_power as deposit_power
 from invertwin.channel.ray_paths import KINDS as KINDS
+from invertwin.channel.ray_paths import METASURFACE as METASURFACE
 from invertwin.channel.ray_paths import RayPaths as RayPaths
 from invertwin.channel.rays.backend import alone as alone
 from invertwin.channel.rays.backend import backend as backend

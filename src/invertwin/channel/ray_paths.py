@@ -9,9 +9,9 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 
-KINDS = ("", "reflection", "transmission", "diffraction")
+KINDS = ("", "reflection", "transmission", "diffraction", "metasurface")
 """What happens where a path meets a surface or an edge, by its number in ``RayPaths.kinds``."""
-REFLECTION, TRANSMISSION, DIFFRACTION = 1, 2, 3
+REFLECTION, TRANSMISSION, DIFFRACTION, METASURFACE = 1, 2, 3, 4
 
 
 @dataclass(frozen=True, eq=False)

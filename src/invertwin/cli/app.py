@@ -174,7 +174,8 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
 def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
     if run.map is not None:
         return ("gradcheck", "map", "transmitter")
-    return ("gradcheck",) if run.rcs is not None else ("gradcheck", "radar", "grid")
+    alone = run.rcs is not None or run.placement is not None
+    return ("gradcheck",) if alone else ("gradcheck", "radar", "grid")
 
 
 @app.command()
@@ -252,10 +253,7 @@ def _each(
 
 
 def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
-    def sections(run: Any) -> Sequence[str]:
-        return ("reconstruct", "data", "grid" if run.map is None else "transmitter", "parameters")
-
-    runs = load_runs([file], options, "reconstruct", sections)
+    runs = load_runs([file], options, "reconstruct", _needs_of_reconstruct)
     with run_folder(options, default, runs) as folder:
         if folder.complete:
             return
@@ -265,6 +263,12 @@ def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
             tables, outcome = run_reconstruct(runs[file.stem], folder, console)
         print_tables(tables)
         console.print(outcome, markup=False, soft_wrap=True)
+
+
+def _needs_of_reconstruct(run: Any) -> tuple[str, ...]:
+    if run.placement is not None:
+        return ()
+    return ("reconstruct", "data", "grid" if run.map is None else "transmitter", "parameters")
 
 
 def _demo_file() -> Path:

@@ -14,7 +14,9 @@ from invertwin.cli.sensors import grid as grid
 from invertwin.cli.sensors import radar as radar
 from invertwin.cli.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
+from invertwin.inversion.placement import Placing
 from invertwin.inversion.tangents import Change, changes_of
+from invertwin.links.placement import PlacedPanel
 from invertwin.registry.kinds import Table
 from invertwin.scene import Mesh, Object, Scene, SkinnedBody, joined
 from invertwin.scene.files import CONCRETE, load_scene_xml
@@ -148,16 +150,38 @@ def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, Change]]:
         sensor = need(run, "transmitter", "a transmitter that moves").build()
         module: nn.Module = table.parameter.build(None, initial=sensor.positions[0])
     else:
-        module = _module(table.parameter, "gradcheck.parameter", run.scene, scene)
+        own, panel = run.scene, _panel(run, scene)
+        module = _module(table.parameter, "gradcheck.parameter", own, scene, panel)
     changes = {n: c.build() if isinstance(c, Table) else c for n, c in table.tangent.items()}
     with about("gradcheck.tangent"):
         changes_of(module, changes)
     return module, changes
 
 
-def _module(table: Any, path: str, objects: Mapping[str, ObjectTable], scene: Scene) -> nn.Module:
+def placing(run: RunFile, scene: Scene) -> tuple[Placing, PlacedPanel]:
+    """The metasurface of `[placement]`, and where a gradient check has it.
+
+    Raises:
+        InputError: What the library refuses, by its key.
+    """
+    table = need(run, "placement", "a metasurface")
+    found = table.placing(table.coverage(scene, run.seed))
+    return found, table.example(found)
+
+
+def _panel(run: RunFile, scene: Scene) -> dict[type, object]:
+    return {} if run.placement is None else {PlacedPanel: placing(run, scene)[1]}
+
+
+def _module(
+    table: Any,
+    path: str,
+    objects: Mapping[str, ObjectTable],
+    scene: Scene,
+    more: Mapping[type, object] | None = None,
+) -> nn.Module:
     name = getattr(table, "object", None)
-    given: dict[type, object] = {Scene: scene}
+    given: dict[type, object] = {Scene: scene, **(more or {})}
     if name is not None:
         given = given_for(name, scene, objects)
     with about(path):

@@ -40,6 +40,8 @@ def run_check(run: RunFile) -> tuple[list[Table], str]:
             "map: expected a run of a radar to estimate, got a radio map, whose memory is bounded; "
             "run it"
         )
+    if run.placement is not None:
+        return _of_placement(run)
     truth, sensors = build.true_scene(run), _sensors(run)
     build.parameters(
         [table for table in run.parameters if not isinstance(table, Mover)],
@@ -60,6 +62,42 @@ def _tables(found: Estimate, scene: Scene, seconds: float, work: str) -> tuple[l
         f"{time_left(seconds)} for {work}"
     )
     return [Table("Estimate", heads, rows, texts("notes")["estimate"]), _meshes(scene)], line
+
+
+def _of_placement(run: RunFile) -> tuple[list[Table], str]:
+    """The same of `[placement]`: its time is that of one evaluation, and of one derivative."""
+    placing, module = build.placing(run, build.scene(run))
+    table = need(run, "placement", run.task)
+    settings = table.descent.build()
+    once = _timed(lambda: placing.level(module))
+    step = _timed(lambda: placing.descend(module, 1, settings, width=0.0))
+    steps = settings.tracks * settings.track_steps + settings.steps
+    grid = table.grid.places * table.grid.yaws * len(table.grid.spread_deg) ** 2
+    levels = grid + 2 * table.starts * settings.scouts
+    annealed = min(table.starts, table.annealed_starts)
+    levels += annealed * table.annealing * settings.evaluations
+    descents = (2 * table.starts + 1) * steps
+    count = table.panel.counts[0] * table.panel.counts[1]
+    rows = [
+        ["receivers", table.receivers.count + table.receivers.scored, "placement.receivers"],
+        ["elements", count, "placement.panel.counts"],
+        ["evaluations", levels, "placement.annealing, placement.grid"],
+        ["derivatives", descents, "placement.descent"],
+    ]
+    seconds = levels * once + descents * step
+    if run.task == "gradcheck":
+        seconds = 10 * once
+    line = f"about {time_left(seconds)} for {levels} evaluations and {descents} derivatives"
+    heads = ("needs", "how many", "key")
+    return [Table("Estimate", heads, rows), _meshes(build.scene(run))], line
+
+
+def _timed(work: Callable[[], object]) -> float:
+    """Seconds of some work, once it has been compiled."""
+    work()
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
 
 
 def _of_signature(run: RunFile) -> tuple[list[Table], str]:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -22,8 +23,8 @@ from invertwin.cli.schema.signature import swept
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
-from invertwin.links import MapPlane, Transmitters
-from invertwin.models import ForwardModel, SignatureMap, SurrogateMap
+from invertwin.links import MapPlane
+from invertwin.models import ForwardModel, PanelMap, SignatureMap, SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene
@@ -132,14 +133,9 @@ class _Seen:
     """What is differentiated."""
 
     model: ForwardModel
+    sensor: Any
     device: tuple[Radar, Grid] | None
     draw: Callable[[GradientReport], Figure]
-    transmitters: Transmitters | None = None
-
-    @property
-    def sensor(self) -> Radar | Transmitters | None:
-        """What sees the scene."""
-        return self.device[0] if self.device else self.transmitters
 
 
 def _signature(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
@@ -164,7 +160,7 @@ def _signature(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
             curves = {name: values[:, 0] for name, values in curves.items()}
         return plotting.slopes(curves, *places, f"∂σ, σ in m² [{_unit(settings)}]")
 
-    return _Seen(SignatureMap(signature), None, draw)
+    return _Seen(SignatureMap(signature), None, None, draw)
 
 
 def _radio_map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
@@ -190,7 +186,7 @@ def _radio_map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
             derivative_label=f"∂ gain [peaks, {_unit(settings)}]",
         )
 
-    return _Seen(model, None, draw, sensor)
+    return _Seen(model, sensor, None, draw)
 
 
 def _map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
@@ -205,7 +201,23 @@ def _map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
     require_room(run, scene, {"": Sensor(run, radar, grid)})
     drawn = {key: getattr(settings, key) for key in ("depth", "samples", "boundary_samples")}
     model = SurrogateMap(grid, build.made(run, "surrogate"), Sampling(**drawn))
-    return _Seen(model, (radar, grid), lambda report: _maps(report, grid, settings))
+    return _Seen(model, radar, (radar, grid), lambda report: _maps(report, grid, settings))
+
+
+def _panel(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+    """What the metasurface of `[placement]` brings to receivers."""
+    placing, module = build.placing(run, scene)
+    aim = placing.coverage
+    with torch.no_grad():
+        panel = placing.panel if settings.parameter.kind == "panel" else module(placing.panel)
+
+    def draw(report: GradientReport) -> Figure:
+        order = report.difference[0].argsort()
+        curves = {n: values[0, order] for n, values in _derivatives(report).items()}
+        number = torch.arange(len(order), dtype=torch.float64)
+        return plotting.slopes(curves, number, "receiver", f"∂ path gain [{_unit(settings)}]")
+
+    return _Seen(PanelMap(aim.tx, aim.receivers, aim.frequency), panel, None, draw)
 
 
 def _check(
@@ -214,12 +226,11 @@ def _check(
     begin = time.perf_counter()
     settings = need(run, "gradcheck", "gradcheck")
     scene = build.scene(run)
-    kind = _map if run.rcs is None else _signature
-    seen = (kind if run.map is None else _radio_map)(run, settings, scene)
+    seen = _seen_of(run)(run, settings, scene)
     module, tangent = build.tangent(run, scene)
     for key in _studies(run):
         if seen.device is None:
-            raise InputError(f"{key}: expected [radar] and [grid] with it, got others; remove it")
+            raise InputError(f"{key}: expected [radar] and [grid] with it, got none; remove it")
         if settings.parameter.kind not in _MOVES:
             raise InputError(
                 f"{key}: expected a parameter that moves something, got one of a shape; remove it"
@@ -248,6 +259,15 @@ def _check(
             found[key], figure = study.compare(checked)
             picture(folder, f"{name}_{key}", figure)
     return found | {"seconds": time.perf_counter() - begin}
+
+
+def _seen_of(run: RunFile) -> Callable[[RunFile, Gradcheck, Scene], _Seen]:
+    """What makes a gradient check of the sections that are there."""
+    if run.placement is not None:
+        return _panel
+    if run.map is not None:
+        return _radio_map
+    return _map if run.rcs is None else _signature
 
 
 def _studies(run: RunFile) -> dict[str, GradcheckStudy]:

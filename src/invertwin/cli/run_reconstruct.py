@@ -34,6 +34,7 @@ from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table, finish, picture
+from invertwin.cli.run_placement import run_placement
 from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
@@ -53,6 +54,8 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
         return run_mover(run, folder, console)
     if run.map is not None:
         return run_radio(run, folder, console)
+    if run.placement is not None:
+        return run_placement(run, folder, console)
     begin = time.perf_counter()
     settings_of(run)
     problem, calibration = calibrated(problem_of(run, console), folder, console)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
+from invertwin.links.placement import PlacedPanel
 from invertwin.radar.parameters import RadarPose
 from invertwin.registry.kinds import Group, OneOf, Registry, Table
 from invertwin.registry.section import Counts, InputPath, Vector, about, key
@@ -105,6 +106,22 @@ class Mover(ParameterTable):
     )
 
 
+class PanelParameter(ParameterTable):
+    """The metasurface of `[placement]`, in a gradient check."""
+
+    kind: Literal["panel"]
+
+    def build(self, given: Mapping[type, object] | None = None, /, **more: Any) -> PlacedPanel:
+        """The module of the section."""
+        found = (given or {}).get(PlacedPanel)
+        if not isinstance(found, PlacedPanel):
+            raise InputError(
+                "expected a section [placement] and a gradient check with the metasurface, got "
+                "none; choose another kind"
+            )
+        return found
+
+
 def register(registry: Registry) -> None:
     """Add shapes, and the modules that fit them."""
     registry.groups["shape"] = Group(tag="shape", base=Placement, product=Mesh)
@@ -132,6 +149,7 @@ def register(registry: Registry) -> None:
         ("material", MaterialValues.of, ()),
         ("radar_pose", RadarPose, ("translation", "rotation")),
         ("mover", Mover, ()),
+        ("panel", PanelParameter, ()),
     ):
         registry.add("parameter", name, make, without=without)
 

@@ -9,7 +9,7 @@ At the shadow of an edge the lost path and what the edge diffracts have one dela
 in every band, and the mean has no jump. Powers that add would jump by up to 7 dB.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -19,6 +19,7 @@ from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel import RayPaths, trace_paths
 from invertwin.errors import InputError
+from invertwin.links.metasurface import Metasurface, panel_paths
 from invertwin.links.responses import Terminals, frequency_response, path_amplitudes, phasors
 from invertwin.links.spreads import delay_spread
 from invertwin.links.transmitters import Transmitters
@@ -55,6 +56,7 @@ class Reception:
         edges: Most edges that a path goes round.
         rays: Shot to find sequences of surfaces; None tries all.
         receivers: Antenna and axes of every receiver; of several elements the mean power counts.
+        panels: Metasurfaces, whose paths are added, see ``panel_paths``.
 
     Raises:
         InputError: A number out of range, or edges without a bandwidth.
@@ -66,6 +68,7 @@ class Reception:
     edges: int = 0
     rays: int | None = 100_000
     receivers: Terminals = field(default_factory=Terminals)
+    panels: Sequence[Metasurface] = ()
 
     def __post_init__(self) -> None:
         checked_number(self.frequency, "frequency [Hz]", 0.0, open_low=True)
@@ -89,7 +92,7 @@ class Reception:
             places: Of the receivers [m].
             seed: Of the rays that find them.
         """
-        return trace_paths(
+        found = trace_paths(
             scene,
             sensor.positions,
             places,
@@ -99,6 +102,10 @@ class Reception:
             rays=self.rays,
             seed=seed,
         )
+        if not self.panels:
+            return found
+        over = panel_paths(scene, self.panels, sensor.positions, places, self.frequency)
+        return found + over
 
     def at(
         self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int

@@ -40,12 +40,13 @@ class Gradcheck(Table):
     @property
     def of(self) -> Literal["scene", "sensor"]:
         """What changes with θ."""
-        return "sensor" if self.parameter.kind in ("radar_pose", "transmitter") else "scene"
+        moved = ("radar_pose", "transmitter", "panel")
+        return "sensor" if self.parameter.kind in moved else "scene"
 
     @property
     def turns(self) -> bool:
         """Whether θ is an angle."""
-        return "rotation" in self.tangent or self.parameter.kind == "body"
+        return not {"rotation", "yaw"}.isdisjoint(self.tangent) or self.parameter.kind == "body"
 
     def build(self, given: Any = None, /, **more: Any) -> Check:
         """How sharp the check is."""

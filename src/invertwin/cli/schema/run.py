@@ -23,6 +23,7 @@ from invertwin.cli.schema.fits import (
     Variant,
 )
 from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.schema.placement import Placement
 from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTable
 from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
@@ -163,6 +164,9 @@ class _RunFile(Section):
     calibration: Calibration | None = key("calibration before the fit", None)
     landscape: Landscape | None = key("losses along a line", None)
     gradcheck: AnyGradcheck | None = key("the gradient check", None)
+    placement: Placement | None = key(
+        "a metasurface that is placed; with [gradcheck] what is differentiated", None
+    )
     rcs: AnyRcs | None = key("the radar signature; with [gradcheck] what is differentiated", None)
 
     @model_validator(mode="after")

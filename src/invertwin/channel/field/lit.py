@@ -1,0 +1,299 @@
+"""How much of each cell of a flat panel a place sees: lit fractions, differentiable.
+
+The shadow of a scene on the plane of a panel ends at the projections of silhouette edges. A cell
+that such a line cuts is lit in part: ``clamp(s/w + 1/2, 0, 1)``, with s the distance of its centre
+from the line, positive in the light, and w its width across the line. Rays say which side is lit,
+and are detached; s carries the derivatives by the place, by the panel and by the vertices.
+
+Source: derivations §12.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.field.waves import cross, dot
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.scene import Occluders, visible
+from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.errors import InputError
+from invertwin.scene import Scene
+from invertwin.scene.checks import plain
+
+_PAIRS = 1 << 21  # of edges and places, or of edges and cells, at a time
+_LEVEL = 0.999  # of the way up to the place: edges above it cast no shadow onto the panel
+_ASIDE = 1e-4  # of the way to an edge: how far aside rays pass it
+_SAME_PLANE = 1e-9  # of lengths: an apex in the plane of a place and an edge
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Equal rectangular cells of a flat panel.
+
+    Attributes:
+        center: of the panel [m].
+        axes: columns are the panel's x and y axes and its normal, in the world.
+        offsets: centres of the cells along x and y [m].
+        size: of a cell along x and y [m].
+    """
+
+    center: Float64[Tensor, "3"]
+    axes: Float64[Tensor, "3 3"]
+    offsets: Float64[Tensor, "cell 2"]
+    size: tuple[float, float]
+
+    @property
+    def places(self) -> Float64[Tensor, "cell 3"]:
+        """Centres of the cells in the world [m]."""
+        return self.center + self.offsets @ self.axes[:, :2].T
+
+    @property
+    def radius(self) -> float:
+        """From the centre to the farthest corner [m]."""
+        half = 0.5 * torch.tensor(self.size, dtype=torch.float64)
+        return float((plain(self.offsets).abs() + half).norm(dim=1).max())
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Edges that may end shadows, one row for each place that they may shade.
+
+    Attributes:
+        place: number of the place.
+        ends: numbers of the vertices.
+        apex: a vertex of a triangle beside the edge, on the dark side.
+        share: part of the edge whose shadow is counted, from 0 to 1.
+    """
+
+    place: Int64[Tensor, " row"]
+    ends: Int64[Tensor, "row 2"]
+    apex: Int64[Tensor, " row"]
+    share: Float64[Tensor, "row 2"]
+
+    def rows(self, index: Tensor) -> "_Edges":
+        """Some rows."""
+        return _Edges(*(column[index] for column in vars(self).values()))
+
+
+def lit_fractions(
+    scene: Scene,
+    places: Float64[Tensor, "place 3"],
+    cells: Cells,
+    *,
+    width: float = 0.0,
+    boundary: bool = True,
+) -> Float64[Tensor, "place cell"]:
+    """The fraction of each cell that a place sees, in front of the panel.
+
+    All surfaces of the scene block, sheets too. Fractions of cells that a single straight line cuts
+    along the panel's axes are exact.
+
+    Args:
+        scene: what is in the way; the panel is no part of it.
+        places: [m].
+        cells: of the panel.
+        width: added to the width over which shadows end [m]; 0 = that of a cell.
+        boundary: False leaves out of derivatives that shadows move.
+
+    Raises:
+        InputError: a cloud among the objects.
+    """
+    clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
+    if clouds:
+        raise InputError(
+            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
+        )
+    items = list(scene.objects.values())
+    topology = topology_of([item.mesh for item in items])
+    vertices = torch.cat([item.vertices for item in items])
+    with tracing():
+        rays = Occluders(plain(vertices), topology, plain(cells.center))
+        still = Cells(plain(cells.center), plain(cells.axes), plain(cells.offsets), cells.size)
+        spots = plain(places)
+        edges = _candidates(plain(vertices), topology, spots, still, still.radius + width)
+        edges = _seen(rays, plain(vertices), spots, still, edges)
+        lit = _lit(rays, spots, still, edges, plain(vertices))
+        row, cell = _cut(edges, lit, (plain(vertices), spots, still), width)
+    found = lit.to(torch.float64)
+    if not len(row):
+        return found
+    moved = (vertices, places, cells) if boundary else (plain(vertices), spots, still)
+    edges = edges.rows(row)
+    offsets = moved[2].offsets[cell]
+    distance, across = _distances(_shadows(edges, *moved), offsets)
+    span = torch.tensor(cells.size, dtype=torch.float64)
+    share = distance / ((across.abs() * span).sum(-1) + width) + 0.5
+    return found.index_put((edges.place, cell), share.clamp(0.0, 1.0))
+
+
+def _candidates(
+    vertices: Tensor, topology: Topology, places: Tensor, cells: Cells, reach: float
+) -> _Edges:
+    """Silhouette edges whose shadows end within reach of the panel's centre."""
+    normal = cells.axes[:, 2]
+    found: list[_Edges] = []
+    count = len(topology.edges)
+    for some in torch.arange(len(places)).split(max(1, _PAIRS // max(1, count))):
+        start, end = vertices[topology.edges].unbind(1)
+        spot = places[some, None]
+        plane = cross(start - spot, (end - start).expand(len(some), -1, -1))
+        sides = []
+        for apex in topology.opposite.T:
+            offset = vertices[apex.clamp_min(0)] - start
+            side = dot(plane, offset.expand_as(plane))
+            near = side.abs() <= _SAME_PLANE * plane.norm(dim=-1) * offset.norm(dim=-1)
+            side = torch.where(near | (apex < 0), 0.0, side.sign())
+            sides.append(side)
+        table = torch.stack(sides)
+        silhouette = (table.sum(0).abs() == table.abs().sum(0)) & (table.abs().sum(0) > 0)
+        # Which part of the edge lies between the panel's plane and the place.
+        height = (spot - cells.center) @ normal
+        rise = torch.stack([(end_ - cells.center) @ normal for end_ in (start, end)])
+        level = rise[:, None] / torch.where(height > 0, height, torch.inf)[None]
+        first, slope = level[0], level[1] - level[0]
+        safe = torch.where(slope == 0, 1.0, slope)
+        bounds = torch.stack([-first / safe, (_LEVEL - first) / safe])
+        inside = (first >= 0) & (first <= _LEVEL)
+        low = torch.where(slope == 0, torch.where(inside, 0.0, 1.0), bounds.amin(0)).clamp_min(0)
+        high = torch.where(slope == 0, torch.where(inside, 1.0, 0.0), bounds.amax(0)).clamp_max(1)
+        place, edge = torch.nonzero(silhouette & (height > 0) & (low < high)).T
+        chosen = table.abs()[:, place, edge].argmax(0)
+        share = torch.stack([low[place, edge], high[place, edge]], 1)
+        apex = topology.opposite[edge, chosen]
+        found.append(_Edges(some[place], topology.edges[edge], apex, share))
+    edges = _Edges(*(torch.cat(c) for c in zip(*(vars(f).values() for f in found), strict=True)))
+    none = torch.zeros(len(edges.place), 2, dtype=torch.float64)
+    distance, _ = _distances(_shadows(edges, vertices, places, cells), none)
+    return edges.rows(torch.nonzero(distance.abs() <= reach)[:, 0])
+
+
+def _shadows(
+    edges: _Edges, vertices: Tensor, places: Tensor, cells: Cells
+) -> Float64[Tensor, "row 3 2"]:
+    """Projections of both ends and of the apex's side onto the panel's plane, along its axes [m].
+
+    The last one is a point beside the line on the dark side: the apex may have no projection.
+    """
+    spot = places[edges.place]
+    ends = vertices[edges.ends]
+    side = ends[:, 1] - ends[:, 0]
+    points = ends[:, :1] + edges.share[:, :, None] * side[:, None]
+    way = _ways(edges, vertices, places, cells)
+    cast = spot[:, None] + (points - spot[:, None]) / way[..., None]
+    flat = (cast - cells.center) @ cells.axes[:, :2]
+    # The plane of place and edge cuts the panel's plane in the line; its normal tells the side.
+    plane = cross(points[:, 0] - spot, points[:, 1] - spot)
+    dark = dot(plane, vertices[edges.apex] - ends[:, 0]).detach().sign()
+    toward = dark[:, None] * (plane @ cells.axes[:, :2])
+    return torch.cat([flat, (flat[:, 0] + toward)[:, None]], 1)
+
+
+def _ways(
+    edges: _Edges, vertices: Tensor, places: Tensor, cells: Cells
+) -> Float64[Tensor, "row 2"]:
+    """Where ends of edges lie on the way from their places to the panel's plane: 0 to 1."""
+    normal = cells.axes[:, 2]
+    height = (places[edges.place] - cells.center) @ normal
+    ends = ((vertices[edges.ends] - cells.center) @ normal) / height[:, None]
+    return 1 - (ends[:, :1] + edges.share * (ends[:, 1:] - ends[:, :1]))
+
+
+def _distances(
+    shadows: Float64[Tensor, "row 3 2"], at: Float64[Tensor, "row 2"]
+) -> tuple[Float64[Tensor, " row"], Float64[Tensor, "row 2"]]:
+    """How far points are from the ends of shadows, positive in the light, and unit normals.
+
+    Args:
+        shadows: from ``_shadows``.
+        at: a point each, in the panel's plane [m].
+    """
+    start, end, dark = shadows.unbind(1)
+    side = end - start
+    length = side.norm(dim=1).clamp_min(1e-300)
+    across = torch.stack([side[:, 1], -side[:, 0]], 1) / length[:, None]
+    across = across * -((dark - start) * across).sum(1).detach().sign()[:, None]
+    offset = at - start
+    aside = (offset * across).sum(1)
+    along = (offset * side).sum(1) / length
+    beyond = along - along.clamp_min(0).minimum(length)
+    past = beyond.detach() != 0
+    # Past the end of an edge its shadow is a corner.
+    far = torch.where(past, aside.square() + beyond.square(), 1.0).sqrt()
+    sign = torch.where(aside.detach() < 0, -1.0, 1.0)
+    return torch.where(past, sign * far, aside), across
+
+
+def _seen(rays: Occluders, vertices: Tensor, places: Tensor, cells: Cells, edges: _Edges) -> _Edges:
+    """Edges that nothing hides from their places, where their shadows are nearest to the panel.
+
+    On the panel itself nothing else may shade the lit side of the line.
+    """
+    if not len(edges.place):
+        return edges
+    shadows = _shadows(edges, vertices, places, cells)
+    start, end, _ = shadows.unbind(1)
+    side = end - start
+    along = (-(start * side).sum(1) / side.square().sum(1).clamp_min(1e-300)).clamp(0, 1)
+    nearest = start + along[:, None] * side
+    _, across = _distances(shadows, nearest)
+    spot = places[edges.place]
+    foot = cells.center + nearest @ cells.axes[:, :2].T
+    step = _ASIDE * (foot - spot).norm(dim=1, keepdim=True) * (across @ cells.axes[:, :2].T)
+    # Where the edge lies on the way from the place to its shadow.
+    first, last = _ways(edges, vertices, places, cells).unbind(1)
+    until = 1 / ((1 - along) / first + along / last)
+    until = torch.where(nearest.norm(dim=1) <= cells.radius, 1.0, until)
+    free = visible(rays, spot, spot + until[:, None] * (foot + step - spot))
+    return edges.rows(torch.nonzero(free)[:, 0])
+
+
+def _lit(
+    rays: Occluders, places: Tensor, cells: Cells, edges: _Edges, vertices: Tensor
+) -> Bool[Tensor, "place cell"]:
+    """Whether places see the centres of cells: all are tried where a shadow may end among them."""
+    none = torch.zeros(len(edges.place), 2, dtype=torch.float64)
+    distance, _ = _distances(_shadows(edges, vertices, places, cells), none)
+    mixed = torch.zeros(len(places), dtype=torch.bool)
+    mixed[edges.place[distance.abs() <= cells.radius]] = True
+    middle = visible(rays, places, cells.center.expand_as(places))
+    found = middle[:, None].expand(-1, len(cells.offsets)).clone()
+    rows = torch.nonzero(mixed)[:, 0]
+    if len(rows):
+        count = len(cells.offsets)
+        start = places[rows].repeat_interleave(count, 0)
+        found[rows] = visible(rays, start, cells.places.repeat(len(rows), 1)).view(-1, count)
+    return found
+
+
+def _cut(
+    edges: _Edges, lit: Tensor, at: tuple[Tensor, Tensor, Cells], width: float
+) -> tuple[Int64[Tensor, " cut"], Int64[Tensor, " cut"]]:
+    """Which cells the end of a shadow cuts: rows of edges, and cells.
+
+    Of several lines the nearest counts that has the cell's centre on the side that rays find.
+    """
+    cells, count = at[2], lit.shape[1]
+    span = torch.tensor(cells.size, dtype=torch.float64)
+    best = torch.full_like(lit, torch.inf, dtype=torch.float64).ravel()
+    held: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+    for some in torch.arange(len(edges.place)).split(max(1, _PAIRS // count)):
+        own = edges.rows(some)
+        shadows = _shadows(own, *at).repeat_interleave(count, 0)
+        distance, across = _distances(shadows, cells.offsets.repeat(len(some), 1))
+        reach = 0.5 * ((across.abs() * span).sum(1) + width)
+        where = (own.place[:, None] * count + torch.arange(count)).ravel()
+        agrees = (distance >= 0) == lit.ravel()[where]
+        near = torch.nonzero(agrees & (distance.abs() < reach))[:, 0]
+        held.append((some[near // count], near % count, where[near], distance[near].abs()))
+    if not held:
+        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+    row, cell, where, far = (torch.cat(column) for column in zip(*held, strict=True))
+    best = best.scatter_reduce(0, where, far, "amin")
+    nearest = torch.nonzero(far <= best[where])[:, 0]
+    # Of lines that are as near as each other, the first.
+    order = nearest[where[nearest].argsort(stable=True)]
+    first = torch.ones(len(order), dtype=torch.bool)
+    first[1:] = where[order][1:] != where[order][:-1]
+    return row[order[first]], cell[order[first]]

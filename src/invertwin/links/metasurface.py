@@ -1,0 +1,307 @@
+"""Metasurfaces: panels of many small elements, each of which turns the phase of what it scatters.
+
+The field from antenna to antenna over a panel is the sum over its elements,
+``(λ/4π)(−j) Σ (d²/λ) ½(cosθ_t + cosθ_r)/(r₁r₂) V_t V_r A e^{−jk(r₁+r₂) + jφ}``, near the panel as
+well as far from it. V is the part of an element's cell that an antenna sees.
+
+Source: derivations §12.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+from torch.nn.functional import normalize
+from torch.utils.checkpoint import checkpoint
+
+from invertwin.channel import METASURFACE, Cells, Pattern, RayPaths, lit_fractions, polarisations
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.scene import Scene
+from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
+
+_VALUES_AT_ONCE = 1 << 22  # of antennas and elements
+_UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
+_MOST_BITS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Metasurface:
+    """A flat panel of equal elements in rows and columns, which scatters in front of it.
+
+    It is no object of the scene: it blocks nothing, and what lies behind it mirrors as without it.
+
+    Attributes:
+        position: Of its centre [m].
+        axes: Columns are its x and y axes and its normal, in the world.
+        phase: Of the elements along x and y [rad]; 0 = those of a mirror that turns the field over.
+        spacing: Of the elements, along x and y alike [m]; a cell is as large. Half a wavelength
+            and less sum up to the integral over a plate.
+        amplitude: Of the elements, one or one for each; 1 = all that falls on a cell is scattered.
+        bits: Phases are rounded to 2^bits values; derivatives pass straight through. None does not
+            round.
+        pattern: Of an element, about its normal. None is that of an aperture, ½(cosθ_t + cosθ_r),
+            which ends at once behind the panel's plane.
+
+    Raises:
+        InputError: Wrong shapes, axes that are not orthonormal, or a number out of range.
+    """
+
+    position: Float64[Tensor, "3"]
+    axes: Float64[Tensor, "3 3"]
+    phase: Float64[Tensor, "x y"]
+    spacing: float
+    amplitude: float | Float64[Tensor, "_ _"] = 1.0
+    bits: int | None = None
+    pattern: Pattern | None = None
+
+    def __post_init__(self) -> None:
+        what = "of a metasurface"
+        place = checked_tensor(self.position, (3,), f"position {what} [m]", "give x, y, z")
+        axes = checked_tensor(self.axes, (3, 3), f"axes {what}", "give them as columns")
+        still = axes.detach()
+        if float((still.mT @ still - torch.eye(3, dtype=torch.float64)).abs().max()) > 1e-5:
+            raise InputError(
+                f"expected axes {what} with orthonormal columns; give x, y and the normal"
+            )
+        do = "give one for each element, along x and y"
+        phase = checked_tensor(self.phase, (None, None), f"phases {what} [rad]", do)
+        if not phase.numel():
+            raise InputError(f"expected at least one element {what}, got none; {do}")
+        amplitude = checked_tensor(
+            torch.as_tensor(self.amplitude, dtype=torch.float64).expand(phase.shape)
+            if torch.as_tensor(self.amplitude).ndim == 0
+            else self.amplitude,
+            tuple(phase.shape),
+            f"amplitudes {what}",
+            "give one, or one for each",
+        )
+        if bool((amplitude.detach() < 0).any()):
+            raise InputError(f"expected amplitudes {what} of at least 0, got less; turn the phase")
+        checked_number(self.spacing, f"spacing {what} [m]", 0.0, open_low=True)
+        if self.bits is not None and checked_count(self.bits, f"bits {what}", 1) > _MOST_BITS:
+            raise InputError(
+                f"expected at most {_MOST_BITS} bits {what}, got {self.bits}; use None"
+            )
+        found = {"position": place, "axes": axes, "phase": phase, "amplitude": amplitude}
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def cells(self) -> Cells:
+        """The cells of the elements; x runs slowest."""
+        offsets = [
+            (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * self.spacing
+            for count in self.phase.shape
+        ]
+        grid = torch.stack(torch.meshgrid(*offsets, indexing="ij"), -1).reshape(-1, 2)
+        return Cells(self.position, self.axes, grid, (self.spacing, self.spacing))
+
+    @property
+    def response(self) -> Complex128[Tensor, " element"]:
+        """What every element multiplies the field with, after rounding of its phase."""
+        phase = self.phase.ravel()
+        if self.bits is not None:
+            step = 2 * math.pi / 2**self.bits
+            phase = phase + ((phase / step).round() * step - phase).detach()
+        assert isinstance(self.amplitude, Tensor)
+        return torch.polar(self.amplitude.ravel(), phase)
+
+    def focused(self, tx: ArrayLike, target: ArrayLike, frequency: float) -> "Metasurface":
+        """The panel with phases that focus a transmitter on a point, added to its own.
+
+        Args:
+            tx: Place of the transmitter [m].
+            target: The point [m].
+            frequency: [Hz].
+        """
+        do = "give x, y, z"
+        ends = [checked_tensor(p, (3,), "ends of a focus [m]", do) for p in (tx, target)]
+        elements = self.cells.places
+        length = (elements[:, None] - torch.stack(ends)).norm(dim=2).sum(1)
+        turn = 2 * math.pi * frequency / SPEED_OF_LIGHT * length
+        return replace(self, phase=self.phase + turn.view(self.phase.shape))
+
+
+def panel_response(
+    scene: Scene,
+    panel: Metasurface,
+    tx: Float64[Tensor, "tx 3"],
+    rx: Float64[Tensor, "rx 3"],
+    frequency: float,
+    *,
+    width: float = 0.0,
+    boundary: bool = True,
+    far: bool = False,
+) -> Complex128[Tensor, "tx rx"]:
+    """The sum over a panel's elements for fields that a mirror keeps, isotropic antennas.
+
+    Its phase is that over the phase of the path by the panel's centre, ``e^{−jk(R₁+R₂)}``.
+
+    Args:
+        scene: What is in the way.
+        panel: The metasurface.
+        tx, rx: Places of the antennas [m].
+        frequency: [Hz].
+        width: Added to the width over which shadows end on the panel [m].
+        boundary: False leaves out of derivatives that shadows move over the panel.
+        far: Waves are plane over the panel: quicker, right beyond 2D²/λ.
+    """
+    cells, k = panel.cells, 2 * math.pi * frequency / SPEED_OF_LIGHT
+    both = torch.cat([tx, rx])
+    lit = lit_fractions(scene, both, cells, width=width, boundary=boundary)
+    sent = _waves(panel, cells, tx, lit[: len(tx)], k, far)
+    weights = panel.response
+    scale = panel.spacing**2 * k / (2 * math.pi)
+    seen = (lit[len(tx) :] > 0).any(1) & bool((lit[: len(tx)] > 0).any())
+    live = torch.nonzero(seen)[:, 0]
+    heavy = len(live) * len(weights) > _VALUES_AT_ONCE
+    found = [torch.zeros(len(tx), 0, dtype=torch.complex128)]
+
+    def total(places: Tensor, lit: Tensor) -> Tensor:
+        wave, cosine = _waves(panel, cells, places, lit, k, far)
+        first = sent[0] * weights
+        if panel.pattern is not None:
+            return (first * sent[1]) @ (wave * cosine).T
+        half = (first * sent[1]) @ (wave * (cosine > 0)).T
+        return 0.5 * (half + (first * (sent[1] > 0)) @ (wave * cosine).T)
+
+    for some in live.split(max(1, _VALUES_AT_ONCE // len(weights))):
+        rows = rx[some], lit[len(tx) + some]
+        found.append(checkpoint(total, *rows, use_reentrant=False) if heavy else total(*rows))
+    sums = torch.zeros(len(tx), len(rx), dtype=torch.complex128)
+    return sums.index_copy(1, live, -1j / (2 * k) * scale * torch.cat(found, 1))
+
+
+def _waves(
+    panel: Metasurface, cells: Cells, places: Tensor, lit: Tensor, k: float, far: bool
+) -> tuple[Complex128[Tensor, "place element"], Float64[Tensor, "place element"]]:
+    """Wave of each place at each element, over its phase at the centre, and its obliquity."""
+    whole = (places - panel.position) @ panel.axes
+    reach = whole.norm(dim=1, keepdim=True)
+    shift = -whole[:, :2] @ cells.offsets.T
+    if far:
+        later, length = shift / reach, reach.expand_as(shift)
+    else:
+        # The difference of squares is exact where that of lengths would cancel.
+        squares = 2 * shift + cells.offsets.square().sum(1)
+        length = (reach.square() + squares).sqrt()
+        later = squares / (length + reach)
+    if panel.pattern is None:
+        obliquity = whole[:, 2:].clamp_min(0) / length
+    else:
+        aside = whole[:, None, :2] - (0 if far else cells.offsets)
+        up = whole[:, None, 2:].expand(-1, len(cells.offsets), 1)
+        gain = panel.pattern.gain(
+            torch.cat([aside.expand(*up.shape[:2], 2), up], 2) / length[..., None]
+        )
+        some = gain > 0  # a root of zero has no derivative
+        # Of a cell of λ/2, π is the gain that takes all of what falls on it.
+        obliquity = torch.where(some, torch.where(some, gain, 1.0) / math.pi, 0.0).sqrt()
+    return torch.polar(lit / length, -k * later), obliquity
+
+
+def panel_paths(
+    scene: Scene,
+    panels: Metasurface | Sequence[Metasurface],
+    tx: ArrayLike,
+    rx: ArrayLike,
+    frequency: float,
+    *,
+    width: float = 0.0,
+    boundary: bool = True,
+    far: bool = False,
+) -> RayPaths:
+    """Paths over metasurfaces: one for each panel and link, whose coefficient sums up its elements.
+
+    They have the delay of the way by the panel's centre, and polarisation as a mirror there. Add
+    them to those of ``trace_paths`` with ``+``: all then sum up coherently. Antennas are at rest.
+    From the panel to the antennas waves go straight, unless something is in the way.
+
+    Args:
+        scene: What is in the way.
+        panels: One or several; each sees the antennas, none sees another.
+        tx: Transmitters, [3] or [tx, 3] in the world [m].
+        rx: Receivers, [3] or [rx, 3] [m].
+        frequency: Of the coefficients [Hz].
+        width: Added to the width over which shadows end on a panel [m]; more than 0 smooths the
+            landscape of a fit.
+        boundary: False leaves out of derivatives that shadows move over panels, for ablation.
+        far: Waves are plane over a panel: quicker, right beyond 2D²/λ.
+
+    Raises:
+        InputError: Wrong shapes or numbers, or an antenna within a spacing of a panel.
+
+    Source: derivations §12.
+    """
+    several = [panels] if isinstance(panels, Metasurface) else list(panels)
+    ends = [_places(place, what) for place, what in ((tx, "tx"), (rx, "rx"))]
+    checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+    checked_number(width, "width of shadows [m]", 0.0)
+    counts = len(ends[0]), len(ends[1])
+    up = torch.tensor(_UP, dtype=torch.float64)
+    source = torch.arange(counts[0]).repeat_interleave(counts[1])
+    target = torch.arange(counts[1]).repeat(counts[0])
+    rows: list[RayPaths] = []
+    for panel in several:
+        _require_off(panel, torch.cat(ends))
+        total = panel_response(
+            scene, panel, ends[0], ends[1], frequency, width=width, boundary=boundary, far=far
+        ).ravel()
+        link = torch.nonzero(total.detach() != 0)[:, 0]
+        ways = [
+            panel.position - end[at[link]] for end, at in zip(ends, (source, target), strict=True)
+        ]
+        length = ways[0].norm(dim=1) + ways[1].norm(dim=1)
+        units = [normalize(way, dim=1) for way in ways]
+        sent, received = (polarisations(unit, up) for unit in units)
+        normal = panel.axes[:, 2]
+        turned = sent - 2 * (sent @ normal)[..., None] * normal
+        matrix = received @ turned.mT
+        one = torch.ones(len(link), 1, dtype=torch.int64)
+        rows.append(
+            RayPaths(
+                counts,
+                frequency,
+                source[link],
+                target[link],
+                length / SPEED_OF_LIGHT,
+                total[link, None, None] * matrix,
+                units[0],
+                units[1],
+                panel.position.expand(len(link), 1, 3),
+                METASURFACE * one,
+                -one,
+                -one,
+                scene.names,
+                torch.zeros(len(link), dtype=torch.float64),
+            )
+        )
+    if not rows:
+        raise InputError("expected at least one metasurface, got none; give one")
+    found = rows[0]
+    for more in rows[1:]:
+        found = found + more
+    return found.sorted()
+
+
+def _places(value: ArrayLike, what: str) -> Tensor:
+    given = torch.as_tensor(value, dtype=torch.float64)
+    given = given[None] if given.ndim == 1 else given
+    found = checked_tensor(given, (None, 3), f"{what} places [m]", "give x, y, z of each")
+    if not len(found):
+        raise InputError(f"expected at least one place of {what}, got none; give x, y, z of each")
+    return found
+
+
+def _require_off(panel: Metasurface, places: Tensor) -> None:
+    local = (places.detach() - panel.position.detach()) @ panel.axes.detach()
+    half = 0.5 * panel.spacing * torch.tensor(panel.phase.shape, dtype=torch.float64)
+    beyond = (local[:, :2].abs() - half).clamp_min(0)
+    if float((beyond.square().sum(1) + local[:, 2].square()).min()) < panel.spacing**2:
+        raise InputError(
+            "expected antennas at least a spacing away from a metasurface, got one on it; move it"
+        )

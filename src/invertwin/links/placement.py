@@ -1,0 +1,187 @@
+"""Where a metasurface stands: on a path along the walls, turned about the vertical."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor, nn
+
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.links.metasurface import Metasurface
+from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
+
+_DO = "give x, y of at least two corners, the room on the left"
+_UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A straight or round piece of a path: where it begins, and its bend [1/m], left positive."""
+
+    begin: float
+    length: float
+    start: Tensor
+    along: Tensor
+    bend: float
+
+
+class WallPath:
+    """A level path along walls, with the room on its left; corners are rounded.
+
+    Args:
+        corners: Of the walls' plan, [corner, 2], off the walls by as much as a panel needs [m].
+        height: z of the path [m].
+        radius: Of round corners [m].
+        closed: Whether the last corner leads back to the first.
+
+    Attributes:
+        length: [m].
+        closed: As given.
+
+    Raises:
+        InputError: Fewer than two corners, or a wall that is too short for the round corners.
+    """
+
+    def __init__(
+        self,
+        corners: Sequence[Sequence[float]],
+        height: float,
+        radius: float = 0.2,
+        closed: bool = False,
+    ) -> None:
+        flat = checked_tensor(corners, (None, 2), "corners of a path along walls [m]", _DO)
+        if len(flat) < 2 + closed:
+            raise InputError(f"expected more corners of a path along walls, got {len(flat)}; {_DO}")
+        level = checked_number(height, "height of a path [m]", -math.inf)
+        bow = checked_number(radius, "radius of corners [m]", 0.0, open_low=True)
+        points = torch.cat([flat, torch.full((len(flat), 1), level, dtype=torch.float64)], 1)
+        self.closed = closed
+        self._pieces = _pieces(points, bow, closed)
+        self.length = self._pieces[-1].begin + self._pieces[-1].length
+
+    def at(self, along: Float64[Tensor, ""]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+        """Position [m], and the unit vector into the room.
+
+        Args:
+            along: Length of the path up to here [m]; beyond the ends of an open path it goes
+                straight on, a closed one is gone round again.
+        """
+        if self.closed:
+            along = along - self.length * math.floor(float(along.detach()) / self.length)
+        here = float(along.detach())
+        piece = next((p for p in self._pieces if here < p.begin + p.length), self._pieces[-1])
+        inward = torch.linalg.cross(_UP, piece.along)
+        rest = along - piece.begin
+        if not piece.bend:
+            return piece.start + rest * piece.along, inward
+        turn = rest * piece.bend
+        normal = inward * turn.cos() - piece.along * turn.sin()
+        return piece.start + (inward - normal) / piece.bend, normal
+
+
+def _pieces(points: Tensor, radius: float, closed: bool) -> list[_Piece]:
+    ends = torch.cat([points, points[:1]]) if closed else points
+    sides = ends[1:] - ends[:-1]
+    lengths = sides.norm(dim=1)
+    if float(lengths.min()) <= 0:
+        raise InputError("expected corners of a path apart from each other, got two at one place")
+    units = sides / lengths[:, None]
+    count = len(sides)
+    turns = [0.0] * (count + 1)  # at the end of each side; the first is before the first side
+    for n in range(count):
+        after = (n + 1) % count
+        if closed or after:
+            cross = float(torch.linalg.cross(units[n], units[after])[2])
+            turns[n + 1] = math.atan2(cross, float(units[n] @ units[after]))
+    turns[0] = turns[count] if closed else 0.0
+    cuts = [radius * math.tan(abs(turn) / 2) for turn in turns]
+    found: list[_Piece] = []
+    begin = 0.0
+    for n in range(count):
+        left = float(lengths[n]) - cuts[n] - cuts[n + 1]
+        if left <= 0:
+            raise InputError(
+                f"expected walls longer than their round corners, got one of {lengths[n]:.3g} m "
+                f"with a radius of {radius:g} m; lower the radius"
+            )
+        start = ends[n] + cuts[n] * units[n]
+        found.append(_Piece(begin, left, start, units[n], 0.0))
+        begin += left
+        if turns[n + 1]:
+            bend = math.copysign(1 / radius, turns[n + 1])
+            round_ = radius * abs(turns[n + 1])
+            found.append(_Piece(begin, round_, start + left * units[n], units[n], bend))
+            begin += round_
+    return found
+
+
+class PlacedPanel(nn.Module):
+    """A module Metasurface → Metasurface: its place along walls, its yaw, and its phases.
+
+    Phases are those of a focus that stays where it is when the panel moves, widened by a quadratic
+    term, plus a shift of each element. The derivative by the place holds that of the focus.
+
+    Args:
+        path: Along the walls.
+        tx: The transmitter that is focused [m].
+        target: On what [m].
+        frequency: [Hz].
+        counts: Of elements along x and y.
+        along: Place on the path at the start [m].
+        yaw: Turn about the vertical away from the wall's normal, at the start [rad].
+        spread: Half widths of the beam, across and up, at the start [rad].
+
+    Attributes:
+        along, yaw, spread: Parameters.
+        shift: Parameter, [x, y] of the elements [rad].
+
+    Raises:
+        InputError: Wrong shapes or numbers.
+    """
+
+    def __init__(
+        self,
+        path: WallPath,
+        tx: ArrayLike,
+        target: ArrayLike,
+        frequency: float,
+        counts: Sequence[int],
+        *,
+        along: float = 0.0,
+        yaw: float = 0.0,
+        spread: ArrayLike = (0.0, 0.0),
+    ) -> None:
+        super().__init__()
+        self.path = path
+        do = "give x, y, z"
+        self._tx = checked_tensor(tx, (3,), "place of a transmitter [m]", do)
+        self._target = checked_tensor(target, (3,), "target of a focus [m]", do)
+        self._frequency = checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+        place = checked_number(along, "place of a panel [m]", -math.inf)
+        turn = checked_number(yaw, "yaw of a panel [rad]", -math.inf)
+        self.along = nn.Parameter(torch.tensor(place, dtype=torch.float64))
+        self.yaw = nn.Parameter(torch.tensor(turn, dtype=torch.float64))
+        widths = checked_tensor(spread, (2,), "spread of a beam [rad]", "give two half widths")
+        self.spread = nn.Parameter(widths.clone())
+        self.shift = nn.Parameter(torch.zeros(*counts, dtype=torch.float64))
+
+    def forward(self, panel: Metasurface) -> Metasurface:
+        """The panel where it stands, with its phases."""
+        place, normal = self.path.at(self.along)
+        turned = normal * self.yaw.cos() + torch.linalg.cross(_UP, normal) * self.yaw.sin()
+        axes = torch.stack([torch.linalg.cross(_UP, turned), _UP, turned], 1)
+        offsets = panel.cells.offsets
+        half = 0.5 * panel.spacing * torch.tensor(panel.phase.shape, dtype=torch.float64)
+        wave_number = 2 * math.pi * self._frequency / SPEED_OF_LIGHT
+        bowed = 0.5 * wave_number * (offsets.square() / half) @ self.spread
+        phase = panel.phase + self.shift + bowed.view(panel.phase.shape)
+        placed = replace(panel, position=place, axes=axes, phase=phase)
+        return placed.focused(self._tx, self._target, self._frequency)
+
+    def values(self) -> dict[str, Tensor]:
+        """Place [m], yaw and spread [rad] by name, for progress and reports."""
+        named = {"along": self.along, "yaw": self.yaw, "spread": self.spread}
+        return {f"panel.{name}": value.detach().clone() for name, value in named.items()}

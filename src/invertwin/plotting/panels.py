@@ -1,0 +1,98 @@
+"""Figures of coverage: path gain over a floor plan, and the landscape of a panel's place."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float64
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from invertwin.plotting.figures import PALETTE, legible, numbers
+from invertwin.scene import Scene
+
+_SPAN = 60.0  # dB below the strongest that are told apart
+
+
+def floor_plan(
+    levels: Mapping[str, Float64[Tensor, "x y"]],
+    corners: tuple[Tensor, Tensor],
+    scene: Scene,
+    height: float,
+    tx: Float64[Tensor, "3"],
+    panel: Float64[Tensor, "3"],
+) -> Figure:
+    """Path gain at one height, side by side, with the walls that are there.
+
+    Args:
+        levels: [dB], by title.
+        corners: Of the map; x and y count [m].
+        scene: Its objects are cut at the height.
+        height: z of the map [m].
+        tx, panel: Where they stand [m].
+    """
+    figure = Figure(figsize=(1.0 + 4.6 * len(levels), 3.9), layout="constrained")
+    cells = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
+    low, high = (numbers(corner) for corner in corners)
+    top = max(float(value.max()) for value in levels.values())
+    image: Any = None
+    for axes, (title, value) in zip(cells, levels.items(), strict=True):
+        image = axes.imshow(
+            numbers(value).T,
+            origin="lower",
+            extent=(low[0], high[0], low[1], high[1]),
+            vmin=top - _SPAN,
+            vmax=top,
+            cmap="viridis",
+            aspect="equal",
+        )
+        axes.add_collection(LineCollection(_cut(scene, height), colors="black", linewidths=1.5))
+        axes.plot(*numbers(tx)[:2], "^", color="white", markeredgecolor="black", label="sender")
+        if title != next(iter(levels)):
+            axes.plot(*numbers(panel)[:2], "s", color=PALETTE[1], label="panel")
+        axes.set(title=legible(title), xlabel="x [m]")
+        axes.legend(fontsize=8, loc="upper left")
+    cells[0].set_ylabel("y [m]")
+    figure.colorbar(image, ax=list(cells), label="path gain [dB]")
+    return figure
+
+
+def placements(
+    along: Float64[Tensor, " place"],
+    levels: Float64[Tensor, " place"],
+    ends: Float64[Tensor, "start 2"],
+) -> Figure:
+    """The aim over the place of a panel, and where searches have ended.
+
+    Args:
+        along: Places on the path [m].
+        levels: The best of a grid at each [dB].
+        ends: Place [m] and level [dB] of every search.
+    """
+    figure = Figure(figsize=(8, 3.3), layout="constrained")
+    axes = figure.subplots()
+    label = "best of the grid at this place"
+    axes.plot(numbers(along), numbers(levels), color=PALETTE[0], label=label)
+    axes.plot(*numbers(ends).T, "o", color=PALETTE[1], label="found by gradient, phases fitted")
+    axes.set(xlabel="place along the walls [m]", ylabel="worst receivers [dB]")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return figure
+
+
+def _cut(scene: Scene, height: float) -> list[list[list[float]]]:
+    """Segments in which a level plane cuts the triangles of a scene, x and y of both ends."""
+    found: list[list[list[float]]] = []
+    for item in scene.objects.values():
+        corners = item.vertices.detach()[item.mesh.faces]
+        above = corners[..., 2] - height
+        for triangle, rise in zip(corners, above, strict=True):
+            points = []
+            for a, b in ((0, 1), (1, 2), (2, 0)):
+                if (rise[a] > 0) != (rise[b] > 0):
+                    share = rise[a] / (rise[a] - rise[b])
+                    points.append(torch.lerp(triangle[a], triangle[b], share)[:2].tolist())
+            if len(points) == 2:
+                found.append(points)
+    return found

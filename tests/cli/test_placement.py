@@ -1,0 +1,115 @@
+"""`[placement]` in run files: a small room from end to end, and its errors."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from invertwin.cli.app import app
+from invertwin.errors import InputError
+
+ROOM = """
+task = "reconstruct"
+seed = 1
+
+[scene.screen]
+shape = "plate"
+width = 3.0
+height = 3.0
+position = [0.5, 0.0, 1.35]
+rotation_deg = [90.0, 0.0, 0.0]
+material = { kind = "perfect_conductor" }
+
+[placement]
+frequency = 60e9
+transmitter = [1.0, -2.5, 2.0]
+receivers = { low = [0.0, 0.5, 1.2], high = [2.0, 2.5, 1.2], count = 40, batch = 20, scored = 20 }
+walls = { corners = [[3.9, -2.9], [3.9, 2.9]], height = 1.8 }
+panel = { counts = [6, 6], spacing = 2.5e-3, bits = 2, pattern.kind = "isotropic" }
+starts = 2
+annealing = 1
+annealed_starts = 1
+descent = { scouts = 2, tracks = 1, track_steps = 1, steps = 2 }
+grid = { places = 3, yaws = 1, spread_deg = [5.0] }
+"""
+CHECK = """
+[gradcheck]
+parameter = { kind = "panel" }
+tangent = { along = 1.0 }
+step = 1e-6
+"""
+
+
+def run(*arguments: object) -> None:
+    app([str(argument) for argument in arguments], standalone_mode=False)
+
+
+def written(folder: Path, text: str) -> Path:
+    file = folder / "panel.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def metrics(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+
+
+def test_a_panel_is_placed_scored_and_drawn(tmp_path: Path):
+    out = tmp_path / "out"
+    run("reconstruct", written(tmp_path, ROOM), "-o", out)
+    found = metrics(out)
+    assert found["worst_after_db"] - found["worst_before_db"] == pytest.approx(found["gain_db"])
+    assert found["evaluations"] == 2 + 3 * 3 + 2
+    assert found["evaluations_exhaustive"] == 3
+    assert len(found["starts"]) == 2
+    assert "evaluations_ratio" in found["starts"][0]
+    assert "evaluations_ratio" not in found["starts"][1]
+    assert 0 <= found["successes"] <= 2
+    for name in ("landscape.png", "coverage.png", "report.html"):
+        assert (out / name).stat().st_size > 1000
+
+
+def test_check_says_what_a_placement_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run("check", written(tmp_path, ROOM))
+    assert "evaluations" in capsys.readouterr().out
+
+
+def test_derivatives_by_the_place_are_checked(tmp_path: Path, repository: Path):
+    file = repository / "experiments" / "gradients" / "waves" / "coverage_metasurface.toml"
+    run("gradcheck", file, "-o", tmp_path / "out")
+    (found,) = metrics(tmp_path / "out")["scenes"].values()
+    assert found["full"]["relative_l1"] <= 0.015
+    assert found["interior"]["relative_l1"] >= 0.1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("counts = [6, 6]", "counts = [6]", "placement.panel.counts"),
+        ("frequency = 60e9", "frequency = -1.0", "placement.frequency"),
+        ("[3.9, 2.9]]", "[3.9, -2.9]]", "placement.walls: .*two at one place"),
+        ("bits = 2", "bits = 9", "placement.panel: expected at most 8 bits"),
+        ("starts = 2", "stars = 2", "did you mean `starts`"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, old: str, new: str, words: str):
+    with pytest.raises(InputError, match=words):
+        run("reconstruct", written(tmp_path, ROOM.replace(old, new)), "-o", tmp_path / "out")
+
+
+def test_a_panel_needs_its_section(tmp_path: Path):
+    text = ROOM[: ROOM.index("[placement]")].replace("reconstruct", "gradcheck")
+    radar = """
+[radar]
+waveform = { kind = "fmcw", start_frequency = 77e9, bandwidth = 4e9, duration = 5e-5, samples = 64 }
+transmitters = { kind = "positions", positions = [[0.0, 0.0, 0.0]] }
+receivers = { kind = "linear", count = 4, spacing = 1.9e-3 }
+positions = [[0.0, 0.0, 0.0]]
+
+[grid]
+range_min = 1.0
+range_max = 2.0
+"""
+    with pytest.raises(InputError, match=r"expected a section \[placement\]"):
+        run("gradcheck", written(tmp_path, text + radar + CHECK), "-o", tmp_path / "out")
