@@ -63,7 +63,7 @@ class TransmitterTable(AntennaTable):
         return Transmitters(places, self.terminals(places), self.power_dbm)
 
 
-RECEPTION: Any = registry.table_of(Reception, "Reception", without=("receivers",))
+RECEPTION: Any = registry.table_of(Reception, "Reception", without=("receivers", "panels"))
 
 
 class MapTable(registry.table_of(RadioMap, "RadioMap", RECEPTION, without=("reception",))):
