@@ -23,7 +23,7 @@ from invertwin.cli.schema.signature import swept
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
-from invertwin.links import MapPlane
+from invertwin.links import MapPlane, Points
 from invertwin.models import ForwardModel, PanelMap, SignatureMap, SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.runs import RunFolder
@@ -164,26 +164,32 @@ def _signature(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
 
 
 def _radio_map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
-    """The gain over the cells of `[map]`."""
+    """The gain at the points or over the cells of `[map]`."""
     with about("map"):
         model = need(run, "map", "gradcheck").build()
     sensor = need(run, "transmitter", "gradcheck").build()
-    plane = model.places
-    if not isinstance(plane, MapPlane) or len(sensor.positions) > 1 or model.quantity != "gain":
+    places = model.places
+    drawn = isinstance(places, MapPlane | Points)
+    if not drawn or len(sensor.positions) > 1 or model.quantity != "gain":
         raise InputError(
-            'map: expected quantity = "gain", places of kind "plane" and one transmitter, got '
-            "others; gradient checks compare and draw these"
+            'map: expected quantity = "gain", places of kind "points" or "plane" and one '
+            "transmitter, got others; gradient checks compare and draw these"
         )
+    label = f"∂ gain [peaks, {_unit(settings)}]"
 
     def draw(report: GradientReport) -> Figure:
         peak = float(report.value.max())
+        rates = {name: values[0] / peak for name, values in _derivatives(report).items()}
+        if isinstance(places, Points):
+            number = torch.arange(len(places.positions), dtype=torch.float64)
+            return plotting.slopes(rates, number, "receiver", label)
         return plotting.coverage(
             {},
-            plane,
-            derivatives={name: values[0] / peak for name, values in _derivatives(report).items()},
+            places,
+            derivatives=rates,
             scene=scene,
             transmitters=sensor,
-            derivative_label=f"∂ gain [peaks, {_unit(settings)}]",
+            derivative_label=label,
         )
 
     return _Seen(model, sensor, None, draw)
