@@ -691,7 +691,7 @@ class RadioMap(ForwardModel):
             unknown = sorted(set(self.without) - set(scene.names))
             if unknown:
                 raise InputError(
-                    f"expected names of objects ({', '.join(scene.names)}), got {unknown[0]}; "
+                    f"expected names of objects in without ({', '.join(scene.names)}), got {unknown[0]}; "
                     "correct it",
                     "without",
                 )
