@@ -312,7 +312,7 @@ def test_derivatives_of_a_radio_map_are_differences():
     def shown(x: Tensor) -> Tensor:
         return model.predict(scene, Transmitters(place + float64([x, 0.7 * x, -0.4 * x])), 0)
 
-    # Between 1e-6 and 1e-5 a path ends that is mirrored and diffracted: a step of 1e-6 of the field.
+    # From 1e-6 to 1e-5 a path ends that is mirrored and diffracted: 1e-6 of the field are lost.
     step = 1e-6
     expected = (shown(float64(step)) - shown(float64(-step))) / (2 * step)
     x = torch.zeros((), dtype=torch.float64)

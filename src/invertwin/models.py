@@ -691,8 +691,8 @@ class RadioMap(ForwardModel):
             unknown = sorted(set(self.without) - set(scene.names))
             if unknown:
                 raise InputError(
-                    f"expected names of objects in without ({', '.join(scene.names)}), got {unknown[0]}; "
-                    "correct it",
+                    f"expected names of objects in without ({', '.join(scene.names)}), got "
+                    f"{unknown[0]}; correct it",
                     "without",
                 )
             kept = {n: o for n, o in scene.objects.items() if n not in self.without}
