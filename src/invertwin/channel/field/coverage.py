@@ -19,7 +19,7 @@ from invertwin.channel.field.cuts import cut_points, cut_rates
 from invertwin.channel.field.images import Chains, Walls, chains_between
 from invertwin.channel.field.sequences import every_sequence, shot_sequences
 from invertwin.channel.field.shadow_edges import ASIDE, Screen, rim_points, rims
-from invertwin.channel.field.specular import _computed, _powers, _Stage, _staged
+from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
 from invertwin.channel.ray_paths import RayPaths, joined
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import differentiated
@@ -104,7 +104,7 @@ def trace_coverage(
             derivatives by places use them.
         seed: Of rays and edge points.
     """
-    stage = _staged(scene, tx, points, frequency, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    stage = staged(scene, tx, points, frequency, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     with tracing():
         trace = _Trace(stage, screen, measure, width, depth, rays, seed)
         amount = trace.amounts(stage, trace.chains(plain(stage.rx)))
@@ -121,7 +121,7 @@ class _Trace:
 
     def __init__(
         self,
-        stage: _Stage,
+        stage: Stage,
         screen: Mesh,
         measure: Measure,
         width: int,
@@ -130,7 +130,7 @@ class _Trace:
         seed: int,
     ) -> None:
         self.measure, self.width, self.depth = measure, width, depth
-        self.tx, self.powers = plain(stage.tx), _powers(stage)
+        self.tx, self.powers = plain(stage.tx), powers_of(stage)
         # Discrete: to `torch.func`, tensors made on the way would be its own.
         with _DisableFuncTorch():
             places = plain(screen.vertices)
@@ -169,7 +169,7 @@ class _Trace:
                 )
             ]
 
-    def amounts(self, stage: _Stage, parts: list[_Some]) -> Float64[Tensor, "tx point amount"]:
+    def amounts(self, stage: Stage, parts: list[_Some]) -> Float64[Tensor, "tx point amount"]:
         """What paths bring to points; a derivative computes the paths again, and keeps none."""
         again = stage.vertices.requires_grad or stage.tx.requires_grad
         found: list[Tensor] = []
@@ -177,17 +177,17 @@ class _Trace:
             rx = stage.rx[some.begin : some.begin + some.count]
             here = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
 
-            def total(here: _Stage = here, some: _Some = some) -> Tensor:
+            def total(here: Stage = here, some: _Some = some) -> Tensor:
                 sums = torch.zeros(len(self.tx) * some.count, self.width, dtype=torch.float64)
                 for part in some.chains:
-                    paths = joined(_computed(here, part))
+                    paths = joined(paths_of(here, part))
                     sums = sums.index_add(0, paths.link, self.measure(paths, here.tx, here.rx))
                 return sums.unflatten(0, (len(self.tx), some.count))
 
             found.append(checkpoint(total, use_reentrant=False) if again else total())
         return torch.cat(found, 1)
 
-    def rims(self, stage: _Stage, samples: int, seed: int) -> list[Crossing]:
+    def rims(self, stage: Stage, samples: int, seed: int) -> list[Crossing]:
         """Boundary paths to rims: what each path would bring, times the rim's rate."""
         with _DisableFuncTorch():
             met = rim_points(
@@ -199,7 +199,7 @@ class _Trace:
             found = rims(self.walls, self.screen, some, stage.tx, stage.vertices)
             here = _fixed(stage, found.place)
             with torch.no_grad():
-                paths = joined(_computed(here, found.chains))
+                paths = joined(paths_of(here, found.chains))
                 brought = plain(self.measure(paths, here.tx, here.rx))
             # One path a row, in another order.
             amount = torch.zeros_like(brought).index_copy(0, paths.rx, brought)
@@ -208,7 +208,7 @@ class _Trace:
             )
         return crossings
 
-    def cuts(self, stage: _Stage, samples: int, seed: int) -> list[Crossing]:
+    def cuts(self, stage: Stage, samples: int, seed: int) -> list[Crossing]:
         """Boundary paths where the scene cuts the screen: the jump of power, times the rate."""
         with _DisableFuncTorch():
             both = topology_of(self.meshes)
@@ -232,7 +232,7 @@ class _Trace:
         ]
 
 
-def _fixed(stage: _Stage, points: Tensor) -> _Stage:
+def _fixed(stage: Stage, points: Tensor) -> Stage:
     """The stage without derivatives of places, with other receivers."""
     return replace(
         stage,

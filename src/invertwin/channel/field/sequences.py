@@ -6,6 +6,7 @@ transmission.
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,8 +17,10 @@ from torch.nn.functional import normalize
 from invertwin.channel.field.planes import Planes
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import Occluders
 from invertwin.errors import InputError
+
+if TYPE_CHECKING:  # walls know the planes that sequences are made of
+    from invertwin.channel.field.images import Walls
 
 _LANES = 1 << 20
 _MOST = 1_000_000  # sequences that are tried one by one
@@ -87,7 +90,7 @@ def every_sequence(planes: Planes, powers: Powers, depth: int) -> Sequences:
 
 
 def shot_sequences(
-    occluders: Occluders,
+    walls: "Walls",
     planes: Planes,
     powers: Powers,
     places: Float64[Tensor, "place 3"],
@@ -106,7 +109,7 @@ def shot_sequences(
     followed, over the number of rays.
 
     Args:
-        occluders: The scene.
+        walls: What may be in the way.
         planes: Of the scene, about the same origin.
         powers: Of the triangles.
         places: From where rays are shot [m].
@@ -116,7 +119,7 @@ def shot_sequences(
 
     Source: I. J. Good, "The population frequencies of species", Biometrika 40, 1953.
     """
-    tables = _Tables(occluders, planes, powers)
+    tables = _Tables(walls, planes, powers)
     # A ray may part at every step.
     parts = 2 ** (depth if bool(powers.transmit.any()) else 0)
     chunk = max(1, _LANES // parts)
@@ -140,7 +143,7 @@ def shot_sequences(
 
 
 def sequences_from_edges(
-    occluders: Occluders,
+    walls: "Walls",
     planes: Planes,
     powers: Powers,
     places: Float64[Tensor, "ray 3"],
@@ -151,7 +154,7 @@ def sequences_from_edges(
     """The sequences that rays from edges follow: number of the edge, then steps; by length from 1.
 
     Args:
-        occluders: The scene.
+        walls: What may be in the way.
         planes: Of the scene, about the same origin.
         powers: Of the triangles.
         places: Where rays start; their directions are random [m].
@@ -159,7 +162,7 @@ def sequences_from_edges(
         depth: Most steps.
         seed: Of the directions.
     """
-    tables = _Tables(occluders, planes, powers)
+    tables = _Tables(walls, planes, powers)
     parts = 2 ** (depth if bool(powers.transmit.any()) else 0)
     draws = np.random.default_rng(seed).standard_normal((len(places), 3))
     directions = normalize(torch.from_numpy(draws), dim=1)
@@ -197,8 +200,8 @@ def _random_turn(seed: int, number: int) -> Float64[Tensor, "3 3"]:
 class _Tables:
     """The scene as rays that follow sequences need it."""
 
-    def __init__(self, occluders: Occluders, planes: Planes, powers: Powers) -> None:
-        self.occluders = occluders
+    def __init__(self, walls: "Walls", planes: Planes, powers: Powers) -> None:
+        self.walls = walls
         self.planes = planes
         self.powers = powers
         self.normal = to_float(planes.normal)
@@ -211,7 +214,7 @@ class _Tables:
 
         They start from one place, or each from its own, with the rows ``number`` of ``known``.
         """
-        local = (place - self.occluders.origin).to(torch.float32)
+        local = (place - self.walls.origin).to(torch.float32)
         origin = local.expand(len(directions), 3)
         direction = directions.to(torch.float32)
         # Sequences share their beginnings: each is the number of its parent, and one more step.
@@ -219,7 +222,7 @@ class _Tables:
         width = known.shape[1] + depth
         for step in range(depth):
             if step:
-                origin = origin + self.occluders.margin * direction
+                origin = origin + self.walls.margin * direction
             face, place_hit, mirrored = self._next(origin, direction)
             hit = (face >= 0) & (self.planes.face_plane[face.clamp_min(0)] >= 0)
             ended.append((known, number[~hit]))
@@ -258,7 +261,7 @@ class _Tables:
             return torch.zeros(0, dtype=torch.int64), none, none
         start = mi.Point3f(*(to_float(origin[:, k].contiguous()) for k in range(3)))
         way = mi.Vector3f(*(to_float(direction[:, k].contiguous()) for k in range(3)))
-        hit = self.occluders.scene.ray_intersect_preliminary(mi.Ray3f(start, way))
+        hit = self.walls.scene.ray_intersect_preliminary(mi.Ray3f(start, way))
         valid = hit.is_valid()
         face = dr.select(valid, mi.Int32(hit.prim_index), -1)
         plane = dr.gather(mi.UInt32, self.face_plane, hit.prim_index, valid)

@@ -59,7 +59,7 @@ _STILL = "give one vector, or one per antenna"
 
 
 @dataclass(frozen=True)
-class _Stage:
+class Stage:
     """Scene and antennas as paths are computed from them, differentiable.
 
     Attributes:
@@ -129,7 +129,7 @@ def trace_paths(
 
     Source: derivations §9 and §10.
     """
-    stage = _staged(scene, tx, rx, frequency, tx_velocity, rx_velocity)
+    stage = staged(scene, tx, rx, frequency, tx_velocity, rx_velocity)
     most = checked_count(depth, "depth", 0)
     if most > _DEEPEST:
         raise InputError(
@@ -140,25 +140,25 @@ def trace_paths(
     if rays is not None and not 1 <= checked_count(rays, "rays", 1) <= MOST:
         raise InputError(f"expected at most {MOST:,} rays, got {rays}; shoot fewer")
     with tracing():
-        powers = _powers(stage)
+        powers = powers_of(stage)
         # Discrete: to `torch.func`, tensors made on the way would be its own.
         with _DisableFuncTorch():
             walls = _walls(stage)
             found, missed = _searched(stage, walls, powers, most, rays, seed)
             bends = _bends(stage, walls, powers, edges, most, rays, seed) if edges else []
-        parts = [part for chains in found for part in _computed(stage, chains)]
+        parts = [part for chains in found for part in paths_of(stage, chains)]
         around = _around(stage, walls)
         parts += [part for some in bends for part in _bent(stage, around, some)]
     return replace(joined(parts), missed=missed)
 
 
-def _walls(stage: _Stage) -> Walls:
+def _walls(stage: Stage) -> Walls:
     antennas = torch.cat([plain(stage.tx), plain(stage.rx)])
     return Walls(plain(stage.vertices), stage.topology, antennas)
 
 
 def _bends(
-    stage: _Stage,
+    stage: Stage,
     walls: Walls,
     powers: Powers,
     edges: int,
@@ -173,7 +173,7 @@ def _bends(
 
 
 def _searched(
-    stage: _Stage, walls: Walls, powers: Powers, depth: int, rays: int | None, seed: int
+    stage: Stage, walls: Walls, powers: Powers, depth: int, rays: int | None, seed: int
 ) -> tuple[list[Chains], float | None]:
     """Which paths there are, and the share of directions that was missed."""
     tx, rx = plain(stage.tx), plain(stage.rx)
@@ -192,14 +192,14 @@ def _searched(
     return [chains.reversed() if swapped else chains for chains in found], sequences.missed
 
 
-def _staged(
+def staged(
     scene: Scene,
     tx: ArrayLike,
     rx: ArrayLike,
     frequency: float,
     tx_velocity: ArrayLike,
     rx_velocity: ArrayLike,
-) -> _Stage:
+) -> Stage:
     objects = scene.objects.values()
     clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
     if clouds:
@@ -215,7 +215,7 @@ def _staged(
     velocities = None
     if any(item.velocity is not None for item in objects):
         velocities = torch.cat([vertex_velocities(item) for item in objects])
-    return _Stage(
+    return Stage(
         scene,
         topology_of([item.mesh for item in objects]),
         torch.cat(vertices),
@@ -243,7 +243,7 @@ def _velocities(value: ArrayLike, count: int, what: str) -> Tensor:
     return checked_tensor(rows, (count, 3), f"{what} velocities [m/s]", _STILL)
 
 
-def _powers(stage: _Stage) -> Powers:
+def powers_of(stage: Stage) -> Powers:
     """Which triangles mirror, and which let through, at 45°."""
     reflect, transmit = [], []
     for item in stage.scene.objects.values():
@@ -257,7 +257,7 @@ def _powers(stage: _Stage) -> Powers:
     return Powers(torch.cat(reflect), torch.cat(transmit))
 
 
-def _around(stage: _Stage, walls: Walls) -> EdgedScene:
+def _around(stage: Stage, walls: Walls) -> EdgedScene:
     return EdgedScene(
         stage.vertices,
         stage.topology,
@@ -266,8 +266,8 @@ def _around(stage: _Stage, walls: Walls) -> EdgedScene:
     )
 
 
-def _bent(stage: _Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
-    """Paths round edges in pieces, as in ``_computed``."""
+def _bent(stage: Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
+    """Paths round edges in pieces, as in ``paths_of``."""
     rows = torch.arange(len(found.tx))
     some = (stage.vertices, stage.tx, stage.rx)
     heavy = len(rows) > _BENT_AT_ONCE and any(value.requires_grad for value in some)
@@ -301,7 +301,7 @@ def _bent(stage: _Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
     return parts
 
 
-def _bent_columns(stage: _Stage, around: EdgedScene, bends: Bends) -> tuple[Tensor, ...]:
+def _bent_columns(stage: Stage, around: EdgedScene, bends: Bends) -> tuple[Tensor, ...]:
     """As ``_columns``, and kinds and faces, of paths round edges."""
     k = 2 * math.pi * stage.frequency / SPEED_OF_LIGHT
     found = diffracted_paths(around, bends, stage.tx, stage.rx, k)
@@ -325,7 +325,7 @@ def _bent_columns(stage: _Stage, around: EdgedScene, bends: Bends) -> tuple[Tens
 
 
 def _approach(
-    stage: _Stage,
+    stage: Stage,
     tx: Tensor,
     rx: Tensor,
     ways: list[Tensor],
@@ -342,7 +342,7 @@ def _approach(
     return rate
 
 
-def _computed(stage: _Stage, chains: Chains) -> list[RayPaths]:
+def paths_of(stage: Stage, chains: Chains) -> list[RayPaths]:
     """The paths in pieces; what derivatives need is computed again for each, not kept."""
     rows = torch.arange(len(chains.source))
     some = (stage.vertices, stage.tx, stage.rx)
@@ -359,7 +359,7 @@ def _computed(stage: _Stage, chains: Chains) -> list[RayPaths]:
     return found
 
 
-def _rows(stage: _Stage, chains: Chains, values: tuple[Tensor, ...]) -> RayPaths:
+def _rows(stage: Stage, chains: Chains, values: tuple[Tensor, ...]) -> RayPaths:
     delay, coefficient, departure, arrival, vertices, doppler = values
     return RayPaths(
         (len(stage.tx), len(stage.rx)),
@@ -379,7 +379,7 @@ def _rows(stage: _Stage, chains: Chains, values: tuple[Tensor, ...]) -> RayPaths
     )
 
 
-def _columns(stage: _Stage, chains: Chains) -> tuple[Tensor, ...]:
+def _columns(stage: Stage, chains: Chains) -> tuple[Tensor, ...]:
     """Delay, coefficient, departure, arrival, vertices and Doppler shift of paths of one length."""
     tx, rx = stage.tx[chains.source], stage.rx[chains.target]
     count, length = chains.faces.shape
@@ -422,7 +422,7 @@ def _at_points(values: Tensor, corners: Tensor, points: Tensor) -> Tensor:
 
 
 def _field(
-    stage: _Stage, chains: Chains, ways: list[Tensor], normal: Tensor, cosine: list[Tensor]
+    stage: Stage, chains: Chains, ways: list[Tensor], normal: Tensor, cosine: list[Tensor]
 ) -> Complex128[Tensor, "path 2 2"]:
     """Field over that of the transmitter, V and H at both ends, without the spreading."""
     up = torch.tensor(_UP, dtype=torch.float64)
@@ -448,7 +448,7 @@ def _turn(new: Tensor, old: Tensor) -> Tensor:
 
 
 def _coefficients(
-    stage: _Stage, faces: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
+    stage: Stage, faces: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
 ) -> FieldCoefficients:
     """What triangles reflect and let through; every material is asked once."""
     items = list(stage.scene.objects.values())
