@@ -58,7 +58,7 @@ class Panel(Section):
     )
 
 
-class Grid(Section):
+class PlacementGrid(Section):
     """The grid whose best place is what a search should find."""
 
     places: Several = key("on the path", 80)
@@ -91,7 +91,7 @@ class Placement(Section):
     annealing: Count = key("most evaluations of simulated annealing, times those of a search", 10)
     annealed_starts: Annotated[int, Ge(0)] = key("of the starts, that annealing is tried from", 3)
     descent: Annotated[Any, TableOf(Descent)] = key("the search", {}, validate_default=True)
-    grid: Grid = key("the exhaustive search", Grid())
+    grid: PlacementGrid = key("the exhaustive search", PlacementGrid())
     seed: Seed | None = key("of the receivers; without it the run's", None)
 
     def coverage(self, scene: Scene, run_seed: int, *, scored: bool = False) -> Coverage:
