@@ -34,6 +34,7 @@ WRITES = {
     "02_reconstruct.py": ["twin.ply"],
     "03_gradient.py": ["gradient.png"],
     "04_own_mesh_and_board.py": ["ball.ply", "ball.nc", "ball.png"],
+    "06_coverage.py": ["coverage.png"],
 }
 
 

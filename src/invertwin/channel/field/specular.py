@@ -200,6 +200,17 @@ def staged(
     tx_velocity: ArrayLike,
     rx_velocity: ArrayLike,
 ) -> Stage:
+    """A scene and antennas as the search for paths needs them.
+
+    Args:
+        scene: Surfaces only.
+        tx, rx: Places [antenna, 3] or [3] [m].
+        frequency: Of the carrier [Hz].
+        tx_velocity, rx_velocity: One for all, or one each [m/s].
+
+    Raises:
+        InputError: A cloud in the scene, or antennas of wrong shape.
+    """
     objects = scene.objects.values()
     clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
     if clouds:
@@ -343,7 +354,12 @@ def _approach(
 
 
 def paths_of(stage: Stage, chains: Chains) -> list[RayPaths]:
-    """The paths in pieces; what derivatives need is computed again for each, not kept."""
+    """The paths in pieces; what derivatives need is computed again for each, not kept.
+
+    Args:
+        stage: Scene and antennas.
+        chains: Which surfaces each path meets.
+    """
     rows = torch.arange(len(chains.source))
     some = (stage.vertices, stage.tx, stage.rx)
     heavy = len(rows) > _ROWS_AT_ONCE and any(value.requires_grad for value in some)
