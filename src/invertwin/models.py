@@ -753,14 +753,18 @@ class RadioMap(ForwardModel):
 
     @property
     def random(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether points are drawn, as those of cells are."""
-        return self.places.random
+        """Whether points are drawn, as those of cells are, or scattered paths."""
+        return self.places.random or self.reception.rough is not None
 
     def for_differences(
         self, scene: Scene, sensor: Transmitters, samples: int, scheme: Literal["rays", "area"]
     ) -> "RadioMap":
-        """The model with so many points on the cells."""
-        return replace(self, places=self.places.finer(samples))
+        """The model with so many points on the cells, and so many scattered paths."""
+        reception, rough = self.reception, self.reception.rough
+        if rough is not None:
+            finer = replace(rough, samples=samples, boundary=False)
+            reception = replace(reception, rough=finer)
+        return replace(self, places=self.places.finer(samples), reception=reception)
 
     def ablations(self) -> dict[str, ForwardModel]:
         """The model at fixed visibility: without diffraction, or without boundary paths of cells.
@@ -768,11 +772,14 @@ class RadioMap(ForwardModel):
         See ``ForwardModel.ablations``.
         """
         fixed = self.places.fixed_visibility()
-        if fixed is not None:
-            return {"boundary": replace(self, places=fixed)}
-        if not self.reception.edges:
+        rough = self.reception.rough
+        moves = rough is not None and rough.boundary
+        if fixed is None and not self.reception.edges and not moves:
             return {}
-        return {"boundary": replace(self, reception=replace(self.reception, edges=0))}
+        if rough is not None:
+            rough = replace(rough, boundary=False)
+        reception = replace(self.reception, edges=0, rough=rough)
+        return {"boundary": replace(self, places=fixed or self.places, reception=reception)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,14 +3,24 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.func import jvp
 
 from invertwin.channel import lit_fractions, trace_paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.links import Metasurface, Reception, Transmitters, frequency_response, panel_paths
+from invertwin.links import (
+    CellSampling,
+    MapPlane,
+    Metasurface,
+    Reception,
+    Transmitters,
+    frequency_response,
+    panel_paths,
+)
 from invertwin.links.metasurface import panel_response
 from invertwin.links.places import Points
 from invertwin.models import RadioMap
@@ -250,3 +260,30 @@ def test_wrong_calls_are_refused():
         panel_paths(aside(), panel(4), far, torch.zeros(0, 3), FREQUENCY)
     with pytest.raises(InputError, match=r"frequency \[Hz\]"):
         panel_paths(aside(), panel(4), far, far, 0.0)
+
+
+def test_cells_hold_what_panels_send_and_how_a_screen_moves_it():
+    mast = Transmitters(float64([-0.6, 0.1, 1.4]))
+    cell = MapPlane.horizontal([-0.3, -0.2], [0.3, 0.2], 2.0, 0.6, CellSampling(points=25))
+    reception = Reception(FREQUENCY, depth=0, panels=[panel(16)])
+
+    def gain(shift: Tensor, reception: Reception) -> Tensor:
+        return cell.received(screened(shift), mast, reception, 3).gain.sum()
+
+    shift = float64(0.05)
+    with_panel, without = (gain(shift, r) for r in (reception, replace(reception, panels=())))
+    points = cell.drawn(np.random.default_rng(np.random.SeedSequence([3, 1]))).flatten(0, 1)
+    over = panel_response(screened(shift), panel(16), mast.positions, points, FREQUENCY)
+    assert float(with_panel - without) == pytest.approx(float(over.abs().square().mean()), rel=1e-9)
+    alone = {how: gain(shift + way, reception) for how, way in (("up", 1e-4), ("down", -1e-4))}
+    bare = {
+        how: gain(shift + way, replace(reception, panels=()))
+        for how, way in (("up", 1e-4), ("down", -1e-4))
+    }
+    truth = float(alone["up"] - bare["up"] - alone["down"] + bare["down"]) / 2e-4
+    rates = [
+        float(jvp(lambda x, r=r: gain(x, r), (shift,), (torch.ones_like(shift),))[1])
+        for r in (reception, replace(reception, panels=()))
+    ]
+    assert rates[0] - rates[1] == pytest.approx(truth, rel=1e-3)
+    assert truth != 0

@@ -17,12 +17,10 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import RayPaths, trace_coverage
-from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count
 from invertwin.links.places import Places
-from invertwin.links.received import Received, Reception
-from invertwin.links.spreads import path_powers, root
+from invertwin.links.received import Received, Reception, spread_of
 from invertwin.links.transmitters import Transmitters
 from invertwin.scene.checks import ArrayLike, check_fields, checked_number, checked_tensor, plain
 from invertwin.scene.mesh import Mesh
@@ -133,9 +131,7 @@ class Cells(Places):
         points = self.drawn(numbers)
 
         def measure(paths: RayPaths, tx: Tensor, rx: Tensor) -> Tensor:
-            power = path_powers(paths, sensor.terminals, reception.receivers)
-            excess = paths.delay - (rx[paths.rx] - tx[paths.tx]).norm(dim=1) / SPEED_OF_LIGHT
-            return torch.stack([power, power * excess, power * excess**2], 1)
+            return reception.moments(paths, tx, rx, sensor.terminals)
 
         lit = trace_coverage(
             scene,
@@ -156,11 +152,10 @@ class Cells(Places):
             row = part.tx * mean.shape[1] + cell
             density = part.amount / self.areas[cell, None]
             mean = mean.flatten(0, 1).index_add(0, row, density).view(mean.shape)
-        power, first, second = mean.unbind(2)
-        safe = torch.where(power > 0, power, 1.0)
-        spread = root(second / safe - (first / safe) ** 2)
+        aside = reception.aside(scene, sensor, points.flatten(0, 1), seed)
+        mean = mean + aside.unflatten(1, points.shape[:2]).mean(2)
         shape = (len(mean), *self.shape)
-        return Received(power.reshape(shape), spread.reshape(shape))
+        return Received(mean[..., 0].reshape(shape), spread_of(mean).reshape(shape))
 
 
 @dataclass(frozen=True, eq=False)

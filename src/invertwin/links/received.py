@@ -17,11 +17,13 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel import RayPaths, trace_paths
+from invertwin.channel import RayPaths, Sampling, trace_paths
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.metasurface import Metasurface, panel_paths
 from invertwin.links.responses import Terminals, frequency_response, path_amplitudes, phasors
-from invertwin.links.spreads import delay_spread
+from invertwin.links.scattered import scattered_moments
+from invertwin.links.spreads import path_powers, root
 from invertwin.links.transmitters import Transmitters
 from invertwin.scene.checks import checked_number
 from invertwin.scene.scene import Scene
@@ -57,6 +59,8 @@ class Reception:
         rays: Shot to find sequences of surfaces; None tries all.
         receivers: Antenna and axes of every receiver; of several elements the mean power counts.
         panels: Metasurfaces, whose paths are added, see ``panel_paths``.
+        rough: How paths that rough surfaces scatter are drawn, over all receivers; their power
+            is added. None leaves them out.
 
     Raises:
         InputError: A number out of range, or edges without a bandwidth.
@@ -69,6 +73,7 @@ class Reception:
     rays: int | None = 100_000
     receivers: Terminals = field(default_factory=Terminals)
     panels: Sequence[Metasurface] = ()
+    rough: Sampling | None = None
 
     def __post_init__(self) -> None:
         checked_number(self.frequency, "frequency [Hz]", 0.0, open_low=True)
@@ -121,11 +126,82 @@ class Reception:
 
         def found(some: Tensor) -> tuple[Tensor, Tensor]:
             paths = self.paths(scene, sensor, some, seed)
-            ends = (sensor.terminals, self.receivers)
-            return received_gain(paths, self.bandwidth, *ends).T, delay_spread(paths, *ends).T
+            gain = received_gain(paths, self.bandwidth, sensor.terminals, self.receivers)
+            return gain.T, self.summed(paths, sensor, some)
 
-        gain, spread = in_batches(found, places)
-        return Received(gain, spread)
+        gain, moments = in_batches(found, places)
+        more = self.scattered(scene, sensor, places, seed)
+        return Received(gain + more[..., 0], spread_of(moments + more))
+
+    def moments(
+        self,
+        paths: RayPaths,
+        tx: Float64[Tensor, "tx 3"],
+        rx: Float64[Tensor, "rx 3"],
+        terminals: Terminals,
+    ) -> Float64[Tensor, "path 3"]:
+        """Power of each path, and that times its excess delay [s] and the square of it [s²].
+
+        The excess delay is that over the straight line.
+
+        Args:
+            paths: From ``trace_paths``.
+            tx: Where the transmitters are [m].
+            rx: Where the receivers are [m].
+            terminals: At the transmitters.
+        """
+        power = path_powers(paths, terminals, self.receivers)
+        excess = paths.delay - (rx[paths.rx] - tx[paths.tx]).norm(dim=1) / SPEED_OF_LIGHT
+        return torch.stack([power, power * excess, power * excess**2], 1)
+
+    def summed(
+        self, paths: RayPaths, sensor: Transmitters, places: Float64[Tensor, "place 3"]
+    ) -> Float64[Tensor, "tx place 3"]:
+        """Sums of ``moments`` over the paths of each link.
+
+        Args:
+            paths: From the sensor to the places.
+            sensor: What sends.
+            places: Of the receivers [m].
+        """
+        each = self.moments(paths, sensor.positions, places, sensor.terminals)
+        return _added(paths, each).view(*paths.counts, 3)
+
+    def aside(
+        self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int
+    ) -> Float64[Tensor, "tx place 3"]:
+        """Sums of ``moments`` of what ``trace_coverage`` does not trace: panels, rough surfaces.
+
+        Args:
+            scene: What is in the way.
+            sensor: What sends.
+            places: Of the receivers [m].
+            seed: Of the paths that are drawn.
+        """
+
+        def found(some: Tensor) -> tuple[Tensor]:
+            over = panel_paths(scene, self.panels, sensor.positions, some, self.frequency)
+            return (self.summed(over, sensor, some),)
+
+        total = self.scattered(scene, sensor, places, seed)
+        return total + in_batches(found, places)[0] if self.panels else total
+
+    def scattered(
+        self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int
+    ) -> Float64[Tensor, "tx place 3"]:
+        """What rough surfaces scatter to receivers: sums of ``moments``, 0 where it is left out.
+
+        Args:
+            scene: What scatters.
+            sensor: What sends.
+            places: Of the receivers [m].
+            seed: Of the paths that are drawn.
+        """
+        if self.rough is None:
+            return places.new_zeros(len(sensor.positions), len(places), 3)
+        return scattered_moments(
+            scene, sensor, self.receivers, places, self.frequency, self.rough, seed
+        )
 
     def responses(
         self,
@@ -143,7 +219,15 @@ class Reception:
             places: Of the receivers [m].
             frequencies: [Hz].
             seed: Of the rays that find paths.
+
+        Raises:
+            InputError: With scattered power, which has no phase.
         """
+        if self.rough is not None:
+            raise InputError(
+                "expected a reception without scattered power for responses, got "
+                f"{self.rough}; scattered power has no phase: leave it out"
+            )
 
         def found(some: Tensor) -> tuple[Tensor]:
             paths = self.paths(scene, sensor, some, seed)
@@ -151,6 +235,17 @@ class Reception:
             return (frequency_response(paths, frequencies, **ends)[:, 0, :, 0].transpose(0, 1),)
 
         return in_batches(found, places)[0]
+
+
+def spread_of(moments: Float64[Tensor, "*link 3"]) -> Float64[Tensor, "*link"]:
+    """Root mean square spread of delays [s], of sums of ``Reception.moments``.
+
+    Args:
+        moments: Power, and its first and second moment over excess delay.
+    """
+    power, first, second = moments.unbind(-1)
+    safe = torch.where(power > 0, power, 1.0)
+    return root(second / safe - (first / safe) ** 2)
 
 
 def in_batches(

@@ -6,6 +6,7 @@ import torch
 from annotated_types import MinLen
 from torch import Tensor
 
+from invertwin.cli.schema.fits import SAMPLED
 from invertwin.cli.sensors import LookAt, Orientation, Polarised, Turned
 from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative
@@ -63,13 +64,20 @@ class TransmitterTable(AntennaTable):
         return Transmitters(places, self.terminals(places), self.power_dbm)
 
 
-RECEPTION: Any = registry.table_of(Reception, "Reception", without=("receivers", "panels"))
+RECEPTION: Any = registry.table_of(Reception, "Reception", without=("receivers", "panels", "rough"))
+
+
+class RoughTable(SAMPLED):
+    """How paths that rough surfaces scatter are drawn."""
 
 
 class MapTable(registry.table_of(RadioMap, "RadioMap", RECEPTION, without=("reception",))):
     """What receivers at known places get of the transmitters."""
 
     antenna: AntennaTable = key("of every receiver", AntennaTable())
+    rough: RoughTable | None = key(
+        "paths that rough surfaces scatter, whose power is added; without it left out", None
+    )
 
     def build(self, given: Any = None, /, **more: Any) -> RadioMap:
         """The forward model."""
@@ -77,7 +85,8 @@ class MapTable(registry.table_of(RadioMap, "RadioMap", RECEPTION, without=("rece
         with about("places"):
             places = self.places.build()
         receivers = self.antenna.terminals(getattr(places, "positions", torch.zeros(1, 3)))
-        reception = Reception(**how, receivers=receivers)
+        rough = None if self.rough is None else self.rough.build()
+        reception = Reception(**how, receivers=receivers, rough=rough)
         return super().build(given, places=places, reception=reception, **more)
 
 

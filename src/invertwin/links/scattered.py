@@ -1,0 +1,181 @@
+"""What rough surfaces scatter from transmitters to receivers: powers without phases.
+
+Mirrored paths hold what smooth surfaces keep together (``trace_paths``). What they lose by their
+roughness goes everywhere: paths that scatter at each of their bounces, by the lobes of
+``EffectiveRoughness`` but the one about the mirror direction. Paths that are mirrored at one
+surface and scattered at another are left out.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.channel import Grid, Link, Sampling, deposit_power
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.links.responses import Terminals
+from invertwin.links.transmitters import Transmitters
+from invertwin.scene import Isotropic, Material, Pattern, Scene, Surface
+from invertwin.scene.antenna import COSINE_COUNT
+
+_PLACES_AT_ONCE = 8192
+_BINS = 64  # of length; moments are exact whatever their number
+_ANGLES = 360  # of a turned pattern about its axis
+
+
+def scattered_moments(
+    scene: Scene,
+    sensor: Transmitters,
+    receivers: Terminals,
+    places: Float64[Tensor, "place 3"],
+    frequency: float,
+    sampling: Sampling,
+    seed: int,
+) -> Float64[Tensor, "tx place 3"]:
+    """Scattered over sent power, and that times the excess delay [s] and its square [s²].
+
+    The excess delay is that over the straight line. Differentiable with respect to the scene and
+    to places, what moving shadows change included.
+
+    Args:
+        scene: What scatters; surfaces, no clouds.
+        sensor: What sends.
+        receivers: Antenna and axes of every receiver.
+        places: Of the receivers [m].
+        frequency: [Hz].
+        sampling: How many paths are drawn, over all receivers; most bounces of a path.
+        seed: Same seed, same paths.
+
+    Raises:
+        InputError: Axes of antennas that carry derivatives, or axes of its own for each receiver
+            with a pattern.
+    """
+    rough = _scattering(scene, frequency)
+    if rough is None:
+        return places.new_zeros(len(sensor.positions), len(places), 3)
+    if sensor.terminals.rotations.requires_grad or receivers.rotations.requires_grad:
+        raise InputError(
+            "expected axes of antennas without derivatives where rough surfaces scatter, got some "
+            "that carry them; scattered power has none by axes: detach them"
+        )
+    grid = _lengths(rough, (sensor.positions.detach(), places.detach()), sampling.depth)
+    parts = places.split(_PLACES_AT_ONCE)
+    rows: list[Tensor] = []
+    for number in range(len(sensor.positions)):
+        one = sensor.frames([number])
+        found: list[Tensor] = []
+        for batch, some in enumerate(parts):
+            link = _link(one, receivers, some, frequency)
+            drawn = _share(sampling, len(some) / len(places))
+            power = deposit_power(rough, link, grid, sampling=drawn, seed=seed + batch)
+            found.append(_moments(power[..., 0, 0].double(), grid, link))
+        rows.append(torch.cat(found))
+    return torch.stack(rows)
+
+
+def _link(sensor: Transmitters, receivers: Terminals, places: Tensor, frequency: float) -> Link:
+    """From one transmitter to receivers, in its axes."""
+    count, turn = len(places), sensor.terminals.rotations.reshape(3, 3)
+    return Link(
+        tx=sensor.positions.expand(count, 3),
+        rx=places,
+        rotations=turn.expand(count, 3, 3),
+        tx_pattern=sensor.terminals.array.pattern,
+        rx_pattern=_turned(receivers, turn),
+        wavelength=SPEED_OF_LIGHT / frequency,
+        shared_visibility=False,
+        tx_jones=sensor.terminals.array.jones,
+        rx_jones=receivers.array.jones,
+    )
+
+
+def _share(sampling: Sampling, share: float) -> Sampling:
+    """So much of all that is drawn."""
+    samples, edges = (math.ceil(n * share) for n in (sampling.samples, sampling.boundary_samples))
+    return replace(sampling, samples=samples, boundary_samples=edges)
+
+
+def _moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) -> Tensor:
+    """Sums of power, of power × excess delay and of power × its square."""
+    straight = (link.rx - link.tx).norm(dim=1, keepdim=True)
+    excess = (2 * grid.ranges - straight) / SPEED_OF_LIGHT
+    # A path lies in three bins, with weights whose second moment is a quarter of a squared step.
+    wide = (grid.range_step / SPEED_OF_LIGHT) ** 2
+    parts = power, power * excess, power * (excess**2 - wide)
+    return torch.stack([part.sum(1) for part in parts], -1)
+
+
+@dataclass(frozen=True)
+class _Scattering(Material):
+    """What a material scatters, without what ``trace_paths`` mirrors at it."""
+
+    of: Material
+
+    @property
+    def faces(self) -> int | None:
+        return self.of.faces
+
+    def surface(self, frequency: float) -> Surface:
+        """That of the material; a surface that is only rough keeps all of it."""
+        surface = self.of.surface(frequency)
+        if self.of.skin(frequency) is None:
+            return surface
+        return replace(surface, lobes=surface.lobes * surface.lobes.new_tensor([0.0, 1.0, 1.0]))
+
+
+def _scattering(scene: Scene, frequency: float) -> Scene | None:
+    """The scene as it scatters; None if it does not."""
+    objects = {
+        name: replace(item, material=_Scattering(item.material))
+        for name, item in scene.objects.items()
+    }
+    with torch.no_grad():
+        surfaces = [item.material.surface(frequency) for item in objects.values()]
+        rough = any(bool((s.diffuse > 0).any() or (s.lobes > 0).any()) for s in surfaces)
+    return replace(scene, objects=objects) if rough else None
+
+
+def _lengths(scene: Scene, ends: Sequence[Tensor], depth: int) -> Grid:
+    """Bins that hold every path of so many bounces, with room for what sheets add."""
+    points = torch.cat([item.vertices.detach() for item in scene.objects.values()] + [*ends])
+    across = float((points.amax(0) - points.amin(0)).norm())
+    step = (0.6 * (depth + 1) * across + 1.0) / (_BINS - 3)
+    return Grid(range_start=-step, range_step=step, range_count=_BINS)
+
+
+def _turned(receivers: Terminals, turn: Float64[Tensor, "3 3"]) -> Pattern:
+    """The receivers' pattern about the axes of the transmitter."""
+    pattern = receivers.array.pattern
+    if isinstance(pattern, Isotropic):
+        return pattern
+    if receivers.rotations.ndim == 3:
+        raise InputError(
+            "expected one orientation of all receivers with a pattern where rough surfaces "
+            f"scatter, got {len(receivers.rotations)}; give one, or isotropic receivers"
+        )
+    between = receivers.rotations.mT @ turn
+    if torch.equal(between, torch.eye(3, dtype=torch.float64)):
+        return pattern
+    return _Turned(pattern, between)
+
+
+@dataclass(frozen=True, eq=False)
+class _Turned(Pattern):
+    """A pattern about other axes."""
+
+    of: Pattern
+    turn: Float64[Tensor, "3 3"]  # from these axes into those of the pattern
+
+    def gain(self, direction: Tensor) -> Tensor:
+        return self.of.gain(direction @ self.turn.to(direction).mT)
+
+    def table(self) -> Float64[Tensor, "n_cos n_phi"]:
+        cosine = torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64)[:, None]
+        phi = 2 * torch.pi * torch.arange(_ANGLES, dtype=torch.float64) / _ANGLES - torch.pi
+        sine = (1 - cosine**2).clamp_min(0).sqrt()
+        parts = sine * phi.cos(), sine * phi.sin(), cosine.expand(-1, _ANGLES)
+        return self.gain(torch.stack(parts, -1))
