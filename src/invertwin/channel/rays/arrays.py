@@ -8,6 +8,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from invertwin.channel.rays.backend import dr, mi
+from invertwin.scene.checks import plain
 
 
 def to_float(values: Tensor) -> Any:
@@ -36,8 +37,8 @@ def _aligned(values: Tensor, kind: torch.dtype) -> np.ndarray:
     Dr.Jit reads such memory in place. Where it begins elsewhere, as NumPy's may, Dr.Jit compiles
     kernels of their own for it.
     """
-    flat = values.detach().cpu().ravel()
-    return torch.empty_like(flat, dtype=kind).copy_(flat).numpy()
+    flat = plain(values).cpu().ravel()
+    return plain(torch.empty_like(flat, dtype=kind).copy_(flat)).numpy()
 
 
 def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> Any:
