@@ -14,7 +14,7 @@ from annotated_types import Ge, Le, MinLen
 from invertwin.errors import InputError
 from invertwin.limits import Angle, Count, Positive
 from invertwin.memory import require_at_most
-from invertwin.scene.checks import checked_count, checked_number, checked_tensor, plain
+from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh
 
 _MOST_TRIANGLES = 1e7  # of one shape
@@ -53,7 +53,7 @@ def box(size: Positive | Sequence[Positive], divisions: Count = 1) -> Mesh:
     """
     sizes = [size] * 3 if isinstance(size, int | float) else list(size)
     given = checked_tensor(sizes, (3,), "box size", "give one number or three")
-    extent = plain(given).numpy()
+    extent = np.asarray(given.tolist())
     for length in extent:
         _length(float(length), "box size [m]")
     n = checked_count(divisions, "divisions", 1)

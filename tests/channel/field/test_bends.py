@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.func import jvp
 
 from invertwin.channel import RayPaths, trace_paths
 from invertwin.scene import (
@@ -220,6 +221,18 @@ def test_gradients_are_differences():
         step[index] = 1e-6
         truth = (value(zero + step) - value(zero - step)) / 2e-6
         assert float((found[:, index] - truth).norm()) < 1e-5 * float(found.norm(dim=0).max())
+
+
+def test_forward_mode_of_torch_func_agrees_with_reverse_mode():
+    def value(shift: Tensor) -> Tensor:
+        wall = scene().replace("wall", pose=rigid(UPRIGHT, float64([0.3, 0.2, 2.0]) + shift))
+        return torch.view_as_real(response(trace(wall, depth=1))).square().sum()
+
+    zero, way = torch.zeros(3, dtype=torch.float64), float64([0.6, -0.3, 0.5])
+    (reverse,) = torch.autograd.grad(value(leaf := zero.requires_grad_()), leaf)
+    forward = jvp(value, (zero.detach(),), (way,))[1]
+    assert float(forward) == pytest.approx(float(reverse @ way), rel=1e-9)
+    assert float(reverse @ way) != 0
 
 
 def test_doppler_is_that_of_moved_geometry():

@@ -17,9 +17,11 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.waves import cross, dot
+from invertwin.scene.checks import plain
 
 LEAST_ANGLE = math.radians(10.0)
 """Nearer to grazing, or to the edge itself, fringe currents are not valid."""
@@ -168,19 +170,38 @@ def joined_wedges(wedges: Wedges) -> Wedges:
     """
     if not len(wedges.start):
         return wedges
-    # Both orders of the faces are one edge: the first one leans more to some direction.
-    lean = (wedges.inwards + wedges.normals * math.sqrt(3)).detach() @ _ANYWHERE
-    order = torch.where((lean[:, :1] < lean[:, 1:]), _SECOND_FIRST, _SECOND_FIRST.flip(0))
+    # Discrete: to `torch.func`, tensors made on the way would be its own.
+    with _DisableFuncTorch():
+        order, against, first, last = _lines(wedges)
     rows = torch.arange(len(order))[:, None]
-    inwards, normals = wedges.inwards[rows, order], wedges.normals[rows, order]
-    axis = cross(inwards[:, 0], normals[:, 0]).detach()
-    against = (dot(axis, wedges.end - wedges.start) < 0)[:, None]
     start = torch.where(against, wedges.end, wedges.start)
     end = torch.where(against, wedges.start, wedges.end)
-    low, high = dot(axis, start.detach()), dot(axis, end.detach())
+    return Wedges(
+        start[first],
+        end[last],
+        wedges.inwards[rows, order][first],
+        wedges.normals[rows, order][first],
+        wedges.opening[first],
+        wedges.faces[rows, order][first],
+    )
+
+
+def _lines(wedges: Wedges) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Order of each edge's faces, whether it runs against its axis, first and last of each line."""
+    names = ("start", "end", "inwards", "normals")
+    start, end, inwards, normals = (plain(getattr(wedges, name)) for name in names)
+    # Both orders of the faces are one edge: the first one leans more to some direction.
+    lean = (inwards + normals * math.sqrt(3)) @ _ANYWHERE
+    order = torch.where((lean[:, :1] < lean[:, 1:]), _SECOND_FIRST, _SECOND_FIRST.flip(0))
+    rows = torch.arange(len(order))[:, None]
+    inwards, normals = inwards[rows, order], normals[rows, order]
+    axis = cross(inwards[:, 0], normals[:, 0])
+    against = (dot(axis, end - start) < 0)[:, None]
+    start, end = torch.where(against, end, start), torch.where(against, start, end)
+    low, high = dot(axis, start), dot(axis, end)
     size = float(torch.maximum(low.abs(), high.abs()).amax()) + float((high - low).amax())
-    aside = (start.detach() - low[:, None] * axis) / size
-    key = torch.cat([aside, inwards.flatten(1), normals.flatten(1)], 1).detach()
+    aside = (start - low[:, None] * axis) / size
+    key = torch.cat([aside, inwards.flatten(1), normals.flatten(1)], 1)
     # Adding zero makes negative zeros positive.
     rounded = (key / _ALIKE).round().numpy() + 0.0
     line = np.unique(rounded, axis=0, return_inverse=True)[1].ravel()
@@ -189,16 +210,7 @@ def joined_wedges(wedges: Wedges) -> Wedges:
     new = torch.ones(len(line), dtype=torch.bool)
     gap = (low[sequence][1:] - high[sequence][:-1]).abs() > _ALIKE * size
     new[1:] = (line[1:] != line[:-1]) | gap
-    first = sequence[new]
-    last = sequence[new.roll(-1)]
-    return Wedges(
-        start[first],
-        end[last],
-        inwards[first],
-        normals[first],
-        wedges.opening[first],
-        wedges.faces[rows, order][first],
-    )
+    return order, against, sequence[new], sequence[new.roll(-1)]
 
 
 def outside(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.scene.checks import plain
@@ -37,8 +38,9 @@ def _aligned(values: Tensor, kind: torch.dtype) -> np.ndarray:
     Dr.Jit reads such memory in place. Where it begins elsewhere, as NumPy's may, Dr.Jit compiles
     kernels of their own for it.
     """
-    flat = plain(values).cpu().ravel()
-    return plain(torch.empty_like(flat, dtype=kind).copy_(flat)).numpy()
+    with _DisableFuncTorch():  # within `torch.func`, even new tensors are wrapped
+        flat = plain(values).cpu().ravel()
+        return torch.empty_like(flat, dtype=kind).copy_(flat).numpy()
 
 
 def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> Any:
