@@ -1,5 +1,6 @@
 """`invertwin reconstruct` of received levels, in small."""
 
+import re
 import tomllib
 
 import pytest
@@ -112,6 +113,14 @@ def test_levels_of_a_file(tmp_path, monkeypatch):
     assert "errors_m" not in found
     place = found["parameters"]["transmitter.position"]
     assert place == pytest.approx([1.0, 0.8, 0.2], abs=0.02)
+
+
+def test_check_says_how_long_a_fit_takes(tmp_path, monkeypatch, capsys):
+    shown = call(monkeypatch, "check", file_of(tmp_path, RUN + STARTS))
+    said = capsys.readouterr().out
+    assert shown == 0
+    assert re.search(r"about .+ for 1 transmitters", said)
+    assert "transmitter_starts.count" in said
 
 
 def test_starts_are_in_free_space(tmp_path):

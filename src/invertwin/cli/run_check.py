@@ -9,7 +9,7 @@ import torch
 from invertwin.channel import Sampling
 from invertwin.cli import build
 from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
-from invertwin.cli.fits.problem import sensors_of
+from invertwin.cli.fits.problem import FULL, sensors_of, settings_of, stages_of, varied_run
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Table, texts
 from invertwin.cli.run_file import about, need
@@ -17,13 +17,13 @@ from invertwin.cli.run_simulate import chirp_train, exact
 from invertwin.cli.running import time_left
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
-from invertwin.errors import InputError
 from invertwin.memory import free_memory, gigabytes
 from invertwin.models import SurrogateMap
 from invertwin.scene import Scene, Translation
 
 _FRAMES = 4  # of the radar, or aspects, in the probe
 _FEW, _MANY = 10_000, 100_000  # rays or paths that are timed: less than a second of work
+_DERIVATIVES = 4  # times the work of a map: a step of a fit with one or several derivatives
 _FITS = ("reconstruct", "demo")
 
 
@@ -36,10 +36,7 @@ def run_check(run: RunFile) -> tuple[list[Table], str]:
     if run.rcs is not None:
         return _of_signature(run)
     if run.map is not None:
-        raise InputError(
-            "map: expected a run of a radar to estimate, got a radio map, whose memory is bounded; "
-            "run it"
-        )
+        return _of_radio_map(run)
     if run.placement is not None:
         return _of_placement(run)
     truth, sensors = build.true_scene(run), _sensors(run)
@@ -90,6 +87,35 @@ def _of_placement(run: RunFile) -> tuple[list[Table], str]:
     line = f"about {time_left(seconds)} for {levels} evaluations and {descents} derivatives"
     heads = ("needs", "how many", "key")
     return [Table("Estimate", heads, rows), _meshes(build.scene(run))], line
+
+
+def _of_radio_map(run: RunFile) -> tuple[list[Table], str]:
+    """The same of `[map]`, whose memory does not grow: the time of one map of each stage."""
+    scene = build.true_scene(run)
+    with about("transmitter"):
+        sensor = need(run, "transmitter", "[map]").build()
+
+    def once(own: RunFile) -> float:
+        with about("map"), torch.no_grad():
+            model = need(own, "map", run.task).build()
+            return _timed(lambda: model.predict(scene, sensor, 0))
+
+    starts = 1 if run.transmitter_starts is None else run.transmitter_starts.count
+    rows: list[list[object]] = [["starts", starts, "transmitter_starts.count"]]
+    if run.task == "reconstruct":
+        seconds = 0.0
+        for mode in (FULL, *run.variants):
+            for number, (_, own) in enumerate(stages_of(varied_run(run, mode)), 1):
+                steps = settings_of(own).steps
+                rows.append([f"steps, {mode}, stage {number}", steps, "reconstruct.steps"])
+                seconds += starts * steps * _DERIVATIVES * once(own)
+    else:
+        check = need(run, "gradcheck", run.task)
+        count = 4 * (check.repeats + check.max_pairs)
+        rows.append(["maps", count, "gradcheck.repeats, gradcheck.max_pairs"])
+        seconds = count * once(run)
+    line = f"about {time_left(seconds)} for {len(sensor.positions)} transmitters"
+    return [Table("Estimate", ("needs", "how many", "key"), rows), _meshes(scene)], line
 
 
 def _timed(work: Callable[[], object]) -> float:

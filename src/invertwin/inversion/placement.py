@@ -164,7 +164,7 @@ class Descent:
     """How a panel is placed by gradient.
 
     Attributes:
-        scouts: Places that are tried before, at random.
+        scouts: Places that are tried before, spread at random over all.
         tracks: The best of them that stand apart, from which short descents start.
         track_steps: Of each short descent.
         steps: Of the last one, from the best end.
@@ -173,8 +173,8 @@ class Descent:
         rates: Of place [m], yaw and spread [rad], and phases [rad] in a step.
     """
 
-    scouts: Count = 16
-    tracks: Count = 3
+    scouts: Count = 32
+    tracks: Count = 4
     track_steps: Count = 12
     steps: Count = 80
     edge_width: NonNegative = 0.3
@@ -243,12 +243,25 @@ class Placing:
         module.load_state_dict(state)
         return module
 
-    def drawn(self, generator: torch.Generator) -> PlacedPanel:
-        """A module at a random place, yaw and spread."""
-        u = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
+    def drawn(self, generator: torch.Generator, count: int = 1) -> list[PlacedPanel]:
+        """Modules at random places, yaws and spreads, each from a slice of its own of every range.
+
+        Args:
+            generator: Of the random numbers.
+            count: How many.
+        """
+        u = torch.rand(count, 4, generator=generator, dtype=torch.float64)
+        slices = [torch.randperm(count, generator=generator) for _ in range(4)]
+        u = (torch.stack(slices, 1) + u) / count
         length = self._example.path.length
-        spread = [self.spread_limit * u[2], self.spread_limit * u[3]]
-        return self.make(length * u[0], self.yaw_limit * (2 * u[1] - 1), spread)
+        return [
+            self.make(
+                length * along,
+                self.yaw_limit * (2 * yaw - 1),
+                [self.spread_limit * across, self.spread_limit * up],
+            )
+            for along, yaw, across, up in u.tolist()
+        ]
 
     @property
     def _example(self) -> PlacedPanel:
@@ -307,7 +320,7 @@ class Placing:
             boundary: False leaves out that shadows move.
         """
         generator = torch.Generator().manual_seed(seed)
-        scouts = [self.drawn(generator) for _ in range(settings.scouts)]
+        scouts = self.drawn(generator, settings.scouts)
         scouts.sort(key=self.level, reverse=True)
         tracks: list[PlacedPanel] = []
         for scout in scouts:
@@ -346,7 +359,7 @@ class Placing:
             enough: A level at which it stops [dB].
         """
         generator = torch.Generator().manual_seed(seed)
-        here = self.drawn(generator)
+        (here,) = self.drawn(generator)
         level = self.level(here)
         found = Found({n: v.clone() for n, v in here.state_dict().items()}, level, 1)
         kept = {n: v.clone() for n, v in found.state.items()}
