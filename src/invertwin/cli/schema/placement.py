@@ -27,9 +27,9 @@ class Receivers(Section):
 
     low: Vector = key("m, a corner of the box")
     high: Vector = key("m, the opposite corner")
-    count: Several = key("those that the search sees", 1200)
+    count: Several = key("those that the search sees", 4800)
     batch: Several = key("of them, in one evaluation", 300)
-    scored: Several = key("others, of another seed, that score what was found", 800)
+    scored: Several = key("others, of another seed, that score what was found", 4000)
 
     def drawn(self, count: int, seed: int) -> Tensor:
         """Places [count, 3] [m]."""
