@@ -4,7 +4,7 @@ from invertwin.channel.field.chains import trace_chains as trace_chains
 from invertwin.channel.field.coverage import trace_coverage as trace_coverage
 from invertwin.channel.field.echoes import trace_echoes as trace_echoes
 from invertwin.channel.field.field import trace_field as trace_field
-from invertwin.channel.field.lit import Cells as Cells
+from invertwin.channel.field.lit import PanelCells as PanelCells
 from invertwin.channel.field.lit import lit_fractions as lit_fractions
 from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle

@@ -17,7 +17,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel import METASURFACE, Cells, Pattern, RayPaths, lit_fractions, polarisations
+from invertwin.channel import (
+    METASURFACE,
+    PanelCells,
+    Pattern,
+    RayPaths,
+    lit_fractions,
+    polarisations,
+)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import Scene
@@ -91,14 +98,14 @@ class Metasurface:
             object.__setattr__(self, name, value)
 
     @property
-    def cells(self) -> Cells:
+    def cells(self) -> PanelCells:
         """The cells of the elements; x runs slowest."""
         offsets = [
             (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * self.spacing
             for count in self.phase.shape
         ]
         grid = torch.stack(torch.meshgrid(*offsets, indexing="ij"), -1).reshape(-1, 2)
-        return Cells(self.position, self.axes, grid, (self.spacing, self.spacing))
+        return PanelCells(self.position, self.axes, grid, (self.spacing, self.spacing))
 
     @property
     def response(self) -> Complex128[Tensor, " element"]:
@@ -177,7 +184,7 @@ def panel_response(
 
 
 def _waves(
-    panel: Metasurface, cells: Cells, places: Tensor, lit: Tensor, k: float, far: bool
+    panel: Metasurface, cells: PanelCells, places: Tensor, lit: Tensor, k: float, far: bool
 ) -> tuple[Complex128[Tensor, "place element"], Float64[Tensor, "place element"]]:
     """Wave of each place at each element, over its phase at the centre, and its obliquity."""
     whole = (places - panel.position) @ panel.axes

@@ -29,7 +29,7 @@ _SAME_PLANE = 1e-9  # of lengths: an apex in the plane of a place and an edge
 
 
 @dataclass(frozen=True)
-class Cells:
+class PanelCells:
     """Equal rectangular cells of a flat panel.
 
     Attributes:
@@ -80,7 +80,7 @@ class _Edges:
 def lit_fractions(
     scene: Scene,
     places: Float64[Tensor, "place 3"],
-    cells: Cells,
+    cells: PanelCells,
     *,
     width: float = 0.0,
     boundary: bool = True,
@@ -110,7 +110,7 @@ def lit_fractions(
     vertices = torch.cat([item.vertices for item in items])
     with tracing():
         rays = Occluders(plain(vertices), topology, plain(cells.center))
-        still = Cells(plain(cells.center), plain(cells.axes), plain(cells.offsets), cells.size)
+        still = PanelCells(plain(cells.center), plain(cells.axes), plain(cells.offsets), cells.size)
         spots = plain(places)
         edges = _candidates(plain(vertices), topology, spots, still, still.radius + width)
         edges = _seen(rays, plain(vertices), spots, still, edges)
@@ -129,7 +129,7 @@ def lit_fractions(
 
 
 def _candidates(
-    vertices: Tensor, topology: Topology, places: Tensor, cells: Cells, reach: float
+    vertices: Tensor, topology: Topology, places: Tensor, cells: PanelCells, reach: float
 ) -> _Edges:
     """Silhouette edges whose shadows end within reach of the panel's centre."""
     normal = cells.axes[:, 2]
@@ -170,7 +170,7 @@ def _candidates(
 
 
 def _shadows(
-    edges: _Edges, vertices: Tensor, places: Tensor, cells: Cells
+    edges: _Edges, vertices: Tensor, places: Tensor, cells: PanelCells
 ) -> Float64[Tensor, "row 3 2"]:
     """Projections of both ends and of the apex's side onto the panel's plane, along its axes [m].
 
@@ -191,7 +191,7 @@ def _shadows(
 
 
 def _ways(
-    edges: _Edges, vertices: Tensor, places: Tensor, cells: Cells
+    edges: _Edges, vertices: Tensor, places: Tensor, cells: PanelCells
 ) -> Float64[Tensor, "row 2"]:
     """Where ends of edges lie on the way from their places to the panel's plane: 0 to 1."""
     normal = cells.axes[:, 2]
@@ -225,7 +225,9 @@ def _distances(
     return torch.where(past, sign * far, aside), across
 
 
-def _seen(rays: Occluders, vertices: Tensor, places: Tensor, cells: Cells, edges: _Edges) -> _Edges:
+def _seen(
+    rays: Occluders, vertices: Tensor, places: Tensor, cells: PanelCells, edges: _Edges
+) -> _Edges:
     """Edges that nothing hides from their places, where their shadows are nearest to the panel.
 
     On the panel itself nothing else may shade the lit side of the line.
@@ -250,7 +252,7 @@ def _seen(rays: Occluders, vertices: Tensor, places: Tensor, cells: Cells, edges
 
 
 def _lit(
-    rays: Occluders, places: Tensor, cells: Cells, edges: _Edges, vertices: Tensor
+    rays: Occluders, places: Tensor, cells: PanelCells, edges: _Edges, vertices: Tensor
 ) -> Bool[Tensor, "place cell"]:
     """Whether places see the centres of cells: all are tried where a shadow may end among them."""
     none = torch.zeros(len(edges.place), 2, dtype=torch.float64)
@@ -268,7 +270,7 @@ def _lit(
 
 
 def _cut(
-    edges: _Edges, lit: Tensor, at: tuple[Tensor, Tensor, Cells], width: float
+    edges: _Edges, lit: Tensor, at: tuple[Tensor, Tensor, PanelCells], width: float
 ) -> tuple[Int64[Tensor, " cut"], Int64[Tensor, " cut"]]:
     """Which cells the end of a shadow cuts: rows of edges, and cells.
 
