@@ -123,6 +123,15 @@ def test_check_says_how_long_a_fit_takes(tmp_path, monkeypatch, capsys):
     assert "transmitter_starts.count" in said
 
 
+def test_a_map_may_hold_scattered_power(tmp_path):
+    text = RUN.replace(
+        "depth = 1\nscatter", "depth = 1\nrough = { depth = 1, samples = 5000 }\nscatter"
+    )
+    rough = loaded(tmp_path, text).map.build().reception.rough
+    assert (rough.depth, rough.samples) == (1, 5000)
+    assert loaded(tmp_path, RUN).map.build().reception.rough is None
+
+
 def test_starts_are_in_free_space(tmp_path):
     wide = STARTS.replace("count = 2", "count = 200\nclear = 0.2")
     run = loaded(tmp_path, RUN + wide)

@@ -111,6 +111,15 @@ def test_searches_reach_the_best_of_the_grid():
     assert own.level(own.module(found.state)) == pytest.approx(found.level)
 
 
+def test_scouts_are_spread_over_all_ranges():
+    own = placing(5)
+    scouts = own.drawn(torch.Generator().manual_seed(4), 8)
+    along = torch.stack([scout.along.detach() for scout in scouts]) / 5.8
+    yaw = torch.stack([scout.yaw.detach() for scout in scouts]) / (2 * own.yaw_limit) + 0.5
+    for share in (along, yaw):
+        assert (8 * share).long().sort().values.tolist() == list(range(8))
+
+
 def test_annealing_keeps_its_best():
     own = placing(20)
     found = own.annealed(40, 1)

@@ -176,10 +176,10 @@ class Descent:
     scouts: Count = 32
     tracks: Count = 4
     track_steps: Count = 12
-    steps: Count = 80
+    steps: Count = 200
     edge_width: NonNegative = 0.3
     softness: Positive = 3.0
-    rates: tuple[Positive, Positive, Positive] = (0.1, 0.04, 0.15)
+    rates: tuple[Positive, Positive, Positive] = (0.05, 0.02, 0.15)
 
     @property
     def evaluations(self) -> int:
@@ -335,9 +335,8 @@ class Placing:
                 boundary=boundary,
             )
         best = max(tracks, key=self.level)
-        self.descend(
-            best, settings.steps, settings, width=settings.edge_width / 3, boundary=boundary
-        )
+        width = settings.edge_width / 10
+        self.descend(best, settings.steps, settings, width=width, boundary=boundary)
         state = {name: value.clone() for name, value in best.state_dict().items()}
         return Found(state, self.level(best), settings.evaluations)
 
