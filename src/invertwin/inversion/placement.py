@@ -174,12 +174,12 @@ class Descent:
     """
 
     scouts: Count = 32
-    tracks: Count = 4
-    track_steps: Count = 12
-    steps: Count = 200
+    tracks: Count = 6
+    track_steps: Count = 24
+    steps: Count = 240
     edge_width: NonNegative = 0.3
     softness: Positive = 3.0
-    rates: tuple[Positive, Positive, Positive] = (0.05, 0.02, 0.15)
+    rates: tuple[Positive, Positive, Positive] = (0.15, 0.06, 0.15)
 
     @property
     def evaluations(self) -> int:
@@ -283,6 +283,7 @@ class Placing:
         *,
         width: float,
         boundary: bool = True,
+        phases: bool = True,
     ) -> None:
         """Move a module by gradient steps.
 
@@ -292,10 +293,11 @@ class Placing:
             settings: Rates and softness.
             width: Added to shadows at the start [m]; none after two thirds of the steps.
             boundary: False leaves out that shadows move.
+            phases: Whether each element's own phase moves, too.
         """
         place, turn, phase = settings.rates
         groups = [([module.along], place), ([module.yaw, module.spread], turn)]
-        groups.append(([module.shift], phase))
+        groups.append(([module.shift], phase if phases else 0.0))
         optimizer = torch.optim.Adam([{"params": p, "lr": r} for p, r in groups])
         # Other receivers in every step: phases must not learn single ones.
         drawn, count = torch.Generator().manual_seed(steps), len(self.coverage.receivers)
@@ -313,6 +315,9 @@ class Placing:
 
     def by_gradient(self, settings: Descent, seed: int, boundary: bool = True) -> Found:
         """Scouts at random, short descents from the best, and a long one from the best of these.
+
+        The short descents leave the phases of single elements alone: these fit the place where
+        they are learnt, and would hold the panel there.
 
         Args:
             settings: How long.
@@ -333,6 +338,7 @@ class Placing:
                 settings,
                 width=settings.edge_width,
                 boundary=boundary,
+                phases=False,
             )
         best = max(tracks, key=self.level)
         width = settings.edge_width / 10

@@ -28,7 +28,7 @@ class Receivers(Section):
     low: Vector = key("m, a corner of the box")
     high: Vector = key("m, the opposite corner")
     count: Several = key("those that the search sees", 4800)
-    batch: Several = key("of them, in one evaluation", 300)
+    batch: Several = key("of them, in one evaluation", 1200)
     scored: Several = key("others, of another seed, that score what was found", 4000)
 
     def drawn(self, count: int, seed: int) -> Tensor:
