@@ -43,7 +43,7 @@ from torch import Tensor
 from invertwin.channel.field.bends import find_bends
 from invertwin.channel.field.diffracted import DiffractedPaths, diffracted_paths
 from invertwin.channel.field.diffraction import Faces, Turn, conductor, diffraction_dyad
-from invertwin.channel.field.edge_paths import Edge, over_edges, slope_transfer
+from invertwin.channel.field.edge_paths import Edge, over_edges
 from invertwin.channel.field.edged import EdgedScene
 from invertwin.channel.field.images import Walls
 from invertwin.channel.field.sequences import Powers
@@ -355,7 +355,7 @@ def slope_jump(*, corrected: bool = True) -> float:
     tx = bend.place(11.0, torch.full((2,), azimuth_in, dtype=torch.float64), 8.0)
     rx = bend.place(9.0, azimuth, -5.0)
     wedges = bend.wedges(2)
-    found = over_edges([Edge(wedges, endless=True)], tx, rx, WAVE_NUMBER)
+    found = over_edges([Edge(wedges, endless=True)], tx, rx, WAVE_NUMBER, slopes=True)
     direction = _unit(found.points[:, 0] - tx).detach()
     turned = _unit(cross(direction, edge_axis(wedges)))  # −e × d
     vector = edge_axis(wedges) + 0j
@@ -370,9 +370,8 @@ def slope_jump(*, corrected: bool = True) -> float:
     phase = torch.polar(torch.ones_like(found.length), -WAVE_NUMBER * found.length)[:, None]
     before = _unit(found.points[:, 0] - tx)
     sent = (found.transfer @ emitted(before)[..., None])[..., 0]
-    if corrected:
-        slope = slope_transfer(Edge(wedges, endless=True), tx, rx, WAVE_NUMBER)
-        sent = sent + (slope @ vector[..., None])[..., 0]
+    if corrected and found.slopes is not None:
+        sent = sent + (found.slopes[0] @ vector[..., None])[..., 0]
     power = (total + sent * phase).abs().square().sum(1)
     (gradient,) = torch.autograd.grad(power.sum(), azimuth)
     return float((gradient[1] - gradient[0]).abs() / gradient.abs().mean())

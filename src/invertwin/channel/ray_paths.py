@@ -42,6 +42,10 @@ class RayPaths:
         names: Of the objects of the scene.
         doppler: Shift of the frequency by motion of antennas and objects [Hz]; positive where
             the path gets shorter.
+        slopes: Of paths round one edge: a of the derivatives of the transmitter's field and of the
+            receiver's by an angle about ``axes``, in which the fields turn with the directions
+            [1/rad]; zero of all others. None = no path has any.
+        axes: Unit vectors of these rotations, at the transmitter and at the receiver.
         missed: Of the directions of the antennas that rays were shot from, the share whose
             sequences of surfaces no ray has followed: an estimate; None where all sequences have
             been tried.
@@ -61,6 +65,8 @@ class RayPaths:
     objects: Int64[Tensor, "path vertex"]
     names: tuple[str, ...]
     doppler: Float64[Tensor, " path"]
+    slopes: Complex128[Tensor, "path 2 2 2"] | None = None
+    axes: Float64[Tensor, "path 2 3"] | None = None
     missed: float | None = None
 
     def __len__(self) -> int:
@@ -128,6 +134,8 @@ class RayPaths:
         turned = {
             n: getattr(self, n)[rows, back] for n in ("vertices", "kinds", "faces", "objects")
         }
+        if self.slopes is not None and self.axes is not None:
+            turned |= {"slopes": self.slopes.mT.flip(1), "axes": self.axes.flip(1)}
         return replace(
             self,
             counts=self.counts[::-1],
@@ -149,6 +157,8 @@ def joined(parts: Sequence[RayPaths]) -> RayPaths:
     Args:
         parts: At least one; they may have other numbers of vertices.
     """
+    if any(part.slopes is not None for part in parts):
+        parts = [_sloped(part) for part in parts]
     first = parts[0]
     width = max((part.kinds.shape[1] for part in parts if len(part)), default=0)
     fill = {"vertices": 0.0, "kinds": 0, "faces": -1, "objects": -1}
@@ -161,6 +171,14 @@ def joined(parts: Sequence[RayPaths]) -> RayPaths:
             values = [_widened(value, width, fill[name]) for value in values]
         columns[name] = torch.cat(values)
     return replace(first, **columns).sorted()
+
+
+def _sloped(paths: RayPaths) -> RayPaths:
+    """With slopes, zero if there are none."""
+    if paths.slopes is not None:
+        return paths
+    slopes = paths.coefficient.new_zeros(len(paths), 2, 2, 2)
+    return replace(paths, slopes=slopes, axes=paths.delay.new_zeros(len(paths), 2, 3))
 
 
 def _widened(value: Tensor, width: int, fill: float) -> Tensor:

@@ -84,6 +84,36 @@ class Terminals:
         weights = torch.einsum("pwb,ek,pkb->pew", change, jones.mixtures, mixed)
         return strength[:, None, None] * weights
 
+    def slopes(
+        self,
+        direction: Float64[Tensor, "path 3"],
+        place: Int64[Tensor, " path"],
+        axis: Float64[Tensor, "path 3"],
+        wave_number: float,
+    ) -> Complex128[Tensor, "path element 2"]:
+        """Derivative of the field of each element as directions turn about axes [1/rad].
+
+        The field turns with them: what is alike on all sides of an axis has none. The elements'
+        places count, by the phase from element to element.
+
+        Args:
+            direction: Unit vectors in the world, away from the terminal.
+            place: Its number.
+            axis: Unit vectors in the world.
+            wave_number: k [1/m].
+        """
+        up = torch.tensor(_VERTICAL, dtype=torch.float64)
+
+        def field(way: Tensor) -> Tensor:
+            return self.weights(way, place) @ polarisations(way, up).to(torch.complex128)
+
+        moved = torch.linalg.cross(axis, direction)
+        value, slope = torch.func.jvp(field, (direction,), (moved,))[:2]
+        around = axis.to(value.dtype)[:, None].expand_as(value)
+        slope = slope - torch.linalg.cross(around, value)
+        slope = slope + 1j * wave_number * self.advances(moved, place)[..., None] * value
+        return slope @ polarisations(direction, up).to(value.dtype).mT
+
     def advances(
         self, direction: Float64[Tensor, "path 3"], place: Int64[Tensor, " path"]
     ) -> Float64[Tensor, "path element"]:
@@ -123,9 +153,27 @@ def path_amplitudes(
     sent = tx.weights(paths.departure, paths.tx)
     received = rx.weights(paths.arrival, paths.rx)
     amplitude = torch.einsum("pri,pij,ptj->prt", received, paths.coefficient, sent)
+    if paths.slopes is not None and paths.axes is not None:
+        amplitude = amplitude + _by_slopes(paths, paths.slopes, paths.axes, tx, rx)
     ahead = rx.advances(paths.arrival, paths.rx)[:, :, None]
     ahead = ahead + tx.advances(paths.departure, paths.tx)[:, None]
     return amplitude, paths.delay[:, None, None] - ahead / SPEED_OF_LIGHT
+
+
+def _by_slopes(
+    paths: RayPaths, slopes: Tensor, axes: Tensor, tx: Terminals, rx: Terminals
+) -> Tensor:
+    """What edges add where the antennas' fields are uneven across the rays."""
+    rows = torch.nonzero(axes.detach().flatten(1).abs().amax(1) > 0)[:, 0]
+    k = 2 * math.pi * paths.frequency / SPEED_OF_LIGHT
+    ways, places = (paths.departure[rows], paths.arrival[rows]), (paths.tx[rows], paths.rx[rows])
+    ends = list(zip((tx, rx), ways, places, axes[rows].unbind(1), strict=True))
+    even = [end.weights(way, place) for end, way, place, _ in ends]
+    uneven = [end.slopes(way, place, axis, k) for end, way, place, axis in ends]
+    by_tx, by_rx = slopes[rows].unbind(1)
+    added = torch.einsum("pri,pij,ptj->prt", even[1], by_tx, uneven[0])
+    added = added + torch.einsum("pri,pij,ptj->prt", uneven[1], by_rx, even[0])
+    return added.new_zeros(len(paths), *added.shape[1:]).index_add(0, rows, added)
 
 
 def frequency_response(

@@ -32,7 +32,7 @@ class Pattern(ABC):
 
     @abstractmethod
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Linear power gain towards unit vectors in the radar frame."""
+        """Linear power gain towards unit vectors in the radar frame, differentiable by torch."""
 
     @abstractmethod
     def table(self) -> Float64[Tensor, "n_cos n_phi"]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from invertwin.channel.field.diffraction import conductor
-from invertwin.channel.field.edge_paths import Edge, over_edges, slope_transfer
+from invertwin.channel.field.edge_paths import Edge, over_edges
 from invertwin.channel.field.wedges import Wedges, joined_wedges
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 
@@ -162,8 +162,9 @@ def test_derivatives():
         once = over_edges([Edge(at, lossy)], tx, rx, K)
         twice = over_edges([Edge(at), Edge(LEANS)], tx, rx, K)
         along = over_edges([Edge(at, azimuth=edges[0].azimuth), edges[1]], tx, rx, K)
-        sloped = slope_transfer(Edge(at), tx, rx, K)
-        sent = torch.stack([once.transfer, twice.transfer, along.transfer, sloped])
+        sloped = over_edges([Edge(at)], tx, rx, K, slopes=True).slopes
+        assert sloped is not None
+        sent = torch.stack([once.transfer, twice.transfer, along.transfer, *sloped])
         return torch.view_as_real(sent.sum((1, 2, 3)))
 
     values = tuple(value.clone().requires_grad_() for value in (TX, RX, FIRST.end))

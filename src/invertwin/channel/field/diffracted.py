@@ -19,6 +19,7 @@ from invertwin.channel.field.edge_paths import over_edges
 from invertwin.channel.field.edged import EdgedScene, on_edge
 from invertwin.channel.field.images import corners_of, images
 from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.field.wedges import edge_axis
 from invertwin.channel.ray_paths import DIFFRACTION
 
 
@@ -37,6 +38,9 @@ class DiffractedPaths:
         length: of the path by these points [m].
         transfer: E at the receiver of E at 1 m from the transmitter, without the phase of
             ``length`` [1/m]; world coordinates, receive × transmit.
+        slopes: as ``transfer``, of derivatives of the transmitter's and of the receiver's field by
+            angles [rad] about ``axes``; zero of paths over two edges.
+        axes: unit vectors about which these angles turn, of transmitter and receiver.
     """
 
     tx: Int64[Tensor, " row"]
@@ -48,6 +52,8 @@ class DiffractedPaths:
     ways: Float64[Tensor, "row leg 3"]
     length: Float64[Tensor, " row"]
     transfer: Complex128[Tensor, "row 3 3"]
+    slopes: Complex128[Tensor, "row 2 3 3"]
+    axes: Float64[Tensor, "row 2 3"]
 
 
 def diffracted_paths(
@@ -74,7 +80,7 @@ def diffracted_paths(
         around.edge(row, pair, absorbs=bends.absorbs)
         for row, pair in zip(bends.edge.T, known, strict=True)
     ]
-    sent = over_edges(edges, legs[0].image, legs[1].image, wave_number)
+    sent = over_edges(edges, legs[0].image, legs[1].image, wave_number, slopes=alone)
     places = [on_edge(edge.wedges, sent.points[:, n]) for n, edge in enumerate(edges)]
     stops = torch.stack([legs[0].image, *places, legs[1].image], 1)
     pieces = stops[:, 1:] - stops[:, :-1]
@@ -85,6 +91,10 @@ def diffracted_paths(
     arriving = legs[0].dyad(sent.points[:, 0])
     # Reciprocity: on its way out a wave is turned as one that comes in.
     leaving = legs[1].dyad(sent.points[:, -1]).mT
+    slopes = torch.zeros_like(sent.transfer).expand(2, -1, -1, -1)
+    if sent.slopes is not None:
+        slopes = leaving @ (sent.slopes * turn) @ arriving
+    axes = [leg.turned(-edge_axis(edges[n].wedges)) for leg, n in zip(legs, (0, -1), strict=True)]
     ways = [normalize(pieces, dim=2)[:, 1:-1]]
     ways.insert(0, torch.stack(legs[0].ways(places[0]), 1))
     ways.append(-torch.stack(legs[1].ways(places[-1]), 1).flip(1))
@@ -102,6 +112,8 @@ def diffracted_paths(
         torch.cat(ways, 1),
         length,
         leaving @ (sent.transfer * turn) @ arriving,
+        slopes.transpose(0, 1),
+        torch.stack(axes, 1),
     )
 
 
@@ -140,6 +152,13 @@ class _Mirrors:
             turned = mirrored(found[0], self.normal[:, step])
             found.insert(0, torch.where(self.legs.through[:, step, None], found[0], turned))
         return found
+
+    def turned(self, axis: Tensor) -> Tensor:
+        """An axis of rotation near the edge, as it is near the antenna."""
+        for step in reversed(range(self.normal.shape[1])):
+            back = -mirrored(axis, self.normal[:, step])
+            axis = torch.where(self.legs.through[:, step, None], axis, back)
+        return axis
 
     def dyad(self, point: Tensor) -> Complex128[Tensor, "row 3 3"]:
         """E that arrives at a point, of E that leaves the antenna."""

@@ -15,7 +15,7 @@ The straight wave's terms of a sheet count by 1 − T.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -99,48 +99,61 @@ class Turn:
 
 
 def diffraction_dyad(turn: Turn, wave_number: float, order: Order = "value") -> Tensor:
-    """D of a wedge: E(s) = A exp(−jks) D·E(Q), with E in world coordinates, [row, 3, 3] in √m.
-
-    A = √(s′/(s(s + s′))) for a spherical wave. With ``order="in"``, times 1/(jk sinβ), it is the
-    slope dyad that acts on the derivative of E(Q) along φ′.
+    """One of ``diffraction_dyads``, [row, 3, 3].
 
     Args:
         turn: the waves.
         wave_number: k [1/m].
         order: the dyad, or its derivative by an azimuth.
     """
-    there = _one_way(turn, wave_number, order)
+    return diffraction_dyads(turn, wave_number, (order,))[0]
+
+
+def diffraction_dyads(
+    turn: Turn, wave_number: float, orders: Sequence[Order]
+) -> Complex128[Tensor, "order row 3 3"]:
+    """D of a wedge: E(s) = A exp(−jks) D·E(Q), with E in world coordinates, in √m.
+
+    A = √(s′/(s(s + s′))) for a spherical wave. That of ``"in"``, times 1/(jk sinβ), is the slope
+    dyad that acts on the derivative of E(Q) along φ′.
+
+    Args:
+        turn: the waves.
+        wave_number: k [1/m].
+        orders: the dyad, or its derivatives by an azimuth.
+    """
+    there = _one_way(turn, wave_number, orders)
     if turn.faces is conductor or turn.absorbs:
         return there
     flipped: dict[Order, Order] = {"value": "value", "in": "out", "out": "in"}
-    back = _one_way(turn.reversed(), wave_number, flipped[order])
+    back = _one_way(turn.reversed(), wave_number, [flipped[order] for order in orders])
     return (there + back.mT) / 2
 
 
-def _one_way(turn: Turn, wave_number: float, order: Order) -> Tensor:
-    weights = _terms(turn, wave_number, order)
+def _one_way(turn: Turn, wave_number: float, orders: Sequence[Order]) -> Tensor:
+    weights = _terms(turn, wave_number, orders)[..., None, None]
     if turn.absorbs:
         along = edge_axis(turn.wedges)
         bases = _basis(along, turn.towards), _basis(along, turn.direction)
         same = torch.eye(3, dtype=torch.complex128)
-        return (weights[0] + weights[1])[:, None, None] * _turned(*bases, same)
+        return (weights[0] + weights[1]) * _turned(*bases, same)
     straight, last, first = _carried(turn)
-    whole = (weights[0] + weights[1])[:, None, None] * straight
-    return whole + weights[2][:, None, None] * last + weights[3][:, None, None] * first
+    return (weights[0] + weights[1]) * straight + weights[2] * last + weights[3] * first
 
 
-def _terms(turn: Turn, wave_number: float, order: Order) -> list[Complex128[Tensor, " row"]]:
+def _terms(
+    turn: Turn, wave_number: float, orders: Sequence[Order]
+) -> Complex128[Tensor, "term order row"]:
     """The four scalar coefficients, or their derivatives."""
     scale = -_TURN / (2 * turn.wedges.opening * math.sqrt(2 * math.pi * wave_number) * turn.sine)
     root = torch.sqrt(2 * wave_number * turn.parameter)
     found = []
     for other, sign in _SIGNS[:2] if turn.absorbs else _SIGNS:
         beta = turn.azimuth + other * turn.azimuth_in
-        value, slope = _cotangent(turn, beta, sign, root, order != "value")
-        if order != "value":
-            value = slope * (other if order == "in" else 1.0)
-        found.append(scale * value)
-    return found
+        value, slope = _cotangent(turn, beta, sign, root, list(orders) != ["value"])
+        each: dict[Order, Tensor] = {"value": value, "in": other * slope, "out": slope}
+        found.append(torch.stack([scale * each[order] for order in orders]))
+    return torch.stack(found)
 
 
 def _cotangent(

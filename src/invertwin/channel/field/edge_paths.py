@@ -19,9 +19,11 @@ from torch import Tensor
 
 from invertwin.channel.field.diffraction import (
     Faces,
+    Order,
     Turn,
     conductor,
     diffraction_dyad,
+    diffraction_dyads,
 )
 from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
@@ -60,12 +62,16 @@ class EdgePaths:
         transfer: E at the receiver of E at 1 m from the transmitter, without the phase of the
             length [1/m]; world coordinates, receive × transmit.
         stationary: False where no such path exists: edges meet in the point where it would turn.
+        slopes: as ``transfer``, of ∂E/∂ψ at the transmitter, and for ∂E/∂ψ of what the receiver
+            would send; where they were asked for. ψ [rad] is the angle at the antenna by which its
+            ray turns about the edge, along ``−edge_axis × direction``, its field with it.
     """
 
     points: Float64[Tensor, "row edge 3"]
     length: Float64[Tensor, " row"]
     transfer: Complex128[Tensor, "row 3 3"]
     stationary: Tensor
+    slopes: Complex128[Tensor, "2 row 3 3"] | None = None
 
 
 def over_edges(
@@ -73,6 +79,8 @@ def over_edges(
     tx: Float64[Tensor, "row 3"],
     rx: Float64[Tensor, "row 3"],
     wave_number: float,
+    *,
+    slopes: bool = False,
 ) -> EdgePaths:
     """The diffracted field of one edge, or of two one after the other.
 
@@ -83,16 +91,28 @@ def over_edges(
         edges: one or two, in the order in which the wave meets them.
         tx, rx: the antennas, or their images [m].
         wave_number: k [1/m].
+        slopes: whether those are asked for; of one edge only.
+
+    Source: derivations §9; slopes are (1/jk sinβ) ∂D/∂φ′ ∂E/∂n′.
     """
     route = _route(edges, tx, rx)
     turns = route.turns(wave_number)
-    transfer = diffraction_dyad(turns[0], wave_number)
+    orders: tuple[Order, ...] = ("value", "in", "out") if slopes else ("value",)
+    transfer, *turned = diffraction_dyads(turns[0], wave_number, orders)
     if len(edges) == 2:
         transfer = _second(route, turns, wave_number, transfer)
-    amplitude = torch.stack([turn.sine for turn in turns]).prod(0)
-    amplitude = amplitude / (route.legs.prod(1) * route.spread)
+    spread = 1 / (route.legs.prod(1) * route.spread)
+    amplitude = torch.stack([turn.sine for turn in turns]).prod(0) * spread
+    found = None
+    if slopes:
+        scale = (spread / (1j * wave_number))[:, None] / route.legs
+        found = torch.stack(turned) * scale.T[..., None, None]
     return EdgePaths(
-        route.points, route.legs.sum(1), transfer * amplitude[:, None, None], route.stationary
+        route.points,
+        route.legs.sum(1),
+        transfer * amplitude[:, None, None],
+        route.stationary,
+        found,
     )
 
 
@@ -109,30 +129,6 @@ def turning_points(
     points = wedges.start + _between(wedges.start, axis, tx, rx)[:, None] * axis
     before, after = (points - tx).norm(dim=1), (rx - points).norm(dim=1)
     return points, torch.minimum(before, after) > _LEAST * (before + after)
-
-
-def slope_transfer(
-    edge: Edge,
-    tx: Float64[Tensor, "row 3"],
-    rx: Float64[Tensor, "row 3"],
-    wave_number: float,
-) -> Complex128[Tensor, "row 3 3"]:
-    """What one edge adds where the transmitter's field has a slope: E of ∂E/∂ψ [1/m].
-
-    ψ is the angle at the transmitter [rad] by which its ray turns about the edge, along
-    ``−edge_axis × direction``. The field per angle is that at 1 m from the transmitter.
-
-    Args:
-        edge: the edge.
-        tx, rx: the antennas [m].
-        wave_number: k [1/m].
-
-    Source: derivations §9: (1/jk sinβ) ∂D/∂φ′ ∂E/∂n′.
-    """
-    route = _route([edge], tx, rx)
-    amplitude = 1 / (route.legs.prod(1) * route.spread * route.legs[:, 0])
-    dyad = diffraction_dyad(route.turns(wave_number)[0], wave_number, "in")
-    return dyad * (amplitude / (1j * wave_number))[:, None, None]
 
 
 @dataclass(frozen=True)

@@ -290,7 +290,8 @@ def _bent(stage: Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
             return _bent_columns(stage, around, part)
 
         values = checkpoint(columns, use_reentrant=False) if heavy else columns()
-        delay, coefficient, departure, arrival, vertices, doppler, kinds, faces = values
+        delay, coefficient, departure, arrival, vertices, doppler, *rest = values
+        kinds, faces, slopes, axes = rest
         parts.append(
             RayPaths(
                 (len(stage.tx), len(stage.rx)),
@@ -307,31 +308,37 @@ def _bent(stage: Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
                 stage.topology.face_object[faces],
                 stage.scene.names,
                 doppler,
+                slopes if part.edge.shape[1] == 1 else None,
+                axes if part.edge.shape[1] == 1 else None,
             )
         )
     return parts
 
 
 def _bent_columns(stage: Stage, around: EdgedScene, bends: Bends) -> tuple[Tensor, ...]:
-    """As ``_columns``, and kinds and faces, of paths round edges."""
+    """As ``_columns``, and kinds, faces, slopes and axes, of paths round edges."""
     k = 2 * math.pi * stage.frequency / SPEED_OF_LIGHT
     found = diffracted_paths(around, bends, stage.tx, stage.rx, k)
     departure, arrival = found.ways[:, 0], -found.ways[:, -1]
     up = torch.tensor(_UP, dtype=torch.float64)
     sent, received = (polarisations(way, up).to(found.transfer) for way in (departure, arrival))
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
+    slopes = torch.einsum("pri,psij,ptj->psrt", received, found.slopes, sent)
+    scale = SPEED_OF_LIGHT / stage.frequency / (4 * math.pi)
     rate = _approach(
         stage, bends.tx, bends.rx, list(found.ways.unbind(1)), found.points, found.faces
     )
     return (
         found.length / SPEED_OF_LIGHT,
-        matrix * (SPEED_OF_LIGHT / stage.frequency / (4 * math.pi)),
+        matrix * scale,
         departure,
         arrival,
         found.points,
         stage.frequency / SPEED_OF_LIGHT * rate,
         found.kinds,
         found.faces,
+        slopes * scale,
+        found.axes,
     )
 
 

@@ -1,0 +1,160 @@
+"""Slope diffraction: fields whose strength changes across the rays that meet an edge."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from invertwin.channel import RayPaths, trace_paths
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.links import Terminals, frequency_response, path_amplitudes
+from invertwin.scene import (
+    AntennaArray,
+    Cosine,
+    Object,
+    PerfectConductor,
+    Scene,
+    Table,
+    linear_array,
+    plate,
+    rigid,
+    rotation_from_vector,
+)
+from scenes import float64
+
+FREQUENCY = 3.5e9
+TX = (-0.9, 0.4, 1.1)
+EDGE = Object(plate(20.0, 20.0), PerfectConductor(), rigid(translation=[10.0, 0.0, 0.0]))
+"""In the plane z = 0, from x = 0 on; the other edges are far away."""
+SCREEN = Scene({"screen": EDGE})
+
+
+def upright(normal: float) -> Object:
+    """A wall whose plane is x = ``normal``, seen from its right."""
+    turn = rotation_from_vector(float64([0.0, math.pi / 2, 0.0]))
+    return Object(plate(8.0, 8.0), PerfectConductor(), rigid(turn, [normal, 0.0, 0.0]))
+
+
+BEFORE_A_WALL = Scene({"screen": EDGE, "wall": upright(-2.0)})
+
+
+def looking(way: list[float], array: AntennaArray) -> Terminals:
+    """An array whose boresight is about along ``way``, its x axis about along the world's x."""
+    z = torch.nn.functional.normalize(float64(way), dim=0)
+    y = torch.nn.functional.normalize(torch.linalg.cross(z, float64([1.0, 0.2, 0.0])), dim=0)
+    return Terminals(array, torch.stack([torch.linalg.cross(y, z), y, z], 1))
+
+
+def beam() -> AntennaArray:
+    """Narrow and slanted."""
+    origin = torch.zeros(1, 3, dtype=torch.float64)
+    return AntennaArray(origin, pattern=Cosine(40.0), polarisation=[[0.8, 0.6]])
+
+
+def row() -> AntennaArray:
+    """Of some wavelengths."""
+    return linear_array(3, 2 * SPEED_OF_LIGHT / FREQUENCY)
+
+
+def shadow(source: tuple[float, float, float]) -> Tensor:
+    """A place where the shadow of the edge for ``source`` ends."""
+    x, _, z = source
+    return float64([-0.8 * x / z, -0.5, -0.8])
+
+
+def step_of_slope(
+    scene: Scene, tx: Terminals, rx: Terminals, sloped: bool, source=TX, frequency=FREQUENCY
+) -> float:
+    """How much the derivative of the received fields by the place steps at the shadow."""
+    bound, way = shadow(source), float64([1.0, 0.0, 0.0])
+    slopes = []
+    for side in (-1e-6, 1e-6):
+        place = (bound + side * way).requires_grad_()
+        paths = trace_paths(scene, float64(TX), place, frequency, depth=1, edges=1, rays=5_000)
+        paths = paths if sloped else replace(paths, slopes=None, axes=None)
+        sent = frequency_response(paths, [frequency], tx=tx, rx=rx)
+        parts = torch.view_as_real(sent).flatten()
+        each = [torch.autograd.grad(part, place, retain_graph=True)[0] @ way for part in parts]
+        slopes.append(torch.stack(each))
+    return float((slopes[1] - slopes[0]).norm() / slopes[0].norm())
+
+
+ONE = Terminals().array
+
+
+@pytest.mark.parametrize("array", [beam(), row(), ONE], ids=["beam", "row", "single"])
+@pytest.mark.parametrize("at_tx", [True, False], ids=["tx", "rx"])
+def test_derivatives_do_not_step_at_the_shadow(array, at_tx):
+    ends = (looking([0.5, -0.3, -1.0], array), Terminals())
+    if not at_tx:
+        ends = (Terminals(), looking([-0.4, 0.5, 1.0], array))
+    plain = step_of_slope(SCREEN, *ends, sloped=False)
+    assert plain > 0.01
+    assert step_of_slope(SCREEN, *ends, sloped=True) < 0.1 * plain
+
+
+def test_what_is_left_falls_faster_than_the_wavelength():
+    # About the axis of the edge, this receiver is alike on all sides.
+    ends = (looking([0.5, -0.3, -1.0], beam()), looking([0.0, 0.0, -1.0], ONE))
+    low, high = (step_of_slope(SCREEN, *ends, sloped=True, frequency=FREQUENCY * n) for n in (1, 4))
+    assert high < low / 4
+
+
+def test_over_a_wall_the_antenna_turns_as_its_image():
+    image = (-4.0 - TX[0], TX[1], TX[2])
+    ends = (looking([-1.0, -0.3, 0.2], beam()), Terminals())
+    plain = step_of_slope(BEFORE_A_WALL, *ends, sloped=False, source=image)
+    assert plain > 0.01
+    assert step_of_slope(BEFORE_A_WALL, *ends, sloped=True, source=image) < 0.05 * plain
+
+
+def one_link(place: Tensor, source: Tensor) -> RayPaths:
+    return trace_paths(BEFORE_A_WALL, source, place, FREQUENCY, depth=1, edges=1, rays=5_000)
+
+
+def test_the_way_back_is_the_same():
+    paths = one_link(float64([0.7, -0.3, -0.8]), float64(TX))
+    ends = looking([0.5, -0.3, -1.0], beam()), looking([-0.4, 0.5, 1.0], row())
+    there, delay = path_amplitudes(paths, *ends)
+    back, late = path_amplitudes(paths.reversed(), *ends[::-1])
+
+    # Rows are in the order of delays, of which some are equal.
+    def turned(amplitude: Tensor, delay: Tensor) -> Tensor:
+        return (amplitude * torch.polar(torch.ones_like(delay), -1e10 * delay)).sum(0)
+
+    torch.testing.assert_close(turned(back, late), turned(there, delay).mT)
+    assert paths.slopes is not None
+    assert paths.slopes.abs().amax() > 0
+
+
+def table_beam() -> AntennaArray:
+    theta = torch.linspace(0, math.pi, 181, dtype=torch.float64)
+    gain = (6 * theta.cos() - 4).exp()[:, None]
+    origin = torch.zeros(1, 3, dtype=torch.float64)
+    return AntennaArray(origin, pattern=Table(theta, float64([0.0]), gain))
+
+
+@pytest.mark.parametrize("array", [beam(), row(), table_beam()], ids=["beam", "row", "table"])
+def test_gradients_of_the_power(array):
+    ends = (looking([0.5, -0.3, -1.0], array), looking([-0.4, 0.5, 1.0], beam()))
+
+    def power(source: Tensor) -> Tensor:
+        sent = frequency_response(
+            one_link(float64([0.9, -0.3, -0.8]), source), [FREQUENCY], tx=ends[0], rx=ends[1]
+        )
+        return sent.abs().square().sum()
+
+    source = float64(TX).requires_grad_()
+    power(source).backward()
+    assert source.grad is not None
+    with torch.no_grad():
+        for axis in range(3):
+            step = torch.zeros(3, dtype=torch.float64)
+            step[axis] = 1e-6
+            truth = (power(source + step) - power(source - step)) / 2e-6
+            torch.testing.assert_close(source.grad[axis], truth, rtol=1e-5, atol=0)
+    way = float64([0.3, -0.8, 0.5])
+    forward = torch.func.jvp(power, (source.detach(),), (way,))[1]
+    torch.testing.assert_close(forward, source.grad @ way)
