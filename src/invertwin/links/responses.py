@@ -22,6 +22,7 @@ from invertwin.scene.checks import ArrayLike, checked_count, checked_number, che
 _VALUES_AT_ONCE = 1 << 21
 _VERTICAL = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
 _UP = (0.0, 1.0, 0.0)  # of V in the frame of an array
+_TURN = 1e-4  # rad: half the step over which fields of antennas are compared
 
 
 def _upright() -> Tensor:
@@ -104,15 +105,23 @@ class Terminals:
         """
         up = torch.tensor(_VERTICAL, dtype=torch.float64)
 
-        def field(way: Tensor) -> Tensor:
-            return self.weights(way, place) @ polarisations(way, up).to(torch.complex128)
-
         moved = torch.linalg.cross(axis, direction)
-        value, slope = torch.func.jvp(field, (direction,), (moved,))[:2]
-        around = axis.to(value.dtype)[:, None].expand_as(value)
-        slope = slope - torch.linalg.cross(around, value)
-        slope = slope + 1j * wave_number * self.advances(moved, place)[..., None] * value
-        return slope @ polarisations(direction, up).to(value.dtype).mT
+        kept = axis * (axis * direction).sum(1, keepdim=True)
+        basis = polarisations(direction, up)
+        # A difference works in every mode of differentiation, and for patterns that are tables.
+        sides = []
+        for sine in (_TURN, -_TURN):
+            cosine = math.sqrt(1 - sine**2)
+            way = direction * cosine + moved * sine + kept * (1 - cosine)
+            # What the basis there is over the one here, turned with the direction.
+            across = torch.linalg.cross(axis[:, None].expand_as(basis), basis)
+            along = axis[:, None] * (basis @ axis[..., None])
+            turned = basis * cosine + across * sine + along * (1 - cosine)
+            change = turned @ polarisations(way, up).mT
+            sides.append(self.weights(way, place) @ change.to(torch.complex128).mT)
+        slope = (sides[0] - sides[1]) / (2 * _TURN)
+        ahead = 1j * wave_number * self.advances(moved, place)[..., None]
+        return slope + ahead * self.weights(direction, place)
 
     def advances(
         self, direction: Float64[Tensor, "path 3"], place: Int64[Tensor, " path"]
