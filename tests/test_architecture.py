@@ -28,7 +28,8 @@ LINKS = CHANNEL - {"doctor", "threads"} | {"links"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
 SIGNATURES = CHANNEL | {"signatures"}
-MODELS = SIMULATION | CAPTURE | LINKS | {"signatures", "models"}
+CAMERA = CHANNEL - {"doctor", "threads"} | {"camera"}
+MODELS = SIMULATION | CAPTURE | LINKS | CAMERA | {"signatures", "models"}
 INVERSION = MODELS | {"inversion"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
@@ -48,6 +49,7 @@ ALLOWED = {
     "channel": CHANNEL,
     "radar": RADAR,
     "links": LINKS,
+    "camera": CAMERA,
     "simulation": SIMULATION,
     "signatures": SIGNATURES,
     "capture": CAPTURE,

@@ -37,3 +37,5 @@ from invertwin.channel.reference.cross_sections import (
 from invertwin.channel.reference.cross_sections import TrihedralSection as TrihedralSection
 from invertwin.channel.reference.power import trace_power as trace_power
 from invertwin.channel.sampling import Sampling as Sampling
+from invertwin.channel.sight import Curves as Curves
+from invertwin.channel.sight import Sight as Sight

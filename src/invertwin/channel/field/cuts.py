@@ -56,7 +56,7 @@ def cut_points(walls: Walls, screen: Screen, both: Topology, samples: int, seed:
     """
     vertices = walls.exact_vertices + walls.origin
     corners = vertices[walls.topology.faces]
-    face, on_screen = _close(corners, screen.corners)
+    face, on_screen = close_pairs(corners, screen.corners)
     points = torch.cat([vertices, screen.vertices])
     met = common_segments(points, both, face, on_screen + len(corners))
     span = met.end - met.start
@@ -100,8 +100,14 @@ def _normals(corners: Tensor) -> Tensor:
     return normalize(cross(b - a, c - a), dim=1)
 
 
-def _close(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Pairs of triangles whose boxes overlap."""
+def close_pairs(
+    first: Float64[Tensor, "n 3 3"], second: Float64[Tensor, "m 3 3"]
+) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
+    """Pairs of triangles whose boxes overlap.
+
+    Args:
+        first, second: Corners of the triangles.
+    """
     low, high = second.amin(1), second.amax(1)
     rows = [torch.zeros(2, 0, dtype=torch.int64)]
     block = max(1, _PAIRS // len(second))

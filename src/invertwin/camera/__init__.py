@@ -1,0 +1,7 @@
+"""Pinhole cameras: silhouettes and depth, with the derivatives of their outlines."""
+
+from invertwin.camera.camera import Camera as Camera
+from invertwin.camera.camera import CameraPose as CameraPose
+from invertwin.camera.images import ImageSampling as ImageSampling
+from invertwin.camera.images import depths as depths
+from invertwin.camera.images import silhouettes as silhouettes

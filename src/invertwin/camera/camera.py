@@ -1,0 +1,198 @@
+"""Pinhole cameras: where they stand, and which pixel sees which direction."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.channel import differentiated
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor, plain
+from invertwin.scene.parameters import Coordinate, RigidMotion
+
+_MOST_PIXELS = 1 << 26
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion, at one pose a frame.
+
+    Camera axes are those of OpenCV: x to the right of the image, y down, z forward. The pixel
+    [row, column] covers u from column to column + 1 and v from row to row + 1; a point (x, y, z)
+    in camera axes is seen at u = c_u + f x/z, v = c_v + f y/z. Rectify images of lenses that
+    distort.
+
+    Attributes:
+        positions: Of the pinhole, [frame, 3] or [3] in the world [m]. Differentiable.
+        rotations: Columns are the camera's axes in the world, [frame, 3, 3] or [3, 3].
+        width, height: [pixel].
+        focal: f [pixel]. Differentiable.
+        centre: c_u, c_v [pixel]; None = the middle of the image. Differentiable.
+
+    Raises:
+        InputError: Wrong shapes or numbers, or rotations that are not orthonormal.
+    """
+
+    positions: Float64[Tensor, "*frame 3"]
+    rotations: Float64[Tensor, "*frame 3 3"]
+    width: int
+    height: int
+    focal: float | Float64[Tensor, ""]
+    centre: Float64[Tensor, "2"] | None = None
+
+    def __post_init__(self) -> None:
+        do = "give x, y, z, or a row of them for each frame"
+        given = torch.as_tensor(self.positions, dtype=torch.float64)
+        shape = (3,) if given.ndim == 1 else (None, 3)
+        places = checked_tensor(given, shape, "positions of a camera [m]", do).reshape(-1, 3)
+        axes = torch.as_tensor(self.rotations, dtype=torch.float64)
+        axes = axes.expand(len(places), 3, 3) if axes.ndim == 2 else axes
+        do = "give the camera's axes as columns, once or for each frame"
+        axes = checked_tensor(axes, (len(places), 3, 3), "rotations of a camera", do)
+        unit = torch.eye(3, dtype=torch.float64)
+        if float((axes.detach().mT @ axes.detach() - unit).abs().max()) > 1e-5:
+            raise InputError(f"expected rotations of a camera with orthonormal columns; {do}")
+        pixels = checked_count(self.width, "width", 1) * checked_count(self.height, "height", 1)
+        if pixels > _MOST_PIXELS:
+            raise InputError(f"expected at most {_MOST_PIXELS:,} pixels, got {pixels:,}; bin them")
+        focal = torch.as_tensor(self.focal, dtype=torch.float64)
+        checked_number(float(focal.detach()), "focal length [pixel]", 0.0, open_low=True)
+        middle = torch.tensor([self.width / 2, self.height / 2], dtype=torch.float64)
+        centre = middle if self.centre is None else self.centre
+        centre = checked_tensor(centre, (2,), "centre of an image [pixel]", "give u and v")
+        for name, value in (
+            ("positions", places),
+            ("rotations", axes),
+            ("focal", focal),
+            ("centre", centre),
+        ):
+            object.__setattr__(self, name, value)
+
+    @staticmethod
+    def looking(
+        positions: ArrayLike,
+        target: ArrayLike,
+        *,
+        width: int,
+        height: int,
+        field_of_view: float,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+    ) -> "Camera":
+        """Cameras that look at a point, upright.
+
+        Args:
+            positions: [frame, 3] or [3] [m].
+            target: In the middle of the images [m].
+            width, height: [pixel].
+            field_of_view: Across the width [rad].
+            up: In the world; the image's upper side points there.
+
+        Raises:
+            InputError: Wrong numbers, or a camera that looks along ``up``.
+        """
+        do = "give x, y, z"
+        given = torch.as_tensor(positions, dtype=torch.float64)
+        places = checked_tensor(given.reshape(-1, 3), (None, 3), "positions [m]", do)
+        aim = checked_tensor(target, (3,), "target of a camera [m]", do) - places
+        above = checked_tensor(up, (3,), "up of a camera", do).expand_as(aim)
+        right = torch.linalg.cross(aim, above)
+        if not bool((right.norm(dim=1) > 1e-9 * aim.norm(dim=1) * above.norm(dim=1)).all()):
+            raise InputError("expected cameras that do not look along up, got one; give another up")
+        unit = torch.nn.functional.normalize
+        forward, right = unit(aim, dim=1), unit(right, dim=1)
+        rotations = torch.stack([right, torch.linalg.cross(forward, right), forward], 2)
+        angle = checked_number(field_of_view, "field of view [rad]", 0.0, math.pi, open_low=True)
+        return Camera(places, rotations, width, height, width / (2 * math.tan(angle / 2)))
+
+    def frames(self, chosen: Sequence[int]) -> "Camera":
+        """Only some of the frames.
+
+        Args:
+            chosen: Their numbers.
+        """
+        rows = torch.as_tensor(chosen)
+        return replace(self, positions=self.positions[rows], rotations=self.rotations[rows])
+
+    def moved(
+        self, rotation: Float64[Tensor, "3 3"], translation: Float64[Tensor, "3"]
+    ) -> "Camera":
+        """All poses moved rigidly: turned about the mean position, then translated.
+
+        Args:
+            rotation: World rotation matrix.
+            translation: World translation [m].
+        """
+        middle = self.positions.mean(0)
+        return replace(
+            self,
+            positions=middle + (self.positions - middle) @ rotation.T + translation,
+            rotations=rotation @ self.rotations,
+        )
+
+    def detached(self) -> "Camera":
+        """The same camera without derivatives."""
+        values = {
+            name: plain(getattr(self, name))
+            for name in ("positions", "rotations", "focal", "centre")
+        }
+        return replace(self, **values)
+
+    @property
+    def middle(self) -> Float64[Tensor, "2"]:
+        """c_u, c_v [pixel]."""
+        return torch.as_tensor(self.centre)
+
+    @property
+    def moves(self) -> bool:
+        """Whether derivatives flow to any of its values."""
+        values = (self.positions, self.rotations, self.focal, self.centre)
+        return any(differentiated(torch.as_tensor(value)) for value in values)
+
+    def directions(self, pixels: Float64[Tensor, "n 2"], frame: int) -> Float64[Tensor, "n 3"]:
+        """What pixels see: ways in the world, one unit forward.
+
+        Args:
+            pixels: u, v.
+            frame: Number of the pose.
+        """
+        aside = (pixels - self.middle) / self.focal
+        local = torch.cat([aside, torch.ones_like(aside[:, :1])], 1)
+        return local @ self.rotations[frame].mT
+
+    def local(self, points: Float64[Tensor, "n 3"], frame: int) -> Float64[Tensor, "n 3"]:
+        """World points in camera axes [m].
+
+        Args:
+            points: [m].
+            frame: Number of the pose.
+        """
+        return (points - self.positions[frame]) @ self.rotations[frame]
+
+    def project(self, points: Float64[Tensor, "n 3"], frame: int) -> Float64[Tensor, "n 2"]:
+        """Where world points in front of the camera are seen: u, v [pixel].
+
+        Args:
+            points: [m].
+            frame: Number of the pose.
+        """
+        local = self.local(points, frame)
+        return self.middle + self.focal * local[:, :2] / local[:, 2:]
+
+
+class CameraPose(RigidMotion):
+    """Turns and moves all poses of a camera together, as ``Camera.moved`` defines it."""
+
+    def forward(self, camera: Camera) -> Camera:
+        """The moved camera."""
+        return camera.moved(self.rotation_matrix, self.shift)
+
+    def values(self) -> dict[str, Tensor]:
+        """Translation [m] and rotation vector [rad] by name, for progress and reports."""
+        return self.named_values("camera")
+
+    def coordinates(self) -> list[Coordinate]:
+        """Place and turn of the camera, as far as they are free."""
+        return self.named_coordinates("camera")

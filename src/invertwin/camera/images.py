@@ -1,0 +1,232 @@
+"""Images of a pinhole camera, with the derivatives that moving outlines have.
+
+A pixel shows the mean over its area of what is seen there: whether a ray meets an object first, or
+how deep. Rays have fixed places in the image. Their derivative at fixed visibility is attached;
+where an outline sweeps over the image, ``ΔI = (f₋ − f₊) n·(x − x_m)`` is added, with x the
+projected point of the outline, n its normal in the image, and f what is seen at both of its sides.
+
+Source: derivations §3, on the image plane instead of a surface.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.camera.camera import Camera
+from invertwin.channel import Curves, Sight
+from invertwin.errors import InputError
+from invertwin.limits import Count
+from invertwin.scene.checks import plain
+from invertwin.scene.scene import Scene
+
+_ASIDE = 0.01  # pixel between an outline and the rays at its sides
+_LEAST_ASIDE = 2e-5  # rad: rays are float32
+_NEAR = 1e-3  # m in front of the camera, where outlines begin
+_ROWS_AT_ONCE = 1 << 20
+_EVEN = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
+"""Steps of the sequence R2, which fills a square evenly: powers of the root of x³ = x + 1."""
+
+Shown = Callable[[Sight, Tensor, Tensor], Tensor]
+"""What single rays show, by scene, the triangles that they meet first (−1: none), and depths."""
+
+
+@dataclass(frozen=True)
+class ImageSampling:
+    """How images and their derivatives are sampled.
+
+    Attributes:
+        samples: Rays of a pixel.
+        outline_samples: Points of outlines for each pixel of their length.
+        boundary: False leaves out of derivatives that outlines move.
+    """
+
+    samples: Count = 16
+    outline_samples: Count = 64
+    boundary: bool = True
+
+
+def silhouettes(
+    scene: Scene, camera: Camera, objects: Sequence[str], sampling: ImageSampling, seed: int
+) -> Float64[Tensor, "frame row column"]:
+    """Of every pixel the share in which one of some objects is seen first.
+
+    Args:
+        scene: What is seen.
+        camera: Where it stands.
+        objects: Their names.
+        sampling: Of pixels and outlines.
+        seed: Of the rays' places in their pixels.
+
+    Raises:
+        InputError: A name that is not in the scene, or a cloud.
+    """
+    missing = [name for name in objects if name not in scene.objects]
+    if missing or not objects:
+        raise InputError(
+            f"expected names of objects among {', '.join(scene.objects)}, got "
+            f"{', '.join(missing) or 'none'}; name those that the mask shows"
+        )
+    numbers = torch.tensor([list(scene.objects).index(name) for name in objects])
+
+    def shown(sight: Sight, face: Tensor, depth: Tensor) -> Tensor:
+        owner = torch.where(face >= 0, sight.face_object[face.clamp_min(0)], -1)
+        return torch.isin(owner, numbers).double()
+
+    return _images(scene, camera, shown, sampling, seed, crossings=True)
+
+
+def depths(
+    scene: Scene, camera: Camera, far: float, sampling: ImageSampling, seed: int
+) -> Float64[Tensor, "frame row column"]:
+    """The mean depth over every pixel: z in camera axes [m].
+
+    Args:
+        scene: What is seen.
+        camera: Where it stands.
+        far: Depth where nothing is seen, or what is further away [m].
+        sampling: Of pixels and outlines.
+        seed: Of the rays' places in their pixels.
+
+    Raises:
+        InputError: A cloud in the scene.
+    """
+
+    def shown(sight: Sight, face: Tensor, depth: Tensor) -> Tensor:
+        return depth.clamp_max(far)
+
+    # Where objects cross, depth has no jump.
+    return _images(scene, camera, shown, sampling, seed, crossings=False)
+
+
+def _images(
+    scene: Scene,
+    camera: Camera,
+    shown: Shown,
+    sampling: ImageSampling,
+    seed: int,
+    *,
+    crossings: bool,
+) -> Tensor:
+    frames = range(len(camera.positions))
+    every = [_Frame(scene, camera, n, shown, sampling, seed).image(crossings) for n in frames]
+    return torch.stack(every)
+
+
+class _Frame:
+    """One image."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera,
+        number: int,
+        shown: Shown,
+        sampling: ImageSampling,
+        seed: int,
+    ) -> None:
+        self.camera, self.number, self.shown, self.sampling = camera, number, shown, sampling
+        self.sight = Sight(scene, camera.positions[number])
+        self.random = np.random.default_rng(np.random.SeedSequence([seed, number]))
+        self.fixed = camera.detached()
+
+    def image(self, crossings: bool) -> Float64[Tensor, "row column"]:
+        """The mean over each pixel, with the derivative of outlines."""
+        camera, count = self.camera, self.sampling.samples
+        pixels = camera.width * camera.height
+        total = torch.zeros(pixels, dtype=torch.float64)
+        shift = torch.from_numpy(self.random.random((pixels, 2)))
+        for some in torch.arange(pixels * count).split(_ROWS_AT_ONCE):
+            pixel = some // count
+            corner = torch.stack([pixel % camera.width, pixel // camera.width], 1)
+            # Even over the pixel, at a shift of its own.
+            inside = (shift[pixel] + (some % count)[:, None] * _EVEN) % 1.0
+            total = total.index_add(0, pixel, self.seen(corner + inside, camera) / count)
+        if self.sampling.boundary and (self.sight.moves or camera.moves):
+            total = total + self._swept(self.sight.outlines())
+            if crossings:
+                total = total + self._swept(self.sight.crossings())
+        return total.unflatten(0, (camera.height, camera.width))
+
+    def seen(self, places: Float64[Tensor, "n 2"], camera: Camera) -> Float64[Tensor, " n"]:
+        """What single places of the image show.
+
+        Args:
+            places: u, v.
+            camera: With derivatives, or without.
+        """
+        face = self.sight.first(self.fixed.directions(places, self.number))
+        rows = torch.nonzero(face >= 0)[:, 0]
+        depth = self.sight.along(face[rows], camera.directions(places[rows], self.number))
+        none = torch.full((len(face),), math.inf, dtype=torch.float64)
+        return self.shown(self.sight, face, none.index_put((rows,), depth))
+
+    def _swept(self, curves: Curves) -> Float64[Tensor, " pixel"]:
+        """What outlines add to derivatives; zero in value."""
+        camera, fixed, number = self.camera, self.fixed, self.number
+        size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+        ends = torch.stack([fixed.local(end, number) for end in (curves.start, curves.end)])
+        low, high = _within(ends, fixed, size)
+        piece = torch.nonzero(high > low)[:, 0]
+        ends = ends[:, piece]
+        cut = [torch.lerp(ends[0], ends[1], share[piece, None]) for share in (low, high)]
+        marks = torch.stack([_projected(fixed, point) for point in cut])
+        length = (marks[1] - marks[0]).norm(dim=1)
+        count = int(np.ceil(float(length.sum()) * self.sampling.outline_samples))
+        if not count:
+            return torch.zeros(1, dtype=torch.float64)
+        spot = (torch.arange(count) + torch.from_numpy(self.random.random(count))) / count
+        until = length.cumsum(0)
+        row = torch.searchsorted(until, spot * until[-1], right=True).clamp_max(len(length) - 1)
+        share = (1 - (until[row] - spot * until[-1]) / length[row]).clamp(0.0, 1.0)
+        # Even in the image is not even along the piece: 1/z is linear in the image.
+        depth = [point[row, 2] for point in cut]
+        share = share * depth[0] / torch.lerp(depth[1], depth[0], share)
+        share = torch.lerp(low[piece][row], high[piece][row], share)
+
+        place = camera.project(self.sight.points(curves, piece[row], share), number)
+        here = plain(place)
+        along = (marks[1] - marks[0])[row] / length[row, None]
+        across = torch.stack([-along[:, 1], along[:, 0]], 1)
+        aside = max(_ASIDE, _LEAST_ASIDE * float(torch.as_tensor(fixed.focal)))
+        low_side, high_side = (
+            plain(self.seen(here + sign * aside * across, fixed)) for sign in (-1.0, 1.0)
+        )
+        sweep = ((place - here) * across).sum(1) * (float(until[-1]) / count)
+        inside = ((here >= 0) & (here < size)).all(1)
+        rows = torch.nonzero(inside & (low_side != high_side))[:, 0]
+        column, line = here[rows].long().unbind(1)
+        added = (low_side - high_side)[rows] * sweep[rows]
+        flat = torch.zeros(camera.width * camera.height, dtype=torch.float64)
+        return flat.index_add(0, line * camera.width + column, added)
+
+
+def _projected(camera: Camera, local: Tensor) -> Tensor:
+    """u, v of points in camera axes."""
+    return camera.middle + camera.focal * local[:, :2] / local[:, 2:]
+
+
+def _within(
+    ends: Float64[Tensor, "2 piece 3"], camera: Camera, size: Tensor
+) -> tuple[Float64[Tensor, " piece"], Float64[Tensor, " piece"]]:
+    """From where to where pieces are in front of the camera and inside its image, 0 to 1."""
+    x, y, z = ends.unbind(2)
+    u, v = camera.middle
+    planes = [
+        z - _NEAR,
+        camera.focal * x + u * z,
+        camera.focal * y + v * z,
+        (size[0] - u) * z - camera.focal * x,
+        (size[1] - v) * z - camera.focal * y,
+    ]
+    low, high = torch.zeros_like(x[0]), torch.ones_like(x[0])
+    for begin, end in planes:
+        turn = begin / torch.where(begin == end, 1.0, begin - end)
+        low = torch.where((begin < 0) & (end > 0), torch.maximum(low, turn), low)
+        high = torch.where((begin > 0) & (end < 0), torch.minimum(high, turn), high)
+        high = torch.where((begin <= 0) & (end <= 0), -1.0, high)
+    return low, high

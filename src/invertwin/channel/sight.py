@@ -1,0 +1,181 @@
+"""What is seen from one place: the first surface along rays, and outlines of surfaces.
+
+Along a ray, what is seen jumps at two kinds of curves: outlines, where a surface turns away or
+ends, and curves in which two objects cross. Both move with the scene and with the place from which
+they are seen; derivatives of images need them.
+
+Source: derivations §3 and §15.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invertwin.channel.field.cuts import close_pairs
+from invertwin.channel.field.waves import cross, dot
+from invertwin.channel.rays.arrays import to_float, to_torch
+from invertwin.channel.rays.backend import dr, mi, tracing
+from invertwin.channel.rays.contacts import common_segments
+from invertwin.channel.rays.geometry import differentiated
+from invertwin.channel.rays.scene import Occluders
+from invertwin.channel.rays.topology import topology_of
+from invertwin.errors import InputError
+from invertwin.scene.checks import plain
+from invertwin.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Straight pieces of the curves at which what is seen may jump; detached.
+
+    Attributes:
+        start, end: Of the pieces [m].
+        first, second: Edges: vertices at the ends. Crossings: the two triangles.
+        crossing: Whether it is a crossing.
+    """
+
+    start: Float64[Tensor, "piece 3"]
+    end: Float64[Tensor, "piece 3"]
+    first: Int64[Tensor, " piece"]
+    second: Int64[Tensor, " piece"]
+    crossing: bool
+
+
+class Sight:
+    """A scene as one place sees it.
+
+    Args:
+        scene: Surfaces only.
+        place: [3] in the world [m].
+
+    Attributes:
+        names: Of the objects.
+        face_object: Number of the object of each triangle.
+
+    Raises:
+        InputError: A cloud in the scene.
+    """
+
+    def __init__(self, scene: Scene, place: Float64[Tensor, "3"]) -> None:
+        objects = scene.objects.values()
+        clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
+        if clouds:
+            raise InputError(
+                f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
+            )
+        self.names = tuple(scene.objects)
+        self._vertices = torch.cat([item.vertices for item in objects])
+        self._place = place
+        with tracing():
+            self._topology = topology_of([item.mesh for item in objects])
+            self._occluders = Occluders(plain(self._vertices), self._topology, plain(place))
+        self.face_object = self._topology.face_object
+
+    @property
+    def moves(self) -> bool:
+        """Whether derivatives flow to the scene's places or to the place itself."""
+        return differentiated(self._vertices) or differentiated(self._place)
+
+    def first(self, directions: Float64[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
+        """The triangle that each ray from the place meets first (−1: none).
+
+        Args:
+            directions: In the world, of any length.
+        """
+        if not len(directions):
+            return torch.zeros(0, dtype=torch.int64)
+        way = normalize(plain(directions), dim=1).to(torch.float32)
+        with tracing():
+            ray = mi.Ray3f(mi.Point3f(0.0), mi.Vector3f(*(to_float(way[:, k]) for k in range(3))))
+            hit = self._occluders.scene.ray_intersect_preliminary(ray)
+            face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
+            return to_torch(face).long()
+
+    def along(
+        self, face: Int64[Tensor, " n"], directions: Float64[Tensor, "n 3"]
+    ) -> Float64[Tensor, " n"]:
+        """How many lengths of its direction each ray goes to the plane of a triangle; attached.
+
+        Args:
+            face: Triangles.
+            directions: In the world.
+        """
+        a, b, c = self._vertices[self._topology.faces[face]].unbind(1)
+        normal = cross(b - a, c - a)
+        return dot(a - self._place, normal) / dot(directions, normal)
+
+    def outlines(self) -> Curves:
+        """Edges where surfaces end, or turn away from the place."""
+        topology, points = self._topology, plain(self._vertices)
+        # Triangles may be wound either way, so that normals say nothing: both neighbours lie on one
+        # side of the plane through the edge and the place.
+        beside, apex = topology.beside, topology.opposite
+        alone = (beside >= 0).sum(1) != 2
+        ends = points[topology.edges]
+        pair = [points[apex[:, k].clamp_min(0)] for k in range(min(2, apex.shape[1]))]
+        turns = torch.zeros(len(beside), dtype=torch.bool)
+        if len(pair) == 2:
+            across = cross(ends[:, 1] - ends[:, 0], ends[:, 0] - plain(self._place))
+            sides = [dot(point - ends[:, 0], across) for point in pair]
+            turns = sides[0] * sides[1] >= 0
+        chosen = torch.nonzero(alone | turns)[:, 0]
+        first, second = topology.edges[chosen].unbind(1)
+        return Curves(points[first], points[second], first, second, crossing=False)
+
+    def crossings(self) -> Curves:
+        """Curves in which two objects cross."""
+        points, topology = plain(self._vertices), self._topology
+        corners = points[topology.faces]
+        low, high = corners.amin(1), corners.amax(1)
+        parts = []
+        for one, other in itertools.combinations(range(len(self.names)), 2):
+            own = [torch.nonzero(self.face_object == number)[:, 0] for number in (one, other)]
+            for number in (0, 1):
+                there = own[1 - number]
+                bounds = low[there].amin(0), high[there].amax(0)
+                near = (low[own[number]] <= bounds[1]) & (high[own[number]] >= bounds[0])
+                own[number] = own[number][near.all(1)]
+                if not len(own[number]):
+                    break
+            if not all(map(len, own)):
+                continue
+            here, there = close_pairs(corners[own[0]], corners[own[1]])
+            met = common_segments(points, topology, own[0][here], own[1][there])
+            parts.append(met.chosen(~met.touching))
+        none = topology.edges[:0, 0]
+        return Curves(
+            torch.cat([corners[:0, 0], *(part.start for part in parts)]),
+            torch.cat([corners[:0, 0], *(part.end for part in parts)]),
+            torch.cat([none, *(part.first for part in parts)]),
+            torch.cat([none, *(part.second for part in parts)]),
+            crossing=True,
+        )
+
+    def points(
+        self, curves: Curves, piece: Int64[Tensor, " n"], share: Float64[Tensor, " n"]
+    ) -> Float64[Tensor, "n 3"]:
+        """Points of curves, attached: they move with the edge, or with the planes that cross.
+
+        Args:
+            curves: From ``outlines`` or ``crossings``.
+            piece: Of them.
+            share: Place from the start to the end of the piece, 0 to 1.
+        """
+        first, second = curves.first[piece], curves.second[piece]
+        if not curves.crossing:
+            return torch.lerp(self._vertices[first], self._vertices[second], share[:, None])
+        at = torch.lerp(curves.start[piece], curves.end[piece], share[:, None])
+        rows, heights = [], []
+        for face in (first, second):
+            a, b, c = self._vertices[self._topology.faces[face]].unbind(1)
+            normal = normalize(cross(b - a, c - a), dim=1)
+            rows.append(normal)
+            heights.append(dot(a - at, normal))
+        rows.append(plain(cross(rows[0], rows[1])))
+        heights.append(torch.zeros_like(share))
+        shift = torch.linalg.solve(torch.stack(rows, 1), torch.stack(heights, 1)[..., None])
+        return at + shift[..., 0]
