@@ -8,6 +8,8 @@ import torch
 
 from cli.small import call, read_metrics
 from invertwin.cli import build
+from invertwin.cli.fits.certainty import certainty_table
+from invertwin.cli.fits.radio import Heard, spread_of_ends
 from invertwin.cli.run_file import validate
 from invertwin.errors import InputError
 from invertwin.links import Points
@@ -175,3 +177,38 @@ def test_antennas_are_turned(tmp_path):
     ahead = -sensor.positions[0] / sensor.positions[0].norm()
     torch.testing.assert_close(sensor.terminals.rotations[0, :, 2], ahead)
     assert sensor.powers.tolist() == [10.0]
+
+
+@pytest.mark.parametrize(
+    ("ends", "near", "inside"),
+    [
+        ([[1.0, 0.8, 0.2], [1.001, 0.8, 0.2], [0.999, 0.8, 0.2], [-1.0, 0.8, 0.2]], 2, 2),
+        ([[1.0, 0.8, 0.2], [1.1, 0.8, 0.2], [0.9, 0.8, 0.2]], 2, 0),
+        ([[1.0, 0.8, 0.2], [1.1, 0.8, 0.2]], None, None),
+    ],
+    ids=["reproduced", "scattered", "too few"],
+)
+def test_ends_that_scatter_beyond_the_bars_are_told(tmp_path, ends, near, inside):
+    run = loaded(tmp_path, RUN + STARTS)
+    scene = build.scene(run)
+    sensor = run.transmitter.build()
+    heard = Heard(run, scene, scene, sensor, sensor, torch.zeros(0), None)
+    rows = [
+        {"start": k, "status": "budget", "values": {"transmitter.position": end}}
+        for k, end in enumerate(ends)
+    ]
+    bars = {f"transmitter.{axis}": 0.005 for axis in "xyz"}
+    found = spread_of_ends(heard, rows, rows[0], bars)
+    if near is None:
+        assert found == {}
+        return
+    assert (found["ends_near"], found["ends_within_bars"]) == (near, inside)
+    expected = 0.001 if inside else 0.1
+    assert found["spread_of_ends"]["transmitter.x"] == pytest.approx(expected)
+    assert found["spread_of_ends"]["transmitter.z"] == 0.0
+    assert ("spread_note" in found) == (inside == 0)
+    shown = certainty_table(
+        found | {"standard_deviations": bars, "within_95": bars, "units": dict.fromkeys(bars, "m")}
+    )
+    assert "spread of other ends" in shown.columns
+    assert ("take the spread" in shown.note) == (inside == 0)

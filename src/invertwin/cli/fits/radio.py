@@ -43,6 +43,7 @@ from invertwin.scene import Scene
 from invertwin.seeds import derived_seed
 
 _TRANSMITTER = "transmitter"  # kind of its parameter
+_FEW_ENDS = 2  # of other starts: fewer say nothing about how ends scatter
 _FOREIGN = (
     *("radar", "grid", "chirps", "starts", "search", "initial", "calibration", "landscape"),
     *("measures", "model"),
@@ -116,7 +117,10 @@ def run_radio(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
         "starts": rows[FULL],
         **{f"starts_{mode}": rows[mode] for mode in modes[1:]},
     }
-    if others and metrics["verdict"] == "consistent":
+    spread = spread_of_ends(heard, rows[FULL], best, believed.get("within_95", {}))
+    metrics |= spread
+    alone = bool(spread) and not spread["ends_within_bars"]
+    if (others or alone) and metrics["verdict"] == "consistent":
         metrics["verdict"] = "ambiguous"
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
@@ -315,6 +319,59 @@ def _others(
             where = ", ".join(f"{x:.2f}" for x in place.tolist())
             told.append(f"a transmitter at {where} m explains the data as well: z = {found:.1f}")
     return {"ambiguities": told} if told else {}
+
+
+def spread_of_ends(
+    heard: Heard,
+    rows: Sequence[dict[str, Any]],
+    best: dict[str, Any],
+    bars: Mapping[str, float],
+) -> dict[str, Any]:
+    """How far other starts have ended from the best one, within the limit of places.
+
+    Error bars hold noise about one minimum. Where no other start has ended in them, there are more.
+
+    Args:
+        heard: The problem.
+        rows: Of all starts.
+        best: One of them.
+        bars: Half widths that hold 95 % of errors, by parameter.
+    """
+    if not _located(heard.run) or not bars:
+        return {}
+    key = "transmitter.position"
+    apart = {
+        row["start"]: [a - b for a, b in zip(row["values"][key], best["values"][key], strict=True)]
+        for row in rows
+        if row["start"] != best["start"] and row["status"] != "diverged"
+    }
+    limit = settings_of(heard.run).position_limit
+    near = [off for off in apart.values() if math.hypot(*off) <= limit]
+    if len(near) < _FEW_ENDS:
+        return {}
+    names = [f"transmitter.{axis}" for axis in "xyz"]
+    inside = [
+        all(abs(x) <= bars.get(name, math.inf) for name, x in zip(names, off, strict=True))
+        for off in near
+    ]
+    squares = zip(names, zip(*near, strict=True), strict=True)
+    middle = sorted(math.hypot(*off) for off in near)[len(near) // 2]
+    found: dict[str, Any] = {
+        "ends_near": len(near),
+        "ends_within_bars": sum(inside),
+        "spread_of_ends": {
+            name: math.sqrt(sum(x * x for x in column) / len(column))
+            for name, column in squares
+            if name in bars
+        },
+    }
+    if not any(inside):
+        found["spread_note"] = (
+            f"{len(near)} other starts ended within {limit:g} m of the best, none within its error "
+            f"bars, half of them more than {middle:.3f} m away: the bars hold noise about one "
+            "minimum of several; take the spread of the ends instead"
+        )
+    return found
 
 
 def _scores(
