@@ -33,7 +33,7 @@ class Verdict:
 
     Attributes:
         word: ``consistent``: nothing speaks against the twin. ``inconsistent``: the data do not
-            look like recordings of it. ``ambiguous``: another pose explains them as well.
+            look like recordings of it. ``ambiguous``: another end explains them as well.
             ``at a bound``: a value is at the end of its range.
             ``worse``: the fit is worse than its start. ``lost``: the twin shows next to nothing of
             what was observed, so nothing tells the fit where to go. ``unknown``: the model gives no
