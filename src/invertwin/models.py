@@ -931,7 +931,8 @@ class DepthMap(ForwardModel):
         Raises:
             InputError: Another shape, or NaN.
         """
-        return _images(recording, "depths [m]").clamp_max(self.far)
+        given = torch.as_tensor(recording, dtype=torch.float64)
+        return _images(given.clamp_max(self.far), "depths [m]")
 
     def looks(self, scene: Scene, sensor: Camera, seed: int) -> Callable[[int, float], Tensor]:
         """The depths with other errors each time."""

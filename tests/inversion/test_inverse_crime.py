@@ -143,13 +143,19 @@ def test_scripts_fit_exact_or_recorded_signals(name):
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)
         and re.search(
-            r"(Capture\.(from_beat|from_range_profile|load)|read|richer\.at)$",
+            r"(Capture\.(from_beat|from_range_profile|load)|read|richer\.at|photograph)$",
             ast.unparse(node.func),
         )
     ]
     # What is made of a run file is guarded with the run files.
     assert captured or "problem_of(" in SOURCES[name], "a fit needs a capture"
     assert not [call for call in captured if any(re.search(rf"\b{n}\b", call) for n in smooth)]
+
+
+def test_a_photograph_is_not_made_by_the_models_of_images():
+    """Labels and depths meet the middles of pixels; what is fitted are means over areas."""
+    source = (ROOT / "src/invertwin/camera/photographs.py").read_text(encoding="utf-8")
+    assert not re.search(r"^(from|import) .*\.images\b", source, re.M)
 
 
 def test_the_guard_sees_a_crime(unchecked):

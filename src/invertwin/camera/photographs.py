@@ -1,0 +1,120 @@
+"""What a camera records: an object's label and one depth in every pixel, with errors.
+
+This is data, not a model that is fitted: one ray meets the middle of each pixel, as labels and
+depth cameras have it, while ``silhouettes`` and ``depths`` are means over the pixels' areas.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from invertwin.camera.camera import Camera
+from invertwin.channel import Sight
+from invertwin.errors import InputError
+from invertwin.scene.checks import checked_number
+from invertwin.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """Labels and depths of a camera's frames.
+
+    Attributes:
+        names: Of the objects.
+        labels: Number of the name in every pixel; −1 where nothing is seen.
+        depth: z in camera axes [m]; infinite where nothing is seen.
+    """
+
+    names: tuple[str, ...]
+    labels: Int64[Tensor, "frame row column"]
+    depth: Float64[Tensor, "frame row column"]
+
+    def mask(self, *objects: str) -> Float64[Tensor, "frame row column"]:
+        """1 in the pixels of some objects, 0 elsewhere.
+
+        Args:
+            objects: Their names.
+
+        Raises:
+            InputError: A name that is not in the scene.
+        """
+        missing = [name for name in objects if name not in self.names]
+        if missing or not objects:
+            raise InputError(
+                f"expected names of objects among {', '.join(self.names)}, got "
+                f"{', '.join(missing) or 'none'}; name those that the mask shows"
+            )
+        numbers = torch.tensor([self.names.index(name) for name in objects])
+        return torch.isin(self.labels, numbers).double()
+
+
+def photograph(
+    scene: Scene, camera: Camera, *, seed: int, wrong_labels: float = 0.0, depth_noise: float = 0.0
+) -> Photograph:
+    """Take labelled pictures and depth images of a scene.
+
+    Labels err where segmentations do, at outlines: a share of the pixels there takes the label of a
+    neighbour. Depths err as those of two eyes or of structured light do, by the square of the
+    depth.
+
+    Args:
+        scene: What is seen; surfaces only.
+        camera: Where it stands.
+        seed: Of the errors.
+        wrong_labels: Share of the pixels at outlines, 0 to 1.
+        depth_noise: Standard deviation of depths at 1 m [m].
+
+    Raises:
+        InputError: A cloud in the scene, or shares and deviations that are none.
+
+    Source: K. Khoshelham, S. O. Elberink, "Accuracy and resolution of Kinect depth data", Sensors
+    12 (2012), eq. 10: the error of a triangulated depth grows with its square.
+    """
+    share = checked_number(wrong_labels, "share of wrong labels", 0.0, 1.0)
+    deviation = checked_number(depth_noise, "noise of depths at 1 m [m]", 0.0)
+    random = torch.Generator().manual_seed(seed)
+    fixed = camera.detached()
+    frames = [_seen(scene, fixed, number) for number in range(len(fixed.positions))]
+    labels = torch.stack([label for label, _ in frames])
+    depth = torch.stack([depth for _, depth in frames])
+    return Photograph(
+        tuple(scene.objects),
+        _mislabelled(labels, share, random),
+        depth + _normal(depth, random) * torch.where(depth.isfinite(), depth**2 * deviation, 0.0),
+    )
+
+
+def _seen(scene: Scene, camera: Camera, number: int) -> tuple[Tensor, Tensor]:
+    with torch.no_grad():
+        sight = Sight(scene, camera.positions[number])
+        row, column = torch.meshgrid(
+            torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
+        )
+        middles = torch.stack([column, row], 2).reshape(-1, 2).double() + 0.5
+        directions = camera.directions(middles, number)
+        face = sight.first(directions)
+        found = face >= 0
+        depth = torch.full((len(face),), torch.inf, dtype=torch.float64)
+        depth[found] = sight.along(face[found], directions[found])
+        label = torch.where(found, sight.face_object[face.clamp_min(0)], -1).long()
+    return label.reshape(row.shape), depth.reshape(row.shape)
+
+
+def _mislabelled(labels: Tensor, share: float, random: torch.Generator) -> Tensor:
+    """Labels of which some at outlines are a neighbour's."""
+    way = torch.randint(0, 4, labels.shape, generator=random)
+    neighbour = torch.stack([labels.roll(by, axis) for axis in (1, 2) for by in (1, -1)])
+    # Images have no neighbours beyond their borders.
+    for number, (axis, edge) in enumerate(((1, 0), (1, -1), (2, 0), (2, -1))):
+        index = torch.tensor([edge % labels.shape[axis]])
+        neighbour[number].index_copy_(axis, index, labels.index_select(axis, index))
+    other = neighbour.gather(0, way[None])[0]
+    wrong = torch.rand(labels.shape, generator=random) < share
+    at_outline = (neighbour != labels).any(0)
+    return torch.where(wrong & at_outline, other, labels)
+
+
+def _normal(like: Tensor, random: torch.Generator) -> Tensor:
+    return torch.randn(like.shape, generator=random, dtype=like.dtype)
