@@ -174,6 +174,8 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
 def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
     if run.map is not None:
         return ("gradcheck", "map", "transmitter")
+    if run.image is not None:
+        return ("gradcheck", "image", "camera")
     alone = run.rcs is not None or run.placement is not None
     return ("gradcheck",) if alone else ("gradcheck", "radar", "grid")
 

@@ -39,6 +39,8 @@ def run_check(run: RunFile) -> tuple[list[Table], str]:
         return _of_radio_map(run)
     if run.placement is not None:
         return _of_placement(run)
+    if run.image is not None and run.task == "gradcheck":
+        return _of_image(run)
     truth, sensors = build.true_scene(run), _sensors(run)
     build.parameters(
         [table for table in run.parameters if not isinstance(table, Mover)],
@@ -115,6 +117,23 @@ def _of_radio_map(run: RunFile) -> tuple[list[Table], str]:
         rows.append(["maps", count, "gradcheck.repeats, gradcheck.max_pairs"])
         seconds = count * once(run)
     line = f"about {time_left(seconds)} for {len(sensor.positions)} transmitters"
+    return [Table("Estimate", ("needs", "how many", "key"), rows), _meshes(scene)], line
+
+
+def _of_image(run: RunFile) -> tuple[list[Table], str]:
+    """The same of `[image]`, whose memory does not grow: the time of one image."""
+    scene, check = build.scene(run), need(run, "gradcheck", run.task)
+    model, camera = build.made(run, "image"), build.made(run, "camera")
+    rays = len(camera.positions) * camera.width * camera.height * model.sampling.samples
+    ends, slopes = 4 * check.max_pairs, 4 * check.repeats
+    with torch.no_grad():
+        ray = _timed(lambda: model.predict(scene, camera, 0)) / rays
+    count = ends * max(rays, check.difference_samples) + _DERIVATIVES * slopes * rays
+    rows: list[list[object]] = [
+        ["images", ends + slopes, "gradcheck.max_pairs, gradcheck.repeats"],
+        ["rays", count, "gradcheck.difference_samples"],
+    ]
+    line = f"about {time_left(count * ray)} for {count:.2g} rays"
     return [Table("Estimate", ("needs", "how many", "key"), rows), _meshes(scene)], line
 
 

@@ -195,6 +195,21 @@ def _radio_map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
     return _Seen(model, sensor, None, draw)
 
 
+def _image(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+    """What `[camera]` shows as `[image]`."""
+    need(run, "camera", "an image")
+    kind = need(run, "image", "gradcheck").kind
+    model, camera = build.made(run, "image"), build.made(run, "camera")
+    unit = "" if kind == "silhouette" else "m · "
+
+    def draw(report: GradientReport) -> Figure:
+        rates = {name: values[0] for name, values in _derivatives(report).items()}
+        label = f"∂ {kind} [{unit}{_unit(settings)}]"
+        return plotting.images({kind: report.value[0]}, rates, label)
+
+    return _Seen(model, camera, None, draw)
+
+
 def _map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
     """The smooth map of `[radar]`, `[grid]` and `[surrogate]`."""
     if run.surrogate.exact:
@@ -271,6 +286,8 @@ def _seen_of(run: RunFile) -> Callable[[RunFile, Gradcheck, Scene], _Seen]:
     """What makes a gradient check of the sections that are there."""
     if run.placement is not None:
         return _panel
+    if run.image is not None:
+        return _image
     if run.map is not None:
         return _radio_map
     return _map if run.rcs is None else _signature

@@ -11,6 +11,7 @@ from invertwin.plotting.curves import count_minima as count_minima
 from invertwin.plotting.curves import landscape as landscape
 from invertwin.plotting.figures import PALETTE as PALETTE
 from invertwin.plotting.figures import png_bytes as png_bytes
+from invertwin.plotting.images import images as images
 from invertwin.plotting.maps import RATE_LABEL as RATE_LABEL
 from invertwin.plotting.maps import U_LABEL as U_LABEL
 from invertwin.plotting.maps import V_LABEL as V_LABEL

@@ -9,6 +9,7 @@ from annotated_types import MinLen
 from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
+from invertwin.cli.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.schema.fits import (
     AnyInitial,
@@ -132,6 +133,8 @@ class _RunFile(Section):
     data: AnyData | None = key("what is fitted", None)
     transmitter: TransmitterTable | None = key("what sends, with [map]", None)
     map: AnyMap | None = key("what receivers at known places get of [transmitter]", None)
+    camera: AnyCamera | None = key("what sees [image]", None)
+    image: AnyImage | None = key("what [camera] shows; with [gradcheck] it is differentiated", None)
     transmitter_starts: TransmitterStarts | None = key(
         "where fits of the first transmitter start; without it where [transmitter] says", None
     )
@@ -184,13 +187,16 @@ class _RunFile(Section):
 
     @model_validator(mode="after")
     def _a_signature_is_differentiated_alone(self) -> "_RunFile":
-        if self.gradcheck is None or (self.rcs is None and self.map is None):
+        seen = next((n for n in ("image", "map") if getattr(self, n) is not None), None)
+        if self.gradcheck is None or (self.rcs is None and seen is None):
             return self
-        if self.map is not None:
+        if seen is not None:
             own = ("depth", "samples", "boundary_samples", "scheme")
             given = [f"gradcheck.{n}" for n in own if n in self.gradcheck.model_fields_set]
-            for path in [*given, *(n for n in ("radar", "grid", "rcs") if getattr(self, n))]:
-                fail("expected nothing with [map], which has its own, got a value; remove it", path)
+            others = {"radar", "grid", "rcs", "map"} - {seen}
+            for path in [*given, *(n for n in sorted(others) if getattr(self, n))]:
+                what = f"expected nothing with [{seen}], which has its own, got a value; remove it"
+                fail(what, path)
             return self
         if self.gradcheck.of == "sensor":
             fail(
@@ -303,6 +309,7 @@ class _RunFile(Section):
         for path, table in self.unknowns.items():
             if getattr(table, "object", None) is not None:
                 used.append((f"{path}.object", table.object))
+        used += [("image.objects", name) for name in getattr(self.image, "objects", [])]
         for section in type(self).model_fields:
             name = getattr(getattr(self, section), "object", None)
             if name is not None:
