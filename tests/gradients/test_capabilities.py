@@ -13,6 +13,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from invertwin.camera import Camera, ImageSampling
 from invertwin.capture import Capture
 from invertwin.capture.track import Track
 from invertwin.channel import (
@@ -29,7 +30,8 @@ from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check, gradcheck
 from invertwin.inversion.lines import line_of
 from invertwin.links import CellSampling, MapPlane, Reception, Transmitters
-from invertwin.models import SurrogateMap
+from invertwin.links.metasurface import Metasurface, panel_response
+from invertwin.models import DepthMap, SilhouetteMap, SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum, surrogate_spectrum
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.scene import (
@@ -44,6 +46,7 @@ from invertwin.scene import (
     Slab,
     Table,
     linear_array,
+    rotation_from_vector,
 )
 from invertwin.scene.parameters import (
     MaterialValues,
@@ -67,6 +70,8 @@ MECHANISMS = {
     "paths between antennas": "antennas",
     "coverage maps": "coverage",
     "chains": "chains",
+    "metasurfaces": "panels",
+    "images": "images",
 }
 ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
 METAL = PerfectConductor()
@@ -413,6 +418,79 @@ def chain_case(parameter: str) -> Found:
     return Found(found, found, (up - down) / 2e-6, 0.0)
 
 
+# A mirror of elements at the wall; a corner of the occluder's shadow lies on it.
+PANEL = Metasurface(
+    float64([0.69, 0.37, 1.85]),
+    float64([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]),
+    torch.zeros(20, 20, dtype=torch.float64),
+    spacing=0.015,
+)
+
+
+def by_panel(scene: Scene, place: Tensor) -> Tensor:
+    """What the panel sends from one antenna to another."""
+    tx, rx = place + float64([[-0.07, 0.04, 0.19]]), float64([[0.9, 0.6, 0.3]])
+    return torch.view_as_real(panel_response(scene, PANEL, tx, rx, 1e10)).flatten()
+
+
+def seen(scene: Scene, radar: Radar, sampling: ImageSampling, seed: int) -> Tensor:
+    """Mask and depths of a camera where the radar stands.
+
+    It is rolled: outlines along the rows of pixels move to other pixels all at once.
+    """
+    axes = rotation_from_vector(float64([0.0, 0.0, 0.5]))
+    axes = axes if radar.rotations is None else radar.rotations @ axes
+    camera = Camera(radar.positions, axes, 6, 5, 9.0)
+    mask = SilhouetteMap(("occluder",), sampling).predict(scene, camera, seed)
+    return torch.cat([mask, DepthMap(4.0, sampling).predict(scene, camera, seed)])
+
+
+def panel_case(parameter: str) -> Found:
+    """Lit fractions of elements are exact, so differences are as smooth as the derivative."""
+
+    def value(theta: Tensor) -> Tensor:
+        scene, radar = changed(parameter, theta)
+        return by_panel(scene, radar.positions)
+
+    up, down = (value(torch.tensor(sign * 1e-5).double()) for sign in (1, -1))
+    found = pushed(value)
+    return Found(found, found, (up - down) / 2e-5, 0.0)
+
+
+def image_case(parameter: str) -> Found:
+    step, pairs, fine = 4e-3, 6, ImageSampling(samples=20_000)
+
+    def value(theta: Tensor, sampling: ImageSampling, seed: int = 0) -> Tensor:
+        return seen(*changed(parameter, theta), sampling, seed)
+
+    ends = [
+        [value(torch.tensor(sign * step).double(), fine, seed) for sign in (1, -1)]
+        for seed in range(pairs)
+    ]
+    differences = torch.stack([(up - down) / (2 * step) for up, down in ends])
+    truth = differences.mean(0)
+    noise = differences.std(0).div(math.sqrt(pairs)).sum() / truth.abs().sum().clamp_min(1e-300)
+    own = ImageSampling(samples=256, outline_samples=1000)
+    full = pushed(lambda theta: value(theta, own))
+    return Found(
+        full,
+        pushed(lambda theta: value(theta, replace(own, boundary=False))),
+        truth,
+        float(noise),
+    )
+
+
+def changed(parameter: str, theta: Tensor) -> tuple[Scene, Radar]:
+    """Scene and radar at θ."""
+    walls = dict.fromkeys(GEOMETRY, METAL) | dict.fromkeys(
+        ("diffuse fraction", "lobe width"), ROUGH
+    )
+    scene = occluder(wall=walls.get(parameter, COATED), occluder=METAL)
+    if parameter == "object velocity":
+        return scene.replace("wall", velocity=theta * float64([0.3, 0.2, 1.0])), power_radar()
+    return MOVES[parameter](scene, power_radar(), theta)
+
+
 _power: dict[str, Found] = {}
 
 
@@ -429,6 +507,10 @@ def case(parameter: str, mechanism: str) -> Found:
         return chain_case(parameter)
     if mechanism == "coverage":
         return coverage_case(parameter)
+    if mechanism == "panels":
+        return panel_case(parameter)
+    if mechanism == "images":
+        return image_case(parameter)
     if parameter not in _power:
         _power[parameter] = bias_case() if parameter == "range bias" else power_case(parameter)
     return _power[parameter]
@@ -487,6 +569,12 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
         return
     if mechanism == "coverage":
         covered(scene, radar.positions[0], CellSampling(1))
+        return
+    if mechanism == "panels":
+        by_panel(scene, radar.positions)
+        return
+    if mechanism == "images":
+        seen(scene, radar, ImageSampling(1), 0)
         return
     if mechanism == "chains":
         exact_spectrum(

@@ -73,7 +73,8 @@ def robot() -> tuple[Camera, iw.Radar]:
     patch = Cosine(2.0)
     tx = planar_array((2, 2), (4 * half, 4 * half), patch)
     rx = planar_array((4, 4), (half, half), patch)
-    return camera, iw.Radar(tx, rx, chirp, [[0.0, 0.12, 1.0]], axes)
+    place = torch.tensor([[0.0, 0.12, 1.0]], dtype=torch.float64)
+    return camera, iw.Radar(tx, rx, chirp, place, axes)
 
 
 def crate(place: Sequence[float], yaw: float, scale: float) -> iw.Object:

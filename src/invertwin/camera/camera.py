@@ -37,7 +37,7 @@ class Camera:
     """
 
     positions: Float64[Tensor, "*frame 3"]
-    rotations: Float64[Tensor, "*frame 3 3"]
+    rotations: Float64[Tensor, "*turn 3 3"]
     width: int
     height: int
     focal: float | Float64[Tensor, ""]
