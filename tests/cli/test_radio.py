@@ -92,7 +92,7 @@ def test_a_transmitter_is_located(tmp_path, monkeypatch):
     assert set(found["standard_deviations"]) == {f"transmitter.{axis}" for axis in "xyz"}
     assert found["verdict"] in ("consistent", "inconsistent", "ambiguous")
     assert 0 < found["blocked_share"] < 1
-    for name in ("report.html", "loss.png", "metrics.json"):
+    for name in ("report.html", "loss.png", "plan.png", "metrics.json"):
         assert (out / name).stat().st_size > 0
 
 

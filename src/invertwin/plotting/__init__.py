@@ -24,6 +24,7 @@ from invertwin.plotting.maps import range_doppler as range_doppler
 from invertwin.plotting.maps import residuals as residuals
 from invertwin.plotting.maps import spectrum as spectrum
 from invertwin.plotting.rooms import floor_plan as floor_plan
+from invertwin.plotting.rooms import located as located
 from invertwin.plotting.rooms import placements as placements
 from invertwin.plotting.scenes import scene as scene
 from invertwin.plotting.signatures import focused as focused

@@ -1,4 +1,4 @@
-"""Figures of coverage: path gain over a floor plan, and the landscape of a panel's place."""
+"""Figures of rooms from above: path gain, a panel's places, located transmitters."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,6 +12,7 @@ from torch import Tensor
 from invertwin.plotting.figures import PALETTE, legible, numbers
 from invertwin.scene import Scene
 
+_MARKS = (("*", "#c0143c"), ("+", PALETTE[1]), (".", PALETTE[2]))
 _SPAN = 60.0  # dB below the strongest that are told apart
 
 
@@ -78,6 +79,34 @@ def placements(
     axes.set(xlabel="place along the walls [m]", ylabel="worst receivers [dB]")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+    return figure
+
+
+def located(
+    scene: Scene,
+    height: float,
+    places: Mapping[str, Float64[Tensor, "place 3"]],
+    fits: Float64[Tensor, "fit 2 3"],
+) -> Figure:
+    """Where fits of a transmitter began and ended, on a floor plan.
+
+    Args:
+        scene: Its objects are cut at the height.
+        height: [m].
+        places: Further places by title, such as the receivers, the truth and what was found [m].
+        fits: Start and end of each [m].
+    """
+    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
+    axes = figure.subplots()
+    axes.add_collection(LineCollection(_cut(scene, height), colors="black", linewidths=1.2))
+    ways = numbers(fits)[..., :2]
+    axes.add_collection(LineCollection([*ways], colors="0.75", linewidths=0.8))
+    axes.plot(*ways[:, 0].T, "o", color="0.6", markersize=4, label="starts")
+    axes.plot(*ways[:, 1].T, "o", color=PALETTE[0], markersize=5, label="ends")
+    for (title, some), style in zip(places.items(), _MARKS, strict=False):
+        axes.plot(*numbers(some)[:, :2].T, style[0], color=style[1], label=legible(title))
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 

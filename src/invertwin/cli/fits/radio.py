@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from rich.console import Console
 from torch import Tensor, nn
 
@@ -126,6 +127,8 @@ def run_radio(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
     metrics["wall_seconds"] = time.perf_counter() - begin
     losses = {name: [row["losses"] for row in fits] for name, fits in rows.items()}
     drawn = [picture(folder, "loss", plotting.convergence(losses))]
+    if _located(run):
+        drawn.append(picture(folder, "plan", _plan(heard, rows[FULL], found)))
     parts = [*_tables(heard, metrics, rows), *drawn]
     title, outcome = run.title or "Received levels", _outcome(run, metrics)
     return finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note), (
@@ -421,6 +424,20 @@ def _line_of_sight(heard: Heard, found: Reconstruction) -> dict[str, Any]:
     with torch.no_grad():
         count = len(trace_paths(scene, *ends, frequency, depth=0))
     return {"blocked_share": 1 - count / (len(ends[0]) * len(ends[1]))}
+
+
+def _plan(heard: Heard, rows: Sequence[dict[str, Any]], best: Reconstruction) -> Figure:
+    """Where the fits of the first transmitter began and ended."""
+    place = best.sensors[0].positions[:1].detach()
+    shown = {"found": place}
+    if heard.true_sensor is not None:
+        shown = {"truth": heard.true_sensor.positions[:1], "found": place}
+    places = heard.places or heard.model(heard.run).places
+    if isinstance(places, Points):
+        shown["receivers"] = places.positions
+    ends = [[row["start_position"], row["values"]["transmitter.position"]] for row in rows]
+    fits = torch.tensor(ends, dtype=torch.float64)
+    return plotting.located(best.scene, float(place[0, 2]), shown, fits)
 
 
 def _outcome(run: RunFile, metrics: Mapping[str, Any]) -> str:
