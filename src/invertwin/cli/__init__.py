@@ -10,4 +10,5 @@ registry.built_in = (
     "invertwin.cli.fit_tables",
     "invertwin.cli.cross_sections",
     "invertwin.cli.radio_tables",
+    "invertwin.cli.schema.dataset",
 )

@@ -10,6 +10,7 @@ from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.cli.fit_tables import SurrogateTable
+from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fits import (
     AnyInitial,
     AnyStarts,
@@ -28,6 +29,7 @@ from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTab
 from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.shape_tables import LearnedTable
+from invertwin.cli.variation import check_varied
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
@@ -168,6 +170,10 @@ class _RunFile(Section):
         "a metasurface that is placed; with [gradcheck] what is differentiated", None
     )
     rcs: AnyRcs | None = key("the radar signature; with [gradcheck] what is differentiated", None)
+    dataset: DatasetTable | None = key("many samples of the run file", None)
+    vary: list[Annotated[Any, OneOf("distribution")]] = key(
+        "[[vary]]: what is drawn anew for every sample of [dataset]", []
+    )
 
     @model_validator(mode="after")
     def _names_exist(self) -> "_RunFile":
@@ -276,6 +282,20 @@ class _RunFile(Section):
             runs.model_validate({"calibration": self._with(self.calibration)}, context=info.context)
         return self
 
+    @model_validator(mode="after")
+    def _samples_are_runs(self, info: Any) -> "_RunFile":
+        """Errors begin at the table that draws what is wrong."""
+        if self.vary and self.dataset is None:
+            fail("expected a section [dataset] with it, got none; add it", "vary")
+        if self.dataset is not None and self.dataset.paths and self.chirps is not None:
+            fail("expected false with [chirps], got true; remove it", "dataset.paths")
+        check_varied(self, self.alone(), info)
+        return self
+
+    def alone(self) -> dict[str, Any]:
+        """As TOML, without what makes it a data set."""
+        return self.model_dump(**_AS_GIVEN, exclude={"dataset", "vary"})
+
     def varied(self, part: Part) -> "_RunFile":
         """The run file with a stage, a variant or the calibration merged over it."""
         return type(self).model_validate(self._with(part))
@@ -300,6 +320,8 @@ class _RunFile(Section):
     def references(self) -> list[tuple[str, str]]:
         """Where the run file names an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
+        if self.dataset is not None:
+            used += [(f"dataset.classes.{name}", name) for name in self.dataset.classes]
         for path, table in self.unknowns.items():
             if getattr(table, "object", None) is not None:
                 used.append((f"{path}.object", table.object))
