@@ -14,7 +14,7 @@ from invertwin.registry.section import fail
 from invertwin.seeds import derived_seed
 
 Steps = tuple[str | int, ...]
-_STEP = re.compile(r'(?:^|\.)(?:"([^"]+)"|([^.\[\]"\s]+))|\[(\d+)\]')
+_STEP = re.compile(r'(?:^|(?<=.)\.)(?:"([^"]+)"|([^.\[\]"\s]+))|\[(\d+)\]')
 _KNOWN = 12  # names that an error lists
 
 
@@ -45,8 +45,8 @@ def check_varied(run: Any, raw: dict[str, Any], info: Any) -> None:
         raw: It as TOML, without what makes it a data set.
         info: Of pydantic.
     """
-    kind: Any = type(run)
-    whole = TypeAdapter(dict[str, kind])
+    kind = type(run)
+    whole = TypeAdapter(dict[str, kind])  # type: ignore[valid-type]
     taken: set[Steps] = set()
     for number, table in enumerate(run.vary):
         at = f"vary[{number}]"
