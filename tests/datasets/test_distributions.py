@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Uniform
+from invertwin.datasets import KEPT, Choice, Integer, LogUniform, Normal, Presence, Uniform
 from invertwin.errors import InputError
 
 
-def draws(law, count=4000, stated=None):
+def draws(law, count=4000):
     generator = np.random.default_rng(1)
-    return [law.draw(generator, stated) for _ in range(count)]
+    return [law.draw(generator) for _ in range(count)]
 
 
 def test_uniform_fills_its_limits_entry_by_entry():
@@ -46,10 +46,10 @@ def test_choice_goes_by_its_weights():
     assert values.count("a") == pytest.approx(1000, rel=0.1)
 
 
-def test_presence_keeps_what_is_stated_or_takes_it_away():
-    values = draws(Presence(0.25), stated={"shape": "box"})
-    assert values.count({"shape": "box"}) == pytest.approx(1000, rel=0.1)
-    assert values.count(None) == 4000 - values.count({"shape": "box"})
+def test_presence_keeps_a_key_or_takes_it_away():
+    values = draws(Presence(0.25))
+    assert values.count(KEPT) == pytest.approx(1000, rel=0.1)
+    assert values.count(None) == 4000 - values.count(KEPT)
 
 
 def test_ends_are_those_that_draws_stay_between():

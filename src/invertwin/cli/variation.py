@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
+from invertwin.datasets import KEPT
 from invertwin.errors import InputError
 from invertwin.registry.section import fail
 from invertwin.seeds import derived_seed
@@ -76,10 +77,9 @@ def sample_of(run: Any, raw: dict[str, Any], index: int) -> dict[str, Any]:
     drawn = []
     for number, table in enumerate(run.vary, 1):
         words = np.random.SeedSequence(run.seed, spawn_key=(index, number))
-        for path in table.paths:  # each from the start of the same random numbers
-            holder, last = _holder(raw, path)
-            stated = holder[last] if isinstance(last, int) else holder.get(last)
-            drawn.append((path, table.build().draw(np.random.default_rng(words), stated)))
+        value = table.build().draw(np.random.default_rng(words))
+        if value is not KEPT:
+            drawn += [(path, value) for path in table.paths]
     return with_values(raw, drawn) | {
         "task": "simulate",
         "seed": derived_seed(run.seed, index, 0),

@@ -1,5 +1,6 @@
 """Data sets of simulated recordings: what is drawn, labels, shards, and their reader."""
 
+from invertwin.datasets.distributions import KEPT as KEPT
 from invertwin.datasets.distributions import Choice as Choice
 from invertwin.datasets.distributions import Distribution as Distribution
 from invertwin.datasets.distributions import Integer as Integer

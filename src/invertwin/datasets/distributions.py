@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -11,19 +11,16 @@ from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive, Share
 
 Numbers = float | Sequence[float]
+KEPT: Final = object()
+"""Drawn where a key stays as it is, with what others have drawn in it."""
 
 
 class Distribution(ABC):
-    """Draws values for a key. None stands for a key that is taken away."""
+    """Draws values for a key. None takes the key away, and ``KEPT`` leaves it as it is."""
 
     @abstractmethod
-    def draw(self, generator: np.random.Generator, stated: Any) -> Any:
-        """A value.
-
-        Args:
-            generator: Of the random numbers.
-            stated: What the run file says.
-        """
+    def draw(self, generator: np.random.Generator) -> Any:
+        """A value, ``KEPT``, or None."""
 
     @abstractmethod
     def ends(self) -> list[Any]:
@@ -48,7 +45,7 @@ class Uniform(Distribution):
     def __post_init__(self) -> None:
         _check_order(self.low, self.high)
 
-    def draw(self, generator: np.random.Generator, stated: Any) -> Any:
+    def draw(self, generator: np.random.Generator) -> Any:
         """A number, or a list of independent ones."""
         return np.asarray(generator.uniform(self.low, self.high, _size(self.low))).tolist()
 
@@ -77,7 +74,7 @@ class LogUniform(Distribution):
         if np.min(self.low) <= 0:
             raise InputError(f"expected low > 0, got {self.low}; its logarithm is needed")
 
-    def draw(self, generator: np.random.Generator, stated: Any) -> Any:
+    def draw(self, generator: np.random.Generator) -> Any:
         """A number, or a list of independent ones."""
         share = generator.random(_size(self.low))
         low, high = np.asarray(self.low, dtype=float), np.asarray(self.high, dtype=float)
@@ -113,7 +110,7 @@ class Normal(Distribution):
         if np.min(self.deviation) < 0:
             raise InputError(f"expected deviations >= 0, got {self.deviation}; correct them")
 
-    def draw(self, generator: np.random.Generator, stated: Any) -> Any:
+    def draw(self, generator: np.random.Generator) -> Any:
         """A number, or a list of independent ones."""
         drawn = generator.normal(self.mean, self.deviation, _size(self.mean))
         return np.asarray(drawn).tolist()
@@ -141,7 +138,7 @@ class Integer(Distribution):
     def __post_init__(self) -> None:
         _check_order(self.low, self.high)
 
-    def draw(self, generator: np.random.Generator, stated: Any) -> Any:
+    def draw(self, generator: np.random.Generator) -> Any:
         """A whole number, or a list of independent ones."""
         drawn = generator.integers(self.low, self.high, _size(self.low), endpoint=True)
         return np.asarray(drawn).tolist()
@@ -179,7 +176,7 @@ class Choice(Distribution):
         if min(self.weights) < 0 or not sum(self.weights) > 0:
             raise InputError(f"expected weights >= 0, some > 0, got {self.weights}; correct them")
 
-    def draw(self, generator: np.random.Generator, stated: Any) -> Any:
+    def draw(self, generator: np.random.Generator) -> Any:
         """One of the values."""
         weights = None if self.weights is None else np.asarray(self.weights) / sum(self.weights)
         return self.values[int(generator.choice(len(self.values), p=weights))]
@@ -199,9 +196,9 @@ class Presence(Distribution):
 
     probability: Share = 0.5
 
-    def draw(self, generator: np.random.Generator, stated: Any) -> Any:
-        """What is stated, or None."""
-        return stated if generator.random() < self.probability else None
+    def draw(self, generator: np.random.Generator) -> Any:
+        """Kept, or None."""
+        return KEPT if generator.random() < self.probability else None
 
     def ends(self) -> list[Any]:
         """None: what is stated has been checked."""
