@@ -47,15 +47,12 @@ def mean_over_views(
         value = loss(view) / len(views)
         total += value.detach()
         # Each view by itself: what its derivative needs is free before the next one begins.
-        for own, part in zip(
-            sums, torch.autograd.grad(value, free, allow_unused=True), strict=True
-        ):
-            own += 0.0 if part is None else part
+        parts = torch.autograd.grad(value, free, allow_unused=True, materialize_grads=True)
+        for own, part in zip(sums, parts, strict=True):
+            own += part
     if count > 1:
         sums, total = _summed(sums, total)
-    for parameter, own in zip(free, sums, strict=True):
-        there: Tensor | None = parameter.grad
-        parameter.grad = own if there is None else there + own
+    torch.autograd.backward(free, sums)  # of parameters themselves: adds the sums
     return float(total)
 
 
