@@ -106,6 +106,7 @@ def shards(folder):
     return {file.name: file.read_bytes() for file in folder.rglob("*.tar")}
 
 
+@pytest.mark.slow
 def test_two_workers_make_the_same_bytes(whole, monkeypatch, capsys):
     _, folder = whole
     file, out = folder / "rooms.toml", folder / "two"
@@ -251,6 +252,16 @@ def test_a_sample_is_simulated_again_from_its_own_run_file(whole, tmp_path, monk
     assert (again - recorded).abs().max() < 1e-6 * recorded.abs().max()
 
 
+def test_check_counts_all_samples(whole, monkeypatch, capsys):
+    _, folder = whole
+    assert call(monkeypatch, "check", folder / "rooms.toml") == 0
+    (few,) = re.findall(r"and ([0-9.e+]+) paths", capsys.readouterr().out)
+    (folder / "more.toml").write_text(RUN.replace("samples = 5", "samples = 500"))
+    assert call(monkeypatch, "check", folder / "more.toml") == 0
+    (many,) = re.findall(r"and ([0-9.e+]+) paths", capsys.readouterr().out)
+    assert float(many) == pytest.approx(100 * float(few), rel=0.1)
+
+
 def test_draws_depend_on_seed_and_index_only():
     run = validate(tomllib.loads(RUN), ANYWHERE)
     longer = validate(tomllib.loads(RUN.replace("samples = 5", "samples = 500")), ANYWHERE)
@@ -348,6 +359,14 @@ def varied(**table):
         (
             {**tomllib.loads(RUN), "dataset": {"samples": 2, "paths": True}},
             r"^dataset.paths: expected false with \[chirps\]",
+        ),
+        (
+            {**tomllib.loads(RUN), "data": {"kind": "capture", "file": "a.nc"}},
+            r"^data.kind: expected \"simulated\" with \[dataset\], got \"capture\"",
+        ),
+        (
+            {**tomllib.loads(RUN), "observations": {"near": {"weight": 2.0}}},
+            r"^observations: expected none with \[dataset\]",
         ),
         (
             {k: v for k, v in tomllib.loads(RUN).items() if k != "dataset"},

@@ -42,6 +42,7 @@ def one_of_two(job: tuple[int, str]) -> tuple[float, list[float]]:
         distributed.destroy_process_group()
 
 
+@pytest.mark.slow
 def test_two_processes_give_what_one_gives(tmp_path, monkeypatch):
     monkeypatch.setenv("GLOO_SOCKET_IFNAME", "lo")
     jobs = [(rank, str(tmp_path / "meeting")) for rank in (0, 1)]

@@ -10,6 +10,7 @@ from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.cli.fit_tables import SurrogateTable
+from invertwin.cli.recordings import SimulatedData
 from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fits import (
     AnyInitial,
@@ -287,10 +288,20 @@ class _RunFile(Section):
         """Errors begin at the table that draws what is wrong."""
         if self.vary and self.dataset is None:
             fail("expected a section [dataset] with it, got none; add it", "vary")
-        if self.dataset is not None and self.dataset.paths and self.chirps is not None:
-            fail("expected false with [chirps], got true; remove it", "dataset.paths")
+        if self.dataset is not None:
+            self._require_simulated()
         check_varied(self, self.alone(), info)
         return self
+
+    def _require_simulated(self) -> None:
+        """What a data set cannot be made of."""
+        if self.dataset is not None and self.dataset.paths and self.chirps is not None:
+            fail("expected false with [chirps], got true; remove it", "dataset.paths")
+        if self.observations:
+            fail("expected none with [dataset], which has one radar, got some", "observations")
+        if self.data is not None and not isinstance(self.data, SimulatedData):
+            got = f'expected "simulated" with [dataset], got "{self.data.kind}"'
+            fail(f"{got}; give points_per_m2 and snr_db instead of a recording", "data.kind")
 
     def alone(self) -> dict[str, Any]:
         """As TOML, without what makes it a data set."""
