@@ -40,7 +40,7 @@ from invertwin.datasets.shards import (
 )
 from invertwin.engines import Engine, spread
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.folders import PARTS
+from invertwin.folders import PARTS, UNFINISHED
 from invertwin.progress import told
 from invertwin.radar import range_doppler_angle
 from invertwin.runs import RunFolder, open_run
@@ -141,7 +141,7 @@ def run_dataset(
     table, begin = need(run, "dataset", "a data set"), time.perf_counter()
     wanted = ranges(table.samples, table.shard, part)
     _check_first(run, wanted[0][1])
-    found = {number: folder.read_json(_part(number)) for number, _, _ in wanted}
+    found = {number: _finished(folder, number) for number, _, _ in wanted}
     missing = [row for row in wanted if found[row[0]] is None]
     text = to_toml(run)
     jobs = [(text, first, count) for _, first, count in missing]
@@ -312,6 +312,13 @@ def _report(
     return finish(
         folder, metrics, run.title or "Data set", status, parts, again="dataset", note=run.note
     )
+
+
+def _finished(folder: RunFolder, number: int) -> dict[str, Any] | None:
+    """The manifest's row of a shard that an interrupted run has written whole, or None."""
+    unfinished = folder.path / UNFINISHED
+    there = (unfinished / _part(number)).exists() and (unfinished / shard_name(number)).exists()
+    return folder.read_json(_part(number)) if there else None
 
 
 def _part(number: int) -> str:
