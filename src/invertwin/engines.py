@@ -158,7 +158,8 @@ def _cluster() -> Iterator[tuple[int, Any, Any]]:
     if ours:
         ray.init(include_dashboard=False, log_to_driver=False)
     try:
-        task = ray.remote(num_cpus=1)(_alone)
+        one_thread = {"env_vars": _ONE_THREAD}
+        task = ray.remote(num_cpus=1, runtime_env=one_thread)(_alone)
         count = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
         def ended(waiting: Any) -> list[tuple[Any, Any]]:
@@ -175,7 +176,7 @@ def _alone(work: Callable[[Any], Any], job: Any) -> Any:
     """A piece of work on a node of a cluster."""
     from invertwin import threads
 
-    # Ray sets it for tasks of one core; a worker that was told otherwise would give other bits.
+    # Asked for with the task; a worker with more threads would give other bits.
     if threads.available() != 1:
         return _Refusal(
             f"expected workers of Ray with one thread, got OMP_NUM_THREADS = "
