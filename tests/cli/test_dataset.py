@@ -128,9 +128,10 @@ def test_a_shard_does_not_depend_on_what_was_made_before(whole):
 
 
 @pytest.mark.slow
-def test_two_nodes_of_a_ray_cluster_make_the_same_bytes(whole):
+def test_two_nodes_of_a_ray_cluster_make_the_same_bytes(whole, monkeypatch):
     """Runs where the extra `ray` is installed."""
     ray = pytest.importorskip("ray")
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")  # what nodes inherit, and workers must not
     from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
     _, folder = whole
