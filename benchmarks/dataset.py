@@ -10,8 +10,8 @@ Prints a table and writes `metrics.json` into DIR (default `out/dataset`). Sampl
   first sample's checks to the last shard, start of the workers included; the best of REPEATS runs,
   in turns. The kernels are in the cache.
 - `scaling`: the second over the first. Other work on the machine makes it smaller.
-- `cpu_seconds`: processor time of all processes of that run, over its samples. Alike where workers do
-  not hinder each other, whatever else the machine does.
+- `cpu_seconds`: processor time of all processes of that run, over its samples. Alike where workers
+  do not hinder each other, whatever else the machine does.
 - `bytes_equal`: of each case, whether all shards have the bytes that one worker has written:
   `workers_2`; `parts_2` and `parts_5`, made by `--shard i/n`; `killed`, a run of two workers that
   was killed (`kill -9`) KILLS times at random moments and went on; `ray`, two nodes of a Ray
