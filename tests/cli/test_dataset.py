@@ -348,6 +348,8 @@ def varied(**table):
             "did you mean `uniform`",
         ),
         (varied(key="seed", kind="integer", low=0, high=9), r"^vary\[0\].*: .*got \"seed\""),
+        (varied(key=3, kind="presence"), r"^vary\[0\].key: expected a text in quotes, got 3"),
+        (varied(key=[], kind="presence"), r"^vary\[0\].key: expected at least 1 items"),
         (varied(key="scene..ball", kind="presence"), r"got \"scene..ball\""),
         (
             varied(key=["data.snr_db", "data.snr_db"], kind="integer", low=0, high=9),

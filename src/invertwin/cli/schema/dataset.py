@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Literal
 
 from annotated_types import MinLen
-from pydantic import model_validator
+from pydantic import GetCoreSchemaHandler, model_validator
 
 from invertwin.cli.variation import steps_of
 from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Uniform
@@ -14,7 +14,15 @@ from invertwin.registry.section import key as described
 
 _OWN = ("task", "seed", "dataset", "vary")  # of the data set itself
 _PATH = Annotated[Words, MinLen(1)]
-_PATHS: Any = number_or_list(_PATH, Annotated[list[_PATH], MinLen(1)])
+
+
+class _Paths:
+    """Annotates a key that is one path, or a list of them."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        kind = number_or_list(_PATH, Annotated[list[_PATH], MinLen(1)])
+        return handler.generate_schema(kind)
 
 
 class DatasetTable(Section):
@@ -35,7 +43,7 @@ class DatasetTable(Section):
 class VaryTable(Table):
     """What is drawn anew for every sample."""
 
-    key: Annotated[Any, _PATHS] = described(
+    key: Annotated[Any, _Paths] = described(
         "its path in the run file, such as scene.box.position[0]; a list of paths gets one value"
     )
 
