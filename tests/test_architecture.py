@@ -29,6 +29,7 @@ SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
 SIGNATURES = CHANNEL | {"signatures"}
 CAMERA = CHANNEL - {"doctor", "threads"} | {"camera"}
+DATASETS = RADAR | {"datasets"}
 MODELS = SIMULATION | CAPTURE | LINKS | CAMERA | {"signatures", "models"}
 INVERSION = MODELS | {"inversion"}
 
@@ -44,6 +45,7 @@ ALLOWED = {
     "apart": {"errors"},
     "progress": set(),
     "threads": set(),
+    "engines": {"errors", "threads"},
     "doctor": FOUNDATION,
     "scene": SCENE,
     "channel": CHANNEL,
@@ -53,12 +55,16 @@ ALLOWED = {
     "simulation": SIMULATION,
     "signatures": SIGNATURES,
     "capture": CAPTURE,
+    "datasets": DATASETS,
     "models": MODELS,
     "inversion": INVERSION,
     "runs": FOUNDATION | {"runs"},
     "plotting": INVERSION | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION | SIGNATURES | {"doctor", "runs", "plotting", "registry", "cli", "__init__"},
+    "cli": INVERSION
+    | SIGNATURES
+    | DATASETS
+    | {"doctor", "threads", "engines", "runs", "plotting", "registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
     "__init__": INVERSION | SIGNATURES | {"doctor", "threads"},
 }

@@ -5,8 +5,8 @@ and antennas; ``channel`` traces them into paths; ``radar`` makes beat signals a
 or their smooth mean, the surrogate; ``links`` makes responses of paths between antennas;
 ``inversion`` compares spectra with a capture and moves θ.
 ``simulation.py`` is the way from scene to spectrum on one page. Beside it, ``capture`` holds
-measured data, ``plotting`` draws figures, ``registry`` says what run files may name and ``cli`` has
-the commands.
+measured data, ``datasets`` simulated ones with labels, ``plotting`` draws figures, ``registry``
+says what run files may name and ``cli`` has the commands.
 
 The names below are the public menu. Each is loaded when it is first used, so ``import invertwin``
 is quick, and ``invertwin doctor`` runs where no ray tracer can.
@@ -19,7 +19,7 @@ from invertwin import doctor, threads
 
 __version__ = "0.2.0"
 
-_ROOMS = ("capture", "channel", "inversion", "links", "plotting", "radar", "scene")
+_ROOMS = ("capture", "channel", "datasets", "inversion", "links", "plotting", "radar", "scene")
 
 # Name → module.
 _MENU = {
@@ -39,6 +39,7 @@ _MENU = {
     "Schedule": "inversion.schedule",
     "Surrogate": "radar.surrogate",
     "SurrogateMap": "models",
+    "dataset": "cli.run_dataset",
     "gradcheck": "inversion.gradcheck",
     "load_mesh": "scene.files",
     "rcs": "signatures",

@@ -22,6 +22,7 @@ def script(name: str) -> Any:
 basin = script("basin")
 channels = script("channels")
 crash_safety = script("crash_safety")
+dataset = script("dataset")
 diffraction = script("diffraction")
 edges = script("edges")
 fine_meshes = script("fine_meshes")

@@ -11,4 +11,5 @@ registry.built_in = (
     "invertwin.cli.cross_sections",
     "invertwin.cli.radio_tables",
     "invertwin.cli.camera_tables",
+    "invertwin.cli.schema.dataset",
 )

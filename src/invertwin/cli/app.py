@@ -15,6 +15,7 @@ from typer.core import TyperGroup
 from invertwin import __version__
 from invertwin.cli.options import (
     BackendOption,
+    Dataset,
     FileArgument,
     FilesArgument,
     Look,
@@ -27,6 +28,7 @@ from invertwin.cli.report import Table
 from invertwin.cli.run_file import about_file
 from invertwin.cli.running import load_runs, now_and_then, print_tables, progress, run_folder
 from invertwin.errors import InputError, interruptible, one_line
+from invertwin.threads import available
 
 
 class _Commands(TyperGroup):
@@ -97,6 +99,25 @@ def simulate(options: Options, file: FileArgument) -> None:
 
         with about_file(file), progress(console):
             tables = run_simulate(runs[file.stem], folder)
+        print_tables(tables)
+
+
+@app.command()
+@with_options(Dataset)
+def dataset(options: Dataset, file: FileArgument) -> None:
+    """Simulate a data set: many samples of a run file with other values each, and their labels."""
+    from invertwin.cli.run_dataset import NEEDS, folder_of_part, part_of, run_dataset
+
+    part = part_of(options.shard)
+    runs = load_runs([file], options, "dataset", NEEDS)
+    chosen = replace(options, out=folder_of_part(options.out or Path("out", file.stem), part))
+    with run_folder(chosen, Path("out"), runs) as folder:
+        if folder.complete:
+            return
+        with about_file(file), progress(console):
+            tables = run_dataset(
+                runs[file.stem], folder, part, options.engine, options.workers or available()
+            )
         print_tables(tables)
 
 

@@ -305,6 +305,8 @@ def _recordings(run: RunFile) -> int:
     """How often data are simulated."""
     if not isinstance(run.data, SimulatedData):
         return 1
+    if run.task == "dataset" and run.dataset is not None:
+        return run.dataset.samples
     anew = run.starts.count if run.data.every_start and run.starts is not None else 1
     return anew + (run.plan.fits if run.plan is not None else 0)
 

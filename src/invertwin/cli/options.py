@@ -68,6 +68,26 @@ class Resumable(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Dataset(Resumable):
+    """Who simulates a data set, and which part of it."""
+
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers", min=1, help="Processes of one thread; default: as many as cores."
+        ),
+    ] = None
+    shard: Annotated[
+        str | None,
+        typer.Option("--shard", help="i/n: part i of n, into a folder of its own inside."),
+    ] = None
+    engine: Annotated[
+        Literal["processes", "ray"],
+        typer.Option("--engine", help="Processes of this machine, or tasks of a Ray cluster."),
+    ] = "processes"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Look(Where):
     """What to look at, as the options of `invertwin look` say it."""
 

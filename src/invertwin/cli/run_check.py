@@ -25,6 +25,7 @@ _FRAMES = 4  # of the radar, or aspects, in the probe
 _FEW, _MANY = 10_000, 100_000  # rays or paths that are timed: less than a second of work
 _DERIVATIVES = 4  # times the work of a map: a step of a fit with one or several derivatives
 _FITS = ("reconstruct", "demo")
+_SIMULATED = ("simulate", "dataset")
 
 
 def run_check(run: RunFile) -> tuple[list[Table], str]:
@@ -198,7 +199,7 @@ def _seconds(run: RunFile, found: Estimate, truth: Scene, sensors: Mapping[str, 
     frames = whole.radar.frame_count
     sensor = replace(whole, radar=whole.radar.frames(range(min(_FRAMES, frames))))
     still = Scene({name: replace(item, velocity=None) for name, item in truth.objects.items()})
-    each, ray = _line(lambda count: _map(sensor, still, depth, count, run.task != "simulate"))
+    each, ray = _line(lambda count: _map(sensor, still, depth, count, run.task not in _SIMULATED))
     used = min(getattr(settings, "frames_per_step", None) or frames, frames)
     seconds = found.maps * each * used / sensor.radar.frame_count + found.rays * ray
     if found.rows:

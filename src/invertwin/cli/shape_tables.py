@@ -239,3 +239,20 @@ def given_for(name: str, scene: Scene, objects: Mapping[str, Any]) -> dict[type,
     item, table = scene[name], objects.get(name)
     found: dict[type, object] = {Scene: scene, Object: item, Mesh: item.mesh}
     return found if table is None else {**found, ObjectTable: table}
+
+
+def joint_places(table: Any, item: Object) -> dict[str, Tensor]:
+    """Where the joints of a body are in the world [m], by name; none of other objects.
+
+    Args:
+        table: Of the object.
+        item: What it has made.
+    """
+    if _shape(table) != "body":
+        return {}
+    template = body_template(table.model, table.file, table.height, table.spacing)
+    template = template.scaled(table.scale)
+    turns = {name: torch.tensor(turn).deg2rad() for name, turn in table.angles_deg.items()}
+    places = template.posed(rotation_from_vector(template.rotations(turns)))[1]
+    world = places @ item.transform[:3, :3].T + item.transform[:3, 3]
+    return dict(zip(template.names, world, strict=True))

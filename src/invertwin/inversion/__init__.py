@@ -1,5 +1,6 @@
 """From observed maps to the scene: observations, loss, schedule, fit; and gradient checks."""
 
+from invertwin.inversion.averaging import mean_over_views as mean_over_views
 from invertwin.inversion.callbacks import Checkpoint as Checkpoint
 from invertwin.inversion.callbacks import Report as Report
 from invertwin.inversion.callbacks import Watch as Watch

@@ -236,7 +236,7 @@ class Registry:
     def names(self, group: str) -> list[str]:
         """The kinds of a group, or of "task"."""
         if group == "task":
-            own = ["simulate", "reconstruct", "gradcheck", "rcs", "loss-scan", "demo"]
+            own = ["simulate", "reconstruct", "gradcheck", "rcs", "dataset", "loss-scan", "demo"]
             return list(dict.fromkeys([*own, *self.commands]))
         return list(self._kinds(group))
 

@@ -11,6 +11,8 @@ from pydantic_core import PydanticCustomError
 
 from invertwin.cli.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.fit_tables import SurrogateTable
+from invertwin.cli.recordings import SimulatedData
+from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fits import (
     AnyInitial,
     AnyStarts,
@@ -29,6 +31,7 @@ from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTab
 from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.shape_tables import LearnedTable
+from invertwin.cli.variation import check_varied
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
@@ -171,6 +174,10 @@ class _RunFile(Section):
         "a metasurface that is placed; with [gradcheck] what is differentiated", None
     )
     rcs: AnyRcs | None = key("the radar signature; with [gradcheck] what is differentiated", None)
+    dataset: DatasetTable | None = key("many samples of the run file", None)
+    vary: list[Annotated[Any, OneOf("distribution")]] = key(
+        "[[vary]]: what is drawn anew for every sample of [dataset]", []
+    )
 
     @model_validator(mode="after")
     def _names_exist(self) -> "_RunFile":
@@ -282,6 +289,30 @@ class _RunFile(Section):
             runs.model_validate({"calibration": self._with(self.calibration)}, context=info.context)
         return self
 
+    @model_validator(mode="after")
+    def _samples_are_runs(self, info: Any) -> "_RunFile":
+        """Errors begin at the table that draws what is wrong."""
+        if self.vary and self.dataset is None:
+            fail("expected a section [dataset] with it, got none; add it", "vary")
+        if self.dataset is not None:
+            self._require_simulated()
+        check_varied(self, self.alone(), info)
+        return self
+
+    def _require_simulated(self) -> None:
+        """What a data set cannot be made of."""
+        if self.dataset is not None and self.dataset.paths and self.chirps is not None:
+            fail("expected false with [chirps], got true; remove it", "dataset.paths")
+        if self.observations:
+            fail("expected none with [dataset], which has one radar, got some", "observations")
+        if self.data is not None and not isinstance(self.data, SimulatedData):
+            got = f'expected "simulated" with [dataset], got "{self.data.kind}"'
+            fail(f"{got}; give points_per_m2 and snr_db instead of a recording", "data.kind")
+
+    def alone(self) -> dict[str, Any]:
+        """As TOML, without what makes it a data set."""
+        return self.model_dump(**_AS_GIVEN, exclude={"dataset", "vary"})
+
     def varied(self, part: Part) -> "_RunFile":
         """The run file with a stage, a variant or the calibration merged over it."""
         return type(self).model_validate(self._with(part))
@@ -306,6 +337,8 @@ class _RunFile(Section):
     def references(self) -> list[tuple[str, str]]:
         """Where the run file names an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
+        if self.dataset is not None:
+            used += [(f"dataset.classes.{name}", name) for name in self.dataset.classes]
         for path, table in self.unknowns.items():
             if getattr(table, "object", None) is not None:
                 used.append((f"{path}.object", table.object))

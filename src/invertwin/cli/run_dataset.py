@@ -1,0 +1,326 @@
+"""`invertwin dataset`: many simulated samples of one run file, in shards."""
+
+import hashlib
+import json
+import re
+import time
+import tomllib
+import warnings
+from collections.abc import Iterator
+from contextlib import closing
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from invertwin import __version__
+from invertwin.channel import Paths
+from invertwin.cli import build
+from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.report import Table, finish, quantities
+from invertwin.cli.run_file import about_file, load_run, need, to_toml, validate
+from invertwin.cli.run_simulate import chirp_train, exact
+from invertwin.cli.schema import RunFile
+from invertwin.cli.shape_tables import joint_places
+from invertwin.cli.variation import sample_of
+from invertwin.datasets import Samples, object_labels, radar_labels, seen_triangles
+from invertwin.datasets.shards import (
+    FORMAT,
+    MANIFEST,
+    Array,
+    Manifest,
+    Shard,
+    described,
+    npy,
+    packed,
+    ranges,
+    shard_name,
+)
+from invertwin.engines import Engine, spread
+from invertwin.errors import InputError, PhysicsWarning
+from invertwin.folders import PARTS, UNFINISHED
+from invertwin.progress import told
+from invertwin.radar import range_doppler_angle
+from invertwin.runs import RunFolder, open_run
+from invertwin.scene import Scene
+
+NEEDS = ("dataset", "radar", "grid", "data")
+_COMPUTE = ("drjit", "finufft", "mitsuba", "numpy", "torch")
+_NAMES = {"raw": "beat", "map": "map"}  # of arrays, by what the run file calls them
+_FIELD = "√(received over sent)"
+
+
+def dataset(
+    run_file: str | Path,
+    folder: str | Path,
+    *,
+    workers: int = 1,
+    engine: Engine = "processes",
+    part: tuple[int, int] = (1, 1),
+    seed: int | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+) -> Samples:
+    """Simulate a data set: samples of a run file with ``[dataset]`` and ``[[vary]]``.
+
+    Sample i depends on the run file, the seed and i only. So any number of workers, parts and
+    interruptions makes the same shards, bit for bit. Workers are spawned: a script that calls this
+    does so below ``if __name__ == "__main__":``.
+
+    Args:
+        run_file: The run file (TOML).
+        folder: For the shards; each part has a folder of its own inside.
+        workers: Processes of one thread each.
+        engine: ``processes`` of this machine, or tasks of a ``ray`` cluster.
+        part: Number from 1, and how many parts there are: part i of n makes every n-th shard.
+        seed: In place of the run file's.
+        overwrite: Replace the results in the folder when this run ends.
+        resume: Go on with the interrupted run in the folder.
+
+    Returns:
+        The samples that the folder holds, for a ``DataLoader``.
+
+    Raises:
+        InputError: A wrong run file, a folder with other files where shards go, or a sample that
+            cannot be simulated.
+    """
+    file = Path(run_file)
+    run = load_run(file)
+    with about_file(file):
+        for section in NEEDS:
+            need(run, section, "dataset")
+    run = run if seed is None else run.model_copy(update={"seed": seed})
+    place = folder_of_part(Path(folder), part)
+    with open_run(place, {"run": to_toml(run)}, overwrite=overwrite, resume=resume) as opened:
+        if not opened.complete:
+            with about_file(file):
+                run_dataset(run, opened, part, engine, workers)
+    return Samples(place)
+
+
+def folder_of_part(folder: Path, part: tuple[int, int]) -> Path:
+    """Where a part of a data set is written.
+
+    Args:
+        folder: Of the whole.
+        part: Number and count; the only part is the whole.
+    """
+    return folder if part == (1, 1) else folder / f"part_{part[0]}_of_{part[1]}"
+
+
+def part_of(text: str | None) -> tuple[int, int]:
+    """The part that `--shard i/n` names.
+
+    Raises:
+        InputError: No such text.
+    """
+    if text is None:
+        return 1, 1
+    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    if found is None:
+        raise InputError(f"expected --shard as i/n such as 2/5, got {text!r}; correct it")
+    return int(found[1]), int(found[2])
+
+
+def run_dataset(
+    run: RunFile, folder: RunFolder, part: tuple[int, int], engine: Engine, workers: int
+) -> list[Table]:
+    """Simulate the shards of a part that are not there yet; return the tables to print.
+
+    Args:
+        run: The run file of the data set.
+        folder: Of the part.
+        part: Number and count.
+        engine, workers: Who simulates.
+
+    Raises:
+        InputError: A sample that cannot be simulated; the message names it.
+    """
+    table, begin = need(run, "dataset", "a data set"), time.perf_counter()
+    wanted = ranges(table.samples, table.shard, part)
+    _check_first(run, wanted[0][1])
+    found = {number: _finished(folder, number) for number, _, _ in wanted}
+    missing = [row for row in wanted if found[row[0]] is None]
+    text = to_toml(run)
+    jobs = [(text, first, count) for _, first, count in missing]
+    with closing(spread(shard_content, jobs, engine=engine, workers=workers)) as done:
+        for _ in told(missing, "shards"):
+            at, content = next(done)
+            number, first, count = missing[at]
+            name = shard_name(number)
+            folder.write_bytes(name, content)
+            found[number] = described(name, first, count, content).model_dump()
+            folder.write_json(_part(number), found[number])
+    shards = [Shard.model_validate(found[number]) for number, _, _ in wanted]
+    _write_manifest(run, folder, part, shards)
+    seconds = time.perf_counter() - begin
+    return _report(run, folder, shards, sum(count for _, _, count in missing), seconds)
+
+
+def shard_content(job: tuple[str, int, int]) -> bytes:
+    """A shard as a tar file: what a worker does.
+
+    Args:
+        job: The run file of the data set, the first sample, and how many.
+    """
+    text, first, count = job
+    run = validate(tomllib.loads(text), Path("run.toml"))
+
+    def samples() -> Iterator[tuple[int, dict[str, bytes]]]:
+        for index in range(first, first + count):
+            yield index, sample_content(run, index)
+
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
+        return packed(samples())
+
+
+def sample_content(run: RunFile, index: int) -> dict[str, bytes]:
+    """The files of a sample by the ends of their names: arrays, labels, and its own run file.
+
+    Args:
+        run: The run file of the data set.
+        index: Of the sample.
+    """
+    own = sample_run(run, index)
+    with about_file(Path(f"sample {index}")):
+        scene, sensor = _built(own)
+        table = need(run, "dataset", "a data set")
+        arrays = _signals(own, scene, sensor, table)
+        seen = seen_triangles(scene, sensor.radar)
+    if table.masks:
+        arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
+    labels = {
+        "index": index,
+        "objects": object_labels(scene, seen, table.classes, _joints(own, scene)),
+        "radar": radar_labels(sensor.radar),
+    }
+    files = {f"{name}.npy": npy(array) for name, array in arrays.items()}
+    text = json.dumps(labels, ensure_ascii=False, allow_nan=False)
+    return files | {"labels.json": text.encode(), "run.toml": to_toml(own).encode()}
+
+
+def sample_run(run: RunFile, index: int) -> RunFile:
+    """The run file of a sample: what `invertwin simulate` takes.
+
+    Args:
+        run: The run file of the data set.
+        index: Of the sample.
+
+    Raises:
+        InputError: Drawn values that are no run file together; the message names the sample.
+    """
+    with about_file(Path(f"sample {index}")):
+        raw = sample_of(run, run.alone(), index)
+    return validate(raw, Path(f"sample {index}"))
+
+
+def _built(run: RunFile) -> tuple[Scene, Sensor]:
+    scene = build.true_scene(run)
+    radar = build.radar(need(run, "radar", "a sample"))
+    return scene, Sensor(run, radar, build.grid(need(run, "grid", "a sample"), radar))
+
+
+def _check_first(run: RunFile, index: int) -> None:
+    """Build a sample before any work is done: its errors and its warnings come at once."""
+    own = sample_run(run, index)
+    with about_file(Path(f"sample {index}")):
+        scene, sensor = _built(own)
+        require_room(own, scene, {"": sensor})
+
+
+def _signals(run: RunFile, scene: Scene, sensor: Sensor, table: Any) -> dict[str, np.ndarray]:
+    """Exact signals and what is made of them, by name."""
+    if run.chirps is None:
+        simulated = exact(run, scene, sensor.radar, sensor.grid)
+        beat, power = simulated.beat, simulated.spectrum
+        more = _path_arrays(simulated.paths) if table.paths else {}
+    else:
+        chirps = run.chirps.build()
+        beat, more = chirp_train(run, scene, sensor.radar, chirps), {}
+        power = torch.zeros(0)
+        if "map" in table.signals:
+            power = range_doppler_angle(beat, sensor.radar, sensor.grid, chirps)
+    found = {"raw": beat.resolve_conj().to(torch.complex64), "map": power.float()}
+    return {_NAMES[name]: found[name].numpy() for name in table.signals} | more
+
+
+def _joints(run: RunFile, scene: Scene) -> dict[str, dict[str, torch.Tensor]]:
+    found = {}
+    for name, table in run.scene.items():
+        truth = run.truth[name].model_dump(exclude_none=True) if name in run.truth else {}
+        found[name] = joint_places(table.model_copy(update=truth), scene[name])
+    return {name: joints for name, joints in found.items() if joints}
+
+
+def _path_arrays(paths: Paths) -> dict[str, np.ndarray]:
+    kept = ("frame", "delay", "coefficient", "first", "last")
+    return {f"paths_{name}": getattr(paths, name).detach().numpy() for name in kept}
+
+
+def _arrays(run: RunFile) -> dict[str, Array]:
+    """What the manifest says of the arrays."""
+    table = need(run, "dataset", "a data set")
+    chirp, rate = ([], []) if run.chirps is None else (["chirp"], ["velocity"])
+    known = {
+        "beat": Array(dims=["frame", *chirp, "tx", "rx", "sample"], unit=_FIELD),
+        "map": Array(dims=["frame", *rate, "range", "u", "v"], unit="received over sent"),
+        "masks": Array(dims=["frame", "triangle"], unit="share that is seen"),
+        "paths_frame": Array(dims=["path"], unit="number"),
+        "paths_delay": Array(dims=["path"], unit="s"),
+        "paths_coefficient": Array(dims=["path"], unit=_FIELD),
+        "paths_first": Array(dims=["path", "xyz"], unit="m"),
+        "paths_last": Array(dims=["path", "xyz"], unit="m"),
+    }
+    held = {_NAMES[name] for name in table.signals}
+    held |= {"masks"} if table.masks else set()
+    return {n: a for n, a in known.items() if n in held or (table.paths and "paths_" in n)}
+
+
+def _write_manifest(
+    run: RunFile, folder: RunFolder, part: tuple[int, int], shards: list[Shard]
+) -> None:
+    versions = {name: metadata.version(name) for name in _COMPUTE}
+    found = Manifest(
+        format=FORMAT,
+        samples=need(run, "dataset", "a data set").samples,
+        part=part,
+        fingerprint=hashlib.sha256(to_toml(run).encode()).hexdigest(),
+        versions={"invertwin": __version__, **versions},
+        arrays=_arrays(run),
+        shards=shards,
+    )
+    folder.write_text(MANIFEST, found.model_dump_json(indent=1) + "\n")
+
+
+def _report(
+    run: RunFile, folder: RunFolder, shards: list[Shard], made: int, seconds: float
+) -> list[Table]:
+    count = sum(shard.samples for shard in shards)
+    metrics = {
+        "task": "dataset",
+        "dataset_samples": count,
+        "shards": len(shards),
+        "dataset_bytes": sum(shard.size for shard in shards),
+        "samples_per_second": made / seconds,
+        "wall_seconds": seconds,
+    }
+    status = f"{count} samples in {len(shards)} shards."
+    parts = [quantities("Data set", metrics)]
+    return finish(
+        folder, metrics, run.title or "Data set", status, parts, again="dataset", note=run.note
+    )
+
+
+def _finished(folder: RunFolder, number: int) -> dict[str, Any] | None:
+    """The manifest's row of a shard that an interrupted run has written whole, or None."""
+    unfinished = folder.path / UNFINISHED
+    there = (unfinished / _part(number)).exists() and (unfinished / shard_name(number)).exists()
+    return folder.read_json(_part(number)) if there else None
+
+
+def _part(number: int) -> str:
+    """What is kept of a shard that is done, until the run ends."""
+    return f"{PARTS}/shard-{number:06d}.json"

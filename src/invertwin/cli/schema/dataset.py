@@ -1,0 +1,79 @@
+"""The tables of data sets: what every sample holds, and what is drawn for it."""
+
+from typing import Annotated, Any, Literal
+
+from annotated_types import MinLen
+from pydantic import GetCoreSchemaHandler, model_validator
+
+from invertwin.cli.variation import steps_of
+from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Uniform
+from invertwin.limits import Count
+from invertwin.registry.kinds import Group, Registry, Table, number_or_list
+from invertwin.registry.section import Section, Words, fail
+from invertwin.registry.section import key as described
+
+_OWN = ("task", "seed", "dataset", "vary")  # of the data set itself
+_PATH = Annotated[Words, MinLen(1)]
+
+
+class _Paths:
+    """Annotates a key that is one path, or a list of them."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        kind = number_or_list(_PATH, Annotated[list[_PATH], MinLen(1)])
+        return handler.generate_schema(kind)
+
+
+class DatasetTable(Section):
+    """A data set: many samples of the run file, each with other values."""
+
+    samples: Count = described("how many")
+    shard: Count = described("samples of a shard, which is one tar file", 100)
+    signals: Annotated[list[Literal["raw", "map"]], MinLen(1)] = described(
+        "raw = beat signals of every channel; map = power over [grid], with [chirps] over range "
+        "rate, too",
+        ["map"],
+    )
+    classes: dict[str, Words] = described("class of an object by its name; without it its name", {})
+    masks: bool = described("write how much of every triangle each radar position sees", False)
+    paths: bool = described("write the paths of every sample; not with [chirps]", False)
+
+
+class VaryTable(Table):
+    """What is drawn anew for every sample."""
+
+    key: Annotated[Any, _Paths] = described(
+        "its path in the run file, such as scene.box.position[0]; a list of paths gets one value"
+    )
+
+    @property
+    def paths(self) -> list[str]:
+        """Where the value goes."""
+        return [self.key] if isinstance(self.key, str) else self.key
+
+    @model_validator(mode="after")
+    def _leads_somewhere(self) -> "VaryTable":
+        for path in self.paths:
+            steps = steps_of(path)
+            if not steps or steps[0] in _OWN:
+                fail(
+                    f"expected a path such as scene.box.position[0], and none of {', '.join(_OWN)},"
+                    f' got "{path}"; correct it',
+                    "key",
+                )
+        return self
+
+
+def register(registry: Registry) -> None:
+    """Add the distributions."""
+    registry.groups["distribution"] = Group(base=VaryTable)
+    for name, make in (
+        ("uniform", Uniform),
+        ("log_uniform", LogUniform),
+        ("normal", Normal),
+        ("integer", Integer),
+        ("choice", Choice),
+        ("presence", Presence),
+    ):
+        registry.add("distribution", name, make)

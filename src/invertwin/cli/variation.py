@@ -1,0 +1,146 @@
+"""Values that are drawn for a run file: where they go, and the run file that comes of them."""
+
+import copy
+import difflib
+import re
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from invertwin.datasets import KEPT
+from invertwin.errors import InputError
+from invertwin.registry.section import fail
+from invertwin.seeds import derived_seed
+
+Steps = tuple[str | int, ...]
+_STEP = re.compile(r'(?:^|(?<=.)\.)(?:"([^"]+)"|([^.\[\]"\s]+))|\[(\d+)\]')
+_KNOWN = 12  # names that an error lists
+
+
+def steps_of(path: str) -> Steps:
+    """Names and numbers of a path such as ``scene.box.position[0]``; none where it is no path.
+
+    A name with dots stands in quotes.
+    """
+    steps: list[str | int] = []
+    place = 0
+    while place < len(path):
+        found = _STEP.match(path, place)
+        if found is None:
+            return ()
+        quoted, name, number = found.groups()
+        steps.append(int(number) if number else quoted or name)
+        place = found.end()
+    return tuple(steps)
+
+
+def check_varied(run: Any, raw: dict[str, Any], info: Any) -> None:
+    """Refuse a run file whose samples would be no run files; errors begin at the table.
+
+    Every distribution is tried at its ends, the other keys as they are stated.
+
+    Args:
+        run: The run file.
+        raw: It as TOML, without what makes it a data set.
+        info: Of pydantic.
+    """
+    kind = type(run)
+    whole = TypeAdapter(dict[str, kind])  # type: ignore[valid-type]
+    taken: set[Steps] = set()
+    for number, table in enumerate(run.vary):
+        at = f"vary[{number}]"
+        for path in table.paths:
+            if steps_of(path) in taken:
+                fail(f'expected every key once, got "{path}" twice; remove one', f"{at}.key")
+            taken.add(steps_of(path))
+        for value in table.build().ends():
+            try:
+                changed = with_values(raw, ((path, value) for path in table.paths))
+            except InputError as error:
+                fail(str(error), f"{at}.key")
+            whole.validate_python({at: changed}, context=info.context)
+
+
+def sample_of(run: Any, raw: dict[str, Any], index: int) -> dict[str, Any]:
+    """The run file of a sample as TOML; it depends on the run file, its seed and the index only.
+
+    Args:
+        run: The run file of the data set.
+        raw: It as TOML, without what makes it a data set.
+        index: Of the sample.
+
+    Raises:
+        InputError: A key that is not there, since another drawn value has replaced its table.
+    """
+    drawn = []
+    for number, table in enumerate(run.vary, 1):
+        words = np.random.SeedSequence(run.seed, spawn_key=(index, number))
+        value = table.build().draw(np.random.default_rng(words))
+        if value is not KEPT:
+            drawn += [(path, value) for path in table.paths]
+    return with_values(raw, drawn) | {
+        "task": "simulate",
+        "seed": derived_seed(run.seed, index, 0),
+    }
+
+
+def with_values(raw: dict[str, Any], values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """A run file as TOML with other values; None takes a key away, after all else is done.
+
+    Args:
+        raw: The run file.
+        values: Path and value of each.
+
+    Raises:
+        InputError: A path that leads nowhere. Only its last name may be new.
+    """
+    changed, removed = copy.deepcopy(raw), []
+    for path, value in values:
+        holder, last = _holder(changed, path)
+        if value is None:
+            removed.append((holder, last))
+        else:
+            holder[last] = copy.deepcopy(value)
+    # Of a list the last ones first: the others keep their numbers until then.
+    for holder, last in sorted(removed, key=lambda row: row[1] if _is_number(row[1]) else -1)[::-1]:
+        if _is_number(last) or last in holder:
+            del holder[last]
+    return changed
+
+
+def _holder(raw: dict[str, Any], path: str) -> tuple[Any, Any]:
+    """The table or list that holds a key, and the key."""
+    *way, last = steps_of(path)
+    holder: Any = raw
+    for step in way:
+        holder = _entry(holder, step, path)
+    if _is_number(last):
+        _entry(holder, last, path)
+    elif not isinstance(holder, dict):
+        raise InputError(f'{path}: expected a table before "{last}", got {holder}; correct the key')
+    return holder, last
+
+
+def _entry(holder: Any, step: str | int, path: str) -> Any:
+    if isinstance(step, int):
+        if isinstance(holder, list) and step < len(holder):
+            return holder[step]
+        got = f"a list of {len(holder)}" if isinstance(holder, list) else "none"
+        raise InputError(
+            f"{path}: expected a list in the run file with an entry [{step}], got {got}; state "
+            "the list, or vary it as a whole"
+        )
+    known = list(holder) if isinstance(holder, dict) else []
+    if step in known:
+        return holder[step]
+    close = difflib.get_close_matches(step, known, n=1)
+    raise InputError(
+        f"{path}: expected a table that the run file has ({', '.join(known[:_KNOWN]) or 'none'}), "
+        f'got "{step}"; ' + (f"did you mean `{close[0]}`?" if close else "add it")
+    )
+
+
+def _is_number(step: str | int) -> bool:
+    return isinstance(step, int)

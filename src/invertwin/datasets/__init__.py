@@ -1,0 +1,15 @@
+"""Data sets of simulated recordings: what is drawn, labels, shards, and their reader."""
+
+from invertwin.datasets.distributions import KEPT as KEPT
+from invertwin.datasets.distributions import Choice as Choice
+from invertwin.datasets.distributions import Distribution as Distribution
+from invertwin.datasets.distributions import Integer as Integer
+from invertwin.datasets.distributions import LogUniform as LogUniform
+from invertwin.datasets.distributions import Normal as Normal
+from invertwin.datasets.distributions import Presence as Presence
+from invertwin.datasets.distributions import Uniform as Uniform
+from invertwin.datasets.labels import object_labels as object_labels
+from invertwin.datasets.labels import radar_labels as radar_labels
+from invertwin.datasets.labels import seen_triangles as seen_triangles
+from invertwin.datasets.reader import Samples as Samples
+from invertwin.datasets.shards import Manifest as Manifest

@@ -1,0 +1,223 @@
+"""What values of a run file may be drawn from."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from invertwin.errors import InputError
+from invertwin.limits import NonNegative, Positive, Share
+
+Numbers = float | Sequence[float]
+KEPT: Final = object()
+"""Drawn where a key stays as it is, with what others have drawn in it."""
+
+
+class Distribution(ABC):
+    """Draws values for a key. None takes the key away, and ``KEPT`` leaves it as it is."""
+
+    @abstractmethod
+    def draw(self, generator: np.random.Generator) -> Any:
+        """A value, ``KEPT``, or None."""
+
+    @abstractmethod
+    def ends(self) -> list[Any]:
+        """Values that are as bad as any other: if these are right, all are."""
+
+
+@dataclass(frozen=True)
+class Uniform(Distribution):
+    """Every number between two limits alike; lists entry by entry.
+
+    Attributes:
+        low: Smallest, one number or a list.
+        high: Largest.
+
+    Raises:
+        InputError: Limits of different lengths, or in the wrong order.
+    """
+
+    low: Numbers
+    high: Numbers
+
+    def __post_init__(self) -> None:
+        _check_order(self.low, self.high)
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """A number, or a list of independent ones."""
+        return np.asarray(generator.uniform(self.low, self.high, _size(self.low))).tolist()
+
+    def ends(self) -> list[Any]:
+        """Both limits."""
+        return [_plain(self.low), _plain(self.high)]
+
+
+@dataclass(frozen=True)
+class LogUniform(Distribution):
+    """Numbers whose logarithms are uniform: every octave alike; lists entry by entry.
+
+    Attributes:
+        low: Smallest, > 0, one number or a list.
+        high: Largest.
+
+    Raises:
+        InputError: Limits of different lengths, in the wrong order, or not positive.
+    """
+
+    low: Positive | Sequence[Positive]
+    high: Positive | Sequence[Positive]
+
+    def __post_init__(self) -> None:
+        _check_order(self.low, self.high)
+        if np.min(self.low) <= 0:
+            raise InputError(f"expected low > 0, got {self.low}; its logarithm is needed")
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """A number, or a list of independent ones."""
+        share = generator.random(_size(self.low))
+        low, high = np.asarray(self.low, dtype=float), np.asarray(self.high, dtype=float)
+        # The last bit of a power may lie beyond a limit.
+        return np.clip(low * (high / low) ** share, low, high).tolist()
+
+    def ends(self) -> list[Any]:
+        """Both limits."""
+        return [_plain(self.low), _plain(self.high)]
+
+
+@dataclass(frozen=True)
+class Normal(Distribution):
+    """Gaussian numbers; lists entry by entry.
+
+    Attributes:
+        mean: One number or a list.
+        deviation: Standard deviation, of all entries or of each.
+
+    Raises:
+        InputError: Lists of different lengths, or a negative deviation.
+    """
+
+    mean: Numbers
+    deviation: NonNegative | Sequence[NonNegative]
+
+    def __post_init__(self) -> None:
+        if np.shape(self.deviation) not in ((), np.shape(self.mean)):
+            raise InputError(
+                f"expected one deviation or one for each of {np.size(self.mean)} means, got "
+                f"{np.size(self.deviation)}; give as many"
+            )
+        if np.min(self.deviation) < 0:
+            raise InputError(f"expected deviations >= 0, got {self.deviation}; correct them")
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """A number, or a list of independent ones."""
+        drawn = generator.normal(self.mean, self.deviation, _size(self.mean))
+        return np.asarray(drawn).tolist()
+
+    def ends(self) -> list[Any]:
+        """The mean: the numbers themselves have no limits."""
+        return [_plain(self.mean)]
+
+
+@dataclass(frozen=True)
+class Integer(Distribution):
+    """Every whole number between two limits alike; lists entry by entry.
+
+    Attributes:
+        low: Smallest, one number or a list.
+        high: Largest, which is drawn, too.
+
+    Raises:
+        InputError: Limits of different lengths, or in the wrong order.
+    """
+
+    low: int | Sequence[int]
+    high: int | Sequence[int]
+
+    def __post_init__(self) -> None:
+        _check_order(self.low, self.high)
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """A whole number, or a list of independent ones."""
+        drawn = generator.integers(self.low, self.high, _size(self.low), endpoint=True)
+        return np.asarray(drawn).tolist()
+
+    def ends(self) -> list[Any]:
+        """Both limits."""
+        return [_plain(self.low), _plain(self.high)]
+
+
+@dataclass(frozen=True)
+class Choice(Distribution):
+    """One of several values: numbers, texts, lists or whole tables.
+
+    Attributes:
+        values: Those to choose from.
+        weights: How often each is chosen, relative to the others; without them all alike.
+
+    Raises:
+        InputError: No values, or weights that are not one for each, negative, or all zero.
+    """
+
+    values: Sequence[Any]
+    weights: Sequence[NonNegative] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.values:
+            raise InputError("expected values to choose from, got none; give some")
+        if self.weights is None:
+            return
+        if len(self.weights) != len(self.values):
+            raise InputError(
+                f"expected a weight for each of {len(self.values)} values, got "
+                f"{len(self.weights)}; give as many"
+            )
+        if min(self.weights) < 0 or not sum(self.weights) > 0:
+            raise InputError(f"expected weights >= 0, some > 0, got {self.weights}; correct them")
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """One of the values."""
+        weights = None if self.weights is None else np.asarray(self.weights) / sum(self.weights)
+        return self.values[int(generator.choice(len(self.values), p=weights))]
+
+    def ends(self) -> list[Any]:
+        """All values."""
+        return list(self.values)
+
+
+@dataclass(frozen=True)
+class Presence(Distribution):
+    """Whether a key or a table, such as an object, is there.
+
+    Attributes:
+        probability: That it is.
+    """
+
+    probability: Share = 0.5
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """Kept, or None."""
+        return KEPT if generator.random() < self.probability else None
+
+    def ends(self) -> list[Any]:
+        """None: what is stated has been checked."""
+        return [None]
+
+
+def _check_order(low: Numbers, high: Numbers) -> None:
+    if np.shape(low) != np.shape(high):
+        raise InputError(
+            f"expected limits of one length, got {np.size(low)} and {np.size(high)} numbers; give "
+            "as many"
+        )
+    if not np.all(np.asarray(low) <= np.asarray(high)):
+        raise InputError(f"expected low <= high, got {low} and {high}; swap them")
+
+
+def _size(value: Numbers) -> tuple[int, ...] | None:
+    return np.shape(value) or None
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, Sequence) else value

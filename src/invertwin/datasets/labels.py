@@ -1,0 +1,116 @@
+"""What is in a scene, as labels of a recording: classes, boxes, poses, what is seen."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from invertwin.channel import visible_points
+from invertwin.radar.radar import Radar
+from invertwin.scene import Mesh, Scene, joined
+
+_POINTS = 256  # at least so many on every object
+_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
+
+
+def object_labels(
+    scene: Scene,
+    seen: Mapping[str, Float[Tensor, "frame face"]],
+    classes: Mapping[str, str],
+    joints: Mapping[str, Mapping[str, Tensor]],
+) -> list[dict[str, Any]]:
+    """What JSON holds of every object, in the order of the scene; world frame, SI units.
+
+    A row has ``name``, ``class``, ``pose`` (4 × 4, from the object's frame to the world), ``box``
+    (``low`` and ``high`` corner along the world's axes), ``oriented_box`` (``center``, ``size`` and
+    ``rotation``: along the object's own axes, the columns of ``rotation``), ``velocity`` (the mean
+    over its vertices), ``triangles`` (number of the first one in the scene, and how many), ``seen``
+    (share of the surface that each position of the radar sees), and ``joints`` where it has some.
+
+    Args:
+        scene: At the time of the recording.
+        seen: Of ``seen_triangles``.
+        classes: By name; an object without one is a class of its own name.
+        joints: Places of joints in the world [m], by object and name.
+    """
+    rows, first = [], 0
+    for name, item in scene.objects.items():
+        corners, own = item.vertices, item.mesh.vertices
+        low, high = own.amin(0), own.amax(0)
+        still = torch.zeros(1, 3, dtype=torch.float64)
+        velocity = still if item.velocity is None else item.velocity.reshape(-1, 3)
+        areas = _areas(item.mesh)
+        found: dict[str, Any] = {
+            "name": name,
+            "class": classes.get(name, name),
+            "pose": item.transform.tolist(),
+            "box": {"low": corners.amin(0).tolist(), "high": corners.amax(0).tolist()},
+            "oriented_box": {
+                "center": item.center.tolist(),
+                "size": (high - low).tolist(),
+                "rotation": item.transform[:3, :3].tolist(),
+            },
+            "velocity": velocity.mean(0).tolist(),
+            "triangles": {"first": first, "count": len(areas)},
+            "seen": (seen[name].double() @ (areas / areas.sum())).tolist(),
+        }
+        if name in joints:
+            found["joints"] = {joint: place.tolist() for joint, place in joints[name].items()}
+        rows.append(found)
+        first += len(areas)
+    return rows
+
+
+def radar_labels(radar: Radar) -> dict[str, Any]:
+    """Where the radar is in every frame: ``positions`` [m] and ``rotations`` in the world.
+
+    The columns of a rotation are the radar's axes: right, up, boresight.
+    """
+    axes = radar.rotations
+    if axes is None:
+        axes = torch.eye(3, dtype=torch.float64).expand(radar.frame_count, 3, 3)
+    return {"positions": radar.positions.tolist(), "rotations": axes.tolist()}
+
+
+def seen_triangles(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "frame face"]]:
+    """Share of every triangle that each position of the radar sees, by object.
+
+    Whatever lies between hides it, sheets too. Counted are points that are spread evenly over a
+    triangle, so that an object has 256 or more: the share of an object's surface is right to some
+    1/√256 at worst, of flat and large ones better.
+
+    Args:
+        scene: Surfaces in the world.
+        radar: Its positions, one a frame; antennas are not told apart.
+    """
+    meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
+    points = [_spread(mesh) for mesh in meshes]
+    flat, whole = torch.cat([part.reshape(-1, 3) for part in points]), joined(meshes)
+    frames = [visible_points(whole, flat, place[None]) for place in radar.positions.detach()]
+    parts = torch.stack(frames).split([part.shape[0] * part.shape[1] for part in points], dim=1)
+    return {
+        name: part.reshape(len(frames), *own.shape[:2]).float().mean(2)
+        for name, part, own in zip(scene.names, parts, points, strict=True)
+    }
+
+
+def _spread(mesh: Mesh) -> Float64[Tensor, "face point 3"]:
+    """Points in every triangle, the same shares of its sides in each.
+
+    Source: M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018 (R₂).
+    """
+    count = math.ceil(_POINTS / len(mesh.faces))
+    numbers = torch.arange(1, count + 1, dtype=torch.float64)
+    u, v = ((0.5 + numbers[:, None] * _STEPS) % 1.0).unbind(1)
+    over = u + v > 1
+    u, v = torch.where(over, 1 - u, u), torch.where(over, 1 - v, v)
+    shares = torch.stack([1 - u - v, u, v], dim=1)
+    return torch.einsum("pk,fkx->fpx", shares, mesh.vertices[mesh.faces])
+
+
+def _areas(mesh: Mesh) -> Float64[Tensor, " face"]:
+    a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
+    return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)

@@ -1,0 +1,109 @@
+"""A data set as PyTorch reads it."""
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from invertwin.datasets.shards import Manifest, members_of, read_manifests
+from invertwin.errors import InputError
+from invertwin.untrusted import reading
+
+
+class Samples(Dataset[Any]):
+    """The samples of a folder that ``invertwin dataset`` made, by number; map-style.
+
+    A sample is a dict: ``index``, its arrays as tensors by name (``beat``, ``map``, …), ``labels``
+    (``invertwin.datasets.object_labels`` says what is in them) and ``run``, the run file that
+    simulates it again. It works in every kind of worker of a DataLoader: nothing is read, and no
+    file is open, before the first sample is asked for.
+
+    Args:
+        folder: Of the data set, or of all of its parts.
+        keep: Which entries are read; the rest costs nothing. None = all.
+        transform: Makes of a sample what a network takes. Workers that are spawned need a function
+            of a module, not a lambda.
+
+    Attributes:
+        manifest: What the folder says of itself; of parts, that of the first one.
+
+    Raises:
+        InputError: No complete data set, or an entry that it does not have.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        *,
+        keep: Sequence[str] | None = None,
+        transform: Callable[[dict[str, Any]], Any] | None = None,
+    ) -> None:
+        parts = read_manifests(Path(folder))
+        self.manifest: Manifest = parts[0][1]
+        known = ["index", *self.manifest.arrays, "labels", "run"]
+        unknown = [name for name in keep or () if name not in known]
+        if unknown:
+            raise InputError(
+                f"expected entries among {', '.join(known)}, got {', '.join(unknown)}; choose some"
+            )
+        self._keep = set(known if keep is None else keep)
+        self._transform = transform
+        found = [(shard.first, shard, place) for place, m in parts for shard in m.shards]
+        self._shards = [
+            (place / s.name, s) for _, s, place in sorted(found, key=lambda row: row[0])
+        ]
+        self._starts = np.cumsum([0, *(shard.samples for _, shard in self._shards)])
+        self._places: dict[int, dict[int, dict[str, tuple[int, int]]]] = {}
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def __getitem__(self, index: int) -> Any:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        index %= len(self)
+        number = int(np.searchsorted(self._starts, index, side="right")) - 1
+        path, shard = self._shards[number]
+        if number not in self._places:
+            self._places[number] = members_of(path)
+        sample = shard.first + index - int(self._starts[number])
+        with reading(path, "a whole shard of a data set", "check() says which are damaged"):
+            found = self._read(path, sample, self._places[number][sample])
+        return found if self._transform is None else self._transform(found)
+
+    def check(self) -> None:
+        """Compare every shard with the digest in the manifest.
+
+        Raises:
+            InputError: One that is damaged or missing.
+        """
+        for path, shard in self._shards:
+            with reading(path, "a shard of a data set"), path.open("rb") as opened:
+                digest = hashlib.file_digest(opened, "sha256").hexdigest()
+            if digest != shard.sha256:
+                raise InputError(
+                    f"expected the shard that the manifest describes, got {path} with other "
+                    "content; copy it again, or make the data set again"
+                )
+
+    def _read(self, path: Path, sample: int, places: dict[str, tuple[int, int]]) -> dict[str, Any]:
+        found: dict[str, Any] = {"index": sample} if "index" in self._keep else {}
+        with path.open("rb") as opened:
+            for end, (start, size) in places.items():
+                name, _, kind = end.rpartition(".")
+                if name in self._keep:
+                    opened.seek(start)
+                    found[name] = _decoded(opened.read(size), kind)
+        return found
+
+
+def _decoded(content: bytes, kind: str) -> Any:
+    if kind == "npy":
+        return torch.from_numpy(np.load(io.BytesIO(content), allow_pickle=False))
+    return json.loads(content) if kind == "json" else content.decode("utf-8")

@@ -1,0 +1,173 @@
+"""Shards of data sets: tar files as WebDataset reads them, and the manifest of a folder of them.
+
+A sample is a few files whose names begin with its number: ``00000017.map.npy``,
+``00000017.labels.json``. A shard is a plain tar of the samples of a range of numbers, in order.
+Nothing in it depends on who wrote it when: the same samples make the same bytes.
+
+Source: A. Aizman, G. Maltby, T. Breuel, "High performance I/O for large scale deep learning", 2019
+(the layout of WebDataset).
+"""
+
+import hashlib
+import io
+import tarfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel
+
+from invertwin.errors import InputError
+from invertwin.untrusted import reading
+
+MANIFEST = "manifest.json"
+FORMAT = "invertwin data set 1"
+_DIGITS = 8  # of a sample's number
+
+
+class Shard(BaseModel):
+    """A tar file of a data set."""
+
+    name: str
+    first: int  # number of its first sample
+    samples: int
+    size: int  # bytes
+    sha256: str
+
+
+class Array(BaseModel):
+    """What an array of every sample is."""
+
+    dims: list[str]
+    unit: str
+
+
+class Manifest(BaseModel):
+    """What a folder of shards holds."""
+
+    format: str
+    samples: int  # of the whole data set
+    part: tuple[int, int]  # which of how many parts of the data set this folder holds
+    fingerprint: str  # SHA-256 of the run file as used
+    versions: dict[str, str]  # of what computed the samples
+    arrays: dict[str, Array]
+    shards: list[Shard]
+
+
+def shard_name(number: int) -> str:
+    """Name of a shard's file."""
+    return f"shard-{number:06d}.tar"
+
+
+def packed(samples: Iterable[tuple[int, Mapping[str, bytes]]]) -> bytes:
+    """A tar file.
+
+    Args:
+        samples: Number of each, and its files by the end of their names, such as ``map.npy``.
+    """
+    made = io.BytesIO()
+    with tarfile.open(fileobj=made, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for number, members in samples:
+            for end, content in members.items():
+                # Owner, mode and time of a new TarInfo are the same everywhere.
+                entry = tarfile.TarInfo(f"{number:0{_DIGITS}d}.{end}")
+                entry.size = len(content)
+                tar.addfile(entry, io.BytesIO(content))
+    return made.getvalue()
+
+
+def npy(array: np.ndarray) -> bytes:
+    """An array as the content of an ``.npy`` file."""
+    made = io.BytesIO()
+    np.save(made, array, allow_pickle=False)
+    return made.getvalue()
+
+
+def described(name: str, first: int, samples: int, content: bytes) -> Shard:
+    """The manifest's row of a shard.
+
+    Args:
+        name: Of the file.
+        first: Number of its first sample.
+        samples: How many it has.
+        content: Of the file.
+    """
+    digest = hashlib.sha256(content).hexdigest()
+    return Shard(name=name, first=first, samples=samples, size=len(content), sha256=digest)
+
+
+def ranges(samples: int, size: int, part: tuple[int, int]) -> list[tuple[int, int, int]]:
+    """Number, first sample and length of every shard of a part: part i of n has every n-th one.
+
+    Args:
+        samples: Of the whole data set.
+        size: Samples of a shard; the last one may have fewer.
+        part: Number from 1, and of how many.
+
+    Raises:
+        InputError: No such part, or one without a shard.
+    """
+    number, count = part
+    if not 1 <= number <= count:
+        raise InputError(
+            f"expected a part i/n with 1 <= i <= n, got {number}/{count}; count from 1"
+        )
+    starts = list(enumerate(range(0, samples, size)))[number - 1 :: count]
+    if not starts:
+        raise InputError(
+            f"expected at most as many parts as shards ({-(-samples // size)}), got part "
+            f"{number} of {count}; use fewer parts or smaller shards"
+        )
+    return [(k, first, min(size, samples - first)) for k, first in starts]
+
+
+def members_of(path: Path) -> dict[int, dict[str, tuple[int, int]]]:
+    """Where the files of every sample of a shard lie: first byte and size, by number and name.
+
+    Args:
+        path: The tar file.
+
+    Raises:
+        InputError: No tar file, or one that is no shard.
+    """
+    found: dict[int, dict[str, tuple[int, int]]] = {}
+    with reading(path, "a shard of a data set"), tarfile.open(path, mode="r:") as tar:
+        for entry in tar:
+            number, _, end = entry.name.partition(".")
+            found.setdefault(int(number), {})[end] = (entry.offset_data, entry.size)
+    return found
+
+
+def read_manifests(folder: Path) -> list[tuple[Path, Manifest]]:
+    """The manifest of a folder, or those of its parts, each with its folder.
+
+    Args:
+        folder: Of the data set.
+
+    Raises:
+        InputError: None, a damaged one, or those of different data sets.
+    """
+    whole = folder / MANIFEST
+    files = [whole] if whole.is_file() else sorted(folder.glob(f"part_*/{MANIFEST}"))
+    found = []
+    for file in files:
+        with reading(file, "the manifest of a data set"):
+            manifest = Manifest.model_validate_json(file.read_bytes())
+        if manifest.format != FORMAT or any(Path(s.name).name != s.name for s in manifest.shards):
+            raise InputError(f"expected {FORMAT!r}, got {file} of another format; make it again")
+        found.append((file.parent, manifest))
+    if not found:
+        raise InputError(
+            f"expected a data set, got {folder} without {MANIFEST}; give a folder that invertwin "
+            "dataset has completed"
+        )
+    _require_one_set(folder, [manifest for _, manifest in found])
+    return found
+
+
+def _require_one_set(folder: Path, manifests: Sequence[Manifest]) -> None:
+    if len({(m.fingerprint, m.samples, m.part[1]) for m in manifests}) > 1:
+        raise InputError(
+            f"expected parts of one data set, got those of several in {folder}; make them with "
+            "one run file and one number of parts"
+        )

@@ -1,0 +1,88 @@
+"""Shards are plain tars of equal bytes; what is wrong with a folder is told in one line."""
+
+import io
+import json
+import tarfile
+
+import numpy as np
+import pytest
+
+from invertwin.datasets.shards import described, members_of, npy, packed, ranges, read_manifests
+from invertwin.errors import InputError
+
+
+def samples(first, count):
+    for k in range(first, first + count):
+        yield k, {"map.npy": npy(np.full((2, 3), k)), "labels.json": b'{"a": 1}'}
+
+
+def test_a_shard_is_a_tar_that_names_no_owner_and_no_time(tmp_path):
+    content = packed(samples(5, 2))
+    assert content == packed(samples(5, 2))
+    with tarfile.open(fileobj=io.BytesIO(content)) as tar:
+        entries = tar.getmembers()
+        names = [entry.name for entry in entries]
+        read = tar.extractfile(entries[2])
+        assert read is not None
+        assert (np.load(io.BytesIO(read.read())) == 6).all()
+    assert names == [f"0000000{k}.{end}" for k in (5, 6) for end in ("map.npy", "labels.json")]
+    assert {(e.mtime, e.uid, e.gid, e.uname, e.mode) for e in entries} == {(0, 0, 0, "", 0o644)}
+    (tmp_path / "a.tar").write_bytes(content)
+    places = members_of(tmp_path / "a.tar")
+    start, size = places[6]["labels.json"]
+    assert content[start : start + size] == b'{"a": 1}'
+
+
+def test_parts_share_all_shards_among_themselves():
+    whole = ranges(23, 5, (1, 1))
+    assert whole == [(0, 0, 5), (1, 5, 5), (2, 10, 5), (3, 15, 5), (4, 20, 3)]
+    assert sorted(row for part in (1, 2, 3) for row in ranges(23, 5, (part, 3))) == whole
+
+
+@pytest.mark.parametrize(
+    ("part", "said"), [((0, 2), "got 0/2"), ((3, 2), "got 3/2"), ((6, 6), r"shards \(5\)")]
+)
+def test_parts_that_are_none_are_refused(part, said):
+    with pytest.raises(InputError, match=said):
+        ranges(23, 5, part)
+
+
+def manifest(**changes) -> str:
+    shard = described("shard-000000.tar", 0, 2, packed(samples(0, 2))).model_dump()
+    whole = {
+        "format": "invertwin data set 1",
+        "samples": 2,
+        "part": [1, 1],
+        "fingerprint": "ab",
+        "versions": {},
+        "arrays": {},
+        "shards": [shard],
+    }
+    return json.dumps(whole | changes)
+
+
+def test_parts_are_found_and_those_of_other_sets_refused(tmp_path):
+    for name in ("part_1_of_2", "part_2_of_2"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "manifest.json").write_text(manifest(part=[int(name[5]), 2]))
+    assert [found.part[0] for _, found in read_manifests(tmp_path)] == [1, 2]
+    (tmp_path / name / "manifest.json").write_text(manifest(part=[2, 2], fingerprint="cd"))
+    with pytest.raises(InputError, match="parts of one data set"):
+        read_manifests(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "without manifest.json"),
+        ("{", "expected the manifest of a data set"),
+        (manifest(format="other"), "of another format"),
+        (manifest().replace("shard-0", "../shard-0"), "of another format"),
+    ],
+)
+def test_folders_that_hold_no_set_are_refused(tmp_path, text, said):
+    if text is not None:
+        (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(InputError, match=said) as found:
+        read_manifests(tmp_path)
+    assert "\n" not in str(found.value)

@@ -1,0 +1,113 @@
+"""Work that is spread over processes is all done; errors and deaths are told in one line."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from invertwin.engines import spread
+from invertwin.errors import InputError
+from invertwin.registry.section import KeyInputError
+
+
+def squared(number: int) -> tuple[int, str, int]:
+    return number**2, os.environ["OMP_NUM_THREADS"], os.getpid()
+
+
+def refused(number: int) -> int:
+    if number == 2:
+        raise KeyInputError("scene.box", "expected a box, got none")
+    return number
+
+
+def dies(number: int) -> int:
+    if number:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_every_piece_is_done_once_by_workers_of_one_thread(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    found = dict(spread(squared, [3, 4, 5, 6, 7], workers=2))
+    assert {number: row[0] for number, row in found.items()} == {0: 9, 1: 16, 2: 25, 3: 36, 4: 49}
+    assert {row[1] for row in found.values()} == {"1"}
+    assert os.getpid() not in {row[2] for row in found.values()}
+    assert os.environ["OMP_NUM_THREADS"] == "2"
+
+
+def test_no_work_starts_nobody():
+    assert list(spread(dies, [])) == []
+
+
+def test_what_a_worker_refuses_is_told_here():
+    with pytest.raises(InputError, match=r"^scene\.box: expected a box, got none$"):
+        list(spread(refused, [1, 2, 3]))
+
+
+def test_a_worker_that_dies_is_told():
+    with pytest.raises(InputError, match="got one that has died"):
+        list(spread(dies, [0, 1]))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [({"engine": "rya"}, "'processes' or 'ray', got 'rya'"), ({"workers": 0}, "got 0")],
+)
+def test_bad_arguments_are_told(unchecked, options, said):
+    with pytest.raises(InputError, match=said):
+        list(spread(squared, [1], **options))
+
+
+def test_ray_that_is_not_installed_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"pip install 'invertwin\[ray\]'"):
+        list(spread(squared, [1], engine="ray"))
+
+
+SLEEPER = """
+import time
+from invertwin.engines import spread
+if __name__ == "__main__":
+    print("begun", flush=True)
+    list(spread(time.sleep, [60, 60], workers=2))
+"""
+
+
+def children_of(process: int) -> list[int]:
+    found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process)], capture_output=True)
+    return [int(number) for number in found.stdout.split()]
+
+
+def alive(number: int) -> bool:
+    try:
+        with open(f"/proc/{number}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="reads /proc")
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    script = tmp_path / "sleeper.py"
+    script.write_text(SLEEPER)
+    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE)
+    try:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == b"begun\n"
+        deadline, workers = time.monotonic() + 30, []
+        # Two workers, and the process that looks after what they share.
+        while len(workers) < 3 and time.monotonic() < deadline:
+            time.sleep(0.2)
+            workers = children_of(parent.pid)
+        assert len(workers) >= 2
+        time.sleep(2.0)
+    finally:
+        parent.kill()
+        parent.communicate()
+    deadline = time.monotonic() + 20
+    while any(map(alive, workers)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(alive, workers))
