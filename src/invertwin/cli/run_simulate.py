@@ -57,6 +57,7 @@ def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> tor
     """Exact beat signals of every chirp with the settings of `[data]` and `[chirps]`."""
     data = _simulated(run)
     front = sensors.impairments(run.impairments, data)
+    table = need(run, "chirps", "several ramps a frame")
     with about("chirps"), torch.no_grad():
         return simulate_chirps(
             scene,
@@ -64,7 +65,8 @@ def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> tor
             chirps,
             seed=run.seed if data.seed is None else data.seed,
             sampling=_sampling(data, 1),
-            retrace=need(run, "chirps", "several ramps a frame").retrace,
+            retrace=table.retrace,
+            visibility_every=table.visibility_every,
             impairments=front,
         )
 

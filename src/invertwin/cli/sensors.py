@@ -173,6 +173,10 @@ class ChirpsTable(Table):
         "trace rays anew at every ramp, instead of moving what is seen at the start of the frame",
         False,
     )
+    visibility_every: Count = key(
+        "with `retrace`: loops for which one trace serves; points follow their surfaces meanwhile",
+        1,
+    )
 
 
 AnyRadar = Annotated[Any, TableOf(Radar, RadarTable, ("rotations", "range_bias"), checked=False)]

@@ -1,0 +1,135 @@
+"""A frame of a person who walks in a furnished room: time, and the difference to tracing anew.
+
+    python benchmarks/motion.py [-o DIR]
+
+64 loops of 2 transmitters, 4 receivers and 256 samples at 77 GHz. Prints a table and writes
+`metrics.json` into DIR (default `out/motion`):
+
+- `frame_seconds`: `simulate_chirps` with rays traced once for the frame; median of three calls.
+- `frame_seconds_ratio`: time with rays traced at every ramp, over that. It is measured in the same
+  run, over SLOW loops of the 64 and carried on.
+- `difference`: of the signals of these loops, relative to those of rays at every ramp.
+- `map_difference_db`: the same of the range–Doppler map of the whole frame, its largest bin to the
+  largest bin of the map; rays are traced at 16 loops' distance in place of 64.
+"""
+
+import argparse
+import math
+import statistics
+from pathlib import Path
+from time import perf_counter
+
+import torch
+from report import MetricTable, Required, write
+
+import invertwin as iw
+from invertwin.radar.motion import Chirps
+from invertwin.scene import RoughDielectric, box, linear_array, plate, rigid, rotation_from_vector
+from invertwin.scene.geometry.person import person
+
+LOOPS, SLOW, INTERVAL = 64, 8, 50e-6
+SPEED, STRIDES = 1.4, 0.9  # m/s and 1/s
+PAINT = RoughDielectric(permittivity=4.0)
+SAMPLING = iw.Sampling(depth=1, points_per_m2=1_000.0)
+REQUIRED: Required = {
+    "frame_seconds": ("<=", 3.0),
+    "frame_seconds_ratio": (">=", 10.0),
+}
+BODY = person()
+
+
+def standing(size: tuple[float, float, float], x: float, z: float) -> iw.Object:
+    """A box on the floor, 1 m below the radar."""
+    return iw.Object(box(size), PAINT, rigid(translation=[x, size[1] / 2 - 1.0, z]))
+
+
+def wall(width: float, height: float, turn: list[float], place: list[float]) -> iw.Object:
+    """A side of the room."""
+    pose = rigid(rotation_from_vector(torch.tensor(turn, dtype=torch.float64)), place)
+    return iw.Object(plate(width, height), PAINT, pose)
+
+
+QUARTER = math.pi / 2
+ROOM = {
+    "floor": wall(6.0, 8.0, [QUARTER, 0.0, 0.0], [0.0, -1.0, 4.0]),
+    "back": wall(6.0, 3.0, [0.0, 0.0, 0.0], [0.0, 0.5, 7.5]),
+    "left": wall(8.0, 3.0, [0.0, QUARTER, 0.0], [-3.0, 0.5, 4.0]),
+    "right": wall(8.0, 3.0, [0.0, QUARTER, 0.0], [3.0, 0.5, 4.0]),
+    "table": standing((1.2, 0.7, 0.8), 1.5, 5.0),
+    "shelf": standing((0.5, 2.0, 1.0), -2.5, 6.0),
+    "sofa": standing((0.8, 0.8, 1.8), -2.4, 3.5),
+    "cupboard": standing((1.0, 1.8, 0.5), 1.0, 7.2),
+}
+
+
+def walking(time: float) -> iw.Scene:
+    """The room, and the person who swings legs on the way to the radar."""
+    phase = 2 * math.pi * STRIDES * time + 0.7
+    turns: dict[str, list[float]] = {}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        turns[f"{side}_hip"] = [0.5 * sign * math.sin(phase), 0.0, 0.0]
+        turns[f"{side}_knee"] = [-0.4 * (1 + sign * math.cos(phase)), 0.0, 0.0]
+        turns[f"{side}_shoulder"] = [0.0, 0.0, 1.3 * sign]
+    place = rigid(translation=[0.2, -0.05, 4.0 - SPEED * time])
+    return iw.Scene({**ROOM, "person": iw.Object(BODY.mesh(turns), PAINT, place)})
+
+
+def sensor() -> iw.Radar:
+    """Two transmitters and four receivers."""
+    chirp = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=40e-6, samples=256)
+    half = chirp.wavelength / 2
+    place = torch.zeros(1, 3, dtype=torch.float64)
+    return iw.Radar(linear_array(2, 4 * half), linear_array(4, half), chirp, place)
+
+
+def frame(loops: int, every: int) -> tuple[torch.Tensor, float]:
+    """Signals of some loops, and the seconds that they took."""
+    begin = perf_counter()
+    found = iw.simulate_chirps(
+        walking,
+        sensor(),
+        Chirps(loops, INTERVAL),
+        seed=1,
+        sampling=SAMPLING,
+        visibility_every=every,
+    )
+    return found, perf_counter() - begin
+
+
+def measured() -> dict[str, float]:
+    """All metrics."""
+    frame(LOOPS, LOOPS)  # compiled now
+    runs = [frame(LOOPS, LOOPS) for _ in range(3)]
+    fast, seconds = runs[0][0], statistics.median(time for _, time in runs)
+    few, _ = frame(SLOW, SLOW)
+    slow, slow_seconds = frame(SLOW, 1)
+    often, _ = frame(LOOPS, 16)
+    maps = [torch.fft.fft2(beat[0, :, 0, 0]).abs() for beat in (fast, often)]
+    return {
+        "frame_seconds": seconds,
+        "frame_seconds_ratio": slow_seconds * LOOPS / SLOW / seconds,
+        "difference": float((few - slow).norm() / slow.norm()),
+        "map_difference_db": 20 * math.log10(float((maps[0] - maps[1]).max() / maps[1].max())),
+    }
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/motion"))
+    out = parser.parse_args().output
+    metrics = measured()
+    table = MetricTable("A walking person in a furnished room", REQUIRED)
+    counted = {
+        "frame_seconds": "s, a frame of 64 loops, rays traced once; median of three",
+        "frame_seconds_ratio": "time with rays at every ramp, over that",
+        "difference": "of signals of 8 loops, relative",
+        "map_difference_db": "of range and Doppler, rays once against every 16 loops",
+    }
+    for key, text in counted.items():
+        table.row(key, metrics[key], ".3g", text)
+    write(metrics, table.grid, out)
+
+
+if __name__ == "__main__":
+    main()
