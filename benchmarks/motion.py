@@ -24,18 +24,24 @@ from report import MetricTable, Required, write
 
 import invertwin as iw
 from invertwin.radar.motion import Chirps
-from invertwin.scene import RoughDielectric, box, linear_array, plate, rigid, rotation_from_vector
-from invertwin.scene.geometry.person import person
+from invertwin.scene import (
+    RoughDielectric,
+    Walk,
+    box,
+    linear_array,
+    plate,
+    rigid,
+    rotation_from_vector,
+)
 
 LOOPS, SLOW, INTERVAL = 64, 8, 50e-6
-SPEED, STRIDES = 1.4, 0.9  # m/s and 1/s
 PAINT = RoughDielectric(permittivity=4.0)
 SAMPLING = iw.Sampling(depth=1, points_per_m2=1_000.0)
 REQUIRED: Required = {
     "frame_seconds": ("<=", 3.0),
     "frame_seconds_ratio": (">=", 10.0),
 }
-BODY = person()
+WALK = Walk(1.4)  # m/s
 
 
 def standing(size: tuple[float, float, float], x: float, z: float) -> iw.Object:
@@ -63,15 +69,9 @@ ROOM = {
 
 
 def walking(time: float) -> iw.Scene:
-    """The room, and the person who swings legs on the way to the radar."""
-    phase = 2 * math.pi * STRIDES * time + 0.7
-    turns: dict[str, list[float]] = {}
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        turns[f"{side}_hip"] = [0.5 * sign * math.sin(phase), 0.0, 0.0]
-        turns[f"{side}_knee"] = [-0.4 * (1 + sign * math.cos(phase)), 0.0, 0.0]
-        turns[f"{side}_shoulder"] = [0.0, 0.0, 1.3 * sign]
-    place = rigid(translation=[0.2, -0.05, 4.0 - SPEED * time])
-    return iw.Scene({**ROOM, "person": iw.Object(BODY.mesh(turns), PAINT, place)})
+    """The room, and the person on the way to the radar."""
+    place = rigid(translation=[0.2, -1.0, 4.0])
+    return iw.Scene({**ROOM, "person": iw.Object(WALK.mesh(time), PAINT, place)})
 
 
 def sensor() -> iw.Radar:

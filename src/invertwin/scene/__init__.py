@@ -23,6 +23,7 @@ from invertwin.scene.geometry.density import DensityGrid as DensityGrid
 from invertwin.scene.geometry.distance import DistanceGrid as DistanceGrid
 from invertwin.scene.geometry.distance import NeuralDistance as NeuralDistance
 from invertwin.scene.geometry.distance import signed_distance as signed_distance
+from invertwin.scene.geometry.gait import Walk as Walk
 from invertwin.scene.geometry.iso_surface import iso_surface as iso_surface
 from invertwin.scene.geometry.person import person as person
 from invertwin.scene.geometry.prior import PriorShape as PriorShape
