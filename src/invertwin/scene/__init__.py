@@ -80,6 +80,7 @@ from invertwin.scene.pose import rotation_angle as rotation_angle
 from invertwin.scene.pose import rotation_from_quaternion as rotation_from_quaternion
 from invertwin.scene.pose import rotation_from_vector as rotation_from_vector
 from invertwin.scene.pose import vector_from_quaternion as vector_from_quaternion
+from invertwin.scene.room import room as room
 from invertwin.scene.scene import Object as Object
 from invertwin.scene.scene import Scene as Scene
 from invertwin.scene.shapes import box as box
