@@ -25,60 +25,37 @@ from report import MetricTable, Required, write
 import invertwin as iw
 from invertwin.radar.motion import Chirps
 from invertwin.scene import (
+    InMotion,
     RoughDielectric,
-    Walk,
-    box,
+    Walking,
     linear_array,
-    plate,
+    person,
     rigid,
-    rotation_from_vector,
+    room,
+    standing_height,
 )
 
 LOOPS, SLOW, INTERVAL = 64, 8, 50e-6
-PAINT = RoughDielectric(permittivity=4.0)
+SPEED = 1.4  # m/s
 SAMPLING = iw.Sampling(depth=1, points_per_m2=1_000.0)
 REQUIRED: Required = {
     "frame_seconds": ("<=", 3.0),
     "frame_seconds_ratio": (">=", 10.0),
 }
-WALK = Walk(1.4)  # m/s
-
-
-def standing(size: tuple[float, float, float], x: float, z: float) -> iw.Object:
-    """A box on the floor, 1 m below the radar."""
-    return iw.Object(box(size), PAINT, rigid(translation=[x, size[1] / 2 - 1.0, z]))
-
-
-def wall(width: float, height: float, turn: list[float], place: list[float]) -> iw.Object:
-    """A side of the room."""
-    pose = rigid(rotation_from_vector(torch.tensor(turn, dtype=torch.float64)), place)
-    return iw.Object(plate(width, height), PAINT, pose)
-
-
-QUARTER = math.pi / 2
-ROOM = {
-    "floor": wall(6.0, 8.0, [QUARTER, 0.0, 0.0], [0.0, -1.0, 4.0]),
-    "back": wall(6.0, 3.0, [0.0, 0.0, 0.0], [0.0, 0.5, 7.5]),
-    "left": wall(8.0, 3.0, [0.0, QUARTER, 0.0], [-3.0, 0.5, 4.0]),
-    "right": wall(8.0, 3.0, [0.0, QUARTER, 0.0], [3.0, 0.5, 4.0]),
-    "table": standing((1.2, 0.7, 0.8), 1.5, 5.0),
-    "shelf": standing((0.5, 2.0, 1.0), -2.5, 6.0),
-    "sofa": standing((0.8, 0.8, 1.8), -2.4, 3.5),
-    "cupboard": standing((1.0, 1.8, 0.5), 1.0, 7.2),
-}
-
-
-def walking(time: float) -> iw.Scene:
-    """The room, and the person on the way to the radar."""
-    place = rigid(translation=[0.2, -1.0, 4.0])
-    return iw.Scene({**ROOM, "person": iw.Object(WALK.mesh(time), PAINT, place)})
+BODY = person()
+SKIN = RoughDielectric(permittivity=4.0)
+PLACE = [0.2, standing_height(BODY), 4.0]
+STANDING = iw.Object(BODY.mesh({}), SKIN, rigid(translation=PLACE))
+walking = InMotion(
+    iw.Scene({**room(), "person": STANDING}), {"person": Walking(BODY, SPEED, phase=0.8)}
+)
 
 
 def sensor() -> iw.Radar:
-    """Two transmitters and four receivers."""
+    """Two transmitters and four receivers at the front wall."""
     chirp = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=40e-6, samples=256)
     half = chirp.wavelength / 2
-    place = torch.zeros(1, 3, dtype=torch.float64)
+    place = torch.tensor([[0.0, 1.0, 0.1]], dtype=torch.float64)
     return iw.Radar(linear_array(2, 4 * half), linear_array(4, half), chirp, place)
 
 

@@ -1,205 +1,274 @@
-"""How a person walks: joint angles over the cycle of a gait, and the skin at any time.
+"""A person who walks: joint angles by the walking speed, from a published model of gait.
 
-Source: R. Boulic, N. Magnenat Thalmann, D. Thalmann, "A global human walking model with real-time
-kinematic personification", The Visual Computer 6 (1990) 344–358: curves through control points
-from biomechanical data; V. C. Chen, "The Micro-Doppler Effect in Radar", 2011, ch. 4.
-
-Differs from the source: curves are the first 16 harmonics of those through the control points, so
-that accelerations are continuous. The body has no ankles, and its pelvis does not lean.
+Source: R. Boulic, N. Magnenat-Thalmann, D. Thalmann, "A global human walking model with real-time
+kinematic personification", The Visual Computer 6, 1990, 344–358, as V. C. Chen's "The Micro-Doppler
+Effect in Radar" (2011) uses it for radar. All curves depend on the relative speed v, in leg lengths
+per second, and the phase of the cycle, which begins as the right foot lands.
+Differs from the source: curves through its control points are monotone cubics of which the first
+seven harmonics are kept. Beyond these gait has 0.3 % of its power (D. A. Winter, H. G. Sidwall,
+D. A. Hobson, "Measurement and reduction of noise in kinematics of locomotion", J. Biomechanics 7,
+1974, 157–159), and with them accelerations are continuous. The forward and sideways shifts of brisk
+walks are those of slow ones carried on, positive at v = 0.5; transcriptions of the source have a
+minus there, with which they would jump to the other side. Feet do not turn: bodies have no ankles.
 """
 
 import math
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_number
+from invertwin.limits import Positive
+from invertwin.scene.checks import checked_number, checked_type
 from invertwin.scene.geometry.body import BodyTemplate
-from invertwin.scene.geometry.person import person
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import rotation_from_vector
+from invertwin.scene.pose import compose, rigid, rotation_from_vector
+from invertwin.scene.scene import Object
 
-_HARMONICS = 16
-_FASTEST = 3.0  # hip heights a second: beyond that people run
-_HIPS = 0.895 / 1.75  # height of the hip joints above the sole, of a body 1 m tall
-_SOLE = 0.955 / 1.75  # of the pelvis
-Curve = NDArray[np.complex128]
-"""Fourier coefficients of an angle [rad] or of a length over the cycle."""
+_HARMONICS = 7
+_SAMPLES = 512  # of a cycle, from which harmonics are found
+_FASTEST = 3.0  # relative speed
+_HANGING = math.radians(80.0)  # from the rest pose, in which arms are held out
+_ADULT_LEG = 0.84  # m, of ``person`` of 1.75 m; the source states shifts for adults in metres
+JOINTS = (
+    *("pelvis", "chest", "left_shoulder", "left_elbow", "right_shoulder", "right_elbow"),
+    *("left_hip", "left_knee", "right_hip", "right_knee"),
+)
+Posture = tuple[Float64[Tensor, "j 3 3"], Float64[Tensor, "3"]]
+"""Rotation of every joint in the frame of its parent, and the shift of the pelvis [m]."""
 
 
-@dataclass(frozen=True)
-class Walk:
-    """A person who walks straight on.
+@dataclass(frozen=True, eq=False)
+class Walking:
+    """A person who walks straight ahead, along −z of the object's frame, or on the spot.
 
-    At time 0 the person is above the origin, faces −z, and walks that way; y is up and the floor is
-    y = 0. The right leg is in front then. Place and turn the object by its pose:
-    ``lambda t: scene.replace("person", mesh=walk.mesh(t))`` is a motion for ``simulate_chirps``.
+    The object's pose places the pelvis as of a person who stands; ``standing_height`` says how
+    high that is. ``InMotion`` applies it.
 
     Attributes:
-        speed: [m/s].
-        height: Of the person [m].
-        spacing: Distance of neighbouring corners of the triangles [m].
+        body: With the joints of ``person``.
+        speed: Mean speed [m/s].
+        phase: Where the cycle is at time 0, in cycles; 0: the right foot lands.
+        on_spot: Stay where the object is, such as one that ``Along`` carries at that speed.
 
     Raises:
-        InputError: A speed beyond walking, or a size out of range.
+        InputError: A body without these joints, or a speed of more than three leg lengths a
+            second, which is none of walking.
     """
 
-    speed: float = 1.4
-    height: float = 1.75
-    spacing: float = 0.03
-    body: BodyTemplate = field(init=False, repr=False, compare=False)
-    _curves: dict[str, Curve] = field(init=False, repr=False, compare=False)
+    body: BodyTemplate
+    speed: Positive
+    phase: float = 0.0
+    on_spot: bool = False
 
     def __post_init__(self) -> None:
-        checked_number(self.speed, "walking speed [m/s]", 0.0, open_low=True)
-        object.__setattr__(self, "body", person(self.height, self.spacing))
-        if self.relative_speed > _FASTEST:
-            most = _FASTEST * _HIPS * self.height
-            raise InputError(
-                f"expected a walking speed up to {most:.1f} m/s for this height, got "
-                f"{self.speed:g}; faster people run"
-            )
-        object.__setattr__(self, "_curves", _curves(self.relative_speed))
+        check_joints(self.body)
+        checked_number(self.phase, "phase [cycles]", -math.inf)
+        fastest = _FASTEST * leg_length(self.body)
+        checked_number(self.speed, "walking speed [m/s]", 0.0, fastest, open_low=True)
 
     @property
     def relative_speed(self) -> float:
-        """Speed over the height of the hips [1/s], which decides on the gait."""
-        return self.speed / (_HIPS * self.height)
+        """Leg lengths per second."""
+        return self.speed / leg_length(self.body)
 
     @property
-    def cycle(self) -> float:
-        """Duration of two steps [s]: 1.346/√(relative speed)."""
+    def period(self) -> float:
+        """Time of a cycle, two steps [s]: 1.346 / √v."""
         return 1.346 / math.sqrt(self.relative_speed)
 
-    def joints(self, time: float) -> dict[str, Tensor]:
-        """Where the joints are [m], by name.
+    def rotations(self, phase: float) -> Float64[Tensor, "j 3 3"]:
+        """Rotation of every joint in the frame of its parent.
+
+        Args:
+            phase: In cycles.
+        """
+        v, curves = self.relative_speed, _curves(self.relative_speed)
+        found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
+        cycle = math.cos(2 * math.pi * phase)
+        yaw, roll = math.radians(4.0 * v) * cycle, -_at(curves["tilt"], phase)
+        pelvis = about("y", yaw) @ about("z", roll)
+        lean = math.radians(_swing(v, 8.0)) * (math.sin(2 * math.pi * (2 * phase - 0.1)) - 1)
+        chest = about("y", -_at(curves["thorax"], phase)) @ about("x", lean)
+        found[self.body.joint("pelvis")] = pelvis
+        found[self.body.joint("chest")] = pelvis.T @ chest
+        for side, later in (("right", 0.0), ("left", 0.5)):
+            own = phase + later
+            swing = 9.88 * v
+            arm = math.radians(3.0 - swing / 2 - swing * math.cos(2 * math.pi * own))
+            turns = {
+                "hip": about("x", _at(curves["hip"], own)),
+                "knee": about("x", -_at(curves["knee"], own)),
+                "shoulder": about("x", arm) @ hanging(side),
+                "elbow": bent_elbow(side, _at(curves["elbow"], own)),
+            }
+            for name, turn in turns.items():
+                found[self.body.joint(f"{side}_{name}")] = turn
+        return found
+
+    def shift(self, phase: float) -> Float64[Tensor, "3"]:
+        """How far the pelvis is from where it moves evenly, x, y and z [m].
+
+        Args:
+            phase: In cycles.
+        """
+        v, scale = self.relative_speed, leg_length(self.body) / _ADULT_LEG
+        support = 0.752 - 0.143 / self.period
+        turn = 2 * math.pi
+        side = _swing(v, 0.128) * math.sin(turn * (phase - 0.1))
+        rise = 0.015 * v * (math.sin(turn * (2 * phase - 0.35)) - 1)
+        ahead = _swing(v, 0.084) * math.sin(turn * 2 * (phase + 0.625 - support))
+        return scale * torch.tensor([side, rise, -ahead], dtype=torch.float64)
+
+    def posture(self, time: float) -> Posture:
+        """Rotations of the joints in the frames of their parents, and the shift of the pelvis [m].
 
         Args:
             time: [s].
         """
-        places = self._posed(time)[1] + self._root(time)
-        return dict(zip(self.body.names, places, strict=True))
+        phase = self.phase + time / self.period
+        way = 0.0 if self.on_spot else self.speed * time
+        shift = self.shift(phase) + torch.tensor([0.0, 0.0, -way], dtype=torch.float64)
+        return self.rotations(phase), shift
 
-    def mesh(self, time: float) -> Mesh:
-        """The skin; the same triangles at all times.
+    def __call__(self, item: Object, time: float) -> Object:
+        """The object at a time [s].
 
         Args:
+            item: At the place where the person stands at time 0.
             time: [s].
         """
-        return Mesh(self._posed(time)[0] + self._root(time), self.body.faces)
-
-    def _at(self, name: str, time: float, later: float = 0.0) -> float:
-        """A curve at a time, some share of the cycle later."""
-        coefficients = self._curves[name]
-        turns = np.exp(2j * np.pi * (time / self.cycle + later) * np.arange(len(coefficients)))
-        return float((coefficients * turns).real.sum())
-
-    def _root(self, time: float) -> Tensor:
-        """Where the pelvis is [m]."""
-        size = _HIPS * self.height
-        aside, up, ahead = (size * self._at(n, time) for n in ("aside", "up", "ahead"))
-        place = [aside, _SOLE * self.height + up, -self.speed * time - ahead]
-        return torch.tensor(place, dtype=torch.float64)
-
-    def _posed(self, time: float) -> tuple[Tensor, Tensor]:
-        turns = {
-            "pelvis": [_about(1, self._at("pelvis", time))],
-            "chest": [_about(1, self._at("chest", time)), _about(0, -self._at("bend", time))],
-        }
-        for side, sign, later in (("right", 1.0, 0.0), ("left", -1.0, 0.5)):
-            hip, knee, shoulder, elbow = (
-                self._at(name, time, later) for name in ("hip", "knee", "shoulder", "elbow")
-            )
-            turns[f"{side}_hip"] = [_about(0, hip)]
-            turns[f"{side}_knee"] = [_about(0, -knee)]
-            # Arms are held out at rest: down first, then forth and back.
-            turns[f"{side}_shoulder"] = [_about(2, -sign * math.pi / 2), _about(0, shoulder)]
-            turns[f"{side}_elbow"] = [_about(1, sign * elbow)]
-        found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.names), 1, 1)
-        for name, parts in turns.items():
-            for turn in parts:
-                row = self.body.joint(name)
-                found[row] = turn @ found[row]
-        return self.body.posed(found)
+        return posed(item, self.body, *self.posture(time))
 
 
-def _about(axis: int, angle: float) -> Tensor:
-    vector = torch.zeros(3, dtype=torch.float64)
-    vector[axis] = angle
-    return rotation_from_vector(vector)
+def standing_height(body: BodyTemplate) -> float:
+    """Height of the origin of a body above the soles of its rest pose [m]."""
+    return -float(body.vertices[:, 1].min())
 
 
-def _curves(rate: float) -> dict[str, Curve]:
-    """All curves of a relative speed, over the cycle of the right leg; angles in rad."""
-    slow, fast = rate < 0.5, rate >= 1.3
-    more = (rate - 1.3) / 1.7 if fast else 0.0
-    share = np.arange(512) / 512
-    hip = [(0.2 * more - 0.1, 25 + 5 * more), (0.5, -15.0), (0.9, 25 + 6 * more)]
-    knee = [
-        (0.17 - 0.05 * more, 3 + 22 * more),
-        (0.4, 3.0),
-        (0.75 - 0.05 * more, 70 - 5 * more),
-        (1 - 0.03 * more, 3 + 3 * more),
-    ]
-    middle = (rate - 0.5) / 0.8
+def leg_length(body: BodyTemplate) -> float:
+    """Length of a leg [m]: twice the thigh, since the shank is as long within 1 %."""
+    hip, knee = (body.joints[body.joint(f"right_{name}")] for name in ("hip", "knee"))
+    return 2 * float((knee - hip).norm())
+
+
+def check_joints(body: BodyTemplate) -> None:
+    """Raise unless a body has the joints of ``person``.
+
+    Raises:
+        InputError: Others, or none with names.
+    """
+    checked_type(body, BodyTemplate, "a body", "make one with person()")
+    missing = [name for name in JOINTS if name not in body.names]
+    if missing:
+        raise InputError(
+            f"expected a body with the joints of person(), got none named {', '.join(missing)}; "
+            "name the joints so"
+        )
+
+
+def posed(
+    item: Object, body: BodyTemplate, rotations: Float64[Tensor, "j 3 3"], shift: Tensor
+) -> Object:
+    """An object as the skin of a body, moved in its own frame.
+
+    Args:
+        item: The object.
+        body: The body.
+        rotations: Of every joint in the frame of its parent.
+        shift: [m].
+    """
+    mesh = Mesh(body.posed(rotations)[0], body.faces)
+    return replace(item, mesh=mesh, pose=compose(rigid(translation=shift), item.transform))
+
+
+def about(axis: str, angle: float) -> Float64[Tensor, "3 3"]:
+    """Rotation about a coordinate axis.
+
+    Args:
+        axis: x, y or z.
+        angle: [rad].
+    """
+    return rotation_from_vector(torch.tensor([angle * (axis == name) for name in "xyz"]).double())
+
+
+def hanging(side: str) -> Float64[Tensor, "3 3"]:
+    """Turn of a shoulder that lets the arm hang.
+
+    Args:
+        side: left or right.
+    """
+    return about("z", _HANGING if side == "left" else -_HANGING)
+
+
+def bent_elbow(side: str, angle: float) -> Float64[Tensor, "3 3"]:
+    """Turn of an elbow.
+
+    Args:
+        side: left or right.
+        angle: By which it is bent [rad].
+    """
+    return about("y", -angle if side == "left" else angle)
+
+
+def _swing(v: float, slope: float) -> float:
+    """Parabola of slow walks, at its top from half a leg length per second on."""
+    slow = min(v, 0.5)
+    return slope * slow * (1 - slow)
+
+
+def _at(harmonics: np.ndarray, phase: float) -> float:
+    """Value of a series [rad]."""
+    turns = np.exp(2j * math.pi * phase * np.arange(len(harmonics)))
+    return float(np.real(harmonics * turns).sum())
+
+
+@lru_cache(maxsize=32)
+def _curves(v: float) -> dict[str, np.ndarray]:
+    """Harmonics of the angles by name [rad]."""
+    slow, brisk = min(v, 0.5), min(max(v - 0.5, 0.0) / 0.8, 1.0)
+    fast = max(v - 1.3, 0.0) / 1.7
+    hip = [(0.9, 50 * slow + 6 * fast), (0.5, -30 * slow)]
+    if fast > 0:
+        hip.append((0.9 + 0.2 * fast, 50 * slow + 5 * fast))
+    knee = [(0.17 - 0.05 * fast, 3 + 22 * fast), (0.4, 3.0)]
+    knee += [(0.75 - 0.05 * fast, 140 * slow - 5 * fast), (1 - 0.03 * fast, 3 + 3 * fast)]
     elbow = [
-        (0.05, 6 + 8 * middle),
-        (0.5 + 0.01 * middle, 20 + 24 * middle),
-        (0.9, 8 + 9 * middle),
+        (0.05, 3 + 6 * slow + 8 * brisk - 6 * fast),
+        (0.5 + 0.01 * brisk + 0.04 * fast, 3 + 34 * slow + 24 * brisk + 26 * fast),
+        (0.9 - 0.1 * fast, 3 + 10 * slow + 9 * brisk - 6 * fast),
     ]
-    if slow:
-        hip = [(-0.1, 50 * rate), (0.5, -30 * rate), (0.9, 50 * rate)]
-        knee = [(0.17, 3.0), (0.4, 3.0), (0.75, 140 * rate), (1.0, 3.0)]
-        elbow = [(0.05, 6 * rate + 3), (0.5, 34 * rate + 3), (0.9, 10 * rate + 3)]
-    if fast:
-        elbow = [
-            (0.05, 14 - 6 * more),
-            (0.51 + 0.04 * more, 44 + 26 * more),
-            (0.9 - 0.1 * more, 17 - 6 * more),
-        ]
-    twist = [(0.1, 4 / 3), (0.4, -1.5), (0.6, -4 / 3), (0.9, 1.5)]
-    swing, lean = 9.88 * rate, -8 * rate**2 + 8 * rate if slow else 2.0
-    sway = -0.128 * rate**2 + 0.128 * rate if slow else 0.032
-    surge = -0.084 * rate**2 + 0.084 * rate if slow else 0.021
-    support = 0.752 - 0.143 * math.sqrt(rate) / 1.346  # share of the cycle on a foot
-
-    def wave(turns: float, early: float) -> NDArray[np.float64]:
-        return np.sin(2 * np.pi * (turns * share + early))
-
-    degrees = {
-        "hip": _through(hip, share),
-        "knee": _through(knee, share),
-        "elbow": _through(elbow, share),
-        "shoulder": 3 - swing / 2 - swing * np.cos(2 * np.pi * share),
-        "pelvis": -4 * rate * np.cos(2 * np.pi * share),
-        "chest": _through([(at, rate * angle) for at, angle in twist], share),
-        "bend": -lean + lean * wave(2, -0.1),
-    }
-    lengths = {
-        "up": -0.015 * rate + 0.015 * rate * wave(2, -0.35),
-        "aside": -sway * wave(1, -0.1),
-        "ahead": -surge * wave(2, 2 * (0.625 - support)),
-    }
-    known = {name: np.radians(values) for name, values in degrees.items()} | lengths
-    return {name: _harmonics(values) for name, values in known.items()}
+    thorax = [(0.1, 4 / 3 * v), (0.4, -1.5 * v), (0.6, -4 / 3 * v), (0.9, 1.5 * v)]
+    points = {"hip": hip, "knee": knee, "elbow": elbow, "thorax": thorax}
+    found = {name: _harmonics(_through(own)) for name, own in points.items()}
+    return found | {"tilt": _harmonics(lambda phase: 1.66 * v * _tilt(phase))}
 
 
-def _through(points: list[tuple[float, float]], share: NDArray[np.float64]) -> Any:
-    """A periodic curve through control points, without overshoot."""
+def _through(points: list[tuple[float, float]]) -> Callable[[np.ndarray], np.ndarray]:
+    """Monotone cubics through control points of a cycle, again and again [deg]."""
     from scipy.interpolate import PchipInterpolator  # slow to import, and few people walk
 
-    rounds = [(at + turn, value) for turn in (-1, 0, 1) for at, value in points]
-    places = {round(at, 9): value for at, value in rounds}
-    at = sorted(places)
-    return PchipInterpolator(at, [places[x] for x in at])(share)
+    phases, values = np.array(sorted((phase % 1.0, value) for phase, value in points)).T
+    more = np.concatenate([phases + turn for turn in (-1, 0, 1)])
+    return PchipInterpolator(more, np.tile(values, 3))
 
 
-def _harmonics(values: NDArray[np.float64]) -> Curve:
-    found = np.fft.rfft(values)[: _HARMONICS + 1] / len(values)
+def _tilt(phase: np.ndarray) -> np.ndarray:
+    """Fall of the pelvis towards the leg that swings, of amplitude 1."""
+    half = phase % 0.5
+    fall = np.where(half < 0.15, np.cos(2 * np.pi * half / 0.3), 0.0)
+    rise = np.where(half >= 0.15, -np.cos(2 * np.pi * (half - 0.15) / 0.7), 0.0)
+    return np.where(phase < 0.5, 1.0, -1.0) * (fall + rise - 1)
+
+
+def _harmonics(curve: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """The first harmonics of a curve in degrees [rad]."""
+    values = np.radians(curve(np.arange(_SAMPLES) / _SAMPLES))
+    found = np.fft.rfft(values)[: _HARMONICS + 1] / _SAMPLES
     found[1:] *= 2
     return found
