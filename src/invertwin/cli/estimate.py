@@ -227,7 +227,8 @@ def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
         for part, traced in _of_simulation(run.data, scene, frames):
             parts.append(part)
             table = run.chirps
-            again = chirps if table is not None and table.retrace else 1
+            moves = any(item.motion for item in run.scene.values())
+            again = chirps if table is not None and (table.retrace or moves) else 1
             again = 1 if table is None else -(-again // table.visibility_every)
             rows += traced * again
     return parts, rows

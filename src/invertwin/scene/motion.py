@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor, checked_type
+from invertwin.scene.checks import ArrayLike, Point, checked_number, checked_tensor, checked_type
 from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.scene import Object, Scene
 
@@ -73,9 +73,9 @@ class Turning:
         InputError: An axis without a direction, or numbers that are not finite.
     """
 
-    axis: ArrayLike
+    axis: Point
     rate: float
-    center: ArrayLike | None = None
+    center: Point | None = None
 
     def __post_init__(self) -> None:
         axis = checked_tensor(self.axis, (3,), "axis", "give x, y, z")

@@ -1,6 +1,8 @@
 """Sitting down, standing up, waving: where the body ends, what rests, and that nothing jumps."""
 
 import math
+from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
@@ -20,6 +22,7 @@ from invertwin.scene import (
 )
 from scenes import float64
 
+UP: Any = "up"
 BODY = person(spacing=0.05)
 HIGH = standing_height(BODY)
 STANDING = Object(BODY.mesh({}), RoughDielectric(4.0), rigid(translation=[0.0, HIGH, 3.0]))
@@ -92,7 +95,7 @@ def test_the_forearm_swings_beside_the_head(side):
         heights.append(float(place[1]))
         aside.append(sign * float(place[0]))
     assert min(heights) > HIGH + 0.6
-    turns = sum(a < 0.47 <= b for a, b in zip(aside, aside[1:], strict=False))
+    turns = sum(a < 0.47 <= b for a, b in pairwise(aside))
     assert turns == 3  # 1.5 Hz for two seconds
     assert max(aside) - min(aside) == pytest.approx(2 * 0.25 * math.sin(math.radians(30)), rel=0.1)
     other = "left" if side == "right" else "right"
@@ -134,7 +137,7 @@ def test_velocities_do_not_jump(motion):
         (lambda: Sitting(BODY, 0.9), "height of the seat"),
         (lambda: Sitting(BODY, 0.1), "height of the seat"),
         (lambda: Sitting(BODY, 0.45, duration=0.0), "duration"),
-        (lambda: Waving(BODY, "up"), "side left or right"),
+        (lambda: Waving(BODY, UP), "side left or right"),
         (lambda: Waving(BODY, rate=0.0), "rate"),
         (lambda: Waving(BODY, duration=1.0), "duration"),
         (lambda: Waving(BODY, during=Walking(person(spacing=0.05), 1.0)), "one body"),

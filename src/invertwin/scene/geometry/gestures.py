@@ -13,6 +13,7 @@ people. Bodies have no ankles: shanks stay upright, and feet stay where they are
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -140,7 +141,7 @@ class Waving:
     """
 
     body: BodyTemplate
-    side: str = "right"
+    side: Literal["left", "right"] = "right"
     rate: Positive = 1.5
     start: float = 0.0
     duration: float = 4.0
