@@ -7,7 +7,15 @@ import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor
 
-from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field
+from invertwin.channel import (
+    Grid,
+    Paths,
+    Sampling,
+    Speckle,
+    draw_speckle,
+    torch_threads,
+    trace_field,
+)
 from invertwin.errors import InputError
 from invertwin.radar.blocks import Blocks, displacements
 from invertwin.radar.impairments import Impairments
@@ -158,7 +166,8 @@ def simulate_chirps(
         return front.record(traced(scene), radar, seed=seed, chirps=chirps)
     if visibility_every > 1:
         plan = replace(plan, boundary=False)
-        with torch.no_grad():
+        # Ramps of what moves are small work, which several threads on a busy machine slow tenfold.
+        with torch.no_grad(), torch_threads(1):
             blocks = Blocks(motion, traced, radar, chirps, visibility_every)
             beat = every_ramp(chirps, radar.shape[1], blocks.ramp)
         return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
