@@ -5,7 +5,7 @@ those of what moves: signals of the empty room are taken away.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float64
@@ -14,7 +14,6 @@ from torch import Tensor
 import invertwin as iw
 from invertwin.channel import trace_echoes
 from invertwin.radar import beat_signal
-from invertwin.radar.range_profile import add_noise
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.scene import (
     Cosine,
@@ -99,9 +98,7 @@ def scene_of(room: Room) -> iw.Scene:
         for (name, (turn, place)), material in zip(places.items(), materials, strict=True)
     }
     middle = torch.stack([*room.cabinet, zero + CABINET[2] / 2 - HEIGHT])
-    objects["cabinet"] = iw.Object(
-        box(CABINET), PerfectConductor(), rigid(translation=middle)
-    )
+    objects["cabinet"] = iw.Object(box(CABINET), PerfectConductor(), rigid(translation=middle))
     return iw.Scene(objects)
 
 

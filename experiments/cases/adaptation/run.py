@@ -10,9 +10,6 @@ the bound.
 Writes `metrics.json` and `adaptation.png`. An interrupted run goes on with the next step.
 """
 
-import argparse
-import json
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -22,12 +19,9 @@ import network
 import rooms
 import torch
 import twin
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from rooms import Room, Samples
 
 from invertwin.folders import replacing
-from invertwin.plotting import PALETTE
 from invertwin.seeds import derived_seed
 
 WEAK, STRONG = (1.5, 4.0), (60.0, 200.0)  # permittivity of walls: generic and unseen rooms

@@ -6,6 +6,7 @@ well the best places explain all recordings. It is differentiable by the room th
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -16,12 +17,21 @@ from invertwin.channel import trace_paths
 from invertwin.constants import SPEED_OF_LIGHT
 
 STEP = 0.35  # of the grid of places [m]
-RANGE_BLUR, U_BLUR = 0.35, 0.06  # standard deviations: a person is no point [m], [1]
+RANGE_BLUR = 0.12  # standard deviation of the main lobe of a range bin [m]
+SPREAD = 0.18 * torch.tensor([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=torch.float64)
+"""Parts of a person, who is no point [m]."""
 SHARPNESS = 40.0  # of the choice of a place
 POOLED = 3
-CHANNELS = 0.07  # standard deviation of the beam of the eight receivers in u
-"""The two transmitters narrow it further; a person is wider than that."""
-STEPS, RATE = 60, 0.03
+CONTRAST = 30.0  # of logarithmic maps: ghosts 15 dB below the strongest bin still count
+STEPS, RATE = 40, 0.01
+
+
+START = Room(
+    *(torch.tensor(value, dtype=torch.float64) for value in (-2.4, 2.4, 5.9)),
+    torch.full((3,), 20.0, dtype=torch.float64),
+    torch.tensor([2.8, 0.5], dtype=torch.float64),
+)
+"""In the middle of what rooms may be."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +66,10 @@ def predicted(room: Room, places: Tensor, blur: float = 1.0) -> Tensor:
     Args:
         room: Differentiable.
         places: [place, 2].
-        blur: Of directions and ranges, over that of a person.
+        blur: Of ranges, over that of the radar.
     """
-    points = torch.cat([places, torch.zeros(len(places), 1, dtype=torch.float64)], dim=1)
+    parts = (places[:, None] + SPREAD).flatten(0, 1)
+    points = torch.cat([parts, torch.zeros(len(parts), 1, dtype=torch.float64)], dim=1)
     wave = float(RADAR.link().wavelength)
     legs = trace_paths(
         scene_of(room), [0.0, 0.0, 0.0], points, SPEED_OF_LIGHT / wave, depth=1, rays=None
@@ -68,15 +79,27 @@ def predicted(room: Room, places: Tensor, blur: float = 1.0) -> Tensor:
     power = legs.coefficient.abs().square().sum((1, 2)) * pattern
     both = power[out] * power[home]
     ranges = 0.5 * SPEED_OF_LIGHT * (legs.delay[out] + legs.delay[home])
-    u = 0.5 * (legs.departure[out, 1] + legs.departure[home, 1])
     bins, directions = pooled_axes()
     near = torch.exp(-0.5 * ((ranges[:, None] - bins) / (blur * RANGE_BLUR)) ** 2)
-    wide = blur * math.hypot(U_BLUR, CHANNELS)
-    beam = torch.exp(-0.5 * ((u[:, None] - directions) / wide) ** 2)
+    beam = _beam(legs.departure[out, 1], legs.departure[home, 1], directions)
     maps = torch.zeros(len(places), len(bins), len(directions), dtype=torch.float64)
-    parts = both[:, None, None] * near[:, :, None] * beam[:, None, :]
-    maps = maps.index_add(0, legs.rx[out], parts)
+    rows = both[:, None, None] * near[:, :, None] * beam[:, None, :]
+    maps = maps.index_add(0, legs.rx[out] // len(SPREAD), rows)
     return maps * bins[:, None] ** 4
+
+
+def _beam(sent: Tensor, received: Tensor, directions: Tensor) -> Tensor:
+    """Power of the array for waves that leave and arrive along some directions [path, u]."""
+    tx, rx = RADAR.transmitters.positions[:, 0], RADAR.receivers.positions[:, 0]
+    taper = torch.hamming_window(len(tx) * len(rx), periodic=False, dtype=torch.float64)
+    turns = 2 * math.pi / float(RADAR.link().wavelength)
+    phase = sent[:, None] * tx.repeat_interleave(len(rx))
+    phase = turns * (phase + received[:, None] * rx.repeat(len(tx)))
+    steer = turns * directions[:, None] * (tx[:, None] + rx).flatten()
+    field = (
+        torch.polar(taper.expand_as(phase), phase) @ torch.polar(torch.ones_like(steer), -steer).T
+    )
+    return field.abs().square() / taper.sum() ** 2
 
 
 def pooled_axes() -> tuple[Tensor, Tensor]:
@@ -109,39 +132,72 @@ def score(room: Room, seen: Tensor, blur: float = 1.0) -> Tensor:
     maps = predicted(room, places_in(room), blur)
 
     def level(power: Tensor) -> Tensor:
-        flat = (power + 1e-30).sqrt().flatten(1)
-        return flat / flat.norm(dim=1, keepdim=True)
+        flat = power.flatten(1)
+        shown = (1 + CONTRAST * flat / flat.amax(1, keepdim=True)).log()
+        return shown / shown.norm(dim=1, keepdim=True)
 
     alike = level(seen) @ level(maps).T
     return (torch.logsumexp(SHARPNESS * alike, dim=1) / SHARPNESS).mean()
 
 
-def fitted(maps: Tensor, start: Room) -> Fit:
+def fitted(maps: Tensor, start: Room = START) -> Fit:
     """The twin of the room of some recordings.
 
-    Each wall is looked for by itself, then the cabinet, then all again together by steps of Adam.
+    Walls, cabinet and permittivities are looked for one after the other, twice, at first in large
+    steps; then all together by the derivative of the score.
 
     Args:
         maps: Power [sample, range, u], unlabelled.
         start: A room to begin with.
     """
     seen, room = observed(maps), start
-    scans = {
-        "left": -torch.arange(1.5, 3.31, 0.15, dtype=torch.float64),
-        "right": torch.arange(1.5, 3.31, 0.15, dtype=torch.float64),
-        "back": torch.arange(4.7, 7.11, 0.2, dtype=torch.float64),
-    }
-    spots = torch.cartesian_prod(
-        torch.arange(2.0, 3.61, 0.4, dtype=torch.float64),
-        torch.tensor([-0.8, -0.5, -0.2, 0.2, 0.5, 0.8], dtype=torch.float64),
-    )
     with torch.no_grad():
-        for _ in range(2):
-            for name, values in scans.items():
-                tried = [replace(room, **{name: value}) for value in values]
-                room = max(tried, key=lambda other: float(score(other, seen, 1.3)))
-            tried = [replace(room, cabinet=spot) for spot in spots]
-            room = max(tried, key=lambda other: float(score(other, seen)))
+        for near in (False, True):
+            for tried in _tries(near):
+                others = [room, *tried(room)]
+                room = max(others, key=lambda other: float(score(other, seen)))
+    return _polished(room, seen)
+
+
+def _tries(near: bool) -> list[Callable[[Room], list[Room]]]:
+    """What is tried of every value: everywhere, or near the present one."""
+    small = torch.tensor([-0.12, -0.06, 0.06, 0.12], dtype=torch.float64)
+
+    def line(name: str, low: float, high: float) -> Callable[[Room], list[Room]]:
+        def tried(now: Room) -> list[Room]:
+            grid = torch.arange(low, high, 0.15, dtype=torch.float64)
+            values = getattr(now, name) + small if near else grid
+            return [replace(now, **{name: value}) for value in values]
+
+        return tried
+
+    def spots(now: Room) -> list[Room]:
+        if near:
+            steps = torch.tensor([-0.2, -0.1, 0.0, 0.1, 0.2], dtype=torch.float64)
+            return [
+                replace(now, cabinet=now.cabinet + o) for o in torch.cartesian_prod(steps, steps)
+            ]
+        x = torch.arange(2.0, 3.61, 0.4, dtype=torch.float64)
+        y = torch.tensor([-0.8, -0.5, -0.2, 0.2, 0.5, 0.8], dtype=torch.float64)
+        return [replace(now, cabinet=spot) for spot in torch.cartesian_prod(x, y)]
+
+    def wall(number: int) -> Callable[[Room], list[Room]]:
+        def tried(now: Room) -> list[Room]:
+            found = []
+            for factor in (0.25, 0.5, 2.0, 4.0):
+                values = now.permittivity.clone()
+                values[number] *= factor
+                found.append(replace(now, permittivity=values))
+            return found
+
+        return tried
+
+    lines = [line("back", 4.7, 7.15), line("left", -3.3, -1.45), line("right", 1.5, 3.35)]
+    return [*lines, spots, *(wall(number) for number in range(3))]
+
+
+def _polished(room: Room, seen: Tensor) -> Fit:
+    """A room after steps of Adam, the best on the way."""
     values = {item.name: getattr(room, item.name).clone() for item in fields(Room)}
     values["permittivity"] = values["permittivity"].log()
     for value in values.values():
