@@ -195,8 +195,6 @@ def recorded(room: Room, count: int, seed: int) -> Samples:
         points[:, :2] += place
         drawn = torch.rand(len(points), generator=random, dtype=torch.float64)
         echoes = trace_echoes(scene, RADAR.link(), points, -SIZE * drawn.log(), rays=None)
-        phases = torch.rand(2, *RADAR.shape[1:], generator=random, dtype=torch.float64)
-        del phases
         beat = beat_signal(echoes, RADAR)
         noise = torch.randn((2, *beat.shape), generator=random, dtype=torch.float64)
         beat = beat + NOISE * torch.complex(noise[0], noise[1])

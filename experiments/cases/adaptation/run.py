@@ -10,6 +10,9 @@ the bound.
 Writes `metrics.json` and `adaptation.png`. An interrupted run goes on with the next step.
 """
 
+import argparse
+import json
+import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -19,9 +22,12 @@ import network
 import rooms
 import torch
 import twin
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from rooms import Room, Samples
 
 from invertwin.folders import replacing
+from invertwin.plotting import PALETTE
 from invertwin.seeds import derived_seed
 
 WEAK, STRONG = (1.5, 4.0), (60.0, 200.0)  # permittivity of walls: generic and unseen rooms
@@ -125,8 +131,7 @@ def in_room(number: int, net: network.Finder, plan: Plan, folder: Path) -> dict[
 
     tested = of("tested", true, plan.tested, TESTED)
     maps = of("seen", true, plan.seen, SEEN).maps  # without labels
-    found = kept(folder / f"room_{number}_twin.pt", lambda: vars(twin.fitted(maps)))
-    room = Room(**found["room"]) if isinstance(found["room"], dict) else found["room"]
+    room = Room(**kept(folder / f"room_{number}_twin.pt", lambda: vars(twin.fitted(maps))))
     site, bound = of("site", room, plan.site, SITE), of("true", true, plan.site, TRUE)
     nets = {
         "before": net,
@@ -154,3 +159,96 @@ def in_room(number: int, net: network.Finder, plan: Plan, folder: Path) -> dict[
 
 def _listed(room: Room) -> dict[str, Any]:
     return {item.name: getattr(room, item.name).tolist() for item in fields(Room)}
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """All metrics.
+
+    Args:
+        rows: Of the rooms.
+    """
+    walls = [error for row in rows for error in row["wall_errors_m"].values()]
+    return {
+        "seeds": list(range(len(rows))),
+        "gap_recovered": statistics.fmean(row["gap_recovered"] for row in rows),
+        "gap_recovered_least": min(row["gap_recovered"] for row in rows),
+        "above_tent": sum(row["gap_recovered"] > row["gap_recovered_tent"] for row in rows),
+        "position_error_m": _means(rows, "position_error_m"),
+        "right_postures": _means(rows, "right_postures"),
+        "wall_error_median_m": statistics.median(walls),
+        "wall_error_most_m": max(walls),
+        "cabinet_error_median_m": statistics.median(row["cabinet_error_m"] for row in rows),
+        "rooms": rows,
+    }
+
+
+def _means(rows: list[dict[str, Any]], key: str) -> dict[str, float]:
+    return {name: statistics.fmean(row[key][name] for row in rows) for name in METHODS}
+
+
+def figure(rows: list[dict[str, Any]]) -> Figure:
+    """Rooms with their twins, and the errors in each.
+
+    Args:
+        rows: Of the rooms.
+    """
+    drawn = Figure(figsize=(11, 4.2), layout="constrained")
+    above, below = drawn.subfigures(2, 1, height_ratios=[1.2, 1])
+    plans: Any = above.subplots(1, len(rows), squeeze=False)[0]
+    for number, (axes, row) in enumerate(zip(plans, rows, strict=True)):
+        _plan(axes, row["true"], "0.6", "room")
+        _plan(axes, row["twin"], PALETTE[1], "twin")
+        axes.set(aspect="equal", xlim=(-3.6, 3.6), ylim=(-0.4, 7.4), xticks=[], yticks=[])
+        axes.set_title(f"room {number}", fontsize=8)
+    plans[0].legend(fontsize=7, loc="lower left")
+    axes = below.subplots()
+    width = 0.8 / len(METHODS)
+    for place, name in enumerate(METHODS):
+        values = [row["position_error_m"][name] for row in rows]
+        at = [number + (place - 2) * width for number in range(len(rows))]
+        axes.bar(at, values, width, color=PALETTE[place], label=name)
+    axes.set_xticks(range(len(rows)), [f"room {n}" for n in range(len(rows))], fontsize=8)
+    axes.set_ylabel("median error [m]", fontsize=8)
+    axes.legend(fontsize=7, ncols=len(METHODS), loc="upper center")
+    axes.set_ylim(0, 1.35 * max(max(row["position_error_m"].values()) for row in rows))
+    axes.tick_params(labelsize=7)
+    return drawn
+
+
+def _plan(axes: Axes, room: dict[str, Any], color: str, name: str) -> None:
+    """Walls and cabinet from above, the radar below."""
+    left, right, back = room["left"], room["right"], room["back"]
+    axes.plot([left, left, right, right], [0, back, back, 0], color=color, label=name)
+    x, y = room["cabinet"]
+    deep, wide = (size / 2 for size in rooms.CABINET[:2])
+    corners = [(y - wide, x - deep), (y + wide, x - deep), (y + wide, x + deep)]
+    corners += [(y - wide, x + deep), (y - wide, x - deep)]
+    axes.plot(*zip(*corners, strict=True), color=color)
+    axes.plot([0], [0], "k^", markersize=4)
+
+
+def main() -> None:
+    """Run the case."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="a small version, under a minute")
+    parser.add_argument("-o", "--output", type=Path, default=None)
+    given = parser.parse_args()
+    plan = QUICK if given.quick else Plan()
+    folder = given.output or Path("out/adaptation_quick" if given.quick else "out/adaptation")
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)  # all of it is small work
+    net, rows = generic_network(plan, folder), list[dict[str, Any]]()
+    for number in range(plan.rooms):
+        rows.append(in_room(number, net, plan, folder))
+        errors = rows[-1]["position_error_m"]
+        told = ", ".join(f"{name} {errors[name]:.2f} m" for name in METHODS)
+        print(f"room {number}: {told}; gap recovered {rows[-1]['gap_recovered']:.2f}", flush=True)
+    figure(rows).savefig(folder / "adaptation.png", dpi=110)
+    metrics = summary(rows)
+    with replacing(folder / "metrics.json") as part:
+        part.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    print(json.dumps({key: value for key, value in metrics.items() if key != "rooms"}, indent=2))
+
+
+if __name__ == "__main__":
+    main()

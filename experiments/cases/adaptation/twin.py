@@ -7,7 +7,7 @@ well the best places explain all recordings. It is differentiable by the room th
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import torch
 from rooms import GRID, RADAR, Room, inside, scene_of
@@ -32,19 +32,6 @@ START = Room(
     torch.tensor([2.8, 0.5], dtype=torch.float64),
 )
 """In the middle of what rooms may be."""
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A twin and how it was found.
-
-    Attributes:
-        room: The twin.
-        score: Mean correlation of the recordings with their best places.
-    """
-
-    room: Room
-    score: float
 
 
 def places_in(room: Room) -> Tensor:
@@ -140,7 +127,7 @@ def score(room: Room, seen: Tensor, blur: float = 1.0) -> Tensor:
     return (torch.logsumexp(SHARPNESS * alike, dim=1) / SHARPNESS).mean()
 
 
-def fitted(maps: Tensor, start: Room = START) -> Fit:
+def fitted(maps: Tensor, start: Room = START) -> Room:
     """The twin of the room of some recordings.
 
     Walls, cabinet and permittivities are looked for one after the other, twice, at first in large
@@ -196,7 +183,7 @@ def _tries(near: bool) -> list[Callable[[Room], list[Room]]]:
     return [*lines, spots, *(wall(number) for number in range(3))]
 
 
-def _polished(room: Room, seen: Tensor) -> Fit:
+def _polished(room: Room, seen: Tensor) -> Room:
     """A room after steps of Adam, the best on the way."""
     values = {item.name: getattr(room, item.name).clone() for item in fields(Room)}
     values["permittivity"] = values["permittivity"].log()
@@ -215,4 +202,4 @@ def _polished(room: Room, seen: Tensor) -> Fit:
         (-found).backward()
         adam.step()
         plan.step()
-    return Fit(best, most)
+    return best
