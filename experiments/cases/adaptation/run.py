@@ -193,7 +193,8 @@ def figure(rows: list[dict[str, Any]]) -> Figure:
         rows: Of the rooms.
     """
     drawn = Figure(figsize=(11, 4.2), layout="constrained")
-    above, below = drawn.subfigures(2, 1, height_ratios=[1.2, 1])
+    parts: Any = drawn.subfigures(2, 1, height_ratios=[1.2, 1])
+    above, below = parts
     plans: Any = above.subplots(1, len(rows), squeeze=False)[0]
     for number, (axes, row) in enumerate(zip(plans, rows, strict=True)):
         _plan(axes, row["true"], "0.6", "room")

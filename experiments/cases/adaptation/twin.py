@@ -27,9 +27,11 @@ STEPS, RATE = 40, 0.01
 
 
 START = Room(
-    *(torch.tensor(value, dtype=torch.float64) for value in (-2.4, 2.4, 5.9)),
-    torch.full((3,), 20.0, dtype=torch.float64),
-    torch.tensor([2.8, 0.5], dtype=torch.float64),
+    left=torch.tensor(-2.4, dtype=torch.float64),
+    right=torch.tensor(2.4, dtype=torch.float64),
+    back=torch.tensor(5.9, dtype=torch.float64),
+    permittivity=torch.full((3,), 20.0, dtype=torch.float64),
+    cabinet=torch.tensor([2.8, 0.5], dtype=torch.float64),
 )
 """In the middle of what rooms may be."""
 
