@@ -1,0 +1,452 @@
+"""A robot with a radar on board among boxes: worlds, motion, what the radar shows, and the loss.
+
+Many worlds are one scene: they stand so far apart that all echoes of another world lie beyond the
+last range bin. Every robot is one frame of one radar, so that a single trace serves all worlds, and
+its derivative by the radar's poses serves all robots.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+import invertwin as iw
+from invertwin.scene import Cosine, Mesh, RoughDielectric, box, linear_array
+from invertwin.seeds import derived_seed
+
+STEPS = 24
+INTERVAL = 0.3  # [s] of one step
+RADIUS = 0.2  # of the robot [m]
+ARRIVED = 0.4  # distance at which the goal counts as reached [m]
+THRUST, DRAG, TURN = 3.0, 2.0, 1.6  # [m/s²], [1/s], [rad/s]: 1.5 m/s at most
+SPACING = 40.0  # of worlds [m]
+HEIGHT = 1.2  # of boxes [m]
+MARGIN, SOFTNESS = 0.2, 0.07  # of the clearance in the loss [m]
+CLEARANCE_WEIGHT, EFFORT_WEIGHT = 4.0, 0.005
+PAINT = RoughDielectric(permittivity=4.0)
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """Some worlds, each in coordinates of its own.
+
+    Attributes:
+        centres: Of the boxes [world, box, 2] [m].
+        halves: Half their sides [world, box, 2] [m].
+        yaws: How they are turned [world, box] [rad].
+        gap: The middle of the gap in the wall [world, 2] [m].
+        goal: Where to go [world, 2] [m].
+        start: x, y, heading and speed of the robot [world, 4].
+    """
+
+    centres: Float64[Tensor, "world box 2"]
+    halves: Float64[Tensor, "world box 2"]
+    yaws: Float64[Tensor, "world box"]
+    gap: Float64[Tensor, "world 2"]
+    goal: Float64[Tensor, "world 2"]
+    start: Float64[Tensor, "world 4"]
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.goal)
+
+    def chosen(self, rows: list[int]) -> "Worlds":
+        """Some of the worlds.
+
+        Args:
+            rows: Their numbers.
+        """
+        return Worlds(*(value[rows] for value in vars(self).values()))
+
+
+def random_worlds(count: int, seed: int) -> Worlds:
+    """A wall with a gap, a box on the way to the gap and one on the way from it to the goal.
+
+    Args:
+        count: How many.
+        seed: Of all of them.
+    """
+    random = torch.Generator().manual_seed(seed)
+
+    def between(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, generator=random, dtype=torch.float64)
+
+    def pair(x: Tensor, y: Tensor) -> Tensor:
+        return torch.stack([x, y], dim=-1)
+
+    start = torch.stack(
+        [torch.zeros(count), between(-0.8, 0.8), between(-0.3, 0.3), between(0.2, 0.8)], dim=-1
+    )
+    gap = pair(between(3.2, 4.0), between(-1.4, 1.4))
+    goal = pair(between(7.0, 7.6), between(-1.5, 1.5))
+    thick, half_gap, end = between(0.1, 0.2), between(0.6, 0.8), torch.full((count,), 3.5)
+    boxes: list[tuple[Tensor, Tensor, Tensor]] = []
+    for side in (-1.0, 1.0):
+        inner, outer = gap[:, 1] + side * half_gap, side * end
+        middle = pair(gap[:, 0], 0.5 * (inner + outer))
+        boxes.append((middle, pair(thick, 0.5 * (outer - inner).abs()), torch.zeros(count)))
+    for begin, stop, share in ((start[:, :2], gap, (0.4, 0.5)), (gap, goal, (0.5, 0.6))):
+        place = begin + between(*share)[:, None] * (stop - begin)
+        aside = pair(torch.zeros(count, dtype=torch.float64), between(-0.9, 0.9))
+        boxes.append((place + aside, pair(between(0.2, 0.3), between(0.2, 0.3)), between(-0.8, 0.8)))
+    centres, halves, yaws = (torch.stack(part, dim=1).double() for part in zip(*boxes, strict=True))
+    return Worlds(centres, halves, yaws, gap, goal, start)
+
+
+def origins(count: int) -> Float64[Tensor, "world 2"]:
+    """Where the worlds stand in the scene, on a square lattice about zero [m].
+
+    Args:
+        count: Of worlds.
+    """
+    side = math.ceil(count**0.5)
+    number = torch.arange(count)
+    rows = torch.stack([number % side, number // side], dim=-1)
+    return SPACING * (rows.double() - 0.5 * (side - 1))
+
+
+def scene_of(worlds: Worlds) -> iw.Scene:
+    """All boxes of all worlds as one object.
+
+    Args:
+        worlds: The worlds.
+    """
+    unit = box((2.0, 2.0, HEIGHT))
+    c, s = worlds.yaws.cos()[..., None], worlds.yaws.sin()[..., None]
+    flat = unit.vertices[:, :2] * worlds.halves[:, :, None]
+    x, y = flat[..., 0], flat[..., 1]
+    turned = torch.stack([c * x - s * y, s * x + c * y], dim=-1)
+    place = turned + (worlds.centres + origins(worlds.count)[:, None])[:, :, None]
+    height = (unit.vertices[:, 2] + 0.5 * HEIGHT).expand(place.shape[:-1])[..., None]
+    vertices = torch.cat([place, height], dim=-1).reshape(-1, 3)
+    shift = torch.arange(worlds.yaws.numel()) * len(unit.vertices)
+    faces = (unit.faces[None] + shift[:, None, None]).reshape(-1, 3)
+    return iw.Scene({"boxes": iw.Object(Mesh(vertices, faces), PAINT)})
+
+
+def radar_at(state: Float64[Tensor, "world 4"]) -> iw.Radar:
+    """The radars of all robots, one a frame, looking ahead.
+
+    Args:
+        state: Of the robots.
+    """
+    chirp = iw.FMCW(start_frequency=77e9, bandwidth=0.5e9, duration=20e-6, samples=64)
+    half, patch = chirp.wavelength / 2, Cosine(1.0)
+    tx = linear_array(2, 8 * half, pattern=patch)
+    rx = linear_array(8, half, pattern=patch)
+    x, y, heading, _ = state.unbind(-1)
+    c, s, zero = heading.cos(), heading.sin(), torch.zeros_like(heading)
+    left, up = torch.stack([-s, c, zero], -1), torch.stack([zero, zero, zero + 1], -1)
+    axes = torch.stack([left, up, torch.stack([c, s, zero], -1)], dim=-1)
+    place = torch.stack([x, y], -1) + origins(len(state))
+    position = torch.cat([place, zero[:, None] + 0.5 * HEIGHT], dim=-1)
+    return iw.Radar(tx, rx, chirp, position, axes)
+
+
+def bins() -> iw.Grid:
+    """What the robot looks at: up to 5 m ahead."""
+    still = torch.zeros(1, 4, dtype=torch.float64)
+    return radar_at(still).grid(range_min=0.3, range_max=4.9, u_max=0.78)
+
+
+def moved(
+    state: Float64[Tensor, "world 4"], command: Float64[Tensor, "world 2"]
+) -> Float64[Tensor, "world 4"]:
+    """One step of a unicycle with drag: thrust and rate of turn saturate by tanh.
+
+    Args:
+        state: x, y [m], heading [rad] and speed [m/s].
+        command: Thrust and turn, any numbers.
+    """
+    x, y, heading, speed = state.unbind(-1)
+    thrust, turn = command.tanh().unbind(-1)
+    faster = speed + INTERVAL * (THRUST * thrust - DRAG * speed)
+    turned = heading + INTERVAL * TURN * turn
+    way = 0.5 * INTERVAL * (speed + faster)
+    middle = 0.5 * (heading + turned)
+    return torch.stack([x + way * middle.cos(), y + way * middle.sin(), turned, faster], dim=-1)
+
+
+def clearance(
+    worlds: Worlds, place: Float64[Tensor, "world point 2"]
+) -> Float64[Tensor, "world point box"]:
+    """Signed distance from the robot's hull to every box; below zero it touches [m].
+
+    Args:
+        worlds: The worlds.
+        place: Of the robot's middle, some in each world.
+    """
+    c, s = worlds.yaws.cos()[:, None], worlds.yaws.sin()[:, None]
+    x, y = (place[:, :, None] - worlds.centres[:, None]).unbind(-1)
+    local = torch.stack([c * x + s * y, c * y - s * x], dim=-1)
+    beyond = local.abs() - worlds.halves[:, None]
+    outside = (beyond.clamp_min(0).square().sum(-1) + 1e-12).sqrt()
+    return outside + beyond.amax(-1).clamp_max(0) - RADIUS
+
+
+def way_left(worlds: Worlds, place: Float64[Tensor, "world 2"]) -> Float64[Tensor, " world"]:
+    """Length of the way to the goal: through the gap, as long as the robot is before the wall [m].
+
+    Args:
+        worlds: The worlds.
+        place: Of the robots.
+    """
+    # Sideways counts double, so that robots line up with the gap early.
+    aside = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    to_gap = (((place - worlds.gap) * aside).square().sum(-1) + 1e-4).sqrt()
+    on = (worlds.gap - worlds.goal).norm(dim=-1)
+    direct = ((place - worlds.goal).square().sum(-1) + 1e-4).sqrt()
+    past = torch.sigmoid((place[:, 0] - worlds.gap[:, 0]) / 0.1)
+    return (1 - past) * (to_gap + on) + past * direct
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step did.
+
+    Attributes:
+        state: Afterwards.
+        cost: Its part of the loss; a reward is less this.
+        touched: Whether the robot met a box on the way.
+        arrived: Whether it is at the goal.
+    """
+
+    state: Float64[Tensor, "world 4"]
+    cost: Float64[Tensor, " world"]
+    touched: Bool[Tensor, " world"]
+    arrived: Bool[Tensor, " world"]
+
+
+def step(worlds: Worlds, state: Tensor, command: Tensor) -> Step:
+    """Move all robots.
+
+    Args:
+        worlds: Where they are.
+        state: Of the robots [world, 4].
+        command: Thrust and turn [world, 2].
+    """
+    after = moved(state, command)
+    shares = torch.tensor([1 / 3, 2 / 3, 1.0], dtype=torch.float64)[:, None]
+    begin, end = state[:, None, :2], after[:, None, :2]
+    gaps = clearance(worlds, begin + shares * (end - begin))
+    near = SOFTNESS * torch.nn.functional.softplus((MARGIN - gaps) / SOFTNESS)
+    cost = way_left(worlds, after[:, :2]) - way_left(worlds, state[:, :2])
+    cost = cost + CLEARANCE_WEIGHT * near.sum(-1).mean(-1)
+    cost = cost + EFFORT_WEIGHT * command.square().sum(-1)
+    arrived = (after[:, :2] - worlds.goal).norm(dim=-1) < ARRIVED
+    return Step(after, cost, (gaps < 0).flatten(1).any(1), arrived.detach())
+
+
+Shown = Callable[[Tensor, int], Tensor]
+"""Power spectra [world, range, u] of the robots' radars, by their states and a seed."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothRadar:
+    """The radars by the smooth model, differentiable by where the robots are.
+
+    Attributes:
+        scene: Of all worlds.
+        model: The smooth model.
+    """
+
+    scene: iw.Scene
+    model: iw.SurrogateMap
+
+    def __call__(self, state: Tensor, seed: int) -> Tensor:
+        """See ``Shown``."""
+        return self.model.predict(self.scene, radar_at(state), seed)[..., 0].double()
+
+
+def smooth_radar(worlds: Worlds, samples: int = 2000, *, boundary: bool = True) -> SmoothRadar:
+    """The smooth model of worlds.
+
+    Args:
+        worlds: The worlds.
+        samples: Rays for each robot; an eighth as many on the silhouettes that it sees.
+        boundary: False holds visibility fixed in derivatives.
+    """
+    count = samples * worlds.count
+    sampling = iw.Sampling(
+        depth=1, samples=count, boundary_samples=count // 8, boundary=boundary, contacts=False
+    )
+    return SmoothRadar(scene_of(worlds), iw.SurrogateMap(bins(), sampling=sampling))
+
+
+REFERENCE = 1e-9
+"""Received over transmitted power, times range⁴ [m⁴], that a map shows as ln 2."""
+MAP_SCALE = 0.3
+POOLED = 2, 3  # bins of range and direction in one input of the network
+LOOKS = 2  # independent cells in one input, about: how strong the speckle in training is
+
+
+def inputs(
+    worlds: Worlds, state: Tensor, power: Tensor, speckle: torch.Generator | None = None
+) -> Float64[Tensor, "world input"]:
+    """What the network sees: its map, the goal in its own axes, and its speed.
+
+    Args:
+        worlds: Only their goals are read.
+        state: Of the robots [world, 4].
+        power: Spectra [world, range, u].
+        speckle: Draws the fluctuation of power that one exact recording would have; None = none.
+    """
+    grid = bins()
+    power = power * grid.ranges[:, None] ** 4 / REFERENCE
+    pooled = torch.nn.functional.avg_pool2d(power[:, None], POOLED)[:, 0]
+    if speckle is not None:
+        drawn = torch.rand((LOOKS, *pooled.shape), generator=speckle, dtype=torch.float64)
+        pooled = pooled * -(1 - drawn).log().mean(0)
+    x, y = (worlds.goal - state[:, :2]).unbind(-1)
+    heading = state[:, 2]
+    ahead = heading.cos() * x + heading.sin() * y
+    left = heading.cos() * y - heading.sin() * x
+    distance = (ahead.square() + left.square() + 1e-4).sqrt()
+    own = torch.stack([ahead / distance, left / distance, distance / 5, state[:, 3]], dim=-1)
+    return torch.cat([(1 + pooled).log().flatten(1) * MAP_SCALE, own], dim=-1)
+
+
+
+
+class Steering(torch.nn.Module):
+    """Looks along every direction with the same weights, and turns to where it is best to go.
+
+    It scores the directions of the map, with how near they are to that of the goal; what it sees in
+    the best ones decides on thrust and turn.
+    """
+
+    def __init__(self, width: int = 24) -> None:
+        """Draw the weights.
+
+        Args:
+            width: Features of every direction.
+        """
+        super().__init__()
+        grid, (deep, wide) = bins(), POOLED
+        self.shape = grid.range_count // deep, grid.u_count // wide
+        directions = grid.u[: self.shape[1] * wide].reshape(-1, wide).mean(-1)
+        self.register_buffer("directions", directions)
+        self.trunk = torch.nn.Sequential(
+            torch.nn.Conv1d(self.shape[0] + 6, width, 5, padding=2),
+            torch.nn.Tanh(),
+            torch.nn.Conv1d(width, width, 5, padding=2),
+            torch.nn.Tanh(),
+        )
+        self.score = torch.nn.Conv1d(width, 1, 1)
+        self.head = torch.nn.Linear(width + 5, 2)
+
+    def seen(self, given: Tensor) -> Tensor:
+        """Features of where it is best to go, with that direction and the robot's own inputs.
+
+        Args:
+            given: From ``inputs`` [world, input].
+        """
+        own = given[:, -4:]
+        ahead, left, _, _ = own.unbind(-1)
+        power = given[:, :-4].unflatten(1, self.shape)
+        u = self.directions.to(given).expand(len(given), 1, -1)
+        # A goal behind is at the side to which the way is shorter.
+        aim = torch.where(ahead > 0, left, torch.sign(left))[:, None, None]
+        off = u - aim
+        spread = torch.cat([off, off.abs(), u], dim=1)
+        rest = own[:, [0, 2, 3], None].expand(-1, -1, u.shape[-1])
+        features = self.trunk(torch.cat([power, spread, rest], dim=1))
+        weight = (self.score(features) * 4 - 3 * off.abs()).softmax(dim=-1)
+        return torch.cat([(weight * features).sum(-1), (weight * u).sum(-1), own], dim=-1)
+
+    def forward(self, given: Tensor) -> Tensor:
+        """Thrust and turn [world, 2].
+
+        Args:
+            given: From ``inputs`` [world, input].
+        """
+        seen = self.seen(given)
+        best = seen[:, -5:-4]
+        return self.head(seen) + torch.cat([torch.zeros_like(best), 3 * best], dim=-1)
+
+
+def policy(seed: int) -> Steering:
+    """A small network with random weights.
+
+    Args:
+        seed: Of its weights.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        net = Steering().double()
+    with torch.no_grad():
+        net.head.weight *= 0.1
+        net.head.bias[0] = 0.5  # drives on, towards the goal
+    return net
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A whole drive.
+
+    Attributes:
+        cost: Loss of each world.
+        states: [time, world, 4], the start first; a robot that has arrived rests.
+        success: Reached the goal without touching before.
+        steps: Simulated steps of all worlds together.
+    """
+
+    cost: Float64[Tensor, " world"]
+    states: Float64[Tensor, "time world 4"]
+    success: Bool[Tensor, " world"]
+    steps: int
+
+
+def drive(
+    worlds: Worlds,
+    shown: Shown,
+    net: Callable[[Tensor], Tensor],
+    seed: int,
+    *,
+    steps: int = STEPS,
+    speckle: bool = False,
+    first: Tensor | None = None,
+    most: float | None = None,
+) -> Drive:
+    """Let all robots drive, differentiable by the network and by the first command.
+
+    Args:
+        worlds: The worlds.
+        shown: What the radars show.
+        net: From inputs to commands.
+        seed: Of rays and speckle; the same seed gives the same drive.
+        steps: How many.
+        speckle: Whether maps fluctuate.
+        first: Added to the first command [world, 2].
+        most: Largest derivative of a world's loss by a state that is passed on to the step before;
+            None = all of it.
+    """
+    state, states = worlds.start, [worlds.start]
+    cost = torch.zeros(worlds.count, dtype=torch.float64)
+    driving = torch.ones(worlds.count, dtype=torch.bool)
+    success, clean = ~driving, driving
+    random = torch.Generator().manual_seed(derived_seed(seed, 1)) if speckle else None
+    for number in range(steps):
+        if most is not None and state.requires_grad:
+            state.register_hook(lambda grad, most=most: _limited(grad, most))
+        power = shown(state, derived_seed(seed, 0, number))
+        command = net(inputs(worlds, state, power, random))
+        if number == 0 and first is not None:
+            command = command + first
+        done = step(worlds, state, command)
+        cost = cost + torch.where(driving, done.cost, 0.0)
+        state = torch.where(driving[:, None], done.state, state)
+        clean = clean & ~(driving & done.touched)
+        success = success | (driving & done.arrived & clean)
+        driving = driving & ~done.arrived
+        states.append(state)
+    return Drive(cost, torch.stack(states), success, steps * worlds.count)
+
+
+def _limited(grad: Tensor, most: float) -> Tensor:
+    norm = grad.norm(dim=-1, keepdim=True)
+    return grad * (most / norm.clamp_min(most))
