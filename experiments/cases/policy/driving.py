@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 import invertwin as iw
+from invertwin.channel import Speckle, draw_speckle
 from invertwin.scene import Cosine, Mesh, RoughDielectric, box, linear_array
 from invertwin.seeds import derived_seed
 
@@ -61,6 +62,16 @@ class Worlds:
             rows: Their numbers.
         """
         return Worlds(*(value[rows] for value in vars(self).values()))
+
+    def replaced(self, rows: Int64[Tensor, " row"], others: "Worlds") -> "Worlds":
+        """These worlds, with others in some places.
+
+        Args:
+            rows: The places.
+            others: As many worlds.
+        """
+        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
+        return Worlds(*(value.index_copy(0, rows, other) for value, other in pairs))
 
 
 def random_worlds(count: int, seed: int) -> Worlds:
@@ -277,11 +288,52 @@ def smooth_radar(worlds: Worlds, samples: int = 2000, *, boundary: bool = True) 
     return SmoothRadar(scene_of(worlds), iw.SurrogateMap(bins(), sampling=sampling))
 
 
+@dataclass(frozen=True, eq=False)
+class ExactRadar:
+    """One radar by the exact chain: coherent signals of rough points, with noise.
+
+    Attributes:
+        scene: Of one world.
+        speckle: Rough points with their phases, which stay while the robot drives.
+    """
+
+    scene: iw.Scene
+    speckle: Speckle
+
+    def __call__(self, state: Tensor, seed: int) -> Tensor:
+        """See ``Shown``."""
+        found = iw.simulate(
+            self.scene,
+            radar_at(state),
+            bins(),
+            seed=seed,
+            sampling=EXACT,
+            speckle=self.speckle,
+            snr_db=SNR_DB,
+        )
+        return found.spectrum[..., 0]
+
+
+EXACT = iw.Sampling(depth=1, points_per_m2=400.0, boundary=False)
+SNR_DB = 20.0  # of samples
+
+
+def exact_radar(world: Worlds, seed: int) -> ExactRadar:
+    """The exact chain in one world.
+
+    Args:
+        world: A single one.
+        seed: Of the rough points.
+    """
+    scene = scene_of(world)
+    link = radar_at(world.start).link()
+    return ExactRadar(scene, draw_speckle(scene, link, EXACT, seed))
+
+
 REFERENCE = 1e-9
 """Received over transmitted power, times range⁴ [m⁴], that a map shows as ln 2."""
-MAP_SCALE = 0.3
+MAP_SCALE = 0.3  # so that inputs are about one
 POOLED = 2, 3  # bins of range and direction in one input of the network
-LOOKS = 2  # independent cells in one input, about: how strong the speckle in training is
 
 
 def inputs(
@@ -299,8 +351,9 @@ def inputs(
     power = power * grid.ranges[:, None] ** 4 / REFERENCE
     pooled = torch.nn.functional.avg_pool2d(power[:, None], POOLED)[:, 0]
     if speckle is not None:
-        drawn = torch.rand((LOOKS, *pooled.shape), generator=speckle, dtype=torch.float64)
-        pooled = pooled * -(1 - drawn).log().mean(0)
+        # Power of one look is distributed exponentially; neighbouring bins share a cell.
+        drawn = torch.rand(pooled.shape, generator=speckle, dtype=torch.float64)
+        pooled = pooled * -(1 - drawn).log()
     x, y = (worlds.goal - state[:, :2]).unbind(-1)
     heading = state[:, 2]
     ahead = heading.cos() * x + heading.sin() * y
@@ -310,6 +363,12 @@ def inputs(
     return torch.cat([(1 + pooled).log().flatten(1) * MAP_SCALE, own], dim=-1)
 
 
+
+
+def inputs_count() -> int:
+    """Numbers that the network gets."""
+    deep, wide = (count // size for count, size in zip(bins().shape[:2], POOLED, strict=True))
+    return deep * wide + 4
 
 
 class Steering(torch.nn.Module):
@@ -364,9 +423,7 @@ class Steering(torch.nn.Module):
         Args:
             given: From ``inputs`` [world, input].
         """
-        seen = self.seen(given)
-        best = seen[:, -5:-4]
-        return self.head(seen) + torch.cat([torch.zeros_like(best), 3 * best], dim=-1)
+        return self.head(self.seen(given))
 
 
 def policy(seed: int) -> Steering:
@@ -380,13 +437,33 @@ def policy(seed: int) -> Steering:
         net = Steering().double()
     with torch.no_grad():
         net.head.weight *= 0.1
-        net.head.bias[0] = 0.5  # drives on, towards the goal
+        net.head.bias[0] = 0.5  # drives on, and turns to the best direction: that of the goal
+        net.head.weight[1, -5] += 3.0
     return net
+
+
+def final_distance(
+    worlds: Worlds, shown: Shown, net: Callable[[Tensor], Tensor], seed: int, first: Tensor
+) -> Float64[Tensor, " world"]:
+    """Distance to the goal after all steps, also of robots that were there before [m].
+
+    Args:
+        worlds: The worlds.
+        shown: What the radars show.
+        net: From inputs to commands.
+        seed: Of rays.
+        first: Added to the first command [world, 2].
+    """
+    state = worlds.start
+    for number in range(STEPS):
+        command = net(inputs(worlds, state, shown(state, derived_seed(seed, 0, number))))
+        state = moved(state, command + first if number == 0 else command)
+    return (state[:, :2] - worlds.goal).norm(dim=-1)
 
 
 @dataclass(frozen=True)
 class Drive:
-    """A whole drive.
+    """A whole drive, of every world together.
 
     Attributes:
         cost: Loss of each world.
@@ -409,19 +486,17 @@ def drive(
     *,
     steps: int = STEPS,
     speckle: bool = False,
-    first: Tensor | None = None,
     most: float | None = None,
 ) -> Drive:
-    """Let all robots drive, differentiable by the network and by the first command.
+    """Let all robots drive, differentiable by the network, until all have arrived.
 
     Args:
         worlds: The worlds.
         shown: What the radars show.
         net: From inputs to commands.
         seed: Of rays and speckle; the same seed gives the same drive.
-        steps: How many.
+        steps: At most.
         speckle: Whether maps fluctuate.
-        first: Added to the first command [world, 2].
         most: Largest derivative of a world's loss by a state that is passed on to the step before;
             None = all of it.
     """
@@ -430,13 +505,12 @@ def drive(
     driving = torch.ones(worlds.count, dtype=torch.bool)
     success, clean = ~driving, driving
     random = torch.Generator().manual_seed(derived_seed(seed, 1)) if speckle else None
-    for number in range(steps):
+    number = 0
+    while number < steps and driving.any():
         if most is not None and state.requires_grad:
             state.register_hook(lambda grad, most=most: _limited(grad, most))
         power = shown(state, derived_seed(seed, 0, number))
         command = net(inputs(worlds, state, power, random))
-        if number == 0 and first is not None:
-            command = command + first
         done = step(worlds, state, command)
         cost = cost + torch.where(driving, done.cost, 0.0)
         state = torch.where(driving[:, None], done.state, state)
@@ -444,7 +518,8 @@ def drive(
         success = success | (driving & done.arrived & clean)
         driving = driving & ~done.arrived
         states.append(state)
-    return Drive(cost, torch.stack(states), success, steps * worlds.count)
+        number += 1
+    return Drive(cost, torch.stack(states), success, number * worlds.count)
 
 
 def _limited(grad: Tensor, most: float) -> Tensor:
