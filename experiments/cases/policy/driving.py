@@ -103,7 +103,9 @@ def random_worlds(count: int, seed: int) -> Worlds:
     for begin, stop, share in ((start[:, :2], gap, (0.4, 0.5)), (gap, goal, (0.5, 0.6))):
         place = begin + between(*share)[:, None] * (stop - begin)
         aside = pair(torch.zeros(count, dtype=torch.float64), between(-0.9, 0.9))
-        boxes.append((place + aside, pair(between(0.2, 0.3), between(0.2, 0.3)), between(-0.8, 0.8)))
+        boxes.append(
+            (place + aside, pair(between(0.2, 0.3), between(0.2, 0.3)), between(-0.8, 0.8))
+        )
     centres, halves, yaws = (torch.stack(part, dim=1).double() for part in zip(*boxes, strict=True))
     return Worlds(centres, halves, yaws, gap, goal, start)
 
@@ -361,8 +363,6 @@ def inputs(
     distance = (ahead.square() + left.square() + 1e-4).sqrt()
     own = torch.stack([ahead / distance, left / distance, distance / 5, state[:, 3]], dim=-1)
     return torch.cat([(1 + pooled).log().flatten(1) * MAP_SCALE, own], dim=-1)
-
-
 
 
 def inputs_count() -> int:
