@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import driving
+import steering
 import torch
 from torch import Tensor
 
@@ -61,7 +62,7 @@ class _Updated(Learner):
     def __init__(self, seed: int, updates: int) -> None:
         super().__init__(seed)
         self.updates, self.number = updates, 0
-        self.net = driving.policy(seed)
+        self.net = steering.policy(seed)
         self.adam = torch.optim.Adam(self.net.parameters(), RATE)
 
     def advance(self) -> None:

@@ -1,10 +1,14 @@
 """The simulator as a vectorised environment of stable-baselines3, which is an optional extra."""
 
+# Types are checked without the extra.
+# pyright: reportMissingImports=false, reportUntypedBaseClass=false
+
 from typing import Any
 
 import driving
 import gymnasium
 import numpy as np
+import steering
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -121,12 +125,12 @@ class Seen(BaseFeaturesExtractor):
         Args:
             observation_space: Of the inputs.
         """
-        steering = driving.Steering()
-        super().__init__(observation_space, steering.head.in_features)
-        self.steering = steering
+        network = steering.Steering()
+        super().__init__(observation_space, network.head.in_features)
+        self.steering = network
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """See ``driving.Steering.seen``."""
+        """See ``steering.Steering.seen``."""
         return self.steering.seen(observations)
 
 
@@ -151,7 +155,7 @@ def model(seed: int) -> PPO:
             "log_std_init": -0.5,
         },
     )
-    start: Any = driving.policy(seed).state_dict()
+    start: Any = steering.policy(seed).state_dict()
     actor: Any = learner.policy
     actor.pi_features_extractor.steering.load_state_dict(start)
     with torch.no_grad():

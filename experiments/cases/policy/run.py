@@ -274,11 +274,13 @@ def figure(rows: Sequence[Row], curves: dict[str, list[list[Row]]], plan: Plan) 
         curves: By kind and seed.
         plan: How many worlds.
     """
-    drawn = Figure(figsize=(11, 5.4), layout="constrained")
-    left, right = drawn.subfigures(1, 2, width_ratios=[1.5, 1])
+    drawn = Figure(figsize=(11, 4.2), layout="constrained")
+    parts: Any = drawn.subfigures(1, 2, width_ratios=[1.6, 1])
+    left, right = parts
+    panels = left.subplots(2, 4)
     worlds = unseen(plan)
     corners = torch.tensor([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]], dtype=torch.float64)
-    for number, axes in enumerate(left.subplots(2, 4).flat[: len(rows)]):
+    for number, axes in enumerate(panels.flat[: len(rows)]):
         c, s = worlds.yaws[number].cos(), worlds.yaws[number].sin()
         turn = torch.stack([torch.stack([c, s], -1), torch.stack([-s, c], -1)], dim=-2)
         places = (corners * worlds.halves[number][:, None]) @ turn + worlds.centres[number][:, None]
