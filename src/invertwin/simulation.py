@@ -1,7 +1,7 @@
 """Simulate exact signals as a real radar records them: scene → paths → beat signal → spectrum."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Complex128, Float
@@ -9,12 +9,13 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field
 from invertwin.errors import InputError
+from invertwin.radar.blocks import Blocks, displacements
 from invertwin.radar.impairments import Impairments
 from invertwin.radar.motion import Chirps, Places, Train, every_ramp, sample_interval
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.spectrum import exact_spectrum
-from invertwin.scene.checks import checked_type
+from invertwin.scene.checks import checked_count, checked_type
 from invertwin.scene.scene import Scene, warn_of_mirrors
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.
@@ -102,6 +103,7 @@ def simulate_chirps(
     seed: int,
     sampling: Sampling | None = None,
     retrace: bool = False,
+    visibility_every: int = 1,
     speckle: Speckle | None = None,
     impairments: Impairments | None = None,
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
@@ -122,13 +124,17 @@ def simulate_chirps(
         seed: Places and phases; those of rough points belong to the surface and move with it.
         sampling: How paths are sampled, of one bounce; None = ``Sampling(depth=1)``.
         retrace: Trace visibility and amplitudes anew at every ramp, instead of moving the
-            points seen at the start of the frame. A function of time always does.
+            points seen at the start of the frame. A function of time always does, but see the next.
+        visibility_every: Loops for which visibility and amplitudes of a function of time are kept;
+            those of their middle. Rays are traced once for them. Delays stay exact: points follow
+            their surface at every ramp, and what stands still is summed once. Without derivatives.
         speckle: Rough points to use again.
         impairments: Impairments of the front end; phase noise only without retracing.
 
     Raises:
         InputError: See ``trace_field`` and ``moving_beat``; a function of time whose objects
-            change their triangles; phase noise where rays are traced anew.
+            change their triangles; phase noise where rays are traced anew; visibility kept for
+            several loops where nothing is traced anew, or of paths of several bounces.
     """
     checked_type(radar, Radar, "a radar", "build one with Radar(...)")
     checked_type(chirps, Chirps, "the timing of chirps", "build it with Chirps(count, interval)")
@@ -137,6 +143,11 @@ def simulate_chirps(
         impairments.check_applicable()
     motion = scene.at if isinstance(scene, Scene) else scene
     plan = sampling or Sampling(depth=1)
+    if checked_count(visibility_every, "visibility_every", 1) > 1 and (plan.depth > 1 or not again):
+        raise InputError(
+            f"expected visibility_every 1 with {plan.depth} bounces and retrace={retrace}, got "
+            f"{visibility_every}; it is for paths of one bounce of a function of time"
+        )
     fixed = speckle or draw_speckle(motion(0.0), radar.link(), plan, seed)
 
     def traced(instant: Scene) -> Paths:
@@ -145,6 +156,12 @@ def simulate_chirps(
     if isinstance(scene, Scene) and not again:
         front = impairments or Impairments()
         return front.record(traced(scene), radar, seed=seed, chirps=chirps)
+    if visibility_every > 1:
+        plan = replace(plan, boundary=False)
+        with torch.no_grad():
+            blocks = Blocks(motion, traced, radar, chirps, visibility_every)
+            beat = every_ramp(chirps, radar.shape[1], blocks.ramp)
+        return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
     half = 0.5 * (sampled(radar).samples - 1) * sample_interval(sampled(radar))
 
     def ramp(start: float, senders: list[int]) -> Tensor:
@@ -165,8 +182,8 @@ def _over_a_ramp(
 ) -> tuple[Paths, Places]:
     """Paths in the middle of a ramp, and where their points are half a ramp before and after."""
     scene = motion(middle)
-    ahead = _displacements(scene, motion(middle + half))
-    behind = _displacements(scene, motion(middle - half))
+    ahead = displacements(scene, motion(middle + half))
+    behind = displacements(scene, motion(middle - half))
     # A trace interpolates the velocities of vertices at its points; so it does displacements.
     paths = traced(_with_velocities(scene, ahead))
     if paths.velocity is None:
@@ -188,25 +205,6 @@ def _over_a_ramp(
         return paths.first + slope * part + curve * part**2
 
     return paths, places
-
-
-def _displacements(scene: Scene, other: Scene) -> dict[str, Tensor]:
-    """How far the vertices of one instant are at another."""
-    if scene.names != other.names:
-        raise InputError(
-            f"expected the same objects at all times, got {', '.join(scene.names)} and "
-            f"{', '.join(other.names)}; move objects out of sight instead of leaving them out"
-        )
-    found = {}
-    for name in scene.names:
-        here, there = scene[name], other[name]
-        if not torch.equal(here.mesh.faces, there.mesh.faces):
-            raise InputError(
-                f"expected the same triangles of {name!r} at all times, got others; "
-                "move its vertices only"
-            )
-        found[name] = (there.vertices - here.vertices).detach()
-    return found
 
 
 def _with_velocities(scene: Scene, values: dict[str, Tensor]) -> Scene:

@@ -144,6 +144,9 @@ class Paths:
         matrix: Field coefficients between the polarisations that the elements of the arrays mix,
             receive × transmit; None where all elements are alike. ``coefficient`` is that of the
             mean elements.
+        face: Triangle of the scattering point, counted through all objects of the scene in order;
+            −1 of paths of several bounces. None where paths are not bound to a surface.
+        share: Its barycentric coordinates, the second's and the third's corner; with ``face``.
     """
 
     frame: Int64[Tensor, " path"]
@@ -156,6 +159,8 @@ class Paths:
     boundary: Bool[Tensor, " path"]
     velocity: Float64[Tensor, "path 3"] | None = None
     matrix: Complex128[Tensor, "path r t"] | None = None
+    face: Int64[Tensor, " path"] | None = None
+    share: Float64[Tensor, "path 2"] | None = None
 
     def __len__(self) -> int:
         return self.delay.shape[0]
@@ -192,12 +197,14 @@ class Paths:
 
 def joined(parts: Sequence[Paths]) -> Paths:
     """All paths in order."""
-    names = [f.name for f in fields(Paths) if f.name not in ("kind", "velocity", "matrix")]
+    own = ("kind", "velocity", "matrix", "face", "share")
+    names = [f.name for f in fields(Paths) if f.name not in own]
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     velocity = None
     if any(part.velocity is not None for part in parts):
         still = [torch.zeros_like(p.last) if p.velocity is None else p.velocity for p in parts]
         velocity = torch.cat(still)
+    bound = bool(parts) and all(part.face is not None for part in parts)
     kinds = {part.kind for part in parts}
     matrices = [part.matrix for part in parts if part.matrix is not None]
     return Paths(
@@ -205,4 +212,6 @@ def joined(parts: Sequence[Paths]) -> Paths:
         kind=kinds.pop() if len(kinds) == 1 else "field",
         velocity=velocity,
         matrix=torch.cat(matrices) if len(matrices) == len(parts) else None,
+        face=torch.cat([part.face for part in parts if part.face is not None]) if bound else None,
+        share=torch.cat([p.share for p in parts if p.share is not None]) if bound else None,
     )

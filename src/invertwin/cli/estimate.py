@@ -226,7 +226,10 @@ def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
     if isinstance(run.data, SimulatedData):
         for part, traced in _of_simulation(run.data, scene, frames):
             parts.append(part)
-            again = chirps if run.chirps is not None and run.chirps.retrace else 1
+            table = run.chirps
+            moves = any(item.motion for item in run.scene.values())
+            again = chirps if table is not None and (table.retrace or moves) else 1
+            again = 1 if table is None else -(-again // table.visibility_every)
             rows += traced * again
     return parts, rows
 

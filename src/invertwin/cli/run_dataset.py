@@ -19,11 +19,11 @@ from invertwin import __version__
 from invertwin.channel import Paths
 from invertwin.cli import build
 from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.motion_tables import at_start, joints_at_start
 from invertwin.cli.report import Table, finish, quantities
 from invertwin.cli.run_file import about_file, load_run, need, to_toml, validate
 from invertwin.cli.run_simulate import chirp_train, exact
 from invertwin.cli.schema import RunFile
-from invertwin.cli.shape_tables import joint_places
 from invertwin.cli.variation import sample_of
 from invertwin.datasets import Samples, object_labels, radar_labels, seen_triangles
 from invertwin.datasets.shards import (
@@ -43,6 +43,7 @@ from invertwin.errors import InputError, PhysicsWarning
 from invertwin.folders import PARTS, UNFINISHED
 from invertwin.progress import told
 from invertwin.radar import range_doppler_angle
+from invertwin.radar.radar import Radar
 from invertwin.runs import RunFolder, open_run
 from invertwin.scene import Scene
 
@@ -189,12 +190,13 @@ def sample_content(run: RunFile, index: int) -> dict[str, bytes]:
         scene, sensor = _built(own)
         table = need(run, "dataset", "a data set")
         arrays = _signals(own, scene, sensor, table)
-        seen = seen_triangles(scene, sensor.radar)
+        begun = _labelled(own, scene, sensor.radar)
+        seen = seen_triangles(begun, sensor.radar)
     if table.masks:
         arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
     labels = {
         "index": index,
-        "objects": object_labels(scene, seen, table.classes, _joints(own, scene)),
+        "objects": object_labels(begun, seen, table.classes, joints_at_start(own, begun)),
         "radar": radar_labels(sensor.radar),
     }
     files = {f"{name}.npy": npy(array) for name, array in arrays.items()}
@@ -247,12 +249,11 @@ def _signals(run: RunFile, scene: Scene, sensor: Sensor, table: Any) -> dict[str
     return {_NAMES[name]: found[name].numpy() for name in table.signals} | more
 
 
-def _joints(run: RunFile, scene: Scene) -> dict[str, dict[str, torch.Tensor]]:
-    found = {}
-    for name, table in run.scene.items():
-        truth = run.truth[name].model_dump(exclude_none=True) if name in run.truth else {}
-        found[name] = joint_places(table.model_copy(update=truth), scene[name])
-    return {name: joints for name, joints in found.items() if joints}
+def _labelled(run: RunFile, scene: Scene, radar: Radar) -> Scene:
+    """The scene as the frame begins, which labels are of."""
+    if run.chirps is None:
+        return scene
+    return at_start(run, scene, float(run.chirps.build().times(radar.shape[1]).max()))
 
 
 def _path_arrays(paths: Paths) -> dict[str, np.ndarray]:

@@ -14,6 +14,7 @@ from invertwin.capture import Capture, ChirpData, described_arrays
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build, sensors
 from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.motion_tables import in_motion, refuse_motion
 from invertwin.cli.raw_files import settings_of_run, write_raw
 from invertwin.cli.report import Table, finish, picture, quantities
 from invertwin.cli.run_file import about, need
@@ -39,6 +40,7 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
         InputError: The run file's data are measured, not simulated.
     """
     data = _simulated(run)
+    refuse_motion(run)
     front = None if run.impairments is None else sensors.impairments(run.impairments, data)
     with torch.no_grad():
         return simulate(
@@ -57,14 +59,16 @@ def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> tor
     """Exact beat signals of every chirp with the settings of `[data]` and `[chirps]`."""
     data = _simulated(run)
     front = sensors.impairments(run.impairments, data)
+    table = need(run, "chirps", "several ramps a frame")
     with about("chirps"), torch.no_grad():
         return simulate_chirps(
-            scene,
+            in_motion(run, scene),
             radar,
             chirps,
             seed=run.seed if data.seed is None else data.seed,
             sampling=_sampling(data, 1),
-            retrace=need(run, "chirps", "several ramps a frame").retrace,
+            retrace=table.retrace,
+            visibility_every=table.visibility_every,
             impairments=front,
         )
 

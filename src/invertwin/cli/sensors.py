@@ -170,8 +170,14 @@ class ChirpsTable(Table):
 
     count: Annotated[int, Ge(2)] = key("ramps of each transmitter in a frame (loops)")
     retrace: bool = key(
-        "trace rays anew at every ramp, instead of moving what is seen at the start of the frame",
+        "trace rays anew at every ramp, instead of moving what is seen at the start of the frame; "
+        "always where something has a motion",
         False,
+    )
+    visibility_every: Count = key(
+        "with `retrace` or a motion: loops for which one trace serves; points follow their "
+        "surfaces meanwhile",
+        1,
     )
 
 

@@ -15,6 +15,7 @@ from invertwin.radar.parameters import RadarPose
 from invertwin.registry.kinds import Group, OneOf, Registry, Table
 from invertwin.registry.section import Counts, InputPath, Vector, about, key
 from invertwin.scene import (
+    Along,
     DensityGrid,
     DistanceGrid,
     LatticeDeformation,
@@ -24,15 +25,22 @@ from invertwin.scene import (
     Object,
     PriorShape,
     Scene,
+    Sitting,
     SkinnedBody,
     SmoothVertices,
+    Spline,
+    Turning,
+    Walking,
+    Waving,
     joined,
     load_prior,
     rigid,
     rotation_from_vector,
     shapes,
 )
+from invertwin.scene.checks import ArrayLike, Point
 from invertwin.scene.files import load_mesh
+from invertwin.scene.geometry.body import BodyTemplate
 from invertwin.scene.geometry.body_models import body, body_template
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
 
@@ -63,6 +71,9 @@ class Placement(Table):
 class _Body(Table):
     material: Annotated[Any, OneOf("material")] = key("what it is made of")
     velocity: Vector | None = key("m/s", None)
+    motion: list[Annotated[Any, OneOf("motion")]] = key(
+        "what it does from the start of the frame on, one after the other; needs [chirps]", []
+    )
 
 
 class ObjectTable(Placement, _Body):
@@ -128,7 +139,16 @@ def register(registry: Registry) -> None:
     registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
     registry.groups["parameter"] = Group(base=ParameterTable)
     registry.bases |= {PriorShape: LearnedTable, LinearShape: LearnedTable}
-    registry.given |= {Scene, Mesh, Object, ObjectTable}
+    registry.given |= {Scene, Mesh, Object, ObjectTable, BodyTemplate, Walking, Sitting}
+    registry.groups["motion"] = Group()
+    for name, make in (
+        ("walking", Walking),
+        ("sitting", Sitting),
+        ("waving", Waving),
+        ("turning", Turning),
+        ("along", along),
+    ):
+        registry.add("motion", name, make, checked=False)
     for name in ("plate", "box", "sphere", "dihedral", "trihedral", "text"):
         registry.add("shape", name, getattr(shapes, name))
     registry.add("shape", "prior", learned)
@@ -152,6 +172,17 @@ def register(registry: Registry) -> None:
         ("panel", PanelParameter, ()),
     ):
         registry.add("parameter", name, make, without=without)
+
+
+def along(times: ArrayLike, places: Sequence[Point], heading: bool = False) -> Along:
+    """Carry the object along a natural cubic spline; its position counts from the spline's place.
+
+    Args:
+        times: when each place is reached, rising; the frame must end before the last [s].
+        places: x, y and z of each [m].
+        heading: turn it about the vertical, so that its front, −z, looks where it goes.
+    """
+    return Along(Spline(times, places), heading)
 
 
 def learned(latent: Sequence[float] | None = None, prior: InputPath | None = None) -> Mesh:
@@ -211,14 +242,13 @@ def joints(
     Raises:
         InputError: The object is no body, or has no such joint.
     """
-    known: Any = table
-    if _shape(known) != "body":
+    found = template_of(table)
+    if found is None:
         raise InputError(
             f'expected an object with shape = "body", got {object}; give it this shape, or use '
             'kind = "pose"'
         )
-    found = body_template(known.model, known.file, known.height, known.spacing)
-    return SkinnedBody.of(object, found.scaled(known.scale), mesh, joints)
+    return SkinnedBody.of(object, found, mesh, joints)
 
 
 def _shape(table: Any) -> str | None:
@@ -241,18 +271,32 @@ def given_for(name: str, scene: Scene, objects: Mapping[str, Any]) -> dict[type,
     return found if table is None else {**found, ObjectTable: table}
 
 
-def joint_places(table: Any, item: Object) -> dict[str, Tensor]:
+def template_of(table: Any) -> BodyTemplate | None:
+    """The body of an object's table in its rest pose; None of other shapes.
+
+    Args:
+        table: Of the object.
+    """
+    if _shape(table) != "body":
+        return None
+    found = body_template(table.model, table.file, table.height, table.spacing)
+    return found.scaled(table.scale)
+
+
+def joint_places(table: Any, item: Object, rotations: Tensor | None = None) -> dict[str, Tensor]:
     """Where the joints of a body are in the world [m], by name; none of other objects.
 
     Args:
         table: Of the object.
         item: What it has made.
+        rotations: Of every joint in the frame of its parent; without them those of the table.
     """
-    if _shape(table) != "body":
+    template = template_of(table)
+    if template is None:
         return {}
-    template = body_template(table.model, table.file, table.height, table.spacing)
-    template = template.scaled(table.scale)
-    turns = {name: torch.tensor(turn).deg2rad() for name, turn in table.angles_deg.items()}
-    places = template.posed(rotation_from_vector(template.rotations(turns)))[1]
+    if rotations is None:
+        turns = {name: torch.tensor(turn).deg2rad() for name, turn in table.angles_deg.items()}
+        rotations = rotation_from_vector(template.rotations(turns))
+    places = template.posed(rotations)[1]
     world = places @ item.transform[:3, :3].T + item.transform[:3, 3]
     return dict(zip(template.names, world, strict=True))

@@ -23,6 +23,10 @@ from invertwin.scene.geometry.density import DensityGrid as DensityGrid
 from invertwin.scene.geometry.distance import DistanceGrid as DistanceGrid
 from invertwin.scene.geometry.distance import NeuralDistance as NeuralDistance
 from invertwin.scene.geometry.distance import signed_distance as signed_distance
+from invertwin.scene.geometry.gait import Walking as Walking
+from invertwin.scene.geometry.gait import standing_height as standing_height
+from invertwin.scene.geometry.gestures import Sitting as Sitting
+from invertwin.scene.geometry.gestures import Waving as Waving
 from invertwin.scene.geometry.iso_surface import iso_surface as iso_surface
 from invertwin.scene.geometry.person import person as person
 from invertwin.scene.geometry.prior import PriorShape as PriorShape
@@ -58,6 +62,11 @@ from invertwin.scene.material.values import Texture as Texture
 from invertwin.scene.mesh import Mesh as Mesh
 from invertwin.scene.mesh import MeshSummary as MeshSummary
 from invertwin.scene.mesh import joined as joined
+from invertwin.scene.motion import Along as Along
+from invertwin.scene.motion import InMotion as InMotion
+from invertwin.scene.motion import Mover as Mover
+from invertwin.scene.motion import Spline as Spline
+from invertwin.scene.motion import Turning as Turning
 from invertwin.scene.parameters import Compose as Compose
 from invertwin.scene.parameters import MaterialValues as MaterialValues
 from invertwin.scene.parameters import Pose as Pose
@@ -73,6 +82,7 @@ from invertwin.scene.pose import rotation_angle as rotation_angle
 from invertwin.scene.pose import rotation_from_quaternion as rotation_from_quaternion
 from invertwin.scene.pose import rotation_from_vector as rotation_from_vector
 from invertwin.scene.pose import vector_from_quaternion as vector_from_quaternion
+from invertwin.scene.room import room as room
 from invertwin.scene.scene import Object as Object
 from invertwin.scene.scene import Scene as Scene
 from invertwin.scene.shapes import box as box

@@ -1,6 +1,7 @@
 """Fields: physical optics of conductors, fixed random-phase points and paths of rough surfaces."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -103,6 +104,10 @@ def _fields(
         velocity = kept.velocity(rays.geometry)
         coefficient, matrix = combined(rays.link, field(kept, echo))
         rows = echo.paths(kind, coefficient=coefficient, matrix=matrix, velocity=velocity)
+        single = kept.face.shape[1] == 1
+        face = kept.face[:, 0] if single else torch.full_like(kept.face[:, 0], -1)
+        share = torch.stack([kept.b1[:, 0], kept.b2[:, 0]], dim=1)
+        rows = replace(rows, face=face, share=share)
         found.append(rows.chosen(rows.carries))
     return found
 

@@ -16,6 +16,7 @@ from invertwin.channel import Sampling
 from invertwin.cli import build
 from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.fits.fitting import watched
+from invertwin.cli.motion_tables import at_start
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
 from invertwin.cli.run_file import about, need
@@ -181,10 +182,11 @@ def _errors(
     """
     if not isinstance(run.data, SimulatedData) and name not in run.truth:
         return {}
-    truth = build.true_scene(run)[name]
+    times = _times(recording)
+    truth = at_start(run, build.true_scene(run), float(times.max()))[name]
     still = torch.zeros(1, 3, dtype=torch.float64)
     velocity = (still if truth.velocity is None else truth.velocity).reshape(-1, 3).mean(0)
-    place = truth.center + velocity * _times(recording).mean()
+    place = truth.center + velocity * times.mean()
     return {
         "position_error_m": float((found["position_m"] - place).norm()),
         "velocity_error_m_s": float((found["velocity_m_s"] - velocity).norm()),

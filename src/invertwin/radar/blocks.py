@@ -1,0 +1,173 @@
+"""Frames of a scene in motion, of which rays are traced only now and then.
+
+What is seen at the middle of a few loops is taken as seen during all of them. Points stay on their
+triangles, so that delays are those of every sample, and so is Doppler. What stands still is summed
+once. A trace costs much more than a ramp of what moves: with one for 64 loops, a frame of a walking
+person in a room takes about a fortieth of the time.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from invertwin.channel import Paths
+from invertwin.errors import InputError
+from invertwin.radar.motion import Chirps, Train, sample_interval
+from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.range_profile import beat_signal, check_paths
+from invertwin.scene.scene import Scene
+
+_OFF = 1e-7  # m: a polynomial of time is the place
+_DEGREES = (4, 8, 16, 32, 64)
+_BETWEEN = (0.109, 0.317, 0.489, 0.683, 0.947)  # shares of the time at which it is tried
+
+
+class Blocks:
+    """Ramps by points that are seen at the middle of several loops and follow their surfaces.
+
+    Args:
+        motion: The scene at any time [s].
+        traced: Its paths of one bounce, without boundary paths.
+        radar: What records.
+        chirps: When.
+        loops: For which one trace serves.
+    """
+
+    def __init__(
+        self,
+        motion: Callable[[float], Scene],
+        traced: Callable[[Scene], Paths],
+        radar: Radar,
+        chirps: Chirps,
+        loops: int,
+    ) -> None:
+        self.motion, self.traced, self.radar, self.loops = motion, traced, radar, loops
+        self.starts = chirps.times(radar.shape[1])
+        self.last = (sampled(radar).samples - 1) * sample_interval(sampled(radar))
+        self.number, self.still, self.train = -1, torch.zeros(0), None
+
+    def ramp(self, start: float, senders: list[int]) -> Tensor:
+        """Signals of one ramp [frame, sender, rx, sample].
+
+        Args:
+            start: Its first sample [s].
+            senders: Transmitters that send then.
+        """
+        loop = int((self.starts.amin(1) <= start).sum()) - 1
+        if loop // self.loops != self.number:
+            self.number = loop // self.loops
+            self._begin()
+        still = self.still[:, senders]
+        return still if self.train is None else still + self.train.ramp(start, senders)
+
+    def _begin(self) -> None:
+        own = self.starts[self.number * self.loops : (self.number + 1) * self.loops]
+        begin, end = float(own.min()), float(own.max()) + self.last
+        scene = self.motion(0.5 * (begin + end))
+        paths = self.traced(scene)
+        check_paths(paths, self.radar, sampled(self.radar))
+        assert paths.face is not None
+        assert paths.share is not None
+        corners = torch.cat(
+            [i.mesh.faces + n for i, n in zip(scene.objects.values(), _offsets(scene), strict=True)]
+        )[paths.face]
+        vertices = _Course(self.motion, scene, begin, end)
+        moves = vertices.moves[corners].any(1)
+        self.still = beat_signal(paths.chosen(~moves), self.radar)
+        rows = torch.nonzero(moves)[:, 0]
+        own_corners, share = corners[rows], paths.share[rows]
+        weights = torch.cat([1 - share.sum(1, keepdim=True), share], dim=1)
+        nodes = torch.einsum("kpcx,pc->kpx", vertices.nodes[:, own_corners], weights)
+        self.train = None
+        if len(rows):
+            moving = paths.chosen(rows)
+            here = vertices.mixed(nodes, 0.5 * (begin + end))
+            moving = replace(moving, first=here, last=here, velocity=None)
+            self.train = Train(moving, self.radar, lambda time: vertices.mixed(nodes, time))
+
+
+class _Course:
+    """Where all vertices of a scene are over some time: a polynomial through Chebyshev's nodes.
+
+    Nodes are doubled until it meets the true places between them.
+
+    Attributes:
+        nodes: Vertices at the nodes [node, vertex, 3].
+        moves: Which vertices move.
+    """
+
+    def __init__(
+        self, motion: Callable[[float], Scene], scene: Scene, begin: float, end: float
+    ) -> None:
+        def vertices(time: float) -> Tensor:
+            other = motion(time)
+            displacements(scene, other)
+            return torch.cat([item.vertices for item in other.objects.values()]).double()
+
+        tried = [begin + share * (end - begin) for share in _BETWEEN]
+        known = [(time, vertices(time)) for time in tried]
+        for degree in _DEGREES:
+            angles = torch.arange(degree + 1, dtype=torch.float64) * math.pi / degree
+            self.places = begin + 0.5 * (1 - angles.cos()) * (end - begin)
+            self.nodes = torch.stack([vertices(time) for time in self.places.tolist()])
+            if all(float((self.mixed(self.nodes, t) - v).abs().max()) < _OFF for t, v in known):
+                break
+        else:
+            raise InputError(
+                f"expected motion that is smooth over {end - begin:.3g} s, got one that 65 "
+                "instants do not follow; lower visibility_every"
+            )
+        self.moves = ((self.nodes - self.nodes[:1]).abs() > 0).flatten(2).any(2).any(0)
+
+    def mixed(self, nodes: Tensor, time: float) -> Tensor:
+        """Values at a time of what is known at the nodes.
+
+        Args:
+            nodes: [node, …].
+            time: [s].
+        """
+        apart = time - self.places
+        exact = (apart == 0).nonzero()
+        if len(exact):
+            return nodes[int(exact[0, 0])]
+        # Barycentric weights of these nodes are ±1, half at the ends.
+        weights = (-1.0) ** torch.arange(len(apart), dtype=torch.float64)
+        weights[0], weights[-1] = 0.5 * weights[0], 0.5 * weights[-1]
+        weights = weights / apart
+        return torch.tensordot(weights / weights.sum(), nodes, dims=1)
+
+
+def _offsets(scene: Scene) -> list[int]:
+    """Number of the first vertex of every object."""
+    counts = [len(item.vertices) for item in scene.objects.values()]
+    return [sum(counts[:number]) for number in range(len(counts))]
+
+
+def displacements(scene: Scene, other: Scene) -> dict[str, Tensor]:
+    """How far the vertices of one instant are away at another [m], by object.
+
+    Args:
+        scene: One instant.
+        other: Another.
+
+    Raises:
+        InputError: Other objects or triangles.
+    """
+    if scene.names != other.names:
+        raise InputError(
+            f"expected the same objects at all times, got {', '.join(scene.names)} and "
+            f"{', '.join(other.names)}; move objects out of sight instead of leaving them out"
+        )
+    found = {}
+    for name in scene.names:
+        here, there = scene[name], other[name]
+        if not torch.equal(here.mesh.faces, there.mesh.faces):
+            raise InputError(
+                f"expected the same triangles of {name!r} at all times, got others; "
+                "move its vertices only"
+            )
+        found[name] = (there.vertices - here.vertices).detach()
+    return found

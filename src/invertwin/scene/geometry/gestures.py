@@ -1,0 +1,211 @@
+"""People who sit down, stand up and wave: postures over time.
+
+Sources: A. Kralj, R. J. Jaeger, M. Munih, "Analysis of standing up and sitting down in humans:
+definitions and normative data presentation", J. Biomechanics 23, 1990, 1123–1138, for the order of
+what happens: the trunk leans until the seat carries the person, and is upright at the end.
+T. Flash, N. Hogan, "The coordination of arm movements", J. Neuroscience 5, 1985, 1688–1703: people
+move from rest to rest with the least jerk, along 10 u³ − 15 u⁴ + 6 u⁵. N. Hogan, D. Sternad, "On
+rhythmic and discrete movements", Exp. Brain Research 181, 2007, 13–30: what is repeated evenly is
+a sine.
+Differs from the source: angles between start and end are these curves, not those of measured
+people. Bodies have no ankles: shanks stay upright, and feet stay where they are.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.limits import Positive
+from invertwin.scene.checks import checked_number
+from invertwin.scene.geometry.body import BodyTemplate
+from invertwin.scene.geometry.gait import (
+    Posture,
+    Walking,
+    about,
+    bent_elbow,
+    check_joints,
+    hanging,
+    posed,
+    standing_height,
+)
+from invertwin.scene.scene import Object
+
+_LEAN = math.radians(40.0)  # of the trunk, as the seat is reached
+_REACHED = 0.6  # share of the time after which the seat carries the person
+_LAP = (math.radians(25.0), math.radians(60.0))  # of shoulders and elbows, hands above the lap
+_THIGH = 0.088 / 0.42  # radius of a thigh over its length
+_MOST = math.radians(105.0)  # of the thighs, beyond which the seat is too low to sit on
+_RAISED = 0.8  # s, until the arm is up or down
+_WAVE = math.radians(30.0)  # of the forearm to both sides
+
+
+@dataclass(frozen=True, eq=False)
+class Sitting:
+    """A person who sits down, or stands up: the same course backwards.
+
+    Feet stay where they are; the seat is behind the person, who faces −z of the object's frame.
+    The object's pose places the pelvis as of a person who stands; ``standing_height`` says how
+    high that is. ``InMotion`` applies it.
+
+    Attributes:
+        body: With the joints of ``person``.
+        seat: Height of the seat above the floor [m].
+        start: When the motion begins [s].
+        duration: How long it takes [s].
+        rising: Stand up instead.
+
+    Raises:
+        InputError: A body without these joints, a seat that is as high as the person's legs or too
+            low to sit on, or a time out of range.
+    """
+
+    body: BodyTemplate
+    seat: Positive = 0.45
+    start: float = 0.0
+    duration: Positive = 2.0
+    rising: bool = False
+
+    def __post_init__(self) -> None:
+        check_joints(self.body)
+        checked_number(self.start, "start [s]", -math.inf)
+        checked_number(self.duration, "duration [s]", 0.0, open_low=True)
+        knee, thigh = self._leg()
+        low = knee + thigh * (math.cos(_MOST) - _THIGH)
+        checked_number(self.seat, "height of the seat [m]", low, knee + thigh * (1 - _THIGH))
+
+    def posture(self, time: float) -> Posture:
+        """Rotations of the joints in the frames of their parents, and the shift of the pelvis [m].
+
+        Args:
+            time: [s].
+        """
+        share = (time - self.start) / self.duration
+        u = 1 - share if self.rising else share
+        knee, thigh = self._leg()
+        bent = math.acos((self.seat - knee) / thigh + _THIGH) * _least_jerk(u / _REACHED)
+        lean = _LEAN * (_least_jerk(u / _REACHED) - _least_jerk((u - _REACHED) / (1 - _REACHED)))
+        shoulder, elbow = (angle * _least_jerk(u) for angle in _LAP)
+        found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
+        pelvis = about("x", -lean / 2)
+        found[self.body.joint("pelvis")] = pelvis
+        found[self.body.joint("chest")] = about("x", -lean / 2)
+        for side in ("left", "right"):
+            turns = {
+                "hip": pelvis.T @ about("x", bent),
+                "knee": about("x", -bent),
+                "shoulder": about("x", lean + shoulder) @ hanging(side),
+                "elbow": bent_elbow(side, elbow),
+            }
+            for name, turn in turns.items():
+                found[self.body.joint(f"{side}_{name}")] = turn
+        hip = self.body.joints[self.body.joint("left_hip")] * torch.tensor([0.0, 1.0, 1.0])
+        away = [0.0, thigh * (math.cos(bent) - 1), thigh * math.sin(bent)]
+        return found, hip - pelvis @ hip + torch.tensor(away, dtype=torch.float64)
+
+    def __call__(self, item: Object, time: float) -> Object:
+        """The object at a time [s].
+
+        Args:
+            item: At the place where the person stands.
+            time: [s].
+        """
+        return posed(item, self.body, *self.posture(time))
+
+    def _leg(self) -> tuple[float, float]:
+        """Height of the knee above the sole, and length of the thigh [m]."""
+        hip, knee = (self.body.joints[self.body.joint(f"left_{name}")] for name in ("hip", "knee"))
+        return float(knee[1]) + standing_height(self.body), float((hip - knee).norm())
+
+
+@dataclass(frozen=True, eq=False)
+class Waving:
+    """A person who raises an arm, waves, and lowers it again.
+
+    ``InMotion`` applies it; the object's pose is that of a person who stands.
+
+    Attributes:
+        body: With the joints of ``person``.
+        side: Of the arm: left or right.
+        rate: How often the forearm goes there and back [1/s].
+        start: When the arm begins to rise [s].
+        duration: Until it hangs again [s]; 0.8 s to raise it and 0.8 s to lower it are in it.
+        during: What the rest of the body does meanwhile; None: it stands.
+
+    Raises:
+        InputError: A body without these joints or another body than that of ``during``, an unknown
+            side, or a time out of range.
+    """
+
+    body: BodyTemplate
+    side: Literal["left", "right"] = "right"
+    rate: Positive = 1.5
+    start: float = 0.0
+    duration: float = 4.0
+    during: Walking | Sitting | None = None
+
+    def __post_init__(self) -> None:
+        check_joints(self.body)
+        if self.side not in ("left", "right"):
+            raise InputError(f"expected the side left or right, got {self.side!r}; choose one")
+        checked_number(self.rate, "rate [1/s]", 0.0, open_low=True)
+        checked_number(self.start, "start [s]", -math.inf)
+        checked_number(self.duration, "duration [s]", 2 * _RAISED)
+        if self.during is not None and self.during.body is not self.body:
+            raise InputError(
+                "expected one body for waving and for what it does meanwhile, got two; give the "
+                "same one to both"
+            )
+
+    def posture(self, time: float) -> Posture:
+        """Rotations of the joints in the frames of their parents, and the shift of the pelvis [m].
+
+        Args:
+            time: [s].
+        """
+        found, shift = self._rest(time)
+        since = time - self.start
+        up = _least_jerk(since / _RAISED) - _least_jerk(1 - (self.duration - since) / _RAISED)
+        swing = _WAVE * math.sin(2 * math.pi * self.rate * since)
+        sign = 1.0 if self.side == "right" else -1.0
+        # Held out to the side, forearm upwards: the arm of the rest pose with a bent elbow.
+        bent = sign * (math.pi / 2 + swing)
+        raised = {"shoulder": about("z", 0.0), "elbow": about("z", bent)}
+        for name, turn in raised.items():
+            row = self.body.joint(f"{self.side}_{name}")
+            found[row] = _part_of_the_way(found[row], turn, up)
+        return found, shift
+
+    def __call__(self, item: Object, time: float) -> Object:
+        """The object at a time [s].
+
+        Args:
+            item: At the place where the person stands.
+            time: [s].
+        """
+        return posed(item, self.body, *self.posture(time))
+
+    def _rest(self, time: float) -> Posture:
+        if self.during is not None:
+            return self.during.posture(time)
+        found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
+        for side in ("left", "right"):
+            found[self.body.joint(f"{side}_shoulder")] = hanging(side)
+        return found, torch.zeros(3, dtype=torch.float64)
+
+
+def _least_jerk(share: float) -> float:
+    """From 0 to 1 over shares of the time from 0 to 1, at rest before and after."""
+    u = min(max(share, 0.0), 1.0)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def _part_of_the_way(first: Tensor, last: Tensor, share: float) -> Tensor:
+    """A rotation between two, by a share of the angle between them."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix((first.T @ last).numpy()).as_rotvec()
+    return first @ torch.from_numpy(Rotation.from_rotvec(share * turn).as_matrix())

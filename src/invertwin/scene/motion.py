@@ -1,0 +1,201 @@
+"""Scenes in motion: what turns, follows a path or walks, as a function of time."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.errors import InputError
+from invertwin.scene.checks import ArrayLike, Point, checked_number, checked_tensor, checked_type
+from invertwin.scene.pose import compose, rigid, rotation_from_vector
+from invertwin.scene.scene import Object, Scene
+
+Mover = Callable[[Object, float], Object]
+"""The object at a time [s], from the object as the scene has it."""
+
+_STILL = 1e-6  # m/s, of a level velocity that has no heading
+
+
+@dataclass(frozen=True, eq=False)
+class InMotion:
+    """A scene some of whose objects move: call it with a time [s] to get the scene then.
+
+    ``simulate_chirps`` takes it as it is. Triangles are the same at all times.
+
+    Attributes:
+        scene: Every object as its motion takes it up.
+        movers: By name, one motion or several, applied from first to last.
+
+    Raises:
+        InputError: A name that the scene does not have, or an object that has a velocity, too.
+    """
+
+    scene: Scene
+    movers: Mapping[str, Mover | Sequence[Mover]]
+
+    def __post_init__(self) -> None:
+        checked_type(self.scene, Scene, "a scene", "build one with Scene({name: Object(...)})")
+        for name in self.movers:
+            if self.scene[name].velocity is not None:
+                raise InputError(
+                    f"expected no velocity of {name!r} beside its motion, got one; "
+                    "scene.replace(name, velocity=None) removes it"
+                )
+
+    def __call__(self, time: float) -> Scene:
+        """The scene at a time [s].
+
+        Raises:
+            InputError: A time at which a motion is not known.
+        """
+        scene = self.scene.at(time)
+        for name, given in self.movers.items():
+            steps = (given,) if callable(given) else tuple(given)
+            moved = reduce(lambda item, mover: mover(item, time), steps, scene[name])
+            scene = Scene({**scene.objects, name: moved})
+        return scene
+
+
+@dataclass(frozen=True, eq=False)
+class Turning:
+    """An object that turns about an axis: a wheel, a fan, the crank of a pedal.
+
+    Attributes:
+        axis: Direction of the axis in the object's own frame; turns are right-handed about it.
+        rate: Angular velocity [rad/s].
+        center: Place of the axis in that frame [m]; None is the middle of the mesh.
+
+    Raises:
+        InputError: An axis without a direction, or numbers that are not finite.
+    """
+
+    axis: Point
+    rate: float
+    center: Point | None = None
+
+    def __post_init__(self) -> None:
+        axis = checked_tensor(self.axis, (3,), "axis", "give x, y, z")
+        if float(axis.norm()) == 0:
+            raise InputError("expected an axis with a direction, got zeros; give x, y, z")
+        object.__setattr__(self, "axis", axis / axis.norm())
+        checked_number(self.rate, "rate [rad/s]", -math.inf)
+        if self.center is not None:
+            given = checked_tensor(self.center, (3,), "center [m]", "give x, y, z")
+            object.__setattr__(self, "center", given)
+
+    def __call__(self, item: Object, time: float) -> Object:
+        """The object after it has turned for a time [s].
+
+        Args:
+            item: As it is at time 0.
+            time: [s].
+        """
+        turn = rotation_from_vector(torch.as_tensor(self.axis) * (self.rate * time))
+        center = item.mesh.center if self.center is None else torch.as_tensor(self.center)
+        own = rigid(turn, center - turn @ center)
+        return replace(item, pose=compose(own, item.transform))
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """A path through places at given times: a cubic with continuous accelerations.
+
+    Its ends have no acceleration (natural spline).
+
+    Attributes:
+        times: When each place is reached, rising [s].
+        places: [time, 3] in the world [m].
+
+    Raises:
+        InputError: Fewer than two times, times that do not rise, or places that are not as many.
+    """
+
+    times: ArrayLike
+    places: ArrayLike
+
+    def __post_init__(self) -> None:
+        times = checked_tensor(self.times, (None,), "times [s]", "give one for each place")
+        if len(times) < 2 or bool((times.diff() <= 0).any()):
+            raise InputError(
+                f"expected at least two rising times [s], got {times.tolist()}; sort the places "
+                "by time"
+            )
+        shape = (len(times), 3)
+        places = checked_tensor(self.places, shape, "places [m]", "give x, y, z for each time")
+        object.__setattr__(self, "times", times.detach())
+        object.__setattr__(self, "places", places.detach())
+        from scipy.interpolate import CubicSpline  # slow to import, and few paths are splines
+
+        curve = CubicSpline(times.detach().numpy(), places.detach().numpy(), bc_type="natural")
+        object.__setattr__(self, "_curve", curve)
+
+    def position(self, time: float) -> Float64[Tensor, "3"]:
+        """Place at a time [m].
+
+        Args:
+            time: [s].
+
+        Raises:
+            InputError: A time before the first place or after the last.
+        """
+        return self._value(time, 0)
+
+    def velocity(self, time: float) -> Float64[Tensor, "3"]:
+        """Derivative of the place with respect to time [m/s].
+
+        Args:
+            time: [s].
+
+        Raises:
+            InputError: A time before the first place or after the last.
+        """
+        return self._value(time, 1)
+
+    def _value(self, time: float, order: int) -> Tensor:
+        times = torch.as_tensor(self.times)
+        if not float(times[0]) <= time <= float(times[-1]):
+            raise InputError(
+                f"expected a time in [{float(times[0]):g}, {float(times[-1]):g}] s, got {time:g}; "
+                "give places for longer than the frame"
+            )
+        return torch.from_numpy(vars(self)["_curve"](time, order))
+
+
+@dataclass(frozen=True, eq=False)
+class Along:
+    """An object that is carried along a path; its own pose counts from the path's place.
+
+    Attributes:
+        path: Where to, when.
+        heading: Turn the object about the vertical, so that its front, −z, looks where it goes.
+    """
+
+    path: Spline
+    heading: bool = False
+
+    def __call__(self, item: Object, time: float) -> Object:
+        """The object at a place of the path.
+
+        Args:
+            item: With its pose relative to that place.
+            time: [s].
+
+        Raises:
+            InputError: A time outside the path; a heading where nothing moves sideways.
+        """
+        turn = None
+        if self.heading:
+            ahead = self.path.velocity(time)
+            if math.hypot(float(ahead[0]), float(ahead[2])) < _STILL:
+                raise InputError(
+                    f"expected a level velocity for a heading, got {ahead.tolist()} m/s at "
+                    f"{time:g} s; move its places, or leave out heading"
+                )
+            # −z turned about y by θ is (−sin θ, 0, −cos θ).
+            angle = torch.atan2(-ahead[0], -ahead[2])
+            turn = rotation_from_vector(torch.stack([0 * angle, angle, 0 * angle]))
+        return replace(item, pose=compose(item.transform, rigid(turn, self.path.position(time))))
