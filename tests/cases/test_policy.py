@@ -94,15 +94,12 @@ def test_smooth_radar_is_the_mean_of_exact_ones(driving: ModuleType):
     assert exact == pytest.approx(smooth, rel=0.15)
 
 
-def test_derivative_through_three_steps(
-    driving: ModuleType, steering: ModuleType, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(driving, "STEPS", 3)
-    worlds, net = driving.random_worlds(2, 8), steering.policy(1)
+def test_derivative_through_three_steps(driving: ModuleType, steering: ModuleType):
+    worlds, net = driving.random_worlds(2, 8), steering.policy(1, share=3.0)
     shown = driving.smooth_radar(worlds, 100_000)
 
     def distance(first: torch.Tensor) -> torch.Tensor:
-        return driving.final_distance(worlds, shown, net, 0, first)
+        return driving.final_distance(worlds, shown, net, 0, first, steps=3)
 
     first = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
     (slopes,) = torch.autograd.grad(distance(first).sum(), first)
@@ -116,7 +113,8 @@ def test_derivative_through_three_steps(
 def test_short_training_lowers_the_loss_and_resumes(
     driving: ModuleType, learners: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(learners.ByGradient, "worlds", 8)
+    monkeypatch.setattr(learners, "CHUNK", 5)
+    monkeypatch.setattr(learners.ByGradient, "few", 8)
     worlds = driving.random_worlds(16, 77)
     shown = driving.smooth_radar(worlds, boundary=False)
 

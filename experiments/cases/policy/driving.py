@@ -373,9 +373,14 @@ def inputs_count() -> int:
 
 
 def final_distance(
-    worlds: Worlds, shown: Shown, net: Callable[[Tensor], Tensor], seed: int, first: Tensor
+    worlds: Worlds,
+    shown: Shown,
+    net: Callable[[Tensor], Tensor],
+    seed: int,
+    first: Tensor,
+    steps: int = STEPS // 2,
 ) -> Float64[Tensor, " world"]:
-    """Distance to the goal after all steps, also of robots that were there before [m].
+    """Distance to the goal after some steps; by default before robots arrive [m].
 
     Args:
         worlds: The worlds.
@@ -383,9 +388,10 @@ def final_distance(
         net: From inputs to commands.
         seed: Of rays.
         first: Added to the first command [world, 2].
+        steps: How many.
     """
     state = worlds.start
-    for number in range(STEPS):
+    for number in range(steps):
         command = net(inputs(worlds, state, shown(state, derived_seed(seed, 0, number))))
         state = moved(state, command + first if number == 0 else command)
     return (state[:, :2] - worlds.goal).norm(dim=-1)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import driving
+import steering
 import torch
 from learners import ByEvolution, ByGradient, ByPPO, Learner
 from matplotlib.figure import Figure
@@ -50,14 +51,14 @@ class Plan:
     """
 
     seeds: int = 3
-    updates: int = 200
+    updates: int = 600
     budget: int = 200_000
     watched: int = 100
     unseen: int = 200
-    rays: tuple[int, int] = (400_000, 1_200_000)
+    rays: tuple[int, int] = (300_000, 600_000)
 
 
-QUICK = Plan(1, 20, 10_000, 20, 10, (4_000, 20_000))
+QUICK = Plan(1, 30, 10_000, 20, 10, (4_000, 20_000))
 Row = dict[str, Any]
 
 
@@ -143,12 +144,14 @@ def _over(kind: str, learner: Learner, curve: Sequence[Row], plan: Plan) -> bool
 
 
 def steps_to(curve: Sequence[Row]) -> int | None:
-    """Simulated steps to the target, or None.
+    """Simulated steps to the target, or None: the first of two looks in a row that are there.
 
     Args:
         curve: Of one training.
     """
-    return next((row["steps"] for row in curve if row["success"] >= TARGET), None)
+    there = [row["success"] >= TARGET for row in curve]
+    found = (row["steps"] for row, *both in zip(curve, there, there[1:], strict=False) if all(both))
+    return next(found, None)
 
 
 @torch.no_grad()
@@ -205,23 +208,25 @@ def smooth_success(
     return float(found.success.double().mean())
 
 
-def checks(learner: Learner, plan: Plan, count: int = 8, step: float = 0.02) -> dict[str, float]:
+def checks(plan: Plan, count: int = 12, step: float = 0.02) -> dict[str, float]:
     """Derivatives of final distances by the first commands against central differences.
 
+    The network has random weights and heeds the radar much more than one at the start of training.
+    Trained ones steer back after a push: what is left of it is too small for differences to tell.
     Differences use the same rays on both sides. Errors are sums of absolute differences over sums
     of absolute values, of all worlds and both commands.
 
     Args:
-        learner: The trained policy.
         plan: How many rays.
         count: Of worlds.
         step: Of differences.
     """
     worlds, seed = driving.random_worlds(count, derived_seed(0, CHECKED)), 0
+    net = steering.policy(CHECKED, share=3.0)
     fine = driving.smooth_radar(worlds, plan.rays[1], boundary=False)
 
     def distance(shown: driving.Shown, first: Tensor) -> Tensor:
-        return driving.final_distance(worlds, shown, learner.command, seed, first)
+        return driving.final_distance(worlds, shown, net, seed, first)
 
     def derivative(shown: driving.Shown) -> Tensor:
         first = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
@@ -329,7 +334,7 @@ def main() -> None:
     rows = [exact_rows(f"gradient_{n}", final, plan, folder) for n, final in enumerate(finals)]
     figure(rows[0], curves, plan).savefig(folder / "policy.png", dpi=110)
     exact = [statistics.fmean(row["success"] for row in found) for found in rows]
-    errors = checks(finals[0], plan)
+    errors = checks(plan)
     metrics: Row = {
         "seeds": list(range(plan.seeds)),
         "worlds": plan.unseen,

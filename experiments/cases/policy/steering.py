@@ -61,17 +61,18 @@ class Steering(torch.nn.Module):
         return self.head(self.seen(given))
 
 
-def policy(seed: int) -> Steering:
+def policy(seed: int, share: float = 0.1) -> Steering:
     """A small network with random weights.
 
     Args:
         seed: Of its weights.
+        share: How much the radar sways its commands.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = Steering().double()
     with torch.no_grad():
-        net.head.weight *= 0.1
+        net.head.weight *= share
         net.head.bias[0] = 0.5  # drives on, and turns to the best direction: that of the goal
         net.head.weight[1, -5] += 3.0
     return net
