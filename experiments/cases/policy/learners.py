@@ -13,6 +13,7 @@ import driving
 import steering
 import torch
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel
 
 from invertwin.folders import replacing
 from invertwin.seeds import derived_seed
@@ -54,8 +55,17 @@ class Learner(ABC):
         """Go on from what ``save`` wrote."""
 
 
+def _recent(mean: Tensor, new: Tensor, count: Any) -> Tensor:
+    """Mean over the last updates, about twenty of them."""
+    return mean + (new - mean) * torch.as_tensor(1 - count / (count + 5.0)).clamp_min(0.05)
+
+
 class _Updated(Learner):
-    """A learner by Adam, of worlds that are new in every update."""
+    """A learner by Adam, of worlds that are new in every update; drives by the mean of its weights.
+
+    Source of the mean: Polyak and Juditsky, "Acceleration of stochastic approximation by
+    averaging", 1992; here over the last updates.
+    """
 
     worlds = 16
 
@@ -63,6 +73,7 @@ class _Updated(Learner):
         super().__init__(seed)
         self.updates, self.number = updates, 0
         self.net = steering.policy(seed)
+        self.mean = AveragedModel(self.net, avg_fn=_recent)
         self.adam = torch.optim.Adam(self.net.parameters(), RATE)
 
     def advance(self) -> None:
@@ -74,6 +85,7 @@ class _Updated(Learner):
             self.steps += self.gradient(derived_seed(self.seed, 2, self.number))
             torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
             self.adam.step()
+            self.mean.update_parameters(self.net)
             self.number += 1
 
     @abstractmethod
@@ -81,11 +93,12 @@ class _Updated(Learner):
         """Leave the gradient of the mean loss in the weights; how many steps that took."""
 
     def command(self, given: Tensor) -> Tensor:
-        return self.net(given)
+        return self.mean(given)
 
     def save(self, file: Path) -> None:
         kept = {
             "net": self.net.state_dict(),
+            "mean": self.mean.state_dict(),
             "adam": self.adam.state_dict(),
             "number": self.number,
             "steps": self.steps,
@@ -96,6 +109,7 @@ class _Updated(Learner):
     def load(self, file: Path) -> None:
         kept = torch.load(file)
         self.net.load_state_dict(kept["net"])
+        self.mean.load_state_dict(kept["mean"])
         self.adam.load_state_dict(kept["adam"])
         self.number, self.steps = kept["number"], kept["steps"]
 
