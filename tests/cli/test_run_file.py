@@ -53,7 +53,11 @@ def radar(**changes):
         (run(sede=1), ["sede: ", "task, title, note, seed", "did you mean `seed`?"]),
         (
             run(scene={"letter": {"shape": "text", "text": "A", "materail": ROUGH}}),
-            ["scene.letter.materail: ", "material, velocity, motion, position", "did you mean `material`?"],
+            [
+                "scene.letter.materail: ",
+                "material, velocity, motion, position",
+                "did you mean `material`?",
+            ],
         ),
         (
             run(scene={"letter": letter(shape="txet")}),
