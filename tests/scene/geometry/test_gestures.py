@@ -2,7 +2,6 @@
 
 import math
 from itertools import pairwise
-from typing import Any
 
 import pytest
 import torch
@@ -22,7 +21,6 @@ from invertwin.scene import (
 )
 from scenes import float64
 
-UP: Any = "up"
 BODY = person(spacing=0.05)
 HIGH = standing_height(BODY)
 STANDING = Object(BODY.mesh({}), RoughDielectric(4.0), rigid(translation=[0.0, HIGH, 3.0]))
@@ -137,7 +135,7 @@ def test_velocities_do_not_jump(motion):
         (lambda: Sitting(BODY, 0.9), "height of the seat"),
         (lambda: Sitting(BODY, 0.1), "height of the seat"),
         (lambda: Sitting(BODY, 0.45, duration=0.0), "duration"),
-        (lambda: Waving(BODY, UP), "side left or right"),
+        (lambda: Waving(BODY, "up"), "side left or right"),
         (lambda: Waving(BODY, rate=0.0), "rate"),
         (lambda: Waving(BODY, duration=1.0), "duration"),
         (lambda: Waving(BODY, during=Walking(person(spacing=0.05), 1.0)), "one body"),

@@ -13,7 +13,6 @@ people. Bodies have no ankles: shanks stay upright, and feet stay where they are
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -141,7 +140,7 @@ class Waving:
     """
 
     body: BodyTemplate
-    side: Literal["left", "right"] = "right"
+    side: str = "right"
     rate: Positive = 1.5
     start: float = 0.0
     duration: float = 4.0
