@@ -1,41 +1,27 @@
 """The case of adaptation: recordings, the twin's maps, the network and what adapts it."""
 
-import importlib.util
-import sys
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
 
-FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "cases" / "adaptation"
-
-
-def loaded(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # Files of the case import one another by name; dataclasses look their module up.
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+from cases.loading import loaded
 
 
 @pytest.fixture(scope="module")
 def rooms() -> ModuleType:
-    return loaded("rooms")
+    return loaded("adaptation", "rooms")
 
 
 @pytest.fixture(scope="module")
 def network(rooms: ModuleType) -> ModuleType:
-    return loaded("network")
+    return loaded("adaptation", "network")
 
 
 @pytest.fixture(scope="module")
 def twin(rooms: ModuleType) -> ModuleType:
-    return loaded("twin")
+    return loaded("adaptation", "twin")
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +104,7 @@ def test_adaptation_without_labels_changes_what_it_says(rooms: ModuleType, netwo
 
 
 def test_summary_counts_rooms(rooms: ModuleType, network: ModuleType, twin: ModuleType):
-    run = loaded("run")
+    run = loaded("adaptation", "run")
     errors = {"before": 0.5, "statistics": 0.4, "tent": 0.4, "adapted": 0.2, "bound": 0.1}
     row = {
         "position_error_m": errors,

@@ -1,26 +1,17 @@
 """The case of a camera beside a radar: its summary, its start, and one short fit."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-FILE = Path(__file__).resolve().parents[2] / "experiments" / "cases" / "camera" / "run.py"
+from cases.loading import loaded
 
 
 @pytest.fixture(scope="module")
 def case() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("camera_case", FILE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up.
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return loaded("camera", "run")
 
 
 def row(position: float, yaw: float, scale: float) -> dict[str, float]:

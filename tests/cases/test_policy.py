@@ -1,7 +1,5 @@
 """The case of driving by radar: motion, derivatives through drives, a short training."""
 
-import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,33 +7,22 @@ from typing import Any
 import pytest
 import torch
 
-FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "cases" / "policy"
-
-
-def loaded(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # Files of the case import one another by name; dataclasses look their module up.
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+from cases.loading import loaded
 
 
 @pytest.fixture(scope="module")
 def driving() -> ModuleType:
-    return loaded("driving")
+    return loaded("policy", "driving")
 
 
 @pytest.fixture(scope="module")
 def steering(driving: ModuleType) -> ModuleType:
-    return loaded("steering")
+    return loaded("policy", "steering")
 
 
 @pytest.fixture(scope="module")
 def learners(steering: ModuleType) -> ModuleType:
-    return loaded("learners")
+    return loaded("policy", "learners")
 
 
 def test_motion_is_differentiated_and_saturates(driving: ModuleType):
@@ -155,7 +142,7 @@ def test_evolution_goes_downhill(
 
 
 def test_summary_bounds_what_was_not_reached():
-    run = loaded("run")
+    run = loaded("policy", "run")
     curve = [{"steps": n, "success": n / 100} for n in (20, 60, 85, 90)]
     never = [{"steps": 400, "success": 0.1}, {"steps": 900, "success": 0.2}]
     found = run.summary({"gradient": [curve], "ppo": [never], "evolution": [curve]}, run.Plan())
