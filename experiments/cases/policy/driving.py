@@ -16,6 +16,8 @@ from torch import Tensor
 
 import invertwin as iw
 from invertwin.channel import Speckle, draw_speckle
+from invertwin.radar.range_profile import range_profile
+from invertwin.radar.spectrum import aperture
 from invertwin.scene import Cosine, Mesh, RoughDielectric, box, linear_array
 from invertwin.seeds import derived_seed
 
@@ -333,6 +335,43 @@ def exact_radar(world: Worlds, seed: int) -> ExactRadar:
     return ExactRadar(scene, draw_speckle(scene, link, EXACT, seed))
 
 
+@functools.cache
+def _cells() -> tuple[Tensor, Tensor, float, float]:
+    """How the radar makes bins of its samples.
+
+    Returns:
+        Range profiles of single samples [sample, range], beams [u, element], the mean power of a
+        bin for unit white noise, and how many bins make up all samples, those not shown included.
+    """
+    grid, count = bins(), 64
+    radar = radar_at(torch.zeros(count, 4, dtype=torch.float64))
+    single = torch.eye(count, dtype=torch.complex128)[:, None, None].expand(-1, *radar.shape[1:], -1)
+    profile = range_profile(single, radar, grid)[:, 0, 0]
+    x, y, _ = radar.virtual_positions.unbind(-1)
+    array = aperture(radar)
+    beams = array.beams(grid.u, grid.v, x, y) * array.weight
+    mean = float(profile.abs().square().sum(0).mean() * beams.abs().square().sum(1).mean())
+    return profile, beams, mean, radar.waveform.max_range / grid.range_step * 2 / grid.u_step
+
+
+def fluctuating(power: Tensor, random: torch.Generator) -> Tensor:
+    """Power as one recording shows it, with speckle and thermal noise.
+
+    The field of many rough points, and noise, is complex normal. Neighbouring bins share a cell, so
+    it is what the radar makes of white noise, times the root of the mean power.
+
+    Args:
+        power: Mean spectra [world, range, u].
+        random: Draws.
+    """
+    profile, beams, mean, count = _cells()
+    shape = len(power), len(profile), beams.shape[1]
+    white = torch.randn(shape, generator=random, dtype=torch.complex128)
+    field = torch.einsum("sr,wse,ue->wru", profile, white, beams)
+    noise = 10 ** (-SNR_DB / 10) * power.detach().sum((1, 2), keepdim=True) / count
+    return (power + noise) * field.abs().square() / mean
+
+
 REFERENCE = 1e-9
 """Received over transmitted power, times range⁴ [m⁴], that a map shows as ln 2."""
 MAP_SCALE = 0.3  # so that inputs are about one
@@ -348,15 +387,13 @@ def inputs(
         worlds: Only their goals are read.
         state: Of the robots [world, 4].
         power: Spectra [world, range, u].
-        speckle: Draws the fluctuation of power that one exact recording would have; None = none.
+        speckle: Draws the fluctuations that one recording would have; None = none.
     """
     grid = bins()
+    if speckle is not None:
+        power = fluctuating(power, speckle)
     power = power * grid.ranges[:, None] ** 4 / REFERENCE
     pooled = torch.nn.functional.avg_pool2d(power[:, None], POOLED)[:, 0]
-    if speckle is not None:
-        # Power of one look is distributed exponentially; neighbouring bins share a cell.
-        drawn = torch.rand(pooled.shape, generator=speckle, dtype=torch.float64)
-        pooled = pooled * -(1 - drawn).log()
     x, y = (worlds.goal - state[:, :2]).unbind(-1)
     heading = state[:, 2]
     ahead = heading.cos() * x + heading.sin() * y
