@@ -92,6 +92,26 @@ def sphere(radius: Positive, subdivisions: Annotated[int, Ge(0), Le(8)] = 4) -> 
     return _mesh(unit * length, ball.faces)
 
 
+def cylinder(
+    radius: Positive, height: Positive, sections: Annotated[int, Ge(3), Le(10_000)] = 32
+) -> Mesh:
+    """A closed upright cylinder, its axis along y.
+
+    Args:
+        radius: [m].
+        height: Size along y [m].
+        sections: Number of flat sides around it.
+
+    Raises:
+        InputError: a size that is not positive, or fewer than three sides.
+    """
+    sizes = _length(radius, "cylinder radius [m]"), _length(height, "cylinder height [m]")
+    count = checked_count(sections, "sections", 3)
+    tube = trimesh.creation.cylinder(sizes[0], sizes[1], sections=count)
+    # Turned about x: z to y.
+    return _mesh(tube.vertices[:, [0, 2, 1]] * [1, 1, -1], tube.faces)
+
+
 def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
     """Two square plates that meet on the y axis and open to −z, at a right angle or another.
 

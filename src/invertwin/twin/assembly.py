@@ -1,0 +1,146 @@
+"""A scene of simple shapes that explains recorded maps: how likely it is, and its joint fit."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from invertwin.channel import Sampling
+from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
+from invertwin.inversion.initial import Ground
+from invertwin.models import SurrogateMap
+from invertwin.radar import Radar
+from invertwin.scene import Scene
+from invertwin.twin.clutter import HeavyTailed
+from invertwin.twin.primitives import Figure, Primitive
+
+_RATE = 0.01  # of the optimiser, see the scales of ``Primitive``
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """Maps, and what it takes to judge shapes by them.
+
+    Attributes:
+        model: Predicts maps.
+        radar: Recorded them.
+        power: The maps.
+        loss: How unlikely maps are.
+        shared: How many bins are worth one.
+        ground: The plane on which things stand.
+        level: Its height [m].
+        seed: Of rays.
+    """
+
+    model: SurrogateMap
+    radar: Radar
+    power: Float[Tensor, "frame range u v"]
+    loss: HeavyTailed
+    shared: float
+    ground: Ground
+    level: float
+    seed: int
+
+    def primitives(self, figures: Sequence[Figure]) -> dict[str, Primitive]:
+        """Shapes as unknowns, by name.
+
+        Args:
+            figures: The shapes.
+        """
+        return {
+            f"object_{number}": Primitive(f"object_{number}", figure, self.ground, self.level)
+            for number, figure in enumerate(figures, 1)
+        }
+
+    def scene(self, figures: Sequence[Figure]) -> Scene:
+        """Shapes as a scene.
+
+        Args:
+            figures: The shapes.
+        """
+        return Scene({name: one.item for name, one in self.primitives(figures).items()})
+
+    @torch.no_grad()
+    def predicted(self, figures: Sequence[Figure]) -> Float[Tensor, "frame range u v"]:
+        """The maps of shapes, without background.
+
+        Args:
+            figures: The shapes.
+        """
+        if not figures:
+            return torch.zeros_like(self.power)
+        model = replace(self.model, sampling=replace(self.model.sampling, boundary=False))
+        return model.predict(self.scene(figures), self.radar, self.seed)
+
+    def gains(self, figures: Sequence[Figure]) -> Float64[Tensor, " frame"]:
+        """By how much shapes are likelier than the background alone, of every frame.
+
+        Args:
+            figures: The shapes.
+
+        Returns:
+            Logarithms of likelihood ratios, for as many draws as are independent.
+        """
+        rows = self._nothing - self.loss.rows(self.predicted(figures), self.power)
+        return rows.flatten(1).double().sum(1) / self.shared
+
+    @cached_property
+    def _nothing(self) -> Tensor:
+        return self.loss.rows(torch.zeros_like(self.power), self.power)
+
+    @property
+    def draws(self) -> float:
+        """How many independent draws the maps hold."""
+        return self.power.numel() / self.shared
+
+    def frames(self, numbers: Sequence[int]) -> "Assembly":
+        """Some frames.
+
+        Args:
+            numbers: Of the frames.
+        """
+        chosen = list(numbers)
+        sampling = self.model.sampling
+        share = len(chosen) / self.radar.frame_count
+        fewer = sampling_of(1, max(1, round(sampling.samples * share)))
+        return replace(
+            self,
+            model=replace(self.model, sampling=fewer),
+            radar=self.radar.frames(chosen),
+            power=self.power[chosen],
+        )
+
+    def fitted(self, figures: Sequence[Figure], steps: int) -> tuple[list[Figure], Reconstruction]:
+        """Shapes after a joint fit of all their numbers.
+
+        Args:
+            figures: At the start.
+            steps: Of the fit.
+        """
+        primitives = self.primitives(figures)
+        found = reconstruct(
+            self.scene(figures),
+            Observation(self.model, self.radar, self.power),
+            primitives,
+            loss=self.loss,
+            optimizer=Optimizer("adam", rate=_RATE),
+            schedule=Schedule(steps, annealing=0.5),
+            seed=self.seed,
+        )
+        return [primitive.figure for primitive in primitives.values()], found
+
+
+def sampling_of(frames: int, rays: int) -> Sampling:
+    """Rays of a fit, an eighth as many on silhouettes.
+
+    Args:
+        frames: Of the recording.
+        rays: In each frame.
+    """
+    count = frames * rays
+    return Sampling(
+        depth=1, samples=count, boundary_samples=max(1, count // 8), contacts=False
+    )

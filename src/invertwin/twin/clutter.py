@@ -1,0 +1,112 @@
+"""Power of echoes that nobody has modelled exactly: its likelihood, and how many bins count."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from invertwin.channel import Grid
+from invertwin.errors import InputError
+from invertwin.radar import Radar
+from invertwin.radar.spectrum import aperture
+from invertwin.radar.waveform import SampledWaveform, unit_window
+
+_LEAST = 1e-30  # of power, to keep logarithms finite
+_QUIET = 0.25  # quantile of a range bin that is taken for background
+
+
+def background(power: Float[Tensor, "frame range u v"]) -> Float64[Tensor, " range"]:
+    """The level of noise and of clutter that nothing explains, of every range bin.
+
+    The lower quartile of exponentially distributed power is 0.288 of its mean. Objects that fill
+    less than three quarters of a range bin's directions, over all frames, do not raise it much.
+
+    Args:
+        power: Measured maps.
+    """
+    flat = power.detach().double().movedim(1, 0).flatten(1)
+    level = torch.quantile(flat, _QUIET, dim=1) / -math.log(1 - _QUIET)
+    floor = 1e-12 * float(power.max())
+    return level.clamp_min(floor)
+
+
+def shared_bins(radar: Radar, grid: Grid) -> float:
+    """How many bins of a map are worth one that is independent of all others.
+
+    Fields of noise in bins that are l apart correlate as the windows do; powers correlate as the
+    square. The sum over all lags is the number of bins that share one draw.
+
+    Args:
+        radar: Its windows count.
+        grid: Bins.
+    """
+    waveform = radar.waveform
+    if not isinstance(waveform, SampledWaveform):
+        raise InputError(
+            "expected a radar that samples its echoes, got one of pulses; give the twin the "
+            "number of bins that share one draw"
+        )
+    window = unit_window(radar.window, waveform.samples)
+    sample = torch.arange(waveform.samples, dtype=torch.float64) / waveform.max_range
+    total = _sum_of_squares(window.square(), sample, grid.range_step, grid.range_count)
+    array = aperture(radar)
+    for step, count, places, weight in (
+        (grid.u_step, grid.u_count, array.x[array.column], array.weight),
+        (grid.v_step, grid.v_count, array.y[array.row], array.weight),
+    ):
+        if count > 1:
+            total *= _sum_of_squares(weight.square(), places / waveform.wavelength, step, count)
+    return total
+
+
+def _sum_of_squares(weight: Tensor, cycles: Tensor, step: float, count: int) -> float:
+    lags = step * torch.arange(-count + 1, count, dtype=torch.float64)
+    field = torch.polar(weight.expand(len(lags), -1), 2 * math.pi * lags[:, None] * cycles).sum(1)
+    return float((field.abs() / weight.sum()).square().sum())
+
+
+@dataclass(frozen=True, eq=False)
+class HeavyTailed:
+    """How unlikely maps are, where single bins may be much brighter or dimmer than predicted.
+
+    Speckle of a mean power μ that is itself uncertain: exponential power whose mean has an inverse
+    gamma distribution about μ, of ν degrees. The negative logarithm of its density but for a
+    constant is log μ + (ν + 1) log(1 + D / (ν μ)). For ν → ∞ it is that of plain speckle,
+    log μ + D / μ, under which a few echoes that the scene does not hold outweigh all others:
+    theirs is D / μ, which has no bound; here it is a logarithm.
+
+    Attributes:
+        level: Background of every range bin, added to predicted maps.
+        degrees: ν.
+
+    Source: Conte and Longo, "Characterisation of radar clutter as a spherically invariant random
+    process", IEE Proceedings F 134, 1987.
+    Differs from the source: the mean over textures is that of ν degrees about a mean that is
+    modelled, not of a fitted K distribution.
+    """
+
+    level: Float64[Tensor, " range"]
+    degrees: float = 4.0
+
+    def __call__(
+        self, predicted: Float[Tensor, "frame range u v"], observed: Float[Tensor, "frame range u v"]
+    ) -> Float[Tensor, ""]:
+        """The mean of ``rows`` over all bins."""
+        return self.rows(predicted, observed).mean()
+
+    def rows(
+        self, predicted: Float[Tensor, "frame range u v"], observed: Float[Tensor, "frame range u v"]
+    ) -> Float[Tensor, "frame range u v"]:
+        """How much less likely the power of every bin is than if it were its predicted mean.
+
+        Args:
+            predicted: Power without background.
+            observed: Measured power.
+        """
+        # Power that is predicted is positive but for rounding.
+        mean = predicted.clamp_min(0.0) + self.level.to(predicted)[:, None, None]
+        ratio = observed.to(predicted).clamp_min(_LEAST) / mean
+        tail = torch.log1p(ratio / self.degrees) - math.log1p(1 / self.degrees)
+        return (self.degrees + 1) * tail - ratio.log()

@@ -1,0 +1,130 @@
+"""Shapes that an image suggests: bright places that belong together, and what could stand there."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float64
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from invertwin.inversion.initial import Ground
+from invertwin.twin.primitives import Figure
+
+_TURNS = 45  # yaws that a rectangle is tried at, over a quarter turn
+_TRIM = 0.05  # share of the weight beyond each side of a rectangle
+
+
+def bright(
+    strength: Float64[Tensor, " place"], share: float = 0.02
+) -> Float64[Tensor, " chosen"]:
+    """Weights of places of an image; those that are too dim have none.
+
+    Sizes of echoes differ by orders of magnitude, but even a dim object is brighter than the grain
+    between objects. The reference is that of the brightest hundredth of what is lit at all.
+
+    Args:
+        strength: The image.
+        share: Of the reference, below which a place is dark.
+    """
+    order = strength.sort(descending=True).values
+    total = order.cumsum(0)
+    # Half of all strength is in places brighter than this.
+    typical = order[int((total < 0.5 * total[-1]).sum())]
+    return torch.where(strength > share * typical, strength, 0.0)
+
+
+def groups(
+    places: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], gap: float
+) -> list[Float64[Tensor, " place"]]:
+    """Sets of bright places that are linked by steps of at most a gap, as weights of all places.
+
+    Args:
+        places: On the ground [m].
+        weight: Of every place; zero is dark.
+        gap: Longest step [m].
+    """
+    lit = weight.nonzero()[:, 0]
+    if not len(lit):
+        return []
+    tree = KDTree(places[lit].numpy())
+    _, label = connected_components(tree.sparse_distance_matrix(tree, gap), directed=False)
+    labels = torch.from_numpy(label.astype("int64"))
+    found = []
+    for number in range(int(labels.max()) + 1):
+        own = torch.zeros_like(weight)
+        rows = lit[labels == number]
+        own[rows] = weight[rows]
+        found.append(own)
+    return sorted(found, key=lambda own: -float(own.sum()))
+
+
+def rectangle(
+    places: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], turn: float
+) -> tuple[Float64[Tensor, "2"], Float64[Tensor, "2"], float]:
+    """Middle [m], sides [m] and tightness of the rectangle of one turn about bright places.
+
+    Args:
+        places: On the ground [m].
+        weight: Of every place.
+        turn: Of the first side, from the first axis towards the second [rad].
+
+    Returns:
+        The tightness is the mean over the weight of 1/(d + 3 cm), d the way to the nearest side.
+    """
+    c, s = math.cos(turn), math.sin(turn)
+    own = torch.stack([c * places[:, 0] + s * places[:, 1], c * places[:, 1] - s * places[:, 0]], 1)
+    ends = torch.stack([_quantiles(own[:, axis], weight) for axis in range(2)])
+    middle, sides = ends.mean(1), ends[:, 1] - ends[:, 0]
+    away = (0.5 * sides - (own - middle).abs()).abs().amin(1)
+    tight = float((weight / (away + 0.03)).sum() / weight.sum())
+    x, y = middle.tolist()
+    return torch.tensor([c * x - s * y, s * x + c * y], dtype=torch.float64), sides, tight
+
+
+def _quantiles(along: Tensor, weight: Tensor) -> Tensor:
+    order = along.argsort()
+    share = weight[order].cumsum(0) / weight.sum()
+    low = int((share < _TRIM).sum())
+    high = int((share < 1 - _TRIM).sum())
+    return along[order][[low, min(high, len(along) - 1)]]
+
+
+def figures(
+    places: Float64[Tensor, "place 2"],
+    weight: Float64[Tensor, " place"],
+    ground: Ground,
+    *,
+    step: float,
+    height: float,
+) -> list[Figure]:
+    """What could stand where places are bright: boxes of two turns, and round shapes.
+
+    Args:
+        places: On the ground [m].
+        weight: Of every place; zero is dark.
+        ground: The plane.
+        step: Of the image [m].
+        height: Of the radars above the ground, near which things are seen [m].
+    """
+    lit = weight > 0
+    places, weight = places[lit], weight[lit].sqrt()  # less of glints
+    turns = [k * 0.5 * math.pi / _TURNS for k in range(_TURNS)]
+    tried = [(rectangle(places, weight, turn), turn) for turn in turns]
+    # The tightest, and the smallest: half a box is best enclosed, a whole one best outlined.
+    tightest = max(tried, key=lambda one: one[0][2])
+    smallest = min(tried, key=lambda one: float((one[0][1] + step).prod()))
+    sign = -1.0 if ground.up == "y" else 1.0
+    rows: list[Figure] = []
+    chosen: Sequence[tuple[tuple[Tensor, Tensor, float], float]] = [tightest, smallest]
+    for (middle, sides, _), turn in chosen:
+        # The image is about a step wider than what is there.
+        length, width = (max(float(side), 0.02) for side in sides)
+        x, y = middle.tolist()
+        rows.append(Figure("box", (x, y), sign * turn, length, width, 1.5 * height))
+    spread = max(float(smallest[0][1].mean()), 0.02)
+    x, y = smallest[0][0].tolist()
+    rows.append(Figure("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))
+    rows.append(Figure("sphere", (x, y), 0.0, spread, spread, height))
+    return rows

@@ -1,0 +1,307 @@
+"""Which shapes there are: births from what is unexplained, other kinds, mergers, and deaths."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.inversion.initial import Ground
+from invertwin.twin.assembly import Assembly
+from invertwin.twin.primitives import Figure
+from invertwin.twin.proposals import bright, figures, groups
+from invertwin.twin.sharp_image import Response, sharpened, thinned
+
+_MOST = 24  # objects
+_ROUNDS = 3  # of births
+_NEAR = 0.8  # between middles of what may be one [m]
+_SHORT, _LONG = 25, 50  # steps of fits
+_DIM = 1e-3  # of all strength: dimmer groups wait for the next round
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """The places of an image on the ground, with their responses.
+
+    Attributes:
+        places: On the ground [m].
+        step: Between neighbours [m].
+        response: Of the places, to thinned maps.
+        height: Of the radars above the ground [m].
+    """
+
+    places: Float64[Tensor, "place 2"]
+    step: float
+    response: Response
+    height: float
+
+
+def numbers_of(figure: Figure) -> int:
+    """How many numbers a shape has.
+
+    Args:
+        figure: The shape.
+    """
+    return 7 if figure.boxed else 5
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A search for the shapes that explain maps.
+
+    Evidence is the logarithm of the likelihood less half the logarithm of the number of draws for
+    every free number, on the frames that are fitted; on frames that are held out, a change must
+    not be for the worse either.
+
+    Attributes:
+        fitted: The frames that are fitted.
+        held: Those that are held out; None = too few frames to hold some out.
+        lattice: Of the image.
+
+    Source of the penalty: Schwarz, "Estimating the dimension of a model", 1978.
+    """
+
+    fitted: Assembly
+    held: Assembly | None
+    lattice: Lattice
+
+    @property
+    def ground(self) -> Ground:
+        """The plane."""
+        return self.fitted.ground
+
+    def evidence(self, shapes: Sequence[Figure]) -> float:
+        """Of shapes, on the fitted frames.
+
+        Args:
+            shapes: What there may be.
+        """
+        count = sum(numbers_of(shape) for shape in shapes)
+        return float(self.fitted.gains(shapes).sum()) - 0.5 * count * math.log(self.fitted.draws)
+
+    def better(self, new: Sequence[Figure], old: Sequence[Figure]) -> bool:
+        """Whether shapes are to be preferred.
+
+        Args:
+            new: What there may be.
+            old: What was thought so far.
+        """
+        if self.evidence(new) <= self.evidence(old):
+            return False
+        if self.held is None or len(new) <= len(old):
+            return True
+        return float(self.held.gains(new).sum()) > float(self.held.gains(old).sum())
+
+    def image(self, shapes: Sequence[Figure]) -> Float64[Tensor, " place"]:
+        """What shapes leave unexplained, as an image.
+
+        Args:
+            shapes: What is known already.
+        """
+        one = self.fitted
+        level = one.loss.level[:, None, None]
+        rest, _ = thinned(one.predicted(shapes).double() + level, one.radar, one.model.grid)
+        power, _ = thinned(one.power, one.radar, one.model.grid)
+        return sharpened(self.lattice.response, power, rest, degrees=one.loss.degrees)
+
+    def run(self) -> list[Figure]:
+        """The shapes."""
+        shapes: list[Figure] = []
+        for _ in range(_ROUNDS):
+            born = self.births(shapes)
+            if not born:
+                break
+            shapes = self.settled([*shapes, *born])
+            survivors = self.alive(shapes)
+            stalled = len(survivors) <= len(shapes) - len(born)
+            shapes = survivors
+            if stalled:
+                break
+        if not shapes:
+            return []
+        shapes = self.kinds(shapes)
+        shapes = self.merged(shapes)
+        shapes, _ = self.fitted.fitted(shapes, _LONG)
+        return self.alive(shapes)
+
+    def births(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """What could explain the rest, where it is bright.
+
+        Args:
+            shapes: What is known already.
+        """
+        strength = self.image(shapes)
+        # What a point's own kind of image cannot tell from speckle is left alone.
+        weight = bright(strength)
+        parts = groups(self.lattice.places, weight, 3.5 * self.lattice.step)
+        total = float(strength.sum())
+        parts = [part for part in parts if float(part.sum()) > _DIM * total]
+        born: list[Figure] = []
+        for part in parts[: _MOST - len(shapes)]:
+            options = self.options(part)
+            born.append(self.best([*shapes, *born], options))
+        return born
+
+    def options(self, part: Tensor) -> list[Figure]:
+        """What could stand where a group of places is bright.
+
+        Args:
+            part: Strength of every place [m²], zero outside the group.
+        """
+        lattice = self.lattice
+        rows = figures(
+            lattice.places, part, self.ground, step=lattice.step, height=lattice.height
+        )
+        found: list[Figure] = []
+        for row in rows:
+            # A matte wall of area A seen aslant: cross-section 4 β A cos²θ, half of it on average.
+            seen = 0.5 * math.pi * (row.length + row.width) * 1.5 * lattice.height
+            bright = max(float(part.sum()) / seen, 1e-4)
+            found.append(replace(row, brightness=bright))
+        return found
+
+    def best(self, known: Sequence[Figure], options: Iterable[Figure]) -> Figure:
+        """The likeliest of some shapes, beside others.
+
+        Args:
+            known: The others.
+            options: To choose from.
+        """
+        return max(options, key=lambda one: self.evidence([*known, one]))
+
+    def settled(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes after a short fit.
+
+        Args:
+            shapes: At its start.
+        """
+        return self.fitted.fitted(shapes, _SHORT)[0]
+
+    def alive(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes without those that evidence does not speak for, the weakest first.
+
+        Args:
+            shapes: All of them.
+        """
+        found = list(shapes)
+        while found:
+            without = [found[:k] + found[k + 1 :] for k in range(len(found))]
+            weakest = max(without, key=self.evidence)
+            if self.better(found, weakest):
+                break
+            found = weakest
+        return found
+
+    def kinds(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes, each of the kind that is likeliest, after a fit as every kind.
+
+        Args:
+            shapes: After a fit.
+        """
+        fitted = {
+            kind: self.settled([as_kind(shape, kind) for shape in shapes])
+            for kind in ("box", "cylinder", "sphere")
+        }
+        found = list(shapes)
+        for number in range(len(found)):
+            rest = found[:number], found[number + 1 :]
+            options = [found[number], *(rows[number] for rows in fitted.values())]
+            found[number] = max(
+                options, key=lambda one, rest=rest: self.evidence([*rest[0], one, *rest[1]])
+            )
+        return found
+
+    def merged(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes, with one box in place of two where that is likelier.
+
+        Args:
+            shapes: After a fit.
+        """
+        found, tried = list(shapes), set[tuple[Figure, Figure]]()
+        while True:
+            pairs = [
+                (a, b)
+                for k, a in enumerate(found)
+                for b in found[k + 1 :]
+                if (a, b) not in tried and math.dist(a.place, b.place) < _NEAR
+            ]
+            if not pairs:
+                return found
+            a, b = min(pairs, key=lambda pair: math.dist(pair[0].place, pair[1].place))
+            tried.add((a, b))
+            rest = [shape for shape in found if shape is not a and shape is not b]
+            one = self.best(rest, [around((a, b), turn, self.ground) for turn in _TURNS])
+            if self.evidence([*rest, one]) < self.evidence(found) - 200.0:
+                continue
+            new = self.settled([*rest, one])
+            if self.better(new, found):
+                found = new
+
+
+_TURNS = tuple(k * math.pi / 16 for k in range(8))
+
+
+def as_kind(shape: Figure, kind: str) -> Figure:
+    """A shape of another kind, of about the same size.
+
+    Args:
+        shape: As it is.
+        kind: Which it is to be.
+    """
+    if kind == shape.kind:
+        return shape
+    if kind == "box":
+        side = 0.85 * shape.length
+        high = shape.height if shape.kind == "cylinder" else 2 * shape.height
+        return replace(shape, kind="box", length=side, width=side, height=high)
+    mean = 0.5 * (shape.length + shape.width)
+    across = mean if not shape.boxed else 1.1 * mean
+    high = shape.height
+    if kind == "sphere" and shape.kind != "sphere":
+        high = 0.5 * shape.height
+    elif kind == "cylinder" and shape.kind == "sphere":
+        high = 2 * shape.height
+    return replace(shape, kind=kind, length=across, width=across, height=max(high, 0.05))
+
+
+def around(shapes: Sequence[Figure], yaw: float, ground: Ground) -> Figure:
+    """A box about shapes.
+
+    Args:
+        shapes: Which are to be one.
+        yaw: Of the box [rad].
+        ground: The plane.
+    """
+    corners = torch.cat([outline(shape, ground) for shape in shapes])
+    sign = -1.0 if ground.up == "y" else 1.0
+    c, s = math.cos(sign * yaw), math.sin(sign * yaw)
+    own = corners @ torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
+    low, high = own.amin(0), own.amax(0)
+    x, y = (0.5 * (low + high)).tolist()
+    length, width = (high - low).tolist()
+    brightest = max(shapes, key=lambda one: one.brightness)
+    tall = max(shape.height for shape in shapes)
+    return Figure(
+        "box", (c * x - s * y, s * x + c * y), yaw, length, width, tall, brightest.brightness
+    )
+
+
+def outline(shape: Figure, ground: Ground, count: int = 16) -> Float64[Tensor, "corner 2"]:
+    """Corners of a shape on the ground [m], those of a polygon for round ones.
+
+    Args:
+        shape: The shape.
+        ground: The plane.
+        count: Of the polygon's corners.
+    """
+    middle = torch.tensor(shape.place, dtype=torch.float64)
+    if not shape.boxed:
+        turns = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+        return middle + 0.5 * shape.length * torch.stack([turns.cos(), turns.sin()], dim=1)
+    sign = -1.0 if ground.up == "y" else 1.0
+    c, s = math.cos(sign * shape.yaw), math.sin(sign * shape.yaw)
+    half = 0.5 * torch.tensor([shape.length, shape.width], dtype=torch.float64)
+    signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=torch.float64)
+    return middle + (signs * half) @ torch.tensor([[c, s], [-s, c]], dtype=torch.float64)

@@ -1,0 +1,239 @@
+"""A sharp image of where echoes come from: the reflectivity that explains all maps together."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy import sparse
+from torch import Tensor
+
+from invertwin.channel import Grid
+from invertwin.errors import InputError
+from invertwin.progress import told
+from invertwin.radar import Radar
+from invertwin.radar.spectrum import aperture
+from invertwin.radar.waveform import SampledWaveform, unit_window
+
+_LEAST = 1e-3  # of a response, relative to its peak: less is left out
+_FINE = 32  # entries of a kernel's table in one bin
+_MOST = 8e7  # entries of the matrix: 8 bytes each
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What scatterers at some places add to all bins of all maps.
+
+    Attributes:
+        matrix: Power per radar cross-section [1/m²], bins by places, frames slowest.
+        shape: Of the maps.
+    """
+
+    matrix: sparse.csr_matrix
+    shape: tuple[int, ...]
+
+    def maps(self, strength: Float64[Tensor, " place"]) -> Float64[Tensor, "frame range u v"]:
+        """The maps of scatterers.
+
+        Args:
+            strength: Radar cross-section of every place [m²].
+        """
+        return torch.from_numpy(self.matrix @ strength.numpy()).reshape(self.shape)
+
+
+def thinned(
+    power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
+) -> tuple[Float64[Tensor, "frame range u v"], Grid]:
+    """One bin of a map for each cell of range and direction: nearly independent ones.
+
+    Args:
+        power: Maps.
+        radar: Its bandwidth and its array set the cells.
+        grid: Bins of the maps.
+    """
+    array = aperture(radar)
+    cells = [radar.waveform.range_resolution, *(_cell(p, radar) for p in (array.x, array.y))]
+    steps = [
+        max(1, round(cell / step)) if count > 1 else 1
+        for cell, step, count in zip(
+            cells, (grid.range_step, grid.u_step, grid.v_step), grid.shape, strict=True
+        )
+    ]
+    some = power.detach().double()[:, :: steps[0], :: steps[1], :: steps[2]]
+    return some, replace(
+        grid,
+        range_step=grid.range_step * steps[0],
+        u_step=grid.u_step * steps[1],
+        v_step=grid.v_step * steps[2],
+        range_count=some.shape[1],
+        u_count=some.shape[2],
+        v_count=some.shape[3],
+    )
+
+
+def _cell(places: Float64[Tensor, " place"], radar: Radar) -> float:
+    """Width of a beam of elements in direction cosines."""
+    if len(places) == 1:
+        return 2.0
+    extent = float(places.max() - places.min()) * len(places) / (len(places) - 1)
+    return radar.waveform.wavelength / extent
+
+
+def responses(
+    radar: Radar, grid: Grid, places: Float64[Tensor, "place 3"]
+) -> Response:
+    """The response of a radar to scatterers that reflect alike in all directions, in free space.
+
+    Args:
+        radar: With its positions.
+        grid: Bins.
+        places: In the world [m].
+
+    Raises:
+        InputError: More places than memory allows, or a radar of pulses.
+    """
+    link, shape = radar.link(), (radar.frame_count, *grid.shape)
+    tables = [_Kernel.of_range(radar, grid), *_Kernel.of_directions(radar, grid)]
+    estimate = len(places) * radar.frame_count * np.prod([len(table.offsets) for table in tables])
+    if estimate > 4 * _MOST:
+        raise InputError(
+            f"expected at most {4 * _MOST:.0e} pairs of places and bins, got {estimate:.0e}; look "
+            "at a smaller region, or with a coarser step"
+        )
+    columns = np.arange(len(places), dtype=np.int32)
+    frames = []
+    for frame in told(range(radar.frame_count), "responses of places"):
+        lengths, seen = [], []
+        for ends in (link.tx, link.rx):
+            way = places - ends[frame].detach()
+            lengths.append(way.norm(dim=1))
+            seen.append(way / lengths[-1][:, None] @ link.rotations[frame].detach())
+        gain = link.tx_pattern.gain(seen[0]) * link.rx_pattern.gain(seen[1])
+        gain = gain * radar.waveform.wavelength**2 / (4 * torch.pi) ** 3
+        strength = (gain / (lengths[0] * lengths[1]) ** 2).numpy()
+        where = (0.5 * (lengths[0] + lengths[1]), seen[1][:, 0], seen[1][:, 1])
+        row, value = np.zeros((len(places), 1), dtype=np.int64), np.ones((len(places), 1))
+        inside = np.ones((len(places), 1), dtype=bool)
+        for table, place in zip(tables, where, strict=True):
+            bins, part = table.near(place.numpy())
+            valid = (bins >= 0) & (bins < table.count)
+            row = (row[:, :, None] * table.count + bins[:, None]).reshape(len(places), -1)
+            value = (value[:, :, None] * part[:, None]).reshape(len(places), -1)
+            inside = (inside[:, :, None] & valid[:, None]).reshape(len(places), -1)
+        kept = inside & (value > _LEAST) & (strength[:, None] > 0)
+        index = np.broadcast_to(columns[:, None], kept.shape)[kept]
+        entries = (value * strength[:, None])[kept].astype(np.float32)
+        frames.append(
+            sparse.csr_matrix(
+                (entries, (row[kept].astype(np.int32), index)),
+                shape=(int(np.prod(grid.shape)), len(places)),
+            )
+        )
+    return Response(sparse.vstack(frames, format="csr"), shape)
+
+
+def sharpened(
+    response: Response,
+    power: Float64[Tensor, "frame range u v"],
+    rest: Float64[Tensor, "frame range u v"],
+    *,
+    steps: int = 40,
+    degrees: float = 4.0,
+) -> Float64[Tensor, " place"]:
+    """The reflectivity under which the maps are likeliest, by multiplicative steps.
+
+    Each step multiplies the strength of a place by the root of how much brighter than predicted
+    its bins are. It never turns negative. Bins that are far too bright count less, as in
+    ``HeavyTailed``.
+
+    Source: Févotte, Bertin and Durrieu, "Nonnegative matrix factorization with the Itakura–Saito
+    divergence", Neural Computation 21, 2009.
+    Differs from the source: the responses are known; speckle is heavy-tailed.
+
+    Args:
+        response: Of the places.
+        power: Measured maps.
+        rest: Power of what is known already, and of the background.
+        steps: How many.
+        degrees: Of the speckle.
+
+    Returns:
+        Radar cross-section of every place [m²].
+    """
+    matrix = response.matrix
+    back = matrix.T
+    data = power.numpy().astype(np.float32).reshape(-1)
+    known = rest.numpy().astype(np.float32).reshape(-1)
+    total = np.asarray(matrix.sum(axis=0)).ravel()
+    excess = np.maximum(data - known, 0.0)
+    strength = np.full(matrix.shape[1], excess.sum() / total.sum(), dtype=np.float32)
+    strength[total <= 0] = 0.0
+    for _ in told(range(steps), "sharp image"):
+        mean = matrix @ strength + known
+        ratio = data / mean
+        brighter = back @ (ratio * (degrees + 1) / (degrees + ratio) / mean)
+        alone = np.maximum(back @ (1 / mean), 1e-30)
+        strength *= np.sqrt(brighter / alone)
+    return torch.from_numpy(strength.astype(np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class _Kernel:
+    """The response along one axis of the map, in bins from its centre, as a table."""
+
+    start: float
+    step: float
+    count: int
+    offsets: np.ndarray  # bins that are reached
+    table: np.ndarray
+
+    @classmethod
+    def of_weights(cls, weight: Tensor, cycles: Tensor, axis: tuple[float, float, int]) -> "_Kernel":
+        start, step, count = axis
+        if count == 1:
+            return cls(start, step, 1, np.zeros(1, dtype=np.int64), np.ones(1))
+        lags = torch.arange(-16 * _FINE, 16 * _FINE + 1, dtype=torch.float64) / _FINE
+        phase = 2 * torch.pi * lags[:, None] * step * cycles
+        field = torch.polar(weight.expand(len(lags), -1), phase).sum(1) / weight.sum()
+        power = field.abs().square()
+        # Up to the first null: what lies beyond is below the background of most recordings.
+        middle = 16 * _FINE
+        rising = (power[middle + 1 :] > power[middle:-1]).nonzero()
+        reach = int(rising[0]) if len(rising) else middle
+        power[: middle - reach] = 0.0
+        power[middle + reach + 1 :] = 0.0
+        half = reach // _FINE + 1
+        return cls(start, step, count, np.arange(-half, half + 1), power.numpy())
+
+    @classmethod
+    def of_range(cls, radar: Radar, grid: Grid) -> "_Kernel":
+        waveform = radar.waveform
+        if not isinstance(waveform, SampledWaveform):
+            raise InputError(
+                "expected a radar that samples its echoes, got one of pulses; use backprojection"
+            )
+        samples = torch.arange(waveform.samples, dtype=torch.float64)
+        window = unit_window(radar.window, waveform.samples)
+        axis = grid.range_start, grid.range_step, grid.range_count
+        return cls.of_weights(window, samples / waveform.max_range, axis)
+
+    @classmethod
+    def of_directions(cls, radar: Radar, grid: Grid) -> "list[_Kernel]":
+        array, length = aperture(radar), radar.waveform.wavelength
+        return [
+            cls.of_weights(array.weight, places / length, axis)
+            for places, axis in (
+                (array.x[array.column], (grid.u_start, grid.u_step, grid.u_count)),
+                (array.y[array.row], (grid.v_start, grid.v_step, grid.v_count)),
+            )
+        ]
+
+    def near(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bins near places [place, n], and the response there."""
+        if self.count == 1:
+            zero = np.zeros((len(place), 1), dtype=np.int64)
+            return zero, np.ones((len(place), 1))
+        at = (place - self.start) / self.step
+        bins = np.round(at).astype(np.int64)[:, None] + self.offsets
+        lag = np.round((bins - at[:, None]) * _FINE).astype(np.int64) + 16 * _FINE
+        return bins, self.table[lag]
