@@ -109,7 +109,7 @@ class Evidence:
                 "this fit"
             )
         self._end = end
-        first, second = (_derivatives(fit, found, number) for number in (0, 1))
+        first, second = (map_derivatives(fit, found, number) for number in (0, 1))
         # What nothing depends on is held fixed, unless it has a meaning of its own.
         moves = [any(bool(rows[k].any()) for rows in first) for k in range(len(found))]
         kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
@@ -212,7 +212,7 @@ class Evidence:
             loss, slopes = self._end.slopes(maps)
             least = min(least, loss)
             if step < _REFITS:
-                rows = _derivatives(fit, here(), 0)
+                rows = map_derivatives(fit, here(), 0)
                 parts = zip(rows, slopes, strict=True)
                 slope = torch.stack([a.flatten(1) @ b.flatten() for a, b in parts]).sum(0)
                 own = fit.objective.curvature(maps, rows) * spans * spans[:, None]
@@ -253,7 +253,7 @@ def coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
             yield from coordinates(child, f"{path}{name}.")
 
 
-def _derivatives(fit: Fit, found: Sequence[Coordinate], number: int) -> list[Tensor]:
+def map_derivatives(fit: Fit, found: Sequence[Coordinate], number: int) -> list[Tensor]:
     """For every observation the derivatives of its predicted map [coordinate, …]."""
     rows: list[list[Tensor]] = []
     for coordinate in told(found, "derivatives"):

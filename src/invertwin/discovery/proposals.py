@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from invertwin.inversion.initial import Ground
-from invertwin.twin.primitives import Figure
+from invertwin.discovery.primitives import Figure
 
 _TURNS = 45  # yaws that a rectangle is tried at, over a quarter turn
 _TRIM = 0.05  # share of the weight beyond each side of a rectangle

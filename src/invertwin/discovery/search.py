@@ -9,14 +9,15 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.inversion.initial import Ground
-from invertwin.twin.assembly import Assembly
-from invertwin.twin.primitives import Figure
-from invertwin.twin.proposals import bright, figures, groups
-from invertwin.twin.sharp_image import Response, sharpened, thinned
+from invertwin.discovery.assembly import Assembly
+from invertwin.discovery.primitives import Figure
+from invertwin.discovery.proposals import bright, figures, groups
+from invertwin.discovery.sharp_image import Response, sharpened, thinned
 
 _MOST = 24  # objects
 _ROUNDS = 3  # of births
-_NEAR = 0.8  # between middles of what may be one [m]
+_NEAR = 0.5  # gap between what may be one [m]
+_HOPE = 100.0  # evidence that a fit may gain
 _SHORT, _LONG = 25, 50  # steps of fits
 _DIM = 1e-3  # of all strength: dimmer groups wait for the next round
 
@@ -108,21 +109,20 @@ class Search:
 
     def run(self) -> list[Figure]:
         """The shapes."""
-        shapes: list[Figure] = []
+        shapes, before = list[Figure](), 0
         for _ in range(_ROUNDS):
             born = self.births(shapes)
             if not born:
                 break
-            shapes = self.settled([*shapes, *born])
+            shapes = self.merged(self.settled([*shapes, *born]))
             survivors = self.alive(shapes)
-            stalled = len(survivors) <= len(shapes) - len(born)
-            shapes = survivors
+            stalled = len(survivors) <= before
+            before, shapes = len(survivors), survivors
             if stalled:
                 break
         if not shapes:
             return []
-        shapes = self.kinds(shapes)
-        shapes = self.merged(shapes)
+        shapes = self.merged(self.kinds(shapes))
         shapes, _ = self.fitted.fitted(shapes, _LONG)
         return self.alive(shapes)
 
@@ -138,11 +138,48 @@ class Search:
         parts = groups(self.lattice.places, weight, 3.5 * self.lattice.step)
         total = float(strength.sum())
         parts = [part for part in parts if float(part.sum()) > _DIM * total]
-        born: list[Figure] = []
+        known, born = list(shapes), list[tuple[Tensor, Figure]]()
         for part in parts[: _MOST - len(shapes)]:
-            options = self.options(part)
-            born.append(self.best([*shapes, *born], options))
-        return born
+            one = self.best(known, self.options(part))
+            if float((self.fitted.gains([*known, one]) - self.fitted.gains(known)).sum()) > 0:
+                known.append(one)
+                born.append((part, one))
+        return [one for _, one in self.united(shapes, born)]
+
+    def united(
+        self, shapes: Sequence[Figure], born: Sequence[tuple[Tensor, Figure]]
+    ) -> list[tuple[Tensor, Figure]]:
+        """Groups and their shapes, with one box for two groups where that is likelier.
+
+        Two far ends of a box are often bright, and nothing between them.
+
+        Args:
+            shapes: What is known already.
+            born: Groups of the image, and what stands there.
+        """
+        found, tried = list(born), set[tuple[int, int]]()
+        while True:
+            pairs = [
+                (self._gap(a[0], b[0]), a, b)
+                for k, a in enumerate(found)
+                for b in found[k + 1 :]
+                if (id(a[0]), id(b[0])) not in tried
+            ]
+            pairs = [pair for pair in pairs if pair[0] < _NEAR]
+            if not pairs:
+                return found
+            _, a, b = min(pairs, key=lambda pair: pair[0])
+            tried.add((id(a[0]), id(b[0])))
+            others = [pair for pair in found if pair is not a and pair is not b]
+            known = [*shapes, *(one for _, one in others)]
+            part = a[0] + b[0]
+            one = self.best(known, self.options(part))
+            if self.evidence([*known, one]) > self.evidence([*known, a[1], b[1]]):
+                found = [*others, (part, one)]
+
+    def _gap(self, first: Tensor, second: Tensor) -> float:
+        places = self.lattice.places
+        return float(torch.cdist(places[first > 0], places[second > 0]).min())
 
     def options(self, part: Tensor) -> list[Figure]:
         """What could stand where a group of places is bright.
@@ -225,15 +262,15 @@ class Search:
                 (a, b)
                 for k, a in enumerate(found)
                 for b in found[k + 1 :]
-                if (a, b) not in tried and math.dist(a.place, b.place) < _NEAR
+                if (a, b) not in tried and apart(a, b, self.ground) < _NEAR
             ]
             if not pairs:
                 return found
-            a, b = min(pairs, key=lambda pair: math.dist(pair[0].place, pair[1].place))
+            a, b = min(pairs, key=lambda pair: apart(*pair, self.ground))
             tried.add((a, b))
             rest = [shape for shape in found if shape is not a and shape is not b]
             one = self.best(rest, [around((a, b), turn, self.ground) for turn in _TURNS])
-            if self.evidence([*rest, one]) < self.evidence(found) - 200.0:
+            if self.evidence([*rest, one]) < self.evidence(found) - _HOPE:
                 continue
             new = self.settled([*rest, one])
             if self.better(new, found):
@@ -286,6 +323,21 @@ def around(shapes: Sequence[Figure], yaw: float, ground: Ground) -> Figure:
     return Figure(
         "box", (c * x - s * y, s * x + c * y), yaw, length, width, tall, brightest.brightness
     )
+
+
+def apart(first: Figure, second: Figure, ground: Ground) -> float:
+    """The gap between two shapes, to a few centimetres [m].
+
+    Args:
+        first, second: The shapes.
+        ground: The plane.
+    """
+    share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None, None]
+    sides: list[Tensor] = []
+    for shape in (first, second):
+        corners = outline(shape, ground)
+        sides.append((corners + share * (corners.roll(1, 0) - corners)).flatten(0, 1))
+    return float(torch.cdist(*sides).min())
 
 
 def outline(shape: Figure, ground: Ground, count: int = 16) -> Float64[Tensor, "corner 2"]:

@@ -181,7 +181,12 @@ class Primitive(nn.Module):
     @property
     def item(self) -> Object:
         """The object, differentiable by all parameters."""
-        return Object(self.mesh(), Matte(self.brightness))
+        return Object(self.mesh(), self.matte)
+
+    @property
+    def matte(self) -> Matte:
+        """Its material."""
+        return Matte(self.brightness)
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the object in it, in place of one of the same name."""

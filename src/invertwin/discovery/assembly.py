@@ -14,8 +14,8 @@ from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Scene
-from invertwin.twin.clutter import HeavyTailed
-from invertwin.twin.primitives import Figure, Primitive
+from invertwin.discovery.clutter import HeavyTailed
+from invertwin.discovery.primitives import Figure, Primitive
 
 _RATE = 0.01  # of the optimiser, see the scales of ``Primitive``
 

@@ -1,0 +1,8 @@
+"""From a recording to a twin, with no start: which things there are, and how sure that is."""
+
+from invertwin.discovery.outcome import Picture as Picture
+from invertwin.discovery.outcome import Thing as Thing
+from invertwin.discovery.outcome import Twin as Twin
+from invertwin.discovery.primitives import Figure as Figure
+from invertwin.discovery.primitives import Primitive as Primitive
+from invertwin.discovery.recordings import twin as twin

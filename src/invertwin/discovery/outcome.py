@@ -1,0 +1,128 @@
+"""What was found in a recording: things with their errors, and what nothing is known of."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float64, Int64
+from torch import Tensor
+
+from invertwin.discovery.primitives import Figure, Primitive
+from invertwin.inversion.initial import Ground
+from invertwin.scene import Object, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """One object of a twin.
+
+    Attributes:
+        name: In the twin's scene.
+        kind: The likeliest: wall, box, cylinder, sphere or point.
+        probabilities: Of every kind that was tried.
+        position: Its middle [m].
+        figure: All numbers of its shape; None = only a place is known.
+        deviations: Standard deviation of every number, by name, in SI units.
+        confidence: Probability that it is there.
+        velocity: Along the line of sight [m/s]; None = it was found in what stands still.
+    """
+
+    name: str
+    kind: str
+    probabilities: Mapping[str, float]
+    position: Float64[Tensor, "3"]
+    figure: Figure | None
+    deviations: Mapping[str, float]
+    confidence: float
+    velocity: Float64[Tensor, "3"] | None = None
+
+    def row(self) -> dict[str, Any]:
+        """The thing as plain numbers."""
+        found: dict[str, Any] = {
+            "name": self.name,
+            "kind": self.kind,
+            "probabilities": dict(self.probabilities),
+            "position_m": self.position.tolist(),
+            "confidence": self.confidence,
+            "deviations": dict(self.deviations),
+        }
+        if self.figure is not None:
+            found |= {
+                "yaw_rad": self.figure.yaw,
+                "length_m": self.figure.length,
+                "width_m": self.figure.width,
+                "height_m": self.figure.height,
+                "brightness": self.figure.brightness,
+            }
+        if self.velocity is not None:
+            found["velocity_m_s"] = self.velocity.tolist()
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image of the ground.
+
+    Attributes:
+        places: Along the two axes of the ground [m].
+        strength: Radar cross-section at every place, or brightness of a backprojected image.
+        views: How many radar positions see each place; zero is "never seen".
+    """
+
+    places: Float64[Tensor, "place 2"]
+    strength: Float64[Tensor, " place"]
+    views: Int64[Tensor, " place"]
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """What a recording shows.
+
+    Attributes:
+        things: The surest first; things that move stand last.
+        ground: The plane of the picture.
+        level: Height of the ground [m].
+        picture: Where echoes come from, and what was never seen.
+        predicted: Maps of the things with the background; None where only places were found.
+        observed: Maps of the recording.
+        notes: What to know of it, in sentences.
+    """
+
+    things: tuple[Thing, ...]
+    ground: Ground
+    level: float
+    picture: Picture | None = None
+    predicted: Float[Tensor, "frame range u v"] | None = None
+    observed: Float[Tensor, "frame range u v"] | None = field(default=None, repr=False)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def scene(self) -> Scene | None:
+        """The things that have a shape, of the nearest materials of the library; None = none."""
+        objects: dict[str, Object] = {}
+        for thing in self.things:
+            if thing.figure is not None:
+                one = Primitive(thing.name, thing.figure, self.ground, self.level)
+                item = one.item
+                mesh = type(item.mesh)(item.mesh.vertices.detach(), item.mesh.faces)
+                objects[thing.name] = Object(mesh, one.matte.written())
+        return Scene(objects) if objects else None
+
+
+def brightest_first(things: list[Thing]) -> tuple[Thing, ...]:
+    """Things by confidence, those that move last.
+
+    Args:
+        things: In any order.
+    """
+    return tuple(sorted(things, key=lambda one: (one.velocity is not None, -one.confidence)))
+
+
+def normal_tail(score: float) -> float:
+    """The probability that a standard normal number is larger.
+
+    Args:
+        score: In standard deviations.
+    """
+    return 0.5 * float(torch.special.erfc(torch.tensor(score / 2**0.5, dtype=torch.float64)))

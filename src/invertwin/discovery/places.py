@@ -1,0 +1,165 @@
+"""Things of which only the place is found: movers, and points along a dense track."""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float64
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from invertwin.capture import Capture, ChirpCapture, backproject
+from invertwin.channel import Grid
+from invertwin.discovery.outcome import Thing
+from invertwin.radar import points_of, velocity_span
+
+_CELLS = 3.0  # of range and rate between echoes of one mover
+_STRONG = 0.1  # of the strongest: dimmer peaks may be sidelobes
+_CHUNK = 20_000  # points of an image at a time
+
+
+def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
+    """What moves in one frame, the strongest first, after the mean over the chirps is removed.
+
+    Echoes that are near in range and range rate are one thing; its strongest echo says where it is.
+
+    Args:
+        recording: A train of chirps.
+        grid: Bins of range and direction.
+        frame: Which.
+    """
+    if recording.chirps.count < 4:
+        return []
+    beat = recording.beat - recording.beat.mean(1, keepdim=True)
+    radar, chirps = recording.radar(), recording.chirps
+    points = points_of(beat, radar, grid, chirps, frame)
+    if points is None or not len(points.power):
+        return []
+    cell = 2 * velocity_span(radar, chirps) / chirps.count
+    moves = points.velocity.abs() > cell  # what stands still has lost its mean only
+    scales = torch.tensor([radar.waveform.range_resolution, cell], dtype=torch.float64) * _CELLS
+    rows = moves.nonzero()[:, 0]
+    if not len(rows):
+        return []
+    where = torch.stack([points.range, points.velocity], dim=1)[rows] / scales
+    tree = KDTree(where.numpy())
+    _, label = connected_components(tree.sparse_distance_matrix(tree, 1.0), directed=False)
+    labels = torch.from_numpy(label.astype("int64"))
+    found: list[Thing] = []
+    origin = radar.positions[frame].detach()
+    for number in range(int(labels.max()) + 1):
+        own = rows[labels == number]
+        best = own[points.power[own].argmax()]
+        # Power spread over a group tells the place to the width of the group.
+        weight = points.power[own] / points.power[own].sum()
+        spread = [
+            float((weight * (values[own] - values[best]).square()).sum().sqrt())
+            for values in (points.range, points.velocity)
+        ]
+        position = points.position[best].detach().double()
+        away = (position - origin) / (position - origin).norm()
+        found.append(
+            Thing(
+                f"mover_{number + 1}",
+                "point",
+                {"point": 1.0},
+                position,
+                None,
+                {
+                    "range": max(spread[0], 0.3 * radar.waveform.range_resolution),
+                    "range_rate": max(spread[1], 0.3 * cell),
+                },
+                1 - 1e-6 if len(own) > 1 else 0.9,
+                float(points.velocity[best]) * away,
+            )
+        )
+    strength = {thing.name: float(points.power[rows[labels == k]].max()) for k, thing in enumerate(found)}
+    found.sort(key=lambda thing: -strength[thing.name])
+    return [replace(thing, name=f"mover_{k}") for k, thing in enumerate(found, 1)]
+
+
+def dense(capture: Capture) -> bool:
+    """Whether frames follow each other so closely that echoes add up in phase along the track.
+
+    Args:
+        capture: The recording.
+    """
+    radar = capture.radar()
+    if len(radar.virtual_positions) > 1 or radar.frame_count < 8:
+        return False
+    steps = radar.positions.detach().diff(dim=0).norm(dim=1)
+    return float(steps.median()) < 0.5 * radar.waveform.wavelength
+
+
+def coherent_image(
+    capture: Capture, places: Float64[Tensor, "place 3"]
+) -> tuple[Float64[Tensor, " place"], Float64[Tensor, " place"]]:
+    """The backprojected image along a track, and how well the frames agree.
+
+    Args:
+        capture: The recording.
+        places: In the world [m].
+
+    Returns:
+        Power with the spreading loss removed, and the share of all power that is in phase:
+        1 for a single point, about 1 over the number of frames for noise.
+    """
+    count = capture.radar().frame_count
+    parts = [
+        (backproject(capture, part), _alone(capture, part, count)) for part in places.split(_CHUNK)
+    ]
+    field = torch.cat([image for image, _ in parts])
+    power = torch.cat([alone for _, alone in parts])
+    image = field.abs().square().double()
+    return image, image / power.clamp_min(1e-300)
+
+
+def _alone(capture: Capture, places: Tensor, count: int) -> Tensor:
+    total = torch.zeros(len(places), dtype=torch.float64)
+    for frame in range(count):
+        total += backproject(capture.frames([frame]), places).abs().square().double()
+    return total / count
+
+
+def points_along(
+    capture: Capture, places: Float64[Tensor, "place 3"], apart: float
+) -> tuple[list[Thing], Float64[Tensor, " place"]]:
+    """Points where the echoes of many frames agree in phase, the brightest first; and the image.
+
+    Args:
+        capture: A recording along a dense track.
+        places: Of the image, in the world [m].
+        apart: Peaks that are nearer to a brighter one are its sidelobes [m].
+    """
+    image, agree = coherent_image(capture, places)
+    count = capture.radar().frame_count
+    # The image's own noise: the median of exponentially distributed power.
+    noise = float(image.median()) / math.log(2)
+    left, found = image.clone(), list[Thing]()
+    top = float(image.max())
+    while True:
+        peak = int(left.argmax())
+        value = float(left[peak])
+        if value < _STRONG * top or value < noise * (math.log(len(places)) + 3):
+            break
+        near = (places - places[peak]).norm(dim=1)
+        left[near < apart] = 0.0
+        blob = (near < apart) & (image > 0.5 * value)
+        weight = image[blob] / image[blob].sum()
+        middle = (weight[:, None] * places[blob]).sum(0)
+        spread = (weight[:, None] * (places[blob] - middle).square()).sum(0).sqrt()
+        chance = len(places) * math.exp(-min(count * float(agree[peak]), 700.0))
+        share = min(1.0, value / top)
+        found.append(
+            Thing(
+                f"point_{len(found) + 1}",
+                "point",
+                {"point": 1.0},
+                places[peak].double(),
+                None,
+                dict(zip("xyz", spread.tolist(), strict=True)),
+                max(0.0, 1 - chance) * (1 - 0.5 * (1 - share) ** 2),
+            )
+        )
+    return found, image

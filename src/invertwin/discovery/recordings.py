@@ -1,0 +1,260 @@
+"""From a recording to a twin, with no start."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invertwin.capture import Capture, ChirpCapture
+from invertwin.channel import Grid
+from invertwin.channel.sight import Sight
+from invertwin.discovery.assembly import Assembly, sampling_of
+from invertwin.discovery.certainty import deviations, kind_probabilities, presence
+from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
+from invertwin.discovery.outcome import Picture, Thing, Twin, brightest_first
+from invertwin.discovery.places import dense, movers, points_along
+from invertwin.discovery.primitives import upright
+from invertwin.discovery.search import Lattice, Search
+from invertwin.discovery.sharp_image import responses, thinned
+from invertwin.errors import InputError
+from invertwin.inversion.initial import Ground
+from invertwin.models import SurrogateMap
+from invertwin.radar import Radar, SampledWaveform
+from invertwin.scene import Scene
+from invertwin.scene.checks import checked_count, checked_number, checked_tensor
+
+_NEAREST = 4  # range cells, in which transmitters leak into receivers
+_HEIGHT = 0.6  # of radars above a ground of which nothing is said [m]
+_STEPS = 50  # of the last fit
+_PLACES = 40_000  # of an image at most
+_HOLD = 4  # every fourth frame is held out, where there are twice as many
+
+
+def twin(
+    recording: Capture | ChirpCapture,
+    *,
+    low: Sequence[float] | None = None,
+    high: Sequence[float] | None = None,
+    range_max: float | None = None,
+    ground: Ground | None = None,
+    level: float | None = None,
+    rays: int = 2000,
+    seed: int = 0,
+) -> Twin:
+    """Find what stands in a recording, with no start: shapes, places, sizes, and how sure they are.
+
+    A sharp image shows where echoes come from. Bright places become shapes that stand on the
+    ground; all shapes are fitted together, and evidence decides which kinds there are, which
+    become one, and which are not there. Of recordings along a dense track of one channel, points
+    are found where echoes agree in phase. Of trains of chirps, what moves is found as well.
+
+    Args:
+        recording: Of radars at known places.
+        low, high: Opposite corners of the part of the ground that is searched, along its two axes
+            [m]; None = all that is seen.
+        range_max: Farthest range that is looked at [m]; None = the last one with echoes.
+        ground: Which way is up; None = y.
+        level: Height of the ground [m]; None = 0.6 m below the radars.
+        rays: Of every frame in fits.
+        seed: Of rays.
+
+    Raises:
+        InputError: A region that no radar sees, or one that is too large for its resolution.
+    """
+    plane = ground or Ground()
+    checked_count(rays, "rays", 100)
+    capture = recording.capture() if isinstance(recording, ChirpCapture) else recording
+    radar = capture.radar()
+    base = float(radar.positions.detach()[:, plane.vertical].mean())
+    floor = base - _HEIGHT if level is None else checked_number(level, "level of the ground [m]")
+    first = _NEAREST * radar.waveform.range_resolution
+    last = _reach(capture, first, range_max)
+    moving: list[Thing] = []
+    if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
+        farthest = range_max or recording.max_range
+        moving = movers(recording, radar.grid(first, min(farthest, recording.max_range)))
+    if last is None:
+        said = "nothing that stands still is above the noise" if moving else _NOTHING
+        return Twin(brightest_first(moving), plane, floor, notes=(said,))
+    places, step = _places(radar, plane, base, (first, last), low, high)
+    if dense(capture):
+        found, image = points_along(capture, places, 4 * max(step, radar.waveform.wavelength))
+        picture = Picture(places[:, list(plane.level)], image, _views(radar, places, None))
+        return Twin(brightest_first([*found, *moving]), plane, floor, picture)
+    grid = radar.grid(first, last)
+    still = _standing(capture, radar, grid, plane, floor, places, step, rays, seed)
+    return Twin(
+        brightest_first([*still.things, *moving]),
+        plane,
+        floor,
+        still.picture,
+        still.predicted,
+        still.observed,
+        still.notes,
+    )
+
+
+_NOTHING = "nothing is above the noise"
+
+
+def _standing(
+    capture: Capture,
+    radar: Radar,
+    grid: Grid,
+    ground: Ground,
+    level: float,
+    places: Tensor,
+    step: float,
+    rays: int,
+    seed: int,
+) -> Twin:
+    """Shapes that explain the maps of a recording."""
+    power = capture.spectrum(grid).detach().float()
+    frames = radar.frame_count
+    one = Assembly(
+        SurrogateMap(grid, sampling=sampling_of(frames, rays)),
+        radar,
+        power,
+        HeavyTailed(background(power)),
+        shared_bins(radar, grid),
+        ground,
+        level,
+        seed,
+    )
+    held = list(range(_HOLD - 1, frames, _HOLD)) if frames >= 2 * _HOLD else []
+    fitted = one.frames([k for k in range(frames) if k not in held]) if held else one
+    _, coarse = thinned(fitted.power, fitted.radar, grid)
+    flat = places[:, list(ground.level)]
+    height = float(places[:, ground.vertical].mean()) - level
+    lattice = Lattice(flat, step, responses(fitted.radar, coarse, places), max(height, 0.1))
+    search = Search(fitted, one.frames(held) if held else None, lattice)
+    picture = search.image([])
+    shapes = search.run()
+    level_map = one.loss.level[:, None, None].to(power)
+    if not shapes:
+        seen = Picture(flat, picture, _views(radar, places, None))
+        nothing = level_map.expand_as(power)
+        return Twin((), ground, level, seen, nothing, power, (_NOTHING,))
+    shapes, found = one.fitted(shapes, _STEPS)
+    errors, sure = deviations(one, found), presence(one, shapes)
+    kinds = kind_probabilities(one, shapes)
+    things = [
+        Thing(
+            f"object_{k}",
+            max(kinds[k - 1], key=lambda kind, row=kinds[k - 1]: row[kind]),
+            kinds[k - 1],
+            upright(shape, ground, level),
+            shape,
+            _own(errors, f"object_{k}."),
+            sure[k - 1],
+        )
+        for k, shape in enumerate(shapes, 1)
+    ]
+    views = _views(radar, places, one.scene(shapes))
+    return Twin(
+        tuple(things),
+        ground,
+        level,
+        Picture(flat, picture, views),
+        one.predicted(shapes) + level_map,
+        power,
+    )
+
+
+def _own(errors: dict[str, float], prefix: str) -> dict[str, float]:
+    return {n.removeprefix(prefix): v for n, v in errors.items() if n.startswith(prefix)}
+
+
+def _reach(capture: Capture, first: float, last: float | None) -> float | None:
+    """The farthest range with an echo, and a little more; None if there is none [m]."""
+    radar = capture.radar()
+    waveform = radar.waveform
+    longest = waveform.max_range if isinstance(waveform, SampledWaveform) else None
+    if longest is None:
+        ranges = capture.ranges
+        first, longest = max(first, float(ranges[0])), float(ranges[-1])
+    # The last cells of a period hold what leaks from its first.
+    limit = 0.98 * longest if last is None else min(last, 0.98 * longest)
+    if not first < limit:
+        raise InputError(
+            f"expected range_max beyond the leakage, which ends at {first:.3g} m, got {limit:.3g}; "
+            "give a larger one"
+        )
+    grid = radar.grid(first, limit)
+    power = capture.spectrum(grid).detach().double()
+    level = background(power)
+    # The level of pure noise: no quieter range is ever louder.
+    noise = float(level.min())
+    strongest = power.amax((0, 2, 3)) / noise
+    loud = (strongest > 2 * math.log(power.numel()) + 5).nonzero()[:, 0]
+    if not len(loud):
+        return None
+    return min(limit, float(grid.ranges[loud[-1]]) + 10 * radar.waveform.range_resolution)
+
+
+def _places(
+    radar: Radar,
+    ground: Ground,
+    base: float,
+    ranges: tuple[float, float],
+    low: Sequence[float] | None,
+    high: Sequence[float] | None,
+) -> tuple[Float64[Tensor, "place 3"], float]:
+    """Places of an image on the ground that some radar sees [m], and their distance."""
+    axes = list(ground.level)
+    at = radar.positions.detach()[:, axes]
+    corners = [at.amin(0) - ranges[1], at.amax(0) + ranges[1]]
+    for k, given in enumerate((low, high)):
+        if given is not None:
+            corners[k] = checked_tensor(given, (2,), "corner of the region [m]", "give two numbers")
+    size = corners[1] - corners[0]
+    if not bool((size > 0).all()):
+        raise InputError(
+            f"expected low below high, got {corners[0].tolist()} and {corners[1].tolist()}; give "
+            "opposite corners of the region"
+        )
+    cell = radar.waveform.range_resolution
+    while True:
+        counts = [max(2, math.ceil(float(side) / cell) + 1) for side in size]
+        lines = [
+            corners[0][k] + cell * torch.arange(counts[k], dtype=torch.float64) for k in range(2)
+        ]
+        flat = torch.cartesian_prod(*lines)
+        places = torch.zeros(len(flat), 3, dtype=torch.float64)
+        places[:, axes], places[:, ground.vertical] = flat, base
+        near = torch.zeros(len(flat), dtype=torch.bool)
+        for k in range(radar.frame_count):
+            way = places - radar.positions.detach()[k]
+            distance = way.norm(dim=1)
+            ahead = way @ radar.link().rotations.detach()[k][:, 2] > 0.05 * distance
+            near |= ahead & (distance > ranges[0]) & (distance < ranges[1])
+        if int(near.sum()) <= _PLACES:
+            break
+        cell *= 1.25
+    if not bool(near.any()):
+        raise InputError("expected a region that some radar sees, got none; check low and high")
+    return places[near], cell
+
+
+def _views(
+    radar: Radar, places: Float64[Tensor, "place 3"], scene: Scene | None
+) -> Int64[Tensor, " place"]:
+    """How many positions of the radar see each place, past all things."""
+    total = torch.zeros(len(places), dtype=torch.int64)
+    for k in range(radar.frame_count):
+        place = radar.positions.detach()[k]
+        way = places - place
+        seen = way @ radar.link().rotations.detach()[k][:, 2] > 0
+        if scene is not None:
+            sight = Sight(scene, place)
+            face = sight.first(way)
+            hit = face >= 0
+            length = torch.full((len(way),), math.inf, dtype=torch.float64)
+            length[hit] = sight.along(face[hit], normalize(way, dim=1)[hit]).detach()
+            seen &= length > way.norm(dim=1)
+        total += seen
+    return total
+
