@@ -19,7 +19,17 @@ from invertwin import doctor, threads
 
 __version__ = "0.2.0"
 
-_ROOMS = ("capture", "channel", "datasets", "inversion", "links", "plotting", "radar", "scene")
+_ROOMS = (
+    "capture",
+    "channel",
+    "datasets",
+    "discovery",
+    "inversion",
+    "links",
+    "plotting",
+    "radar",
+    "scene",
+)
 
 # Name → module.
 _MENU = {
@@ -48,6 +58,7 @@ _MENU = {
     "simulate": "simulation",
     "simulate_chirps": "simulation",
     "trace_paths": "channel",
+    "twin": "discovery",
 }
 
 __all__ = ["__version__", *_MENU, *_ROOMS]  # pyright: ignore[reportUnsupportedDunderAll]

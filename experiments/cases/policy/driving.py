@@ -345,7 +345,9 @@ def _cells() -> tuple[Tensor, Tensor, float, float]:
     """
     grid, count = bins(), 64
     radar = radar_at(torch.zeros(count, 4, dtype=torch.float64))
-    single = torch.eye(count, dtype=torch.complex128)[:, None, None].expand(-1, *radar.shape[1:], -1)
+    single = torch.eye(count, dtype=torch.complex128)[:, None, None].expand(
+        -1, *radar.shape[1:], -1
+    )
     profile = range_profile(single, radar, grid)[:, 0, 0]
     x, y, _ = radar.virtual_positions.unbind(-1)
     array = aperture(radar)

@@ -9,13 +9,13 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.channel import Sampling
+from invertwin.discovery.clutter import HeavyTailed
+from invertwin.discovery.primitives import Figure, Primitive
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
 from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Scene
-from invertwin.discovery.clutter import HeavyTailed
-from invertwin.discovery.primitives import Figure, Primitive
 
 _RATE = 0.01  # of the optimiser, see the scales of ``Primitive``
 
@@ -141,6 +141,4 @@ def sampling_of(frames: int, rays: int) -> Sampling:
         rays: In each frame.
     """
     count = frames * rays
-    return Sampling(
-        depth=1, samples=count, boundary_samples=max(1, count // 8), contacts=False
-    )
+    return Sampling(depth=1, samples=count, boundary_samples=max(1, count // 8), contacts=False)

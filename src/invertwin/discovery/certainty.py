@@ -75,9 +75,7 @@ def presence(one: Assembly, shapes: Sequence[Figure]) -> list[float]:
         shapes: All of them.
     """
     together = one.gains(shapes)
-    return [
-        surer(together, one.gains([*shapes[:k], *shapes[k + 1 :]])) for k in range(len(shapes))
-    ]
+    return [surer(together, one.gains([*shapes[:k], *shapes[k + 1 :]])) for k in range(len(shapes))]
 
 
 def kind_probabilities(one: Assembly, shapes: Sequence[Figure]) -> list[Mapping[str, float]]:

@@ -91,13 +91,17 @@ class HeavyTailed:
     degrees: float = 4.0
 
     def __call__(
-        self, predicted: Float[Tensor, "frame range u v"], observed: Float[Tensor, "frame range u v"]
+        self,
+        predicted: Float[Tensor, "frame range u v"],
+        observed: Float[Tensor, "frame range u v"],
     ) -> Float[Tensor, ""]:
         """The mean of ``rows`` over all bins."""
         return self.rows(predicted, observed).mean()
 
     def rows(
-        self, predicted: Float[Tensor, "frame range u v"], observed: Float[Tensor, "frame range u v"]
+        self,
+        predicted: Float[Tensor, "frame range u v"],
+        observed: Float[Tensor, "frame range u v"],
     ) -> Float[Tensor, "frame range u v"]:
         """How much less likely the power of every bin is than if it were its predicted mean.
 

@@ -12,10 +12,12 @@ from torch import Tensor
 from invertwin.capture import Capture, ChirpCapture, backproject
 from invertwin.channel import Grid
 from invertwin.discovery.outcome import Thing
-from invertwin.radar import points_of, velocity_span
+from invertwin.radar import points_of, range_doppler, velocity_span
 
 _CELLS = 3.0  # of range and rate between echoes of one mover
 _STRONG = 0.1  # of the strongest: dimmer peaks may be sidelobes
+_SIDELOBE = 3e-3  # of the strongest mover: dimmer ones may be its sidelobes
+_SURE = 0.5  # of the strongest: brighter peaks are no sidelobes
 _CHUNK = 20_000  # points of an image at a time
 
 
@@ -46,11 +48,16 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
     tree = KDTree(where.numpy())
     _, label = connected_components(tree.sparse_distance_matrix(tree, 1.0), directed=False)
     labels = torch.from_numpy(label.astype("int64"))
+    flat = range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
+    # Beams over all channels have this much less noise than one channel.
+    noise = float(flat.abs().square().median()) / math.log(2) / len(radar.virtual_positions)
+    draws, top = flat.numel(), float(points.power[rows].max())
     found: list[Thing] = []
     origin = radar.positions[frame].detach()
     for number in range(int(labels.max()) + 1):
         own = rows[labels == number]
         best = own[points.power[own].argmax()]
+        power = float(points.power[best])
         # Power spread over a group tells the place to the width of the group.
         weight = points.power[own] / points.power[own].sum()
         spread = [
@@ -70,11 +77,14 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
                     "range": max(spread[0], 0.3 * radar.waveform.range_resolution),
                     "range_rate": max(spread[1], 0.3 * cell),
                 },
-                1 - 1e-6 if len(own) > 1 else 0.9,
+                max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
+                * min(1.0, power / (_SIDELOBE * top)),
                 float(points.velocity[best]) * away,
             )
         )
-    strength = {thing.name: float(points.power[rows[labels == k]].max()) for k, thing in enumerate(found)}
+    strength = {
+        thing.name: float(points.power[rows[labels == k]].max()) for k, thing in enumerate(found)
+    }
     found.sort(key=lambda thing: -strength[thing.name])
     return [replace(thing, name=f"mover_{k}") for k, thing in enumerate(found, 1)]
 
@@ -137,6 +147,7 @@ def points_along(
     # The image's own noise: the median of exponentially distributed power.
     noise = float(image.median()) / math.log(2)
     left, found = image.clone(), list[Thing]()
+    cell = capture.radar().waveform.range_resolution
     top = float(image.max())
     while True:
         peak = int(left.argmax())
@@ -150,7 +161,7 @@ def points_along(
         middle = (weight[:, None] * places[blob]).sum(0)
         spread = (weight[:, None] * (places[blob] - middle).square()).sum(0).sqrt()
         chance = len(places) * math.exp(-min(count * float(agree[peak]), 700.0))
-        share = min(1.0, value / top)
+        share = min(1.0, value / (_SURE * top))
         found.append(
             Thing(
                 f"point_{len(found) + 1}",
@@ -158,8 +169,8 @@ def points_along(
                 {"point": 1.0},
                 places[peak].double(),
                 None,
-                dict(zip("xyz", spread.tolist(), strict=True)),
-                max(0.0, 1 - chance) * (1 - 0.5 * (1 - share) ** 2),
+                dict(zip("xyz", spread.clamp_min(0.3 * cell).tolist(), strict=True)),
+                max(0.0, 1 - chance) * share,
             )
         )
     return found, image

@@ -151,7 +151,9 @@ class Primitive(nn.Module):
         if self.kind not in ("wall", "box"):
             width = length
         yaw = self._TURN * float(self.turn.detach())
-        return Figure(self.kind, (x, y), yaw, length, width, height, float(self.brightness.detach()))
+        return Figure(
+            self.kind, (x, y), yaw, length, width, height, float(self.brightness.detach())
+        )
 
     def mesh(self) -> Mesh:
         """The shape in the world, differentiable by all parameters."""

@@ -9,16 +9,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from invertwin.inversion.initial import Ground
 from invertwin.discovery.primitives import Figure
+from invertwin.inversion.initial import Ground
 
 _TURNS = 45  # yaws that a rectangle is tried at, over a quarter turn
 _TRIM = 0.05  # share of the weight beyond each side of a rectangle
 
 
-def bright(
-    strength: Float64[Tensor, " place"], share: float = 0.02
-) -> Float64[Tensor, " chosen"]:
+def bright(strength: Float64[Tensor, " place"], share: float = 0.02) -> Float64[Tensor, " chosen"]:
     """Weights of places of an image; those that are too dim have none.
 
     Sizes of echoes differ by orders of magnitude, but even a dim object is brighter than the grain

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float64, Int64
@@ -41,6 +42,7 @@ def twin(
     range_max: float | None = None,
     ground: Ground | None = None,
     level: float | None = None,
+    height: float | None = None,
     rays: int = 2000,
     seed: int = 0,
 ) -> Twin:
@@ -58,6 +60,9 @@ def twin(
         range_max: Farthest range that is looked at [m]; None = the last one with echoes.
         ground: Which way is up; None = y.
         level: Height of the ground [m]; None = 0.6 m below the radars.
+        height: Above the ground, at which the image is made [m]; None = that of the radars. Echoes
+            come from about this height where things are as tall as the radars stand; give less
+            where all things are lower.
         rays: Of every frame in fits.
         seed: Of rays.
 
@@ -66,25 +71,39 @@ def twin(
     """
     plane = ground or Ground()
     checked_count(rays, "rays", 100)
-    capture = recording.capture() if isinstance(recording, ChirpCapture) else recording
+    capture = recording
+    if isinstance(recording, ChirpCapture):
+        # What moves fades in the mean over the chirps, and is found apart.
+        capture = replace(recording, moving=False).capture()
+        if recording.real:
+            range_max = min(range_max or math.inf, recording.max_range)
+    assert isinstance(capture, Capture)
     radar = capture.radar()
     base = float(radar.positions.detach()[:, plane.vertical].mean())
-    floor = base - _HEIGHT if level is None else checked_number(level, "level of the ground [m]")
-    first = _NEAREST * radar.waveform.range_resolution
-    last = _reach(capture, first, range_max)
+    floor = (
+        base - _HEIGHT
+        if level is None
+        else checked_number(level, "level of the ground [m]", -math.inf)
+    )
+    plane_at = base if height is None else floor + checked_number(height, "height [m]", 0.0)
+    reach = _reach(capture, range_max)
     moving: list[Thing] = []
     if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
-        farthest = range_max or recording.max_range
-        moving = movers(recording, radar.grid(first, min(farthest, recording.max_range)))
-    if last is None:
+        farthest = min(range_max or math.inf, recording.max_range)
+        near = _NEAREST * radar.waveform.range_resolution
+        moving = movers(recording, radar.grid(near, farthest))
+    if reach is None:
         said = "nothing that stands still is above the noise" if moving else _NOTHING
         return Twin(brightest_first(moving), plane, floor, notes=(said,))
-    places, step = _places(radar, plane, base, (first, last), low, high)
+    places, step = _places(radar, plane, plane_at, reach, low, high)
     if dense(capture):
+        # Frames add up only where all of them have an echo.
+        far = torch.cdist(places, radar.positions.detach())
+        places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
         found, image = points_along(capture, places, 4 * max(step, radar.waveform.wavelength))
         picture = Picture(places[:, list(plane.level)], image, _views(radar, places, None))
         return Twin(brightest_first([*found, *moving]), plane, floor, picture)
-    grid = radar.grid(first, last)
+    grid = radar.grid(*reach)
     still = _standing(capture, radar, grid, plane, floor, places, step, rays, seed)
     return Twin(
         brightest_first([*still.things, *moving]),
@@ -168,16 +187,25 @@ def _own(errors: dict[str, float], prefix: str) -> dict[str, float]:
     return {n.removeprefix(prefix): v for n, v in errors.items() if n.startswith(prefix)}
 
 
-def _reach(capture: Capture, first: float, last: float | None) -> float | None:
-    """The farthest range with an echo, and a little more; None if there is none [m]."""
+def _reach(capture: Capture, last: float | None) -> tuple[float, float] | None:
+    """Ranges from the end of the leakage to the last echo and a little more; None without one [m].
+
+    Args:
+        capture: The recording.
+        last: Farthest range that is looked at [m]; None = all of them.
+    """
     radar = capture.radar()
-    waveform = radar.waveform
-    longest = waveform.max_range if isinstance(waveform, SampledWaveform) else None
-    if longest is None:
-        ranges = capture.ranges
-        first, longest = max(first, float(ranges[0])), float(ranges[-1])
-    # The last cells of a period hold what leaks from its first.
-    limit = 0.98 * longest if last is None else min(last, 0.98 * longest)
+    waveform, cell = radar.waveform, radar.waveform.range_resolution
+    first = _NEAREST * cell
+    if isinstance(waveform, SampledWaveform):
+        # The last cells of a period hold what leaks from its first.
+        longest = 0.98 * waveform.max_range
+    else:
+        first, longest = (
+            max(first, float(capture.ranges[0]) + cell),
+            float(capture.ranges[-1]) - cell,
+        )
+    limit = longest if last is None else min(last, longest)
     if not first < limit:
         raise InputError(
             f"expected range_max beyond the leakage, which ends at {first:.3g} m, got {limit:.3g}; "
@@ -185,20 +213,19 @@ def _reach(capture: Capture, first: float, last: float | None) -> float | None:
         )
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
-    level = background(power)
     # The level of pure noise: no quieter range is ever louder.
-    noise = float(level.min())
+    noise = float(background(power).min())
     strongest = power.amax((0, 2, 3)) / noise
     loud = (strongest > 2 * math.log(power.numel()) + 5).nonzero()[:, 0]
     if not len(loud):
         return None
-    return min(limit, float(grid.ranges[loud[-1]]) + 10 * radar.waveform.range_resolution)
+    return first, min(limit, float(grid.ranges[loud[-1]]) + 10 * cell)
 
 
 def _places(
     radar: Radar,
     ground: Ground,
-    base: float,
+    height: float,
     ranges: tuple[float, float],
     low: Sequence[float] | None,
     high: Sequence[float] | None,
@@ -224,7 +251,7 @@ def _places(
         ]
         flat = torch.cartesian_prod(*lines)
         places = torch.zeros(len(flat), 3, dtype=torch.float64)
-        places[:, axes], places[:, ground.vertical] = flat, base
+        places[:, axes], places[:, ground.vertical] = flat, height
         near = torch.zeros(len(flat), dtype=torch.bool)
         for k in range(radar.frame_count):
             way = places - radar.positions.detach()[k]
@@ -257,4 +284,3 @@ def _views(
             seen &= length > way.norm(dim=1)
         total += seen
     return total
-

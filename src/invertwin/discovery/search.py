@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.inversion.initial import Ground
 from invertwin.discovery.assembly import Assembly
 from invertwin.discovery.primitives import Figure
 from invertwin.discovery.proposals import bright, figures, groups
 from invertwin.discovery.sharp_image import Response, sharpened, thinned
+from invertwin.inversion.initial import Ground
 
 _MOST = 24  # objects
 _ROUNDS = 3  # of births
@@ -188,9 +188,7 @@ class Search:
             part: Strength of every place [m²], zero outside the group.
         """
         lattice = self.lattice
-        rows = figures(
-            lattice.places, part, self.ground, step=lattice.step, height=lattice.height
-        )
+        rows = figures(lattice.places, part, self.ground, step=lattice.step, height=lattice.height)
         found: list[Figure] = []
         for row in rows:
             # A matte wall of area A seen aslant: cross-section 4 β A cos²θ, half of it on average.

@@ -79,9 +79,7 @@ def _cell(places: Float64[Tensor, " place"], radar: Radar) -> float:
     return radar.waveform.wavelength / extent
 
 
-def responses(
-    radar: Radar, grid: Grid, places: Float64[Tensor, "place 3"]
-) -> Response:
+def responses(radar: Radar, grid: Grid, places: Float64[Tensor, "place 3"]) -> Response:
     """The response of a radar to scatterers that reflect alike in all directions, in free space.
 
     Args:
@@ -188,7 +186,9 @@ class _Kernel:
     table: np.ndarray
 
     @classmethod
-    def of_weights(cls, weight: Tensor, cycles: Tensor, axis: tuple[float, float, int]) -> "_Kernel":
+    def of_weights(
+        cls, weight: Tensor, cycles: Tensor, axis: tuple[float, float, int]
+    ) -> "_Kernel":
         start, step, count = axis
         if count == 1:
             return cls(start, step, 1, np.zeros(1, dtype=np.int64), np.ones(1))

@@ -86,6 +86,7 @@ from invertwin.scene.room import room as room
 from invertwin.scene.scene import Object as Object
 from invertwin.scene.scene import Scene as Scene
 from invertwin.scene.shapes import box as box
+from invertwin.scene.shapes import cylinder as cylinder
 from invertwin.scene.shapes import dihedral as dihedral
 from invertwin.scene.shapes import plate as plate
 from invertwin.scene.shapes import sphere as sphere
