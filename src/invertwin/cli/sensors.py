@@ -145,6 +145,11 @@ class RadarTable(Posed):
     board: Annotated[Any, OneOf("board")] | None = key("antenna elements of a board, or:", None)
     transmitters: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
     receivers: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
+    range_center: Vector | None = key(
+        "m, a point in the world that has range 0 in every frame, as in data that are motion "
+        "compensated to a scene; without it ranges count from the radar",
+        None,
+    )
 
     @model_validator(mode="after")
     def _elements(self) -> "RadarTable":
@@ -161,6 +166,8 @@ class RadarTable(Posed):
             more |= {"transmitters": arrays[0], "receivers": arrays[1]}
         more["positions"], more["rotations"] = self.poses(1)
         found = super().build(given, **more)
+        if self.range_center is not None:
+            found = found.centered(_float64(self.range_center))
         WAVEFORMS.setdefault(type(found.waveform).__name__, type(found.waveform))
         return found
 
@@ -181,7 +188,9 @@ class ChirpsTable(Table):
     )
 
 
-AnyRadar = Annotated[Any, TableOf(Radar, RadarTable, ("rotations", "range_bias"), checked=False)]
+AnyRadar = Annotated[
+    Any, TableOf(Radar, RadarTable, ("rotations", "range_bias", "range_origin"), checked=False)
+]
 AnyGrid = Annotated[Any, TableOf(Radar.grid, without=("self",))]
 AnyChirps = Annotated[Any, TableOf(Chirps, ChirpsTable, ("order",))]
 AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_figure_db"))]
