@@ -15,7 +15,6 @@ from invertwin.radar import (
     Impairments,
     Impulse,
     Leakage,
-    Looks,
     PhysicsWarning,
     Radar,
     RadarPose,
@@ -28,6 +27,7 @@ from invertwin.radar import (
     range_profile,
     surrogate_spectrum,
 )
+from invertwin.radar.looks import Looks
 from invertwin.radar.range_profile import fft_bins
 from invertwin.scene import Scene, plate
 from invertwin.scene.antenna import linear_array
@@ -61,7 +61,7 @@ def test_an_origin_takes_its_delay_off(waveform, point_paths):
 
 
 def test_the_origins_are_those_of_the_phase_centres():
-    radar = replace(far(), receivers=linear_array(2, 0.2)).centered(CENTER)
+    radar = replace(far(), receivers=linear_array(2, 0.01)).centered(CENTER)
     expected = [100.0, math.hypot(3.0, 102.0)]
     assert radar.origins.tolist() == pytest.approx(expected, rel=1e-12)
     assert radar.frames([1]).origins.tolist() == pytest.approx(expected[1:])
@@ -121,8 +121,10 @@ def test_movers_and_looks_count_from_the_origin(point_paths):
     train = moving_beat(moving, radar, Chirps(count=2, interval=1e-3))
     assert (train - still[:, None]).abs().max() < 1e-6
     look = Looks(paths, radar).beat(seed=1)
-    assert (look[0] / still[0]).abs().std() < 0.02
-    assert (look[0] / still[0]).angle().std() < 0.1  # cells are a quarter of a resolution cell
+    # The same random amplitude in both frames; cells are a quarter of a resolution cell.
+    first, second = (look / still).mean((1, 2, 3))
+    assert abs(second / first - 1) < 0.1
+    assert abs((second / first).angle()) < 1e-3
 
 
 def test_detections_are_placed_in_the_world(point_paths):
@@ -151,8 +153,8 @@ def test_the_surrogate_counts_from_the_origin_of_every_frame():
 
     plain = shown(radar, 92.0)
     found = shown(radar.centered(CENTER), -8.0)
-    assert float(plain.sum()) > 0
-    assert (found - plain).abs().max() < 1e-4 * plain.max()
+    assert plain.detach().sum() > 0
+    assert (found - plain).abs().max() < 1e-4 * plain.detach().max()
     weight = torch.linspace(0, 1, 24)[None, :, None, None]
     slopes = [torch.autograd.grad((map_ * weight).sum(), pose)[0] for map_ in (plain, found)]
     assert (slopes[1] - slopes[0]).norm() < 2e-3 * slopes[0].norm()
@@ -185,6 +187,7 @@ def test_the_origin_stays_where_the_radar_is_moved(point_paths):
     assert slope[:2].norm() < 0.05 * wavenumber
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_wrong_origins():
     with pytest.raises(InputError, match=r"range_origin as numbers of shape \[2\]"):
         replace(far(), range_origin=float64([1.0]))
