@@ -26,7 +26,11 @@ def test_units_limits_and_defaults_are_shown():
     (table,) = key_tables("grid")
     rows = {row[0]: row[1:] for row in table.rows}
     assert table.title == "[grid]"
-    assert rows["range_min"] == ["number ≥ 0", "required", "First range to cover [m]"]
+    assert rows["range_min"] == [
+        "number",
+        "required",
+        "First range to cover [m], of at least 0 without a range origin",
+    ]
     assert rows["u_max"] == [
         "number > 0, ≤ 1",
         "1.0",

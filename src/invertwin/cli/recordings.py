@@ -11,6 +11,7 @@ from invertwin.capture import (
     ChirpCapture,
     ChirpData,
     described_arrays,
+    described_sweeps,
     ti,
 )
 from invertwin.capture.radar_fields import WAVEFORMS
@@ -88,6 +89,7 @@ def register(kinds: Registry) -> None:
     kinds.add("data", "capture", saved)
     kinds.add("data", "dca1000", dca1000)
     kinds.add("data", "arrays", arrays)
+    kinds.add("data", "sweeps", sweeps)
 
 
 def saved(file: InputPath, trusted: bool = False) -> Capture:
@@ -138,6 +140,17 @@ def arrays(file: InputPath, board: Mounting | None = None, trusted: bool = False
         return recorded(chirps, board)
     with about("board"):
         return chirps.recorded(described_arrays.described_board(file))
+
+
+def sweeps(file: InputPath, trusted: bool = False) -> Capture:
+    """Sweeps over frequency: a Touchstone file, or a TOML description of files or of arrays.
+
+    Args:
+        file: the description, or one Touchstone file.
+        trusted: true reads it in this process, not in a child process.
+    """
+    with about("file"):
+        return described_sweeps.read_sweeps(file, trusted=trusted)
 
 
 def recorded(chirps: ChirpData, board: Mounting) -> ChirpCapture:

@@ -19,7 +19,7 @@ from invertwin.limits import MOST, Among
 from invertwin.memory import require_at_most
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import check_fields, check_shape, checked_tensor
+from invertwin.scene.checks import ArrayLike, check_fields, check_shape, checked_tensor
 
 Window = Annotated[str, Among(WINDOWS)]
 Cosine = Annotated[float, Gt(0), Le(1)]
@@ -167,7 +167,7 @@ class Radar:
         low = max(nearest, -0.5 * self.waveform.max_range)
         return low, low + self.waveform.max_range
 
-    def centered(self, point: Float64[Tensor, "3"]) -> "Radar":
+    def centered(self, point: ArrayLike) -> "Radar":
         """The radar of data that are motion compensated to a point, which has range 0 in them.
 
         The origins are those of the positions as they are now, without derivatives.

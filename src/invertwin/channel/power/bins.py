@@ -64,7 +64,12 @@ class Layout:
 
     @staticmethod
     def of(grid: Grid, link: Link) -> "Layout":
-        """That of an antenna's maps."""
+        """That of the maps of an antenna.
+
+        Args:
+            grid: Bins of one frame.
+            link: Antennas.
+        """
         return Layout(grid, link.frame_count, link.range_origin)
 
     @property
@@ -73,7 +78,11 @@ class Layout:
         return self.frames, *self.grid.shape
 
     def shown(self, found: Contribution) -> Any:
-        """Ranges of paths from the origin of their frame (detached)."""
+        """Ranges of paths from the origin of their frame (detached).
+
+        Args:
+            found: The paths.
+        """
         length = dr.detach(found.range)
         if self.origin is None:
             return length
