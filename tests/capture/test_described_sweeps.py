@@ -1,6 +1,7 @@
 """Touchstone sweeps and phase histories as captures."""
 
 import math
+import re
 
 import h5py
 import numpy as np
@@ -256,3 +257,13 @@ def test_a_centre_stands_for_the_origins(tmp_path):
         read_sweeps(path)
     path.write_text(text.replace('frequencies = "freq"', "start_frequency = 9.7e9\nstep = 1.5e6"))
     assert math.isclose(read_sweeps(path).radar().waveform.center_frequency, 9.7e9 + 63.5 * 1.5e6)
+
+
+def test_descriptions_as_the_docs_have_them(rail, repository):
+    page = (repository / "docs" / "sweeps.md").read_text()
+    analyser, passes = re.findall(r"^```ini\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    rail.write_text(analyser)
+    assert read_sweeps(rail).radar().shape == (17, 1, 1)
+    scipy.io.savemat(rail.parent / "pass.mat", {"data": history([1.0, 2.0, 0.0])})
+    rail.write_text(passes)
+    assert float(read_sweeps(rail, trusted=True).radar().origins[0]) == pytest.approx(1000.0)

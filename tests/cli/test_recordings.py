@@ -4,6 +4,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -339,3 +340,73 @@ def test_samples_are_kept_as_they_are(tmp_path):
     assert torch.equal(tx.positions, radar.transmitters.positions)
     assert torch.equal(rx.positions, radar.receivers.positions)
     assert torch.equal(described_arrays.read_chirps(tmp_path / "a.toml").samples, beat)
+
+
+# A plate 100 m away, of which the data are centred on its first place.
+FAR = """
+task = "reconstruct"
+
+[scene.plate]
+shape = "plate"
+width = 1.0
+height = 0.8
+divisions = 3
+position = [0.0, 0.0, 99.4]
+material = { kind = "rough_dielectric", permittivity = 4.0 }
+
+[truth.plate]
+position = [0.0, 0.0, 100.1]
+
+[grid]
+range_min = -8.0
+range_max = 8.0
+
+[[parameters]]
+kind = "translation"
+object = "plate"
+axes = "z"
+
+[surrogate]
+range_width = 2.0
+
+[reconstruct]
+steps = 40
+samples = 3000
+"""
+FAR_RADAR = """
+[radar]
+waveform = { kind = "stepped", start_frequency = 9.7e9, step = 3e6, samples = 100, dwell = 1e-6 }
+transmitters = { kind = "linear", count = 1, spacing = 1.0 }
+receivers = { kind = "linear", count = 1, spacing = 1.0 }
+positions = [[-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 1.0]]
+range_center = [0.0, 0.0, 100.0]
+"""
+
+
+def test_a_far_scene_is_fitted_by_sweeps_that_are_centred_on_it(tmp_path, monkeypatch):
+    """Unambiguous over 50 m, 100 m away: simulated, written as arrays, read and fitted."""
+    monkeypatch.chdir(tmp_path)
+    simulated = '[data]\nkind = "simulated"\ndepth = 1\npoints_per_m2 = 2e3\nsnr_db = 20.0\n'
+    text = FAR.replace('task = "reconstruct"', 'task = "simulate"')
+    text = text[: text.index("[[parameters]]")]
+    Path("far.toml").write_text(text + FAR_RADAR + simulated)
+    assert call(monkeypatch, "simulate", "far.toml", "-o", "seen") == 0
+    capture = Capture.load(next(Path("seen").glob("*.nc")))
+    radar = capture.radar()
+    assert radar.origins[1] == pytest.approx(100.0)
+    np.savez(
+        "pass.npz",
+        fp=capture.beat[:, 0, 0].numpy().conj(),
+        places=radar.positions.numpy(),
+        r0=radar.origins.numpy(),
+    )
+    Path("pass.toml").write_text(
+        '[data]\nfile = "pass.npz"\nvariable = "fp"\ndimensions = ["frame", "sample"]\n'
+        "conjugate = true\n[sweep]\nstart_frequency = 9.7e9\nstep = 3e6\n"
+        '[radar]\npositions = "places"\nrange_origin = "r0"\n'
+    )
+    Path("fit.toml").write_text(FAR + '[data]\nkind = "sweeps"\nfile = "pass.toml"\n')
+    assert call(monkeypatch, "reconstruct", "fit.toml", "-o", "fitted") == 0
+    found = read_metrics(tmp_path / "fitted")
+    print(found)
+    assert found["position_error_m"] < 0.1
