@@ -297,8 +297,9 @@ def test_sweeps_of_an_analyser(tmp_path, monkeypatch):
         file.write("range_center = [0.0, 0.0, 103.0]\n")
     assert call(monkeypatch, "look", "rail.toml", "-o", "far") == 0
     found = read_metrics(tmp_path / "far")
-    assert found["peak_range_m"] == pytest.approx(3.0, abs=0.04)
+    assert found["peak_range_m"] == pytest.approx(3.0, abs=0.04)  # as the samples say
     assert found["max_range_m"] == pytest.approx(14.99 / 2, abs=0.01)
+    assert found["range_origin_m"] == pytest.approx(102.8)
     assert Capture.load("far/capture.nc").radar().origins.tolist() == pytest.approx(
         [103, 102.8, 102.6]
     )

@@ -69,6 +69,8 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     }
     if isinstance(radar.waveform, SampledWaveform):
         metrics |= {"samples": radar.waveform.samples, "max_range_m": recording.max_range}
+    if radar.range_origin is not None:
+        metrics["range_origin_m"] = float(radar.range_origin.mean())
     shown, found = _maps(capture, chirps, grid, look.frame)
     metrics |= found
     if look.method != "bartlett":
