@@ -11,7 +11,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.links.placement import PlacedPanel
-from invertwin.radar.parameters import RadarPose
+from invertwin.radar.parameters import RadarPath, RadarPose
 from invertwin.registry.kinds import Group, OneOf, Registry, Table
 from invertwin.registry.section import Counts, InputPath, Vector, about, key
 from invertwin.scene import (
@@ -97,7 +97,7 @@ class ParameterTable(Table):
 
 
 class LearnedTable(Table):
-    """Coordinates of a learned shape, which has a size of its own."""
+    """Coordinates in standard deviations: of a learned shape, of a path."""
 
     weight: NonNegative = key("of ½ Σ z²", 0.0)
 
@@ -138,7 +138,7 @@ def register(registry: Registry) -> None:
     registry.groups["shape"] = Group(tag="shape", base=Placement, product=Mesh)
     registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
     registry.groups["parameter"] = Group(base=ParameterTable)
-    registry.bases |= {PriorShape: LearnedTable, LinearShape: LearnedTable}
+    registry.bases |= dict.fromkeys((PriorShape, LinearShape, RadarPath), LearnedTable)
     registry.given |= {Scene, Mesh, Object, ObjectTable, BodyTemplate, Walking, Sitting}
     registry.groups["motion"] = Group()
     for name, make in (
@@ -168,6 +168,7 @@ def register(registry: Registry) -> None:
         ("body", joints, ()),
         ("material", MaterialValues.of, ()),
         ("radar_pose", RadarPose, ("translation", "rotation")),
+        ("radar_path", RadarPath, ()),
         ("mover", Mover, ()),
         ("panel", PanelParameter, ()),
     ):
