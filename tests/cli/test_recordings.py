@@ -410,3 +410,18 @@ def test_a_far_scene_is_fitted_by_sweeps_that_are_centred_on_it(tmp_path, monkey
     found = read_metrics(tmp_path / "fitted")
     assert found["position_error_m"] < 0.1  # from 0.7 m; a cell is 0.5 m
     assert found["verdict"] == "consistent"
+
+
+def test_the_path_of_the_radar_is_refined_along(tmp_path, monkeypatch):
+    """Beside the plate, with an error bar of its own, and held by a heavy odometry."""
+    monkeypatch.chdir(tmp_path)
+    path = '[[parameters]]\nkind = "radar_path"\nsteps = 1\ndrift = 0.02\naxes = ["z"]\n'
+    short = RUN.replace("steps = 8\n", "steps = 4\n").replace("samples = 20_000", "samples = 4_000")
+    for name, more in (("free", ""), ("held", "weight = 1e3\n")):
+        Path(f"{name}.toml").write_text(short + path + more)
+        assert call(monkeypatch, "reconstruct", f"{name}.toml", "-o", name) == 0
+    free, held = (read_metrics(tmp_path / name) for name in ("free", "held"))
+    assert free["standard_deviations"]["radar.step1.z"] > 0
+    moved = [row["parameters"]["radar.displacements"] for row in (free, held)]
+    assert abs(moved[1][0][2]) < abs(moved[0][0][2])
+    assert moved[0][0][:2] == [0.0, 0.0]
