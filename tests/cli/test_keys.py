@@ -51,7 +51,7 @@ def test_what_a_board_owner_looks_for_is_listed():
     waveforms = {table.title.partition(" kind = ")[2] for table in key_tables("radar.waveform")}
     assert waveforms == {'"fmcw"', '"stepped"', '"ofdm"', '"impulse"'}
     kinds = {table.title.partition(" kind = ")[2].strip('"') for table in key_tables("data")}
-    assert kinds >= {"simulated", "capture", "dca1000", "arrays", "rail_sar"}
+    assert kinds >= {"simulated", "capture", "dca1000", "arrays", "sweeps", "rail_sar"}
     (name,) = [row for t in key_tables("radar.board") for row in t.rows if row[0] == "name"]
     assert name[1].replace('"', "").split(", ") == list(BOARDS)
     for section in ("chirps", "raw", "impairments"):

@@ -273,6 +273,9 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
     expected = chirps.samples[:, 2] / ChannelCalibration(gains).gains[..., None]
     torch.testing.assert_close(placed.beat, expected)
     assert placed.radar().positions.tolist() == [[0, 0, -1], [0, 0, -1]]
+    assert placed.radar().range_origin is None
+    far = measured(data_table(**table, **changes, range_center=[0.0, 3.0, 3.0]))
+    assert far.radar().origins.tolist() == pytest.approx([5.0, 5.0], abs=0.01)  # of a wide board
     rotations = placed.radar().rotations
     assert rotations is not None
     assert rotations[1, :, 2].tolist() == pytest.approx([1, 0, 0])
@@ -406,6 +409,7 @@ def test_a_far_scene_is_fitted_by_sweeps_that_are_centred_on_it(tmp_path, monkey
         '[radar]\npositions = "places"\nrange_origin = "r0"\n'
     )
     Path("fit.toml").write_text(FAR + '[data]\nkind = "sweeps"\nfile = "pass.toml"\n')
+    assert call(monkeypatch, "check", "fit.toml") == 0
     assert call(monkeypatch, "reconstruct", "fit.toml", "-o", "fitted") == 0
     found = read_metrics(tmp_path / "fitted")
     assert found["position_error_m"] < 0.1  # from 0.7 m; a cell is 0.5 m

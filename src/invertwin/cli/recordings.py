@@ -1,5 +1,6 @@
 """Data of run files: simulated, captures, and recordings with every chirp."""
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
@@ -77,7 +78,8 @@ class ChirpTable(DataTable, Posed):
         if self.frame is not None:
             with about("frame"):
                 found = found.frames([self.frame])
-        return found.placed(*self.poses(found.frame_count))
+        found = found.placed(*self.poses(found.frame_count))
+        return replace(found, device=self.centered(found.device))
 
 
 def register(kinds: Registry) -> None:

@@ -118,6 +118,11 @@ class Posed(Table):
         [[0.0, 0.0, 0.0]],
     )
     orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
+    range_center: Vector | None = key(
+        "m, a point in the world that has range 0 in every frame, as in data that are motion "
+        "compensated to a scene; without it ranges count from the radar",
+        None,
+    )
 
     def poses(self, frames: int) -> tuple[Tensor, Tensor]:
         """Positions [frame, 3]; columns are the radar's right, up and boresight axes [frame, 3, 3].
@@ -138,6 +143,16 @@ class Posed(Table):
         turn = rotation_from_vector(_float64(self.orientation.rotation_deg).deg2rad())
         return places, turn.expand(len(places), 3, 3).clone()
 
+    def centered(self, radar: Radar) -> Radar:
+        """The radar with the range origin of its data.
+
+        Args:
+            radar: At the poses.
+        """
+        if self.range_center is None:
+            return radar
+        return radar.centered(_float64(self.range_center))
+
 
 class RadarTable(Posed):
     """Arrays, waveform and poses; one frame per position."""
@@ -145,11 +160,6 @@ class RadarTable(Posed):
     board: Annotated[Any, OneOf("board")] | None = key("antenna elements of a board, or:", None)
     transmitters: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
     receivers: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
-    range_center: Vector | None = key(
-        "m, a point in the world that has range 0 in every frame, as in data that are motion "
-        "compensated to a scene; without it ranges count from the radar",
-        None,
-    )
 
     @model_validator(mode="after")
     def _elements(self) -> "RadarTable":
@@ -166,8 +176,7 @@ class RadarTable(Posed):
             more |= {"transmitters": arrays[0], "receivers": arrays[1]}
         more["positions"], more["rotations"] = self.poses(1)
         found = super().build(given, **more)
-        if self.range_center is not None:
-            found = found.centered(_float64(self.range_center))
+        found = self.centered(found)
         WAVEFORMS.setdefault(type(found.waveform).__name__, type(found.waveform))
         return found
 
