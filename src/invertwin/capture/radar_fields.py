@@ -103,7 +103,9 @@ def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
             f"expected dimensions {', '.join(dims)}, got shape {tuple(value.shape)}; "
             "give one size for each of them"
         )
-    return xr.DataArray(value.detach().cpu().numpy().copy(), dims=dims, attrs={"units": unit})
+    return xr.DataArray(
+        value.detach().cpu().resolve_conj().numpy().copy(), dims=dims, attrs={"units": unit}
+    )
 
 
 def tensor(dataset: xr.Dataset, name: str) -> Tensor:
