@@ -159,14 +159,15 @@ def _netcdf(path: str, _variable: str) -> StoredArrays:
     return StoredArrays(arrays, dict(whole.attrs))
 
 
-def _hdf5(path: str, variable: str) -> StoredArrays:
+def _hdf5(path: str, place: str, name: str = "") -> StoredArrays:
     import h5py
     import numpy as np
 
+    name = name or place
     with h5py.File(path, "r") as opened:
-        if variable not in opened:
-            raise KeyError(variable)
-        return StoredArrays({variable: StoredArray((), np.asarray(opened[variable]), {})}, {})
+        if place not in opened:
+            raise KeyError(name)
+        return StoredArrays({name: StoredArray((), np.asarray(opened[place]), {})}, {})
 
 
 def _matlab(path: str, variable: str) -> StoredArrays:
@@ -174,14 +175,21 @@ def _matlab(path: str, variable: str) -> StoredArrays:
     import numpy as np
     import scipy.io
 
+    root, *fields = variable.split(".")
     if h5py.is_hdf5(path):
-        array = _hdf5(path, variable).arrays[variable]
+        inside = _hdf5(path, "/".join([root, *fields]), variable)
         # MATLAB stores the first dimension fastest.
-        return StoredArrays({variable: array._replace(values=array.values.T)}, {})
-    found = scipy.io.loadmat(path, variable_names=[variable])
-    if variable not in found:
-        raise KeyError(variable)
-    return StoredArrays({variable: StoredArray((), np.asarray(found[variable]), {})}, {})
+        array = inside.arrays[variable].values.T
+    else:
+        found = scipy.io.loadmat(path, variable_names=[root])
+        if root not in found:
+            raise KeyError(variable)
+        array = np.asarray(found[root])
+        for field in fields:
+            if field not in (array.dtype.names or ()):
+                raise KeyError(variable)
+            array = np.asarray(array[field].item())  # a structure is an array of one record
+    return StoredArrays({variable: StoredArray((), array, {})}, {})
 
 
 _READERS: dict[str, Callable[[str, str], StoredArrays]] = {

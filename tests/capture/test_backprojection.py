@@ -1,5 +1,7 @@
 """Images and calibration of synthetic point targets, whose places are known."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -70,3 +72,25 @@ def test_bad_searches_are_refused():
         locate(capture(TARGET), TARGET, radius=0.1, step=0.2)
     with pytest.raises(InputError, match="ranges within the profile"):
         locate(capture(TARGET), TARGET + 10)
+
+
+def test_range_profiles_that_count_from_an_origin():
+    """The same data with ranges and origins less 5 m of every frame: image, place, calibration."""
+    plain = capture(TARGET, OTHER)
+    radar = replace(plain.radar(), range_origin=torch.full((81,), 5.0, dtype=torch.float64))
+    centered = Capture.from_range_profile(
+        plain.range_profile,
+        plain.ranges - 5.0,
+        radar,
+        plain.times,
+        track=plain.track,
+        clock_offset=CLOCK,
+        range_bias=BIAS,
+    )
+    points = torch.stack([TARGET, OTHER, TARGET + 0.1])
+    assert torch.allclose(backproject(centered, points), backproject(plain, points), atol=1e-9)
+    assert torch.allclose(locate(centered, TARGET), locate(plain, TARGET), atol=1e-6)
+    found, expected = calibrate(centered, TARGET), calibrate(plain, TARGET)
+    assert found.clock_offset == pytest.approx(expected.clock_offset, abs=1e-5)
+    assert found.range_bias == pytest.approx(expected.range_bias, abs=1e-5)
+    assert found.radar().origins[0] == 5.0

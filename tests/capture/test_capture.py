@@ -309,7 +309,9 @@ def test_half_a_complex_variable_is_refused(tmp_path):
 def test_recordings_are_told_by_their_ending(tmp_path):
     beat_capture().save(tmp_path / "capture.nc")
     assert read(tmp_path / "capture.nc").frame_count == FRAMES
-    with pytest.raises(InputError, match=r"ends in .bin, .setup.json, .toml or .nc, got .*x.wav"):
+    with pytest.raises(
+        InputError, match=r"ends in .bin, .setup.json, .toml, .s1p, .s2p or .nc, got .*x.wav"
+    ):
         read(tmp_path / "x.wav")
 
 

@@ -56,6 +56,19 @@ def test_gains_are_found_beside_clutter_and_taken_out(frames):
     assert clean.radar().waveform == CHIRP
 
 
+def test_gains_are_found_in_data_with_an_origin():
+    """A ramp whose reference is 1 m late: the same gains, of delays that are 2 m/c less."""
+    origin = torch.ones(2, dtype=torch.float64)
+    centered = replace(radar(), range_origin=origin)
+    ends = [(element - PLACE).norm(dim=-1) for element in radar().elements()]
+    delay = ((ends[0][:, :, None] + ends[1][:, None])[..., None] - 2.0) / 299792458.0
+    cycles = CHIRP.start_frequency * delay + CHIRP.slope * delay * CHIRP.sample_times
+    ideal = torch.exp(2j * torch.pi * (cycles - 0.5 * CHIRP.slope * delay**2))
+    estimated = estimate_channels(Capture.from_beat(errors()[..., None] * ideal, centered), PLACE)
+    expected = ChannelCalibration(errors()).gains
+    torch.testing.assert_close(estimated.gains, expected, atol=1e-6, rtol=0)
+
+
 def test_common_power_and_phase_are_left_alone():
     gains = ChannelCalibration(errors()).gains
     assert float(gains.abs().square().mean()) == pytest.approx(1)

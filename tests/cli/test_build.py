@@ -210,13 +210,14 @@ def test_parameters_start_as_the_identity():
         {"kind": "vertices", "object": "box"},
         {"kind": "material", "object": "box", "values": ["permittivity"]},
         {"kind": "radar_pose"},
+        {"kind": "radar_path", "steps": 1, "drift": 0.05},
     ]
     run = read(parameters=tables, radar=RADAR)
     scene = build.scene(run)
     modules = build.parameters(run.parameters, scene)
     assert len(modules) == len(tables)
     changed = scene
-    for module in modules[:-1]:
+    for module in modules[:-2]:
         changed = module(changed)
     torch.testing.assert_close(changed["box"].vertices, scene["box"].vertices)
     material = changed["box"].material

@@ -26,7 +26,11 @@ def test_units_limits_and_defaults_are_shown():
     (table,) = key_tables("grid")
     rows = {row[0]: row[1:] for row in table.rows}
     assert table.title == "[grid]"
-    assert rows["range_min"] == ["number ≥ 0", "required", "First range to cover [m]"]
+    assert rows["range_min"] == [
+        "number",
+        "required",
+        "First range to cover [m], of at least 0 without a range origin",
+    ]
     assert rows["u_max"] == [
         "number > 0, ≤ 1",
         "1.0",
@@ -47,7 +51,7 @@ def test_what_a_board_owner_looks_for_is_listed():
     waveforms = {table.title.partition(" kind = ")[2] for table in key_tables("radar.waveform")}
     assert waveforms == {'"fmcw"', '"stepped"', '"ofdm"', '"impulse"'}
     kinds = {table.title.partition(" kind = ")[2].strip('"') for table in key_tables("data")}
-    assert kinds >= {"simulated", "capture", "dca1000", "arrays", "rail_sar"}
+    assert kinds >= {"simulated", "capture", "dca1000", "arrays", "sweeps", "rail_sar"}
     (name,) = [row for t in key_tables("radar.board") for row in t.rows if row[0] == "name"]
     assert name[1].replace('"', "").split(", ") == list(BOARDS)
     for section in ("chirps", "raw", "impairments"):

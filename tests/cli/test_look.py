@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -263,3 +264,53 @@ def test_public_recordings(data_folder, tmp_path, monkeypatch, folder, key, valu
     monkeypatch.chdir(tmp_path)
     assert call(monkeypatch, "look", data_folder / folder) == 0
     assert abs(read_metrics(tmp_path / "out" / folder)[key] - value) <= within
+
+
+def swept(frames: int = 3) -> None:
+    """Writes sweeps of a point at 3 m, less 0.2 m a frame, and their description."""
+    frequencies = 4e9 + 10e6 * np.arange(101)
+    for frame in range(frames):
+        response = np.exp(-4j * np.pi * frequencies * (3.0 - 0.2 * frame) / 299_792_458)
+        rows = zip(frequencies / 1e9, response.real, response.imag, strict=True)
+        lines = [f"{f:.9f} {a:.9e} {b:.9e}" for f, a, b in rows]
+        Path(f"at_{frame}.s1p").write_text("\n".join(["# GHz S RI R 50", *lines]))
+    places = [[0.0, 0.0, 0.2 * frame] for frame in range(frames)]
+    Path("rail.toml").write_text(
+        f'[data]\nfiles = "at_*.s1p"\n[sweep]\n[radar]\npositions = {places}\n'
+    )
+
+
+def test_sweeps_of_an_analyser(tmp_path, monkeypatch):
+    """One file as it is, and several with their places; centred on what is far away."""
+    monkeypatch.chdir(tmp_path)
+    swept()
+    assert call(monkeypatch, "look", "at_1.s1p") == 0
+    found = read_metrics(tmp_path / "out" / "at_1")
+    assert (found["reader"], found["frames"], found["samples"]) == ("sweeps", 1, 101)
+    assert found["peak_range_m"] == pytest.approx(2.8, abs=0.04)
+    assert found["max_range_m"] == pytest.approx(14.99, abs=0.01)
+    assert call(monkeypatch, "look", "rail.toml", "--frame", "2") == 0
+    found = read_metrics(tmp_path / "out" / "rail")
+    assert (found["frames"], found["channels"]) == (3, 1)
+    assert found["peak_range_m"] == pytest.approx(2.6, abs=0.04)
+    with Path("rail.toml").open("a") as file:
+        file.write("range_center = [0.0, 0.0, 103.0]\n")
+    assert call(monkeypatch, "look", "rail.toml", "-o", "far") == 0
+    found = read_metrics(tmp_path / "far")
+    assert found["peak_range_m"] == pytest.approx(3.0, abs=0.04)  # as the samples say
+    assert found["max_range_m"] == pytest.approx(14.99 / 2, abs=0.01)
+    assert found["range_origin_m"] == pytest.approx(102.8)
+    assert Capture.load("far/capture.nc").radar().origins.tolist() == pytest.approx(
+        [103, 102.8, 102.6]
+    )
+
+
+def test_sweeps_that_do_not_fit_are_one_line(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    swept()
+    text = Path("at_1.s1p").read_text()
+    Path("at_1.s1p").write_text(text.replace("4.010000000", "4.011000000"))
+    assert call(monkeypatch, "look", "rail.toml") == 2
+    error = capfd.readouterr().err
+    assert "at_1.s1p" in error
+    assert "Traceback" not in error

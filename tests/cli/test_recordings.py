@@ -4,6 +4,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -272,6 +273,9 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
     expected = chirps.samples[:, 2] / ChannelCalibration(gains).gains[..., None]
     torch.testing.assert_close(placed.beat, expected)
     assert placed.radar().positions.tolist() == [[0, 0, -1], [0, 0, -1]]
+    assert placed.radar().range_origin is None
+    far = measured(data_table(**table, **changes, range_center=[0.0, 3.0, 3.0]))
+    assert far.radar().origins.tolist() == pytest.approx([5.0, 5.0], abs=0.01)  # of a wide board
     rotations = placed.radar().rotations
     assert rotations is not None
     assert rotations[1, :, 2].tolist() == pytest.approx([1, 0, 0])
@@ -339,3 +343,89 @@ def test_samples_are_kept_as_they_are(tmp_path):
     assert torch.equal(tx.positions, radar.transmitters.positions)
     assert torch.equal(rx.positions, radar.receivers.positions)
     assert torch.equal(described_arrays.read_chirps(tmp_path / "a.toml").samples, beat)
+
+
+# A plate 100 m away, of which the data are centred on its first place.
+FAR = """
+task = "reconstruct"
+
+[scene.plate]
+shape = "plate"
+width = 1.0
+height = 0.8
+divisions = 3
+position = [0.0, 0.0, 99.4]
+material = { kind = "rough_dielectric", permittivity = 4.0 }
+
+[truth.plate]
+position = [0.0, 0.0, 100.1]
+
+[grid]
+range_min = -8.0
+range_max = 8.0
+
+[[parameters]]
+kind = "translation"
+object = "plate"
+axes = ["z"]
+
+[surrogate]
+range_width = 2.0
+
+[reconstruct]
+steps = 40
+samples = 3000
+"""
+FAR_RADAR = """
+[radar]
+waveform = { kind = "stepped", start_frequency = 9.7e9, step = 3e6, samples = 100, dwell = 1e-6 }
+transmitters = { kind = "linear", count = 1, spacing = 1.0 }
+receivers = { kind = "linear", count = 1, spacing = 1.0 }
+positions = [[-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 1.0]]
+range_center = [0.0, 0.0, 100.0]
+"""
+
+
+def test_a_far_scene_is_fitted_by_sweeps_that_are_centred_on_it(tmp_path, monkeypatch):
+    """Unambiguous over 50 m, 100 m away: simulated, written as arrays, read and fitted."""
+    monkeypatch.chdir(tmp_path)
+    simulated = '[data]\nkind = "simulated"\ndepth = 1\npoints_per_m2 = 2e3\nsnr_db = 20.0\n'
+    text = FAR.replace('task = "reconstruct"', 'task = "simulate"')
+    text = text[: text.index("[[parameters]]")]
+    Path("far.toml").write_text(text + FAR_RADAR + simulated)
+    assert call(monkeypatch, "simulate", "far.toml", "-o", "seen") == 0
+    capture = Capture.load(next(Path("seen").glob("*.nc")))
+    radar = capture.radar()
+    assert radar.origins[1] == pytest.approx(100.0)
+    np.savez(
+        "pass.npz",
+        fp=capture.beat[:, 0, 0].numpy().conj(),
+        places=radar.positions.numpy(),
+        r0=radar.origins.numpy(),
+    )
+    Path("pass.toml").write_text(
+        '[data]\nfile = "pass.npz"\nvariable = "fp"\ndimensions = ["frame", "sample"]\n'
+        "conjugate = true\n[sweep]\nstart_frequency = 9.7e9\nstep = 3e6\n"
+        '[radar]\npositions = "places"\nrange_origin = "r0"\n'
+    )
+    Path("fit.toml").write_text(FAR + '[data]\nkind = "sweeps"\nfile = "pass.toml"\n')
+    assert call(monkeypatch, "check", "fit.toml") == 0
+    assert call(monkeypatch, "reconstruct", "fit.toml", "-o", "fitted") == 0
+    found = read_metrics(tmp_path / "fitted")
+    assert found["position_error_m"] < 0.1  # from 0.7 m; a cell is 0.5 m
+    assert found["verdict"] == "consistent"
+
+
+def test_the_path_of_the_radar_is_refined_along(tmp_path, monkeypatch):
+    """Beside the plate, with an error bar of its own, and held by a heavy odometry."""
+    monkeypatch.chdir(tmp_path)
+    path = '[[parameters]]\nkind = "radar_path"\nsteps = 1\ndrift = 0.02\naxes = ["z"]\n'
+    short = RUN.replace("steps = 8\n", "steps = 4\n").replace("samples = 20_000", "samples = 4_000")
+    for name, more in (("free", ""), ("held", "weight = 1e3\n")):
+        Path(f"{name}.toml").write_text(short + path + more)
+        assert call(monkeypatch, "reconstruct", f"{name}.toml", "-o", name) == 0
+    free, held = (read_metrics(tmp_path / name) for name in ("free", "held"))
+    assert free["standard_deviations"]["radar.step1.z"] > 0
+    moved = [row["parameters"]["radar.displacements"] for row in (free, held)]
+    assert abs(moved[1][0][2]) < abs(moved[0][0][2])
+    assert moved[0][0][:2] == [0.0, 0.0]

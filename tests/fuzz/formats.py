@@ -255,6 +255,50 @@ def _mats() -> list[Files]:
     return [*_arrays("mat")(), *_written(seven)]
 
 
+_SWEEP = "# MHz S RI R 50\n100 0.5 0.1 0.2 0 0.2 0 1 1\n110 0.4 0 0.1 0 0.1 0 1 1\n"
+_RAIL = """[data]
+files = "at_*.s2p"
+[sweep]
+background = "empty.s2p"
+parameter = "S21"
+dwell = 1e-3
+[radar]
+positions = "rail.csv"
+look_at = [0.0, 0.0, 3.0]
+tx_positions = [[-0.1, 0.0, 0.0]]
+range_center = [0.0, 0.0, 2.0]
+"""
+_PASS = """[data]
+file = "pass.npz"
+variable = "fp"
+dimensions = ["sample", "frame"]
+conjugate = true
+[sweep]
+frequencies = "freq"
+[radar]
+positions = ["x", "y", "z"]
+range_origin = "r0"
+"""
+
+
+def _sweeps() -> list[Files]:
+    def history(folder: Path) -> str:
+        (folder / "pass.toml").write_text(_PASS)
+        rows = {name: np.arange(3.0) for name in ("x", "y", "z", "r0")}
+        fp = np.ones((4, 3), complex)
+        np.savez(folder / "pass.npz", fp=fp, freq=1e9 + 1e6 * np.arange(4), **rows)
+        return "pass.toml"
+
+    files = {name: _SWEEP.encode() for name in ("at_0.s2p", "at_1.s2p", "empty.s2p")}
+    rail = {"rail.toml": _RAIL.encode(), **files, "rail.csv": b"x,y,z\n0,0,0\n0.1,0,0\n"}
+    return [rail, {"at_0.s2p": _SWEEP.encode()}, *_written(history)]
+
+
+def _read_sweeps(path: Path) -> None:
+    found = read(path)
+    _ = found.max_range, found.radar().range_limits
+
+
 def _read_arrays(path: Path) -> None:
     found = read(path, board=Mounting("xWR1843", 1), trusted=_sound(path))
     _ = found.max_range, found.frame_count
@@ -418,6 +462,7 @@ FORMATS: dict[str, Format] = {
     "capture": Format(_captures, _read_capture, ("bytes", "values", "values", "values"), short=30),
     "npz": Format(_npz, _read_npz, ("bytes", "values")),
     "mat": Format(_mats, _read_arrays, ("bytes", "values", "values", "values"), short=30),
+    "sweeps": Format(_sweeps, _read_sweeps),
     "dca1000": Format(_boards, _read_board),
     "channels": Format(_channels, ChannelCalibration.load),
     "checkpoint": Format(_checkpoints, _read_checkpoint, ("bytes", "values", "values")),

@@ -13,6 +13,7 @@ from invertwin.radar import (
     FMCW,
     Impulse,
     Radar,
+    SteppedFrequency,
     backproject_beat,
     beamform,
     beat_signal,
@@ -152,3 +153,63 @@ def test_wrong_input(linear):
     with pytest.raises(InputError, match="no beat signal"):
         backproject_beat(beat, replace(linear, waveform=Impulse(77e9, 1e9)), far)
     assert backproject_beat(beat, linear, torch.zeros(0, 3, dtype=torch.float64)).shape == (0,)
+
+
+# Spotlight: 200 pulses over 10° towards one scene, 600 MHz at 10 GHz, 100 m unambiguous.
+PULSES = SteppedFrequency(9.7e9, 1.5e6, 400, 1e-6)
+SPREAD = math.radians(10)
+POINTS = torch.tensor([[0, 0, 0], [12.3, -7.1, 0], [-20.4, 15.2, 0.5]], dtype=torch.float64)
+
+
+def spotlight(distance: float, straight: bool) -> Radar:
+    """A pass at a height, over x, y with z up; straight, or on a circle about the centre."""
+    turn = torch.linspace(-SPREAD / 2, SPREAD / 2, 200, dtype=torch.float64)
+    level, height = distance * math.cos(0.5), distance * math.sin(0.5)
+    along = level * (turn.tan() if straight else turn.sin())
+    away = level * (torch.ones_like(turn) if straight else turn.cos())
+    places = torch.stack([along, -away, height * torch.ones_like(turn)], dim=1)
+    one = linear_array(1, 1.0)
+    return Radar(one, one, PULSES, places).centered([0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("straight", [False, True], ids=["circle", "line"])
+@pytest.mark.parametrize("distance", [100.0, 1e3, 1e4])
+def test_spotlight_images(distance, straight, point_paths):
+    """Points are within a tenth of a cell of their places, also 10 km away."""
+    radar = spotlight(distance, straight)
+    beat = recorded(point_paths, radar, POINTS, [1.0, 1.0, 1.0])
+    # On the ground, c/2B over the cosine of the elevation away and λ/2Δθ across.
+    cells = (
+        PULSES.wavelength / (2 * SPREAD * math.cos(0.5)),
+        PULSES.range_resolution / math.cos(0.5),
+    )
+    x, y = (torch.linspace(-1, 1, 21, dtype=torch.float64) * cell for cell in cells)
+    around = torch.nn.functional.pad(torch.cartesian_prod(x, y), (0, 1))
+    for point in POINTS:
+        image = backproject_beat(beat, radar, point + around).abs()
+        found = around[image.argmax()]
+        assert (found[:2].abs() <= 0.1 * torch.tensor(cells) + 1e-9).all()
+        assert float(image.max()) == pytest.approx(1.0, abs=0.05)
+        assert float(image[0]) < 0.4  # a cell away along both axes
+
+
+def test_phases_are_right_from_10_km():
+    """Against the sum as it is written, from the same distances: to 1e-6 of a point's echo."""
+    radar = spotlight(1e4, straight=False)
+    generator = torch.Generator().manual_seed(1)
+    points = 10 * torch.rand(5, 3, dtype=torch.float64, generator=generator)
+    shown = (points[:, None] - radar.positions).norm(dim=-1) - radar.origins
+    ideal = torch.exp(4j * math.pi * shown[..., None] * PULSES.frequencies / SPEED_OF_LIGHT)
+    for point, beat in zip(points, ideal, strict=True):
+        image = backproject_beat(beat[:, None, None], radar, point[None])
+        assert abs(image[0] - 1) < 5e-3  # of the interpolation between samples
+        assert abs(image[0].angle()) < 1e-4
+
+
+def test_without_its_origin_a_far_scene_is_refused(point_paths):
+    radar = spotlight(1e3, straight=False)
+    beat = torch.zeros(200, 1, 1, 400, dtype=torch.complex128)
+    with pytest.raises(InputError, match=r"from 0 to 99\.9308 m, got one at 1000 m; .* origin"):
+        backproject_beat(beat, replace(radar, range_origin=None), POINTS[:1])
+    with pytest.raises(InputError, match=r"from -49\.9654 to 49\.9654 m, got one at -6"):
+        backproject_beat(beat, radar, torch.tensor([[0.0, -70.0, 0.0]], dtype=torch.float64))

@@ -1,13 +1,16 @@
 """The reader of the rail recording, on a small imitation and on the recording itself."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from invertwin.capture import Capture, calibrate, locate
+from invertwin.capture import Capture, backproject, calibrate, locate
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.radar import SteppedFrequency
 from invertwin_studies.recordings.rail_sar import FILE, read
 
 META = {"align_time_offset_s": 0.5, "align_range_bias_m": 0.2, "valid_scan_time_s": [0.1, 0.9]}
@@ -118,3 +121,28 @@ def test_the_recording_calibrated_on_one_reflector(data_folder):
     assert calibrated.range_bias == pytest.approx(0.4626, abs=2e-3)
     assert (locate(calibrated, first) - first).norm() == pytest.approx(0.020, abs=2e-3)
     assert (locate(calibrated, second) - second).norm() == pytest.approx(0.177, abs=2e-3)
+
+
+def test_a_measured_pass_is_centred_beyond_its_unambiguous_range(data_folder):
+    """As sweeps of 5 m of ambiguity, centred between reflectors 7 and 8 m away: the same image."""
+    capture = read(data_folder / "rail_sar")
+    assert capture.survey is not None
+    capture = calibrate(capture, capture.survey[0])
+    center = capture.survey.mean(0)
+    for max_range, centered in ((12.0, False), (5.0, True)):
+        step = SPEED_OF_LIGHT / 2 / max_range
+        sweep = SteppedFrequency(3.1e9, step, int(1.7e9 / step), 1e-6)
+        radar = replace(capture.radar(), waveform=sweep)
+        radar = radar.centered(center) if centered else radar
+        shown = capture.ranges[:, None] * sweep.frequencies
+        response = capture.range_profile.to(torch.complex128) @ torch.exp(
+            -4j * torch.pi * shown / SPEED_OF_LIGHT
+        )
+        back = radar.origins[:, None] * sweep.frequencies
+        beat = response.conj() * torch.exp(-4j * torch.pi * back / SPEED_OF_LIGHT)
+        swept = Capture.from_beat(beat[:, None, None], radar)
+        for target, error in zip(capture.survey, (0.02, 0.17), strict=True):
+            line = torch.linspace(-0.3, 0.3, 121, dtype=torch.float64)
+            offset = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1))
+            image = backproject(swept, target + offset).abs()
+            assert float(offset[image.argmax()].norm()) == pytest.approx(error, abs=0.005)

@@ -11,6 +11,7 @@ from invertwin.capture.chirps import ChirpData as ChirpData
 from invertwin.capture.chirps import ChirpSettings as ChirpSettings
 from invertwin.capture.chirps import adc_counts as adc_counts
 from invertwin.capture.chirps import settings_of as settings_of
+from invertwin.capture.reading import is_sweeps as is_sweeps
 from invertwin.capture.reading import read as read
 from invertwin.capture.signature_files import MeasuredSection as MeasuredSection
 from invertwin.capture.signature_files import Touchstone as Touchstone

@@ -38,7 +38,8 @@ def backproject(
     if "beat" in capture.dataset:
         return backproject_beat(capture.beat, capture.radar(), points)
     flat = points.reshape(-1, 3)
-    ranges = distances(capture.radar().positions, flat)
+    radar = capture.radar()
+    ranges = distances(radar.positions, flat) - radar.origins[:, None]
     return capture.interpolator()(ranges).mean(0).reshape(points.shape[:-1])
 
 
@@ -61,11 +62,12 @@ def locate(
         raise InputError(
             f"expected 0 < step < radius, got {step} and {radius}; give both in metres"
         )
-    interpolator, positions = capture.interpolator(), capture.radar().positions
+    interpolator, radar = capture.interpolator(), capture.radar()
 
     def brightness(offset: Float64[Tensor, "point 2"]) -> Float64[Tensor, " point"]:
         points = center + torch.nn.functional.pad(offset, (0, 1))
-        return interpolator(distances(positions, points)).mean(0).abs()
+        ranges = distances(radar.positions, points) - radar.origins[:, None]
+        return interpolator(ranges).mean(0).abs()
 
     spans = (radius, step), (radius, step)
     found = torch.tensor(_brightest(brightness, spans), dtype=torch.float64)
@@ -87,12 +89,13 @@ def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
         InputError: the capture has no track or holds beat samples, or the search leads outside
             the track or the measured ranges.
     """
-    interpolator = capture.interpolator()
+    interpolator, origins = capture.interpolator(), capture.radar().origins[:, None]
 
     def focus(trial: Float64[Tensor, "trial 2"]) -> Float64[Tensor, " trial"]:
         """Amplitude at the target for rows of shifts of clock [s] and bias [m]."""
-        distances = [(capture.positions(clock) - target).norm(dim=1) for clock in trial[:, 0]]
-        return interpolator(torch.stack(distances, dim=1) + trial[:, 1]).mean(0).abs()
+        ranges = [(capture.positions(clock) - target).norm(dim=1) for clock in trial[:, 0]]
+        shown = torch.stack(ranges, dim=1) - origins + trial[:, 1]
+        return interpolator(shown).mean(0).abs()
 
     clock, bias = _brightest(focus, (_CLOCK_SEARCH, _BIAS_SEARCH))
     return capture.recalibrated(capture.clock_offset + clock, capture.range_bias + bias)

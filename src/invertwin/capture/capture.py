@@ -16,7 +16,7 @@ from invertwin.capture.range_interpolation import RangeInterpolator
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.untrusted import reading
@@ -93,7 +93,7 @@ class Capture:
 
         Args:
             profile: analytic signal at radio frequency: an echo from R turns by 4π f/c (r − R).
-            ranges: R = L/2 of its samples, uniform, the bias already subtracted [m].
+            ranges: R = L/2 of its samples, uniform, less bias and range origin [m].
             radar: what measured them.
             times: time of each frame on the radar's clock [s].
             track: from which the radar's positions are read, at ``times + clock_offset``.
@@ -215,7 +215,7 @@ class Capture:
         """Range up to which the data mean something [m]."""
         if "range_profile" in self.dataset:
             return float(self.ranges[-1])
-        return sampled(self._radar).max_range
+        return self._radar.range_limits[1]
 
     def radar(self) -> Radar:
         """The radar at the poses of the frames."""

@@ -132,10 +132,12 @@ def estimate_channels(
     tx, rx = radar.elements()
     to_tx, to_rx = (tx - place).norm(dim=-1), (rx - place).norm(dim=-1)
     delay = (to_tx[:, :, None] + to_rx[:, None]) / SPEED_OF_LIGHT
+    delay = delay - radar.origin_delays[:, None, None]
     farthest = float(delay.max()) * SPEED_OF_LIGHT / 2
-    if farthest >= waveform.max_range:
+    if farthest >= radar.range_limits[1]:
         raise InputError(
-            f"expected a reflector within {waveform.max_range:g} m, got one at {farthest:g} m; {do}"
+            f"expected a reflector within {radar.range_limits[1]:g} m, got one at {farthest:g} m; "
+            f"{do}"
         )
     cycles = waveform.frequencies * delay[..., None]
     cycles = cycles - 0.5 * waveform.residual_slope * delay.square()[..., None]

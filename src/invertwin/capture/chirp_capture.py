@@ -10,7 +10,7 @@ from torch import Tensor
 from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps
-from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.radar import Radar
 from invertwin.scene.checks import check_shape
 
 
@@ -59,7 +59,7 @@ class ChirpCapture:
     @property
     def max_range(self) -> float:
         """Range up to which the samples mean something [m]."""
-        return sampled(self.device).max_range / (2 if self.real else 1)
+        return self.device.range_limits[1] / (2 if self.real else 1)
 
     def loops(self, first: int, count: int) -> "ChirpCapture":
         """A part of the chirps of every frame.

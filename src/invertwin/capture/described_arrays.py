@@ -1,6 +1,7 @@
 """Samples in NumPy, HDF5 or MATLAB files, described by a small TOML file beside them."""
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def described_board(
     Raises:
         InputError: neither the arguments nor the description say which.
     """
-    described = _description(Path(path)).get("radar", {})
+    described = _described_chirps(Path(path)).get("radar", {})
     if board is None:
         board, tx, rx = (described.get(key) for key in ("board", "tx_positions", "rx_positions"))
         if (board is None) == (tx is None or rx is None):
@@ -67,7 +68,7 @@ def described_board(
                 "invertwin.radar.boards, or list the elements"
             )
         if board is None:
-            return _elements(tx, "TX"), _elements(rx, "RX")
+            return element_array(tx, "TX"), element_array(rx, "RX")
     return Mounting(
         board,
         described.get("elevation") if elevation is None else elevation,
@@ -108,12 +109,12 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
         InputError: no file, a damaged one, unknown or missing keys, or dimensions that do not fit.
     """
     path = Path(path)
-    description = _description(path)
+    description = _described_chirps(path)
     data, given = description["data"], description["settings"]
-    array = _array(path.parent / str(data["file"]), data.get("variable"), trusted=trusted)
+    array = load_array(path.parent / str(data["file"]), data.get("variable"), trusted=trusted)
     real = array.dtype.kind != "c"
     order = data.get("dimensions", list(CHIRP_DIMS))
-    samples = _arranged(array, order, len(given.get("transmit_order", [])) or None)
+    samples = arranged(array, order, len(given.get("transmit_order", [])) or None)
     if data.get("conjugate", False):
         samples = samples.conj()
     _, loops, tx, rx, count = samples.shape
@@ -184,23 +185,22 @@ def write_chirps(
         part.write_text(tomli_w.dumps(description), encoding="utf-8")
 
 
-def _elements(positions: Any, name: str) -> AntennaArray:
+def element_array(positions: Any, name: str) -> AntennaArray:
+    """Elements that a description lists.
+
+    Args:
+        positions: of the elements [m].
+        name: of the array, for the error.
+
+    Raises:
+        InputError: no points.
+    """
     do = "give one [x, y, z] in metres per element in [radar]"
     return AntennaArray(checked_tensor(positions, (None, 3), f"{name} positions", do))
 
 
-def _description(path: Path) -> dict[str, dict[str, Any]]:
-    existing_file(path, "a TOML description")
-    with reading(path, "TOML", "give the description of the data, not the data"):
-        description = tomllib.loads(path.read_text(encoding="utf-8"))
-    for section, keys in description.items():
-        known = _KEYS.get(section)
-        if known is None or not isinstance(keys, dict) or not set(keys) <= known:
-            wrong = f"[{section}]" if known is None else f"{keys!r} in [{section}]"
-            raise InputError(
-                f"expected sections {', '.join(_KEYS)} with the keys of the documentation in "
-                f"{path.name}, got {wrong}; known keys: {sorted(known or _KEYS)}"
-            )
+def _described_chirps(path: Path) -> dict[str, dict[str, Any]]:
+    description = load_description(path, _KEYS)
     if "file" not in description.get("data", {}) or "settings" not in description:
         raise InputError(
             f"expected [data] with a file and [settings] in {path.name}, got none; add them"
@@ -208,7 +208,41 @@ def _description(path: Path) -> dict[str, dict[str, Any]]:
     return description
 
 
-def _array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray:
+def load_description(path: Path, keys: Mapping[str, set[str]]) -> dict[str, dict[str, Any]]:
+    """The sections of a description.
+
+    Args:
+        path: the TOML file.
+        keys: those that each section may have.
+
+    Raises:
+        InputError: no such file, no TOML, or other sections or keys.
+    """
+    existing_file(path, "a TOML description")
+    with reading(path, "TOML", "give the description of the data, not the data"):
+        description = tomllib.loads(path.read_text(encoding="utf-8"))
+    for section, given in description.items():
+        known = keys.get(section)
+        if known is None or not isinstance(given, dict) or not set(given) <= known:
+            wrong = f"[{section}]" if known is None else f"{given!r} in [{section}]"
+            raise InputError(
+                f"expected sections {', '.join(keys)} with the keys of the documentation in "
+                f"{path.name}, got {wrong}; known keys: {sorted(known or keys)}"
+            )
+    return description
+
+
+def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray:
+    """Numbers of a data file.
+
+    Args:
+        path: .npy, .npz, .h5, .hdf5 or .mat.
+        variable: its name in all but .npy; fields of a structure of MATLAB have dots in it.
+        trusted: read it in this process, not in a child process.
+
+    Raises:
+        InputError: no such file or variable, a damaged file, or something else than numbers.
+    """
     existing_file(path, "the data file that [data] names")
     ending = path.suffix.lower()
     if ending not in _ENDINGS:
@@ -247,8 +281,17 @@ def _loaded(path: Path, ending: str, variable: str | None, *, trusted: bool) -> 
     return stored.arrays[str(variable)].values
 
 
-def _arranged(array: np.ndarray, order: Any, transmitters: int | None) -> np.ndarray:
-    """Complex (frame, chirp, tx, rx, sample)."""
+def arranged(array: np.ndarray, order: Any, transmitters: int | None) -> np.ndarray:
+    """Complex (frame, chirp, tx, rx, sample).
+
+    Args:
+        array: samples.
+        order: names of its dimensions, as `read_chirps` explains them.
+        transmitters: their number, where it is known.
+
+    Raises:
+        InputError: names that do not fit.
+    """
     allowed = {*CHIRP_DIMS, "virtual"}
     valid = isinstance(order, list) and set(order) <= allowed and len(set(order)) == len(order)
     both = valid and "virtual" in order and {"tx", "rx"} & set(order)

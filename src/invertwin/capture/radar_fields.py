@@ -37,6 +37,8 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
         "position": labelled(("frame", "axis"), radar.positions, "m"),
         "rotation": labelled(("frame", "axis", "radar_axis"), radar.link().rotations, "1"),
     }
+    if radar.range_origin is not None:
+        variables["range_origin"] = labelled(("frame",), radar.range_origin, "m")
     attributes: dict[str, Any] = {
         "waveform": kind,
         **asdict(waveform),  # type: ignore[call-overload]
@@ -69,6 +71,7 @@ def radar_from_fields(dataset: xr.Dataset) -> Radar:
         shared_visibility=_named(
             dataset.attrs, "visibility", {v: k for k, v in _VISIBILITY.items()}
         ),
+        range_origin=tensor(dataset, "range_origin") if "range_origin" in dataset else None,
     )
 
 
@@ -100,7 +103,9 @@ def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
             f"expected dimensions {', '.join(dims)}, got shape {tuple(value.shape)}; "
             "give one size for each of them"
         )
-    return xr.DataArray(value.detach().cpu().numpy().copy(), dims=dims, attrs={"units": unit})
+    return xr.DataArray(
+        value.detach().cpu().resolve_conj().numpy().copy(), dims=dims, attrs={"units": unit}
+    )
 
 
 def tensor(dataset: xr.Dataset, name: str) -> Tensor:

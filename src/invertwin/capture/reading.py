@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from invertwin.capture import described_arrays, ti
+from invertwin.capture import described_arrays, described_sweeps, ti
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.chirps import ChirpSettings
@@ -20,9 +20,10 @@ def read(
 ) -> Capture | ChirpCapture:
     """Read a recording, as the ending of its file says.
 
-    A `.nc` is a saved capture. A `.toml` describes samples in a file beside it
-    (`described_arrays.read_chirps`). A `.bin` or `.setup.json` comes from a DCA1000
-    (`ti.read_recording`).
+    A `.nc` is a saved capture. A `.toml` describes samples in files beside it: sweeps where it has
+    a section ``[sweep]`` (`described_sweeps.read_sweeps`), else chirps
+    (`described_arrays.read_chirps`). A `.s1p` or `.s2p` is a sweep of a network analyser. A `.bin`
+    or `.setup.json` comes from a DCA1000 (`ti.read_recording`).
 
     Args:
         path: the file.
@@ -42,13 +43,15 @@ def read(
     ending = Path(path).suffix.lower()
     if ending == ".nc":
         return Capture.load(path, trusted=trusted)
+    if is_sweeps(path):
+        return described_sweeps.read_sweeps(path, trusted=trusted)
     if ending == ".toml":
         chirps = described_arrays.read_chirps(path, trusted=trusted)
         return chirps.recorded(board or described_arrays.described_board(path))
     if ending not in (".bin", ".json"):
         raise InputError(
-            f"expected a recording that ends in .bin, .setup.json, .toml or .nc, got {path}; "
-            "convert it"
+            "expected a recording that ends in .bin, .setup.json, .toml, .s1p, .s2p or .nc, got "
+            f"{path}; convert it"
         )
     if board is None:
         raise InputError(
@@ -56,3 +59,18 @@ def read(
             "as it was mounted"
         )
     return ti.read_recording(path, settings, lanes).recorded(board)
+
+
+def is_sweeps(path: str | Path) -> bool:
+    """Whether a recording holds sweeps over frequency: a Touchstone file, or their description.
+
+    Args:
+        path: the file.
+
+    Raises:
+        InputError: a description that does not exist.
+    """
+    ending = Path(path).suffix.lower()
+    if ending == ".toml":
+        return described_sweeps.describes_sweeps(path)
+    return described_sweeps.TOUCHSTONE.fullmatch(ending) is not None

@@ -93,6 +93,7 @@ class Link:
             boundary then has one term instead of two (derivations §3).
         tx_jones: Polarisation of the transmitters, about the radar's y axis.
         rx_jones: That of the receivers.
+        range_origin: Range from which each frame counts that of its maps [m]; None = 0.
     """
 
     tx: Float64[Tensor, "frame 3"]
@@ -104,6 +105,7 @@ class Link:
     shared_visibility: bool
     tx_jones: Polarisation = VERTICAL
     rx_jones: Polarisation = VERTICAL
+    range_origin: Float64[Tensor, " frame"] | None = None
 
     def __post_init__(self) -> None:
         frames = self.tx.shape[0]

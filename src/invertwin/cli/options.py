@@ -94,7 +94,8 @@ class Look(Where):
     recording: Annotated[
         Path,
         typer.Argument(
-            help="Raw .bin or .setup.json, a .toml description of arrays, or a .nc capture.",
+            help="Raw .bin or .setup.json, a .toml description of arrays or sweeps, an .s1p or "
+            ".s2p sweep, or a .nc capture.",
             show_default=False,
         ),
     ]

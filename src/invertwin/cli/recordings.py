@@ -1,5 +1,6 @@
 """Data of run files: simulated, captures, and recordings with every chirp."""
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
@@ -11,6 +12,7 @@ from invertwin.capture import (
     ChirpCapture,
     ChirpData,
     described_arrays,
+    described_sweeps,
     ti,
 )
 from invertwin.capture.radar_fields import WAVEFORMS
@@ -76,7 +78,8 @@ class ChirpTable(DataTable, Posed):
         if self.frame is not None:
             with about("frame"):
                 found = found.frames([self.frame])
-        return found.placed(*self.poses(found.frame_count))
+        found = found.placed(*self.poses(found.frame_count))
+        return replace(found, device=self.centered(found.device))
 
 
 def register(kinds: Registry) -> None:
@@ -88,6 +91,7 @@ def register(kinds: Registry) -> None:
     kinds.add("data", "capture", saved)
     kinds.add("data", "dca1000", dca1000)
     kinds.add("data", "arrays", arrays)
+    kinds.add("data", "sweeps", sweeps)
 
 
 def saved(file: InputPath, trusted: bool = False) -> Capture:
@@ -138,6 +142,17 @@ def arrays(file: InputPath, board: Mounting | None = None, trusted: bool = False
         return recorded(chirps, board)
     with about("board"):
         return chirps.recorded(described_arrays.described_board(file))
+
+
+def sweeps(file: InputPath, trusted: bool = False) -> Capture:
+    """Sweeps over frequency: a Touchstone file, or a TOML description of files or of arrays.
+
+    Args:
+        file: the description, or one Touchstone file.
+        trusted: true reads it in this process, not in a child process.
+    """
+    with about("file"):
+        return described_sweeps.read_sweeps(file, trusted=trusted)
 
 
 def recorded(chirps: ChirpData, board: Mounting) -> ChirpCapture:

@@ -46,7 +46,7 @@ _UNITS = {
     "log_density": "per relative density",
 }
 # Kinds whose objects keep their triangles.
-_MOVES = ("translation", "pose", "scale", "material", "radar_pose")
+_MOVES = ("translation", "pose", "scale", "material", "radar_pose", "radar_path")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from invertwin.capture import (
     ChirpCapture,
     described_arrays,
     estimate_channels,
+    is_sweeps,
     read,
 )
 from invertwin.channel import Grid
@@ -35,7 +36,7 @@ from invertwin.registry.kinds import load_plugins, registry
 from invertwin.runs import RunFolder
 
 Recording = Capture | ChirpCapture
-_ENDINGS = ".bin, .setup.json, .toml, .nc or .npz"
+_ENDINGS = ".bin, .setup.json, .toml, .s1p, .s2p, .nc or .npz"
 # Leakage from transmitters to receivers outshines what is nearer than this many range cells.
 _NEAREST_CELLS = 3
 
@@ -68,6 +69,8 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     }
     if isinstance(radar.waveform, SampledWaveform):
         metrics |= {"samples": radar.waveform.samples, "max_range_m": recording.max_range}
+    if radar.range_origin is not None:
+        metrics["range_origin_m"] = float(radar.range_origin.mean())
     shown, found = _maps(capture, chirps, grid, look.frame)
     metrics |= found
     if look.method != "bartlett":
@@ -105,6 +108,8 @@ def _read(look: Look) -> tuple[str, Recording]:
         raise InputError(f"expected a recording, got no file {path}; check the path")
     if path.is_dir() or ending == ".npz":
         return _read_public(look, path if path.is_dir() else path.parent)
+    if is_sweeps(path):
+        return "sweeps", read(path)
     readers = {".nc": "netcdf", ".toml": "arrays", ".bin": "dca1000", ".json": "dca1000"}
     if ending not in readers:
         raise InputError(
@@ -166,7 +171,8 @@ def _calibrated(
 def _grid(look: Look, capture: Capture, farthest: float) -> Grid:
     radar, profiles = capture.radar(), "range_profile" in capture.dataset
     cell = radar.waveform.range_resolution
-    nearest = float(capture.ranges[0]) if profiles else _NEAREST_CELLS * cell
+    leakage = _NEAREST_CELLS * cell - float(radar.origins.min())
+    nearest = float(capture.ranges[0]) if profiles else max(leakage, radar.range_limits[0])
     low = nearest if look.range_min is None else look.range_min
     high = farthest if look.range_max is None else look.range_max
     if high > farthest * (1 + 1e-9):

@@ -118,6 +118,11 @@ class Posed(Table):
         [[0.0, 0.0, 0.0]],
     )
     orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
+    range_center: Vector | None = key(
+        "m, a point in the world that has range 0 in every frame, as in data that are motion "
+        "compensated to a scene; without it ranges count from the radar",
+        None,
+    )
 
     def poses(self, frames: int) -> tuple[Tensor, Tensor]:
         """Positions [frame, 3]; columns are the radar's right, up and boresight axes [frame, 3, 3].
@@ -137,6 +142,16 @@ class Posed(Table):
                 return places, look_at(places, self.orientation.look_at)
         turn = rotation_from_vector(_float64(self.orientation.rotation_deg).deg2rad())
         return places, turn.expand(len(places), 3, 3).clone()
+
+    def centered(self, radar: Radar) -> Radar:
+        """The radar with the range origin of its data.
+
+        Args:
+            radar: At the poses.
+        """
+        if self.range_center is None:
+            return radar
+        return radar.centered(_float64(self.range_center))
 
 
 class RadarTable(Posed):
@@ -161,6 +176,7 @@ class RadarTable(Posed):
             more |= {"transmitters": arrays[0], "receivers": arrays[1]}
         more["positions"], more["rotations"] = self.poses(1)
         found = super().build(given, **more)
+        found = self.centered(found)
         WAVEFORMS.setdefault(type(found.waveform).__name__, type(found.waveform))
         return found
 
@@ -181,7 +197,9 @@ class ChirpsTable(Table):
     )
 
 
-AnyRadar = Annotated[Any, TableOf(Radar, RadarTable, ("rotations", "range_bias"), checked=False)]
+AnyRadar = Annotated[
+    Any, TableOf(Radar, RadarTable, ("rotations", "range_bias", "range_origin"), checked=False)
+]
 AnyGrid = Annotated[Any, TableOf(Radar.grid, without=("self",))]
 AnyChirps = Annotated[Any, TableOf(Chirps, ChirpsTable, ("order",))]
 AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_figure_db"))]

@@ -11,7 +11,8 @@ from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.links.placement import PlacedPanel
-from invertwin.radar.parameters import RadarPose
+from invertwin.radar.parameters import RadarPath, RadarPose
+from invertwin.radar.radar import Radar
 from invertwin.registry.kinds import Group, OneOf, Registry, Table
 from invertwin.registry.section import Counts, InputPath, Vector, about, key
 from invertwin.scene import (
@@ -96,10 +97,14 @@ class ParameterTable(Table):
     rate: Positive | None = key("of its own; without it the optimizer's", None)
 
 
-class LearnedTable(Table):
-    """Coordinates of a learned shape, which has a size of its own."""
+class LatentTable(Table):
+    """Coordinates in standard deviations."""
 
     weight: NonNegative = key("of ½ Σ z²", 0.0)
+
+
+class LearnedTable(LatentTable):
+    """Coordinates of a learned shape, which has a size of its own."""
 
 
 class Mover(ParameterTable):
@@ -138,7 +143,8 @@ def register(registry: Registry) -> None:
     registry.groups["shape"] = Group(tag="shape", base=Placement, product=Mesh)
     registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
     registry.groups["parameter"] = Group(base=ParameterTable)
-    registry.bases |= {PriorShape: LearnedTable, LinearShape: LearnedTable}
+    registry.bases |= dict.fromkeys((PriorShape, LinearShape), LearnedTable)
+    registry.bases[RadarPath] = LatentTable
     registry.given |= {Scene, Mesh, Object, ObjectTable, BodyTemplate, Walking, Sitting}
     registry.groups["motion"] = Group()
     for name, make in (
@@ -168,6 +174,7 @@ def register(registry: Registry) -> None:
         ("body", joints, ()),
         ("material", MaterialValues.of, ()),
         ("radar_pose", RadarPose, ("translation", "rotation")),
+        ("radar_path", RadarPath, ()),
         ("mover", Mover, ()),
         ("panel", PanelParameter, ()),
     ):
@@ -255,11 +262,11 @@ def _shape(table: Any) -> str | None:
     return getattr(table, "shape", None)
 
 
-def shape_terms(table: Any, module: nn.Module, scene: Scene) -> list[Regularizer]:
-    """Terms of the loss that keep a fitted shape plausible."""
-    if table.kind == "vertices" and table.laplacian > 0:
+def shape_terms(table: Any, module: nn.Module, scene: Scene | Radar) -> list[Regularizer]:
+    """Terms of the loss that keep a fitted shape, or a path, plausible."""
+    if isinstance(scene, Scene) and table.kind == "vertices" and table.laplacian > 0:
         return [Laplacian(scene, table.object, table.laplacian)]
-    if isinstance(table, LearnedTable) and table.weight > 0:
+    if isinstance(table, LatentTable) and table.weight > 0:
         return [LatentNorm(module, table.weight)]
     return []
 

@@ -404,14 +404,14 @@ def _bounded(points: Tensor, yaw: float, ground: Ground) -> Rectangle:
 
 def _incoherent(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tensor:
     """Mean over frames of the maps at the points, times R⁴."""
-    link = radar.link()
+    link, origins = radar.link(), radar.origins
     total = torch.zeros(len(points), dtype=torch.float64)
     for frame in range(radar.frame_count):
         to_tx, to_rx = (points - place[frame].detach() for place in (link.tx, link.rx))
         ranges = 0.5 * (to_tx.norm(dim=1) + to_rx.norm(dim=1))
         seen = (to_rx / to_rx.norm(dim=1, keepdim=True)) @ link.rotations[frame].detach()
         places = (
-            (ranges - grid.range_start) / grid.range_step,
+            (ranges - origins[frame] - grid.range_start) / grid.range_step,
             (seen[:, 0] - grid.u_start) / grid.u_step * (grid.u_count > 1),
             (seen[:, 1] - grid.v_start) / grid.v_step * (grid.v_count > 1),
         )

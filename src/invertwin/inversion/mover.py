@@ -64,8 +64,9 @@ def of_point(model: MotionMap, radar: Radar, echo: Echo, time: float = 0.0) -> T
     """
     link = radar.link()
     origin = 0.5 * (link.tx + link.rx)[0]
-    away = (echo.position - origin) / (echo.position - origin).norm()
-    place = (origin + (echo.range + echo.rate * time) * away)[None]
+    distance = (echo.position - origin).norm()
+    away = (echo.position - origin) / distance
+    place = (origin + (distance + echo.rate * time) * away)[None]
     length = (place - link.tx).norm(dim=1) + (place - link.rx).norm(dim=1)
     point = Paths(
         frame=torch.zeros(1, dtype=torch.int64),

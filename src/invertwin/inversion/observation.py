@@ -21,7 +21,8 @@ class Unknown:
         module: The module, or a function that makes it for the scene (or sensor) as it stands
             when the module is applied.
         rate: Learning rate in place of the optimizer's.
-        regularize: Given the module and the scene that it was made for, terms of the loss.
+        regularize: Given the module and the scene (or sensor) that it was made for, terms of the
+            loss, which are functions of the scene.
     """
 
     module: nn.Module | Callable[[Any], nn.Module]

@@ -109,10 +109,11 @@ def reconstruct(
     names = [*unknowns, *(name for found in own for name in found)]
     settings = Settings(loss or SpectrumLoss(), optimizer or Optimizer(), tuple(regularizers), seed)
     stages = checked_stages(schedule, names)
-    sensor_modules = [
-        {name: item.made(o.sensor) for name, item in found.items()}
-        for o, found in zip(watched, own, strict=True)
-    ]
+    made = [_made(o.sensor, found) for o, found in zip(watched, own, strict=True)]
+    sensor_modules = [found for found, _ in made]
+    settings = replace(
+        settings, regularizers=(*settings.regularizers, *(t for _, found in made for t in found))
+    )
     begun, current, fit, status = scene, unknowns, None, "budget"
     history: list[dict[str, Any]] = []
     modules, terms = _made(begun, current)
@@ -178,11 +179,13 @@ def fit_at(
         seed: Of all random numbers.
     """
     modules, terms = _made(scene, named_unknowns(parameters))
+    of_sensors = [_made(o.sensor, named_unknowns(o.parameters)) for o in observations]
+    terms += [term for _, found in of_sensors for term in found]
     return Fit(
         scene,
         observations,
         list(modules.values()),
-        [[u.made(o.sensor) for u in named_unknowns(o.parameters).values()] for o in observations],
+        [list(found.values()) for found, _ in of_sensors],
         stage=Stage(),
         settings=Settings(loss or SpectrumLoss(), Optimizer(), (*regularizers, *terms), seed),
         rates={},
@@ -200,18 +203,18 @@ def _models(stage: Stage, observations: Sequence[Observation]) -> Sequence[Forwa
     return stage.models or [o.model for o in observations]
 
 
-def _made(scene: Scene, unknowns: Mapping[str, Unknown]) -> tuple[dict[str, nn.Module], list[Any]]:
-    """Modules by name, each for the scene as those before it leave it, and their regularisers."""
+def _made(target: Any, unknowns: Mapping[str, Unknown]) -> tuple[dict[str, nn.Module], list[Any]]:
+    """Modules of a scene or a sensor by name, each for what those before leave, and their terms."""
     modules: dict[str, nn.Module] = {}
     terms: list[Regularizer] = []
     last = max((k for k, item in enumerate(unknowns.values()) if item.depends), default=0)
     for number, (name, unknown) in enumerate(unknowns.items()):
-        modules[name] = unknown.made(scene)
+        modules[name] = unknown.made(target)
         if unknown.regularize is not None:
-            terms += unknown.regularize(modules[name], scene)
+            terms += unknown.regularize(modules[name], target)
         if number < last:
             with torch.no_grad():
-                scene = modules[name](scene)
+                target = modules[name](target)
     return modules, terms
 
 

@@ -41,6 +41,7 @@ from invertwin.radar.motion import Chirps as Chirps
 from invertwin.radar.motion import moving_beat as moving_beat
 from invertwin.radar.motion import range_rate as range_rate
 from invertwin.radar.parameters import ClockOffset as ClockOffset
+from invertwin.radar.parameters import RadarPath as RadarPath
 from invertwin.radar.parameters import RadarPose as RadarPose
 from invertwin.radar.parameters import RangeBias as RangeBias
 from invertwin.radar.point_spread import airy as airy

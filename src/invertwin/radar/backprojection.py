@@ -25,8 +25,9 @@ def backproject_beat(
 
     with τ from each TX element over p to each RX element in each pose: no plane waves, so it
     focuses in the near field of the array and along the track of a moving radar. A point target
-    of coefficient a gives conj(a) at its place; points at rest add in phase, movers do not.
-    Differentiable with respect to the signal, the points and the poses.
+    of coefficient a gives conj(a) at its place; points at rest add in phase, movers do not. τ is
+    counted from the radar's range origin. Delays are float64: at 10 km and 10 GHz phases are right
+    to 1e-9. Differentiable with respect to the signal, the points and the poses.
 
     Source: the matched filter of the paper's eq:fmcw_if.
 
@@ -37,7 +38,7 @@ def backproject_beat(
 
     Raises:
         InputError: The signal does not fit the radar, the radar has no beat signal, or a point
-            lies beyond the unambiguous range.
+            lies beyond the unambiguous ranges, see ``Radar.range_limits``.
     """
     waveform = sampled(radar)
     tx, rx = (places.to(beat.device) for places in radar.elements())
@@ -50,13 +51,15 @@ def backproject_beat(
     turn = torch.exp(2j * math.pi * middle / length * torch.arange(length))
     spectrum = torch.fft.fft(tapered, length) * turn.to(beat.device)
     spectrum = torch.cat([spectrum, spectrum[..., :1]], dim=-1)
+    origin_delays, limits = radar.origin_delays.to(beat.device), radar.range_limits
     image = torch.zeros(len(flat), dtype=torch.complex128, device=beat.device)
     for frame in range(radar.frame_count):
         to_tx, to_rx = distances(tx[frame], flat), distances(rx[frame], flat)
         for sender in range(tx.shape[1]):
-            delay = (to_tx[sender] + to_rx) / SPEED_OF_LIGHT
-            _check_range(delay, waveform.max_range)
-            echo = between_samples(spectrum[frame, sender], delay * (waveform.step * length))
+            delay = (to_tx[sender] + to_rx) / SPEED_OF_LIGHT - origin_delays[frame]
+            _check_range(delay, limits)
+            index = torch.remainder(delay * (waveform.step * length), length)
+            echo = between_samples(spectrum[frame, sender], index)
             cycles = delay * (
                 waveform.start_frequency
                 + middle * waveform.step
@@ -95,10 +98,14 @@ def between_samples(
     return before + (after - before) * (index - cell)
 
 
-def _check_range(delay: Float64[Tensor, "rx point"], max_range: float) -> None:
-    farthest = 0.5 * SPEED_OF_LIGHT * float(delay.detach().max()) if delay.numel() else 0.0
-    if farthest > max_range:
-        raise InputError(
-            f"expected points within the unambiguous range of {max_range:g} m, got one at "
-            f"{farthest:g} m; choose nearer points"
-        )
+def _check_range(delay: Float64[Tensor, "rx point"], limits: tuple[float, float]) -> None:
+    if not delay.numel():
+        return
+    for end in delay.detach().aminmax():
+        shown = 0.5 * SPEED_OF_LIGHT * float(end)
+        if not limits[0] - 1e-9 <= shown <= limits[1]:
+            raise InputError(
+                f"expected points within the unambiguous ranges from {limits[0]:g} to "
+                f"{limits[1]:g} m, got one at {shown:g} m; choose nearer points, or give the radar "
+                "the range origin of data that are centred on a scene"
+            )

@@ -221,7 +221,8 @@ def _refined(
     ahead = (1 - us.square() - vs.square()).clamp(min=0).sqrt()
     link = radar.link()
     origin = (0.5 * (link.tx + link.rx)).detach().cpu()
-    local = ranges[:, None] * torch.stack([us, vs, ahead], dim=1)
+    length = ranges + radar.origins.cpu()[frame]
+    local = length[:, None] * torch.stack([us, vs, ahead], dim=1)
     position = origin[frame] + (link.rotations.detach().cpu()[frame] @ local[..., None])[..., 0]
     return PointCloud(frame, ranges, rates, us, vs, power[tuple(cell)], position)
 

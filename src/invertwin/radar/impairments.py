@@ -213,6 +213,11 @@ class Impairments:
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
         streams = _streams(seed)
         if self.leakage is not None:
+            if radar.range_origin is not None:
+                raise InputError(
+                    "expected no leakage with a range_origin, got both; leave one out: motion "
+                    "compensation spreads leakage over the frames"
+                )
             direct = leakage_signal(self.leakage, radar)
             if self.phase_noise is not None:
                 delay = self.leakage.delay

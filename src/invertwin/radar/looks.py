@@ -23,7 +23,7 @@ class Looks:
 
     Args:
         paths: Field paths of rough surfaces, from ``trace_field``.
-        radar: What records them. Its range bias is added.
+        radar: What records them. Its range bias is added, ranges count from its origin.
     """
 
     def __init__(self, paths: Paths, radar: Radar) -> None:
@@ -36,13 +36,15 @@ class Looks:
         way = paths.last - link.rx[paths.frame]
         way = way / way.norm(dim=1)[:, None]
         u, v, _ = torch.einsum("ni,nij->jn", way, link.rotations[paths.frame])
-        ranges = paths.range + torch.as_tensor(radar.range_bias).detach()
+        bias = torch.as_tensor(radar.range_bias).detach()
+        ranges = paths.range - radar.origins[paths.frame] + bias
         steps = (waveform.range_resolution, *radar.beamwidth)
         axes = [_axis(x, step / _CELLS) for x, step in zip((ranges, u, v), steps, strict=True)]
         (ranges, rows), (u, columns), (v, layers) = axes
         self._cells = len(ranges), len(u), len(v)
         self._cell = (rows * len(u) + columns) * len(v) + layers
-        turn = 2 * math.pi * waveform.center_frequency * paths.delay - paths.coefficient.angle()
+        delay = paths.delay - radar.origin_delays[paths.frame]
+        turn = 2 * math.pi * waveform.center_frequency * delay - paths.coefficient.angle()
         self._field = torch.polar(paths.coefficient.abs(), turn).to(torch.complex64)
         order = torch.argsort(paths.frame, stable=True)
         counts = torch.bincount(paths.frame, minlength=self._shape[0]).tolist()

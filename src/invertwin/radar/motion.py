@@ -227,7 +227,8 @@ class Train:
         centers = [centre.to(device) for centre in (self.radar.link().tx, self.radar.link().rx)]
         span = paths.last - paths.first
         segments = _length(paths.first, span, centers[0][paths.frame], centers[1][paths.frame])
-        inner = paths.delay - segments / SPEED_OF_LIGHT
+        origins = self.radar.origin_delays.to(device)[paths.frame]
+        inner = paths.delay - origins - segments / SPEED_OF_LIGHT
         placed = self._placed(start, 1 if sample_interval(waveform) == 0 else 3)
         if len(placed) > 1 and len(paths):
             length = _length(placed, span, centers[0][paths.frame], centers[1][paths.frame])

@@ -62,7 +62,8 @@ def moving_power(
     direction, own_rates = _seen(paths, velocities, radar)
     off = own_rates - rates[:, None]
     doppler = _doppler_response(off / velocity_span(radar, chirps), chirps, window)
-    spread = _range_spread(paths.range + own_rates * _coupling(radar.waveform), radar, grid)
+    shown = paths.range - radar.origins[paths.frame] + own_rates * _coupling(radar.waveform)
+    spread = _range_spread(shown, radar, grid)
     steered = _steered(direction, radar, grid)
     starts = 4 * math.pi / radar.waveform.wavelength * chirps.times(len(steered))[0]
     frames = []

@@ -1,13 +1,17 @@
-"""Modules Radar → Radar that can be fitted: pose, range bias and clock offset."""
+"""Modules Radar → Radar that can be fitted: pose, path, range bias and clock offset."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.errors import InputError
+from invertwin.limits import Axes, Count, Positive
 from invertwin.radar.radar import Radar
-from invertwin.scene.parameters import Coordinate, RigidMotion
+from invertwin.scene.checks import checked_count, checked_number
+from invertwin.scene.parameters import Coordinate, RigidMotion, axes_mask, free_part
 
 
 class RadarPose(RigidMotion):
@@ -24,6 +28,73 @@ class RadarPose(RigidMotion):
     def coordinates(self) -> list[Coordinate]:
         """Place and turn of the radar, as far as they are free."""
         return self.named_coordinates("radar")
+
+
+class RadarPath(nn.Module):
+    """Refines the path of a radar by what odometry piles up: a random walk from the first frame.
+
+        d(0) = 0,   d(k) = d(k−1) + drift · z_k
+
+    at `steps` + 1 knots at even numbers of frames, linear between them, in the world; z are
+    standard normal. So odometry itself is the prior: `inversion.LatentNorm(module, weight)` adds
+    ½ weight |z|² to the loss. Rotations and the range origin stay as recorded.
+
+    Args:
+        steps: of the walk, at most one less than there are frames.
+        drift: standard deviation of a step along each axis [m].
+        axes: world axes along which the fit may move it.
+
+    Attributes:
+        latent: parameter [step, 3], z in standard deviations.
+    """
+
+    def __init__(self, steps: Count, drift: Positive, axes: Axes = "xyz") -> None:
+        super().__init__()
+        count = checked_count(steps, "steps", 1)
+        self.drift = checked_number(drift, "drift [m]", 0.0, open_low=True)
+        self.latent = nn.Parameter(torch.zeros(count, 3, dtype=torch.float64))
+        self._axes = axes_mask(axes)
+
+    def displacements(self, frames: int) -> Float64[Tensor, "frame 3"]:
+        """How far the frames are from where odometry says [m].
+
+        Args:
+            frames: their number.
+
+        Raises:
+            InputError: fewer frames than knots.
+        """
+        steps = len(self.latent)
+        if frames <= steps:
+            raise InputError(
+                f"expected at most {frames - 1} steps for {frames} frames, got {steps}; give fewer"
+            )
+        walk = (self.drift * free_part(self.latent, self._axes)).cumsum(0)
+        knots = torch.cat([torch.zeros_like(walk[:1]), walk])
+        place = torch.linspace(0, steps, frames, dtype=torch.float64, device=walk.device)
+        before = place.floor().clamp_max(steps - 1).long()
+        share = (place - before)[:, None]
+        return (1 - share) * knots[before] + share * knots[before + 1]
+
+    def forward(self, radar: Radar) -> Radar:
+        """The radar on the refined path."""
+        return replace(radar, positions=radar.positions + self.displacements(radar.frame_count))
+
+    def values(self) -> dict[str, Tensor]:
+        """Displacements of the knots after the first one [m] by name, for progress and reports."""
+        walk = (self.drift * self.latent.detach()).cumsum(0)
+        return {"radar.displacements": walk}
+
+    def coordinates(self) -> list[Coordinate]:
+        """Every step of the walk along the axes that are free."""
+        found = []
+        for number in range(len(self.latent)):
+            for column in torch.nonzero(self._axes)[:, 0].tolist():
+                change = torch.zeros_like(self.latent.detach())
+                change[number, column] = 1 / self.drift
+                name = f"radar.step{number + 1}.{'xyz'[column]}"
+                found.append(Coordinate(name, "m", {"latent": change}))
+        return found
 
 
 class RangeBias(nn.Module):

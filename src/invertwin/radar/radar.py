@@ -13,12 +13,13 @@ from jaxtyping import Complex, Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Paths, differentiated
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.limits import MOST, Among, NonNegative, Positive
+from invertwin.limits import MOST, Among
 from invertwin.memory import require_at_most
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import check_fields, check_shape, checked_tensor
+from invertwin.scene.checks import ArrayLike, check_fields, check_shape, checked_tensor
 
 Window = Annotated[str, Among(WINDOWS)]
 Cosine = Annotated[float, Gt(0), Le(1)]
@@ -49,10 +50,14 @@ class Radar:
             are at most 0.1 m apart.
         range_bias: Moves everything that the surrogate shows to larger ranges [m]; may carry a
             gradient. Exact signals refuse it.
+        range_origin: Range from which each frame counts its own [m], as motion compensation to a
+            scene centre leaves them, see ``centered``: an echo from R shows at R less it. None =
+            from the radar. It is a constant of the data: it stays where the positions are moved.
 
     Raises:
         InputError: Wrong shapes, values that are not finite, matrices that are not rotations,
-            unknown windows, or separate visibility with several transmitters.
+            unknown windows, separate visibility with several transmitters, or origins that carry
+            derivatives.
     """
 
     transmitters: AntennaArray
@@ -64,6 +69,7 @@ class Radar:
     array_window: Window = "hamming"
     shared_visibility: bool | None = None
     range_bias: float | Float64[Tensor, ""] = 0.0
+    range_origin: Float64[Tensor, " frame"] | None = None
 
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per pose"
@@ -74,6 +80,9 @@ class Radar:
         if self.rotations is not None:
             rotations = _checked_rotations(self.rotations, len(positions))
             object.__setattr__(self, "rotations", rotations)
+        if self.range_origin is not None:
+            origin = _checked_origin(self.range_origin, len(positions))
+            object.__setattr__(self, "range_origin", origin)
         check_fields(self)
         if not self._shared_visibility and self.shape[1] > 1:
             raise InputError(
@@ -133,6 +142,44 @@ class Radar:
             return differentiated(bias) or bool(bias)
         return bias != 0
 
+    @property
+    def origins(self) -> Float64[Tensor, " frame"]:
+        """Range from which each frame counts its own, 0 = the radar [m]."""
+        if self.range_origin is not None:
+            return self.range_origin
+        return torch.zeros(self.frame_count, dtype=torch.float64, device=self.positions.device)
+
+    @property
+    def origin_delays(self) -> Float64[Tensor, " frame"]:
+        """Delay of an echo from the origin of each frame's ranges [s]."""
+        return self.origins * (2 / SPEED_OF_LIGHT)
+
+    @property
+    def range_limits(self) -> tuple[float, float]:
+        """Ranges that samples tell apart, from the origin [m]: one unambiguous range of them.
+
+        They begin half of it before the origin, but not behind the radar; without an origin they
+        are those from 0 on. A waveform without samples has no end.
+        """
+        nearest = 0.0 - float(self.origins.min())
+        if not isinstance(self.waveform, SampledWaveform):
+            return nearest, math.inf
+        low = max(nearest, -0.5 * self.waveform.max_range)
+        return low, low + self.waveform.max_range
+
+    def centered(self, point: ArrayLike) -> "Radar":
+        """The radar of data that are motion compensated to a point, which has range 0 in them.
+
+        The origins are those of the positions as they are now, without derivatives.
+
+        Args:
+            point: Centre of the scene in the world [m].
+        """
+        center = checked_tensor(point, (3,), "the centre of the scene", "give [x, y, z] in metres")
+        link = self.link()
+        ways = (link.tx - center).norm(dim=1) + (link.rx - center).norm(dim=1)
+        return replace(self, range_origin=0.5 * ways.detach())
+
     def link(self) -> Link:
         """What the channel needs to know: phase centres, axes, patterns, polarisations."""
         return Link(
@@ -145,6 +192,7 @@ class Radar:
             rx_jones=self.receivers.jones,
             wavelength=self.waveform.wavelength,
             shared_visibility=self._shared_visibility,
+            range_origin=self.range_origin,
         )
 
     def coefficient(
@@ -193,12 +241,14 @@ class Radar:
         radar = copy(self)
         object.__setattr__(radar, "positions", self.positions[chosen])
         object.__setattr__(radar, "rotations", self._rotations[chosen])
+        if self.range_origin is not None:
+            object.__setattr__(radar, "range_origin", self.range_origin[chosen])
         return radar
 
     def grid(
         self,
-        range_min: NonNegative,
-        range_max: Positive,
+        range_min: float,
+        range_max: float,
         u_max: Cosine = 1.0,
         v_max: Cosine = 1.0,
         oversample: Annotated[float, Ge(1)] = 2.0,
@@ -211,7 +261,7 @@ class Radar:
         ±1. An axis along which the virtual array has no extent is not resolved.
 
         Args:
-            range_min: First range to cover [m].
+            range_min: First range to cover [m], of at least 0 without a range origin.
             range_max: Last range to cover [m].
             u_max: Direction cosine to the right; the map is as wide to the left.
             v_max: Direction cosine up; the map is as high downwards.
@@ -221,9 +271,12 @@ class Radar:
             InputError: The limits are not increasing, out of bounds, or beyond the unambiguous
                 range.
         """
-        if not 0 <= range_min < range_max:
+        low, high = self.range_limits
+        # The origins of recorded data are rounded, as limits are.
+        least = low - 1e-9 * abs(low)
+        if not least <= range_min < range_max < math.inf:
             raise InputError(
-                f"expected 0 <= range_min < range_max, got {range_min} and {range_max}; "
+                f"expected {low:.4g} <= range_min < range_max, got {range_min} and {range_max}; "
                 "give the limits in metres"
             )
         if not (0 < u_max <= 1 and 0 < v_max <= 1 and oversample >= 1):
@@ -233,15 +286,17 @@ class Radar:
             )
         step = self.waveform.range_resolution / oversample
         if isinstance(self.waveform, SampledWaveform):
-            if range_max > (1 + 1e-9) * self.waveform.max_range:
+            if range_max > high + 1e-9 * self.waveform.max_range:
                 raise InputError(
-                    f"expected range_max within the unambiguous {self.waveform.max_range:.4g} m, "
-                    f"got {range_max:g}; give metres, or finer frequency steps (more samples)",
+                    f"expected range_max within the unambiguous {high:.4g} m, got {range_max:g}; "
+                    "give metres, finer frequency steps (more samples), or a range origin for "
+                    "data that are centred on a scene",
                     "range_max",
                 )
             step = self.waveform.max_range / round(oversample * self.waveform.samples)
         do = "give metres, and direction cosines, or less oversampling"
-        require_at_most(range_max / step, MOST, "bins of range", do, "range_max")
+        farthest = max(range_max, -range_min)
+        require_at_most(farthest / step, MOST, "bins of range", do, "range_max")
         first = math.floor(range_min / step + 1e-9)
         last = math.ceil(range_max / step - 1e-9)
         axes = {}
@@ -317,6 +372,17 @@ def checked_beat(
     what = "a beat signal (frame, tx, rx, sample)"
     check_shape(beat, expected, what, "use the radar that recorded it")
     return beat
+
+
+def _checked_origin(value: object, frames: int) -> Tensor:
+    do = "give one range in metres per frame"
+    origin = checked_tensor(value, (frames,), "range_origin", do)
+    if differentiated(origin):
+        raise InputError(
+            "expected range_origin without derivatives, got one that carries them; it is what the "
+            "recording was compensated with: detach it"
+        )
+    return origin
 
 
 def _checked_rotations(value: object, frames: int) -> Tensor:

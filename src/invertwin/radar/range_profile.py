@@ -35,7 +35,8 @@ def beat_signal(
     centres, corrected by the exact lengths from its first and last vertex, so the near field
     and multiple bounces are exact. The sum is a non-uniform FFT (type 1) in float64; its adjoint
     (type 2) gives gradients with respect to the coefficient, delay, first and last vertex and
-    the radar's poses.
+    the radar's poses. With a range origin τ is the delay beyond the origin's: the reference, and
+    on a ramp its clock, come so much later; the origin has no derivative.
 
     Source: eq:fmcw_if of the paper; derivations §1 and §6.
     Differs from the source: the coefficient is conj(a) and holds the path's phase φ (printed
@@ -54,6 +55,7 @@ def beat_signal(
     check_paths(paths, radar, waveform)
     device = paths.delay.device
     tx, rx = (places.to(device) for places in radar.elements())
+    origin_delays = radar.origin_delays.to(device)
     order = torch.argsort(paths.frame, stable=True)
     counts = torch.bincount(paths.frame, minlength=radar.frame_count).tolist()
     frames: list[Tensor] = []
@@ -63,6 +65,7 @@ def beat_signal(
         # What remains of the delay without the segments to the antennas.
         inner = (
             paths.delay[rows]
+            - origin_delays[frame]
             - ((first - tx[frame].mean(0)).norm(dim=1) + (last - rx[frame].mean(0)).norm(dim=1))
             / SPEED_OF_LIGHT
         )
@@ -154,7 +157,7 @@ def range_profile(
     if bins is None:
         return tapered @ _range_matrix(waveform, grid).to(beat.device, beat.dtype)
     length, first = bins
-    # A range beyond the unambiguous one shows what is one period nearer.
+    # A range beyond the unambiguous one shows what is one period nearer, one below 0 farther.
     wanted = (first + torch.arange(grid.range_count, device=beat.device)) % length
     return torch.fft.fft(tapered, length)[..., wanted]
 
@@ -184,12 +187,19 @@ def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
             f"expected path frames in 0..{radar.frame_count - 1}, got {int(paths.frame.min())}.."
             f"{int(paths.frame.max())}; trace with the link of the same radar"
         )
-    beyond = int((paths.range > waveform.max_range).sum())
+    low, high = radar.range_limits
+    shown = paths.range - radar.origins.to(paths.delay.device)[paths.frame]
+    beyond = int(((shown < low) | (shown > high)).sum())
     if beyond:
+        within = (
+            f" from {low:.2f} to {high:.2f} m of the origin"
+            if radar.range_origin is not None
+            else ""
+        )
         warnings.warn(
             f"{beyond} of {len(paths)} paths lie beyond the unambiguous range of "
-            f"{waveform.max_range:.2f} m and appear at wrong ranges; use finer frequency steps, "
-            "which are more samples on a ramp",
+            f"{waveform.max_range:.2f} m{within} and appear at wrong ranges; use finer frequency "
+            "steps, which are more samples on a ramp",
             PhysicsWarning,
             stacklevel=3,
         )
@@ -205,7 +215,7 @@ def fft_bins(waveform: SampledWaveform, grid: Grid) -> tuple[int, int] | None:
     length = waveform.max_range / grid.range_step
     first = grid.range_start / grid.range_step
     on_bins = max(abs(length - round(length)), abs(first - round(first))) < 1e-6
-    if on_bins and round(first) >= 0 and round(length) >= waveform.samples:
+    if on_bins and round(length) >= waveform.samples:
         return round(length), round(first)
     return None
 

@@ -1,12 +1,14 @@
 """Paths on a map, against NumPy in float64."""
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
 import torch
 
 from invertwin.channel import Grid
-from invertwin.channel.power.bins import Bins, Contribution
+from invertwin.channel.power.bins import Bins, Contribution, Layout
 from invertwin.channel.rays.backend import mi
 
 FRAMES, PATHS = 2, 50_000
@@ -80,7 +82,7 @@ def spline(found, dots, exists, grid: Grid, derivative: bool) -> np.ndarray:
 @pytest.mark.parametrize("derivative", [False, True], ids=["value", "derivative"])
 def test_bins_hold_what_falls_on_them(name, derivative):
     found, dots, exists = paths()
-    bins = Bins(GRIDS[name], FRAMES)
+    bins = Bins(Layout(GRIDS[name], FRAMES))
     if derivative:
         bins.add_derivative(found, dots, exists)
     else:
@@ -94,13 +96,31 @@ def test_bins_hold_what_falls_on_them(name, derivative):
     assert torch.allclose(bins.map(), expected, rtol=1e-4, atol=1e-4 * scale)
 
 
+@pytest.mark.parametrize("derivative", [False, True], ids=["value", "derivative"])
+def test_ranges_count_from_the_origin_of_their_frame(derivative):
+    found, dots, exists = paths()
+    origin, frame = torch.tensor([1.5, 2.25]).double(), found.frame.numpy()
+    layout = Layout(replace(GRIDS["all"], range_start=0.0), FRAMES, origin)
+    bins = Bins(layout)
+    if derivative:
+        bins.add_derivative(found, dots, exists)
+    else:
+        bins.add(found, exists)
+    shown = mi.Float((found.range.numpy() - origin.numpy()[frame]).astype(np.float32))
+    moved = replace(found, range=shown)
+    expected = torch.from_numpy(spline(moved, dots, exists, layout.grid, derivative)).float()
+    assert expected[0].abs().sum() > 100
+    scale = float(expected.abs().max())
+    assert torch.allclose(bins.map(), expected, rtol=1e-4, atol=1e-4 * scale)
+
+
 def test_sums_of_many_paths_are_rounded_little():
     """Differences of maps live in the last digits of such sums."""
     power = np.random.default_rng(2).uniform(0, 1, 4_000_000).astype(np.float32)
     frame = mi.UInt32(np.zeros(len(power), dtype=np.uint32))
     still = mi.Float(2.3)
     grid = Grid(2.0, 0.1, 7)
-    bins = Bins(grid, 1)
+    bins = Bins(Layout(grid, 1))
     bins.add(
         Contribution(frame, mi.Float(power), still, mi.Float(0.0), mi.Float(0.0)), mi.Bool(True)
     )

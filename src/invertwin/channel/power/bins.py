@@ -13,8 +13,8 @@ from typing import Any
 from jaxtyping import Float32
 from torch import Tensor
 
-from invertwin.channel.paths import Grid
-from invertwin.channel.rays.arrays import to_torch
+from invertwin.channel.paths import Grid, Link
+from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi
 
 
@@ -48,13 +48,57 @@ def _axis(position: Any, start: float, step: float, count: int) -> list[tuple[An
     return list(zip(places, inside, weights, slopes, strict=True))
 
 
-def _taps(grid: Grid, found: Contribution) -> Iterator[tuple[Any, Any, Any, tuple[Any, Any, Any]]]:
+@dataclass(frozen=True)
+class Layout:
+    """The bins of a map, and the range from which each frame counts.
+
+    Attributes:
+        grid: Bins of one frame.
+        frames: Number of radar poses.
+        origin: Of every frame [m]; None = 0.
+    """
+
+    grid: Grid
+    frames: int
+    origin: Tensor | None = None
+
+    @staticmethod
+    def of(grid: Grid, link: Link) -> "Layout":
+        """That of the maps of an antenna.
+
+        Args:
+            grid: Bins of one frame.
+            link: Antennas.
+        """
+        return Layout(grid, link.frame_count, link.range_origin)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Frames, and bins along range, u and v."""
+        return self.frames, *self.grid.shape
+
+    def shown(self, found: Contribution) -> Any:
+        """Ranges of paths from the origin of their frame (detached).
+
+        Args:
+            found: The paths.
+        """
+        length = dr.detach(found.range)
+        if self.origin is None:
+            return length
+        return length - dr.gather(mi.Float, to_float(self.origin), mi.UInt32(found.frame))
+
+
+def _taps(
+    layout: Layout, found: Contribution
+) -> Iterator[tuple[Any, Any, Any, tuple[Any, Any, Any]]]:
     """The bins that paths fall on (detached).
 
     Yields a bin's index, whether it is on the grid, the weight with which paths fall on it, and
     the derivatives of the weight in range, u and v.
     """
-    ranges = _axis(found.range, grid.range_start, grid.range_step, grid.range_count)
+    grid = layout.grid
+    ranges = _axis(layout.shown(found), grid.range_start, grid.range_step, grid.range_count)
     across = _axis(found.u, grid.u_start, grid.u_step, grid.u_count)
     upwards = _axis(found.v, grid.v_start, grid.v_step, grid.v_count)
     for i, on_range, wr, sr in ranges:
@@ -73,14 +117,12 @@ class Bins:
     have no copies: differences of maps were ten times as noisy with them.
 
     Args:
-        grid: Bins.
-        frames: Number of radar poses.
+        layout: Its bins.
     """
 
-    def __init__(self, grid: Grid, frames: int) -> None:
-        self.shape = (frames, *grid.shape)
-        self.grid = grid
-        self.values = dr.zeros(mi.Float, math.prod(self.shape))
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.values = dr.zeros(mi.Float, math.prod(layout.shape))
 
     def add(self, found: Contribution, active: Any) -> None:
         """Add paths.
@@ -89,7 +131,7 @@ class Bins:
             found: The paths.
             active: Which paths exist.
         """
-        for index, inside, weight, _ in _taps(self.grid, found):
+        for index, inside, weight, _ in _taps(self.layout, found):
             dr.scatter_add(self.values, found.power * weight, index, inside & active)
 
     def add_derivative(self, found: Contribution, dots: tuple, active: Any) -> None:
@@ -102,26 +144,28 @@ class Bins:
         """
         power = dr.detach(found.power)
         dot_power, *moves = dots
-        for index, inside, weight, slopes in _taps(self.grid, found):
+        for index, inside, weight, slopes in _taps(self.layout, found):
             moved = sum(dot * slope for dot, slope in zip(moves, slopes, strict=True))
             dr.scatter_add(self.values, dot_power * weight + power * moved, index, inside & active)
 
     def map(self) -> Float32[Tensor, "frame range u v"]:
         """What all bins hold."""
-        return to_torch(self.values).reshape(self.shape)
+        return to_torch(self.values).reshape(self.layout.shape)
 
 
-def gather(seed: Any, grid: Grid, found: Contribution, active: Any) -> tuple[Any, Any, Any, Any]:
+def gather(
+    seed: Any, layout: Layout, found: Contribution, active: Any
+) -> tuple[Any, Any, Any, Any]:
     """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path.
 
     Args:
         seed: ∂loss/∂map, flat.
-        grid: The bins.
+        layout: The bins.
         found: The paths.
         active: Which paths exist.
     """
     bars = [mi.Float(0.0) for _ in range(4)]
-    for index, inside, weight, slopes in _taps(grid, found):
+    for index, inside, weight, slopes in _taps(layout, found):
         value = dr.gather(mi.Float, seed, index, inside & active)
         for number, factor in enumerate((weight, *slopes)):
             bars[number] += value * factor

@@ -66,9 +66,10 @@ def deposit_density(
         raise InputError(
             "expected a cloud at rest, got a velocity; a frame is one instant: use scene.at(time)"
         )
+    layout = bins.Layout.of(grid, link)
     with use_backend(sampling.backend):
         rays = _Rays.of(item, link, sampling.samples, seed)
-        parts = [_Splat.apply(grid, link.frame_count, *part) for part in rays.contributions()]
+        parts = [_Splat.apply(layout, *part) for part in rays.contributions()]
     return torch.stack(parts).sum(0)
 
 
@@ -246,12 +247,12 @@ class _Splat(torch.autograd.Function):
     """Points into the bins of a map, with the derivatives of ``bins`` in both modes."""
 
     @staticmethod
-    def forward(ctx: Any, grid: Grid, frames: int, frame: Tensor, *columns: Tensor) -> Tensor:
-        ctx.grid, ctx.frames, ctx.backend = grid, frames, backend()
+    def forward(ctx: Any, layout: bins.Layout, frame: Tensor, *columns: Tensor) -> Tensor:
+        ctx.layout, ctx.backend = layout, backend()
         with tracing():
             places = [to_float(column) for column in columns]
             ctx.found = bins.Contribution(mi.Int32(to_index(frame)), *places)
-            out = bins.Bins(grid, frames)
+            out = bins.Bins(layout)
             out.add(ctx.found, True)
             return out.map()
 
@@ -259,15 +260,15 @@ class _Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         with tracing(ctx.backend):
-            bars = bins.gather(to_float(grad), ctx.grid, ctx.found, True)
-            return None, None, None, *(to_torch(bar).double() for bar in bars)
+            bars = bins.gather(to_float(grad), ctx.layout, ctx.found, True)
+            return None, None, *(to_torch(bar).double() for bar in bars)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         with tracing(ctx.backend):
             dots = tuple(
-                mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[3:]
+                mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[2:]
             )
-            out = bins.Bins(ctx.grid, ctx.frames)
+            out = bins.Bins(ctx.layout)
             out.add_derivative(ctx.found, dots, True)
             return out.map()

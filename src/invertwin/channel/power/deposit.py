@@ -101,7 +101,8 @@ def deposit_power(
                     *bare, sampling, seed, scheme=scheme, reference=fixed, coupling=coupling
                 )
             tables = tables_of(lossy, link)
-            parts.append(_Deposit.apply(trace, grid, any(map(differentiated, tables)), *tables))
+            layout = bins.Layout.of(grid, link)
+            parts.append(_Deposit.apply(trace, layout, any(map(differentiated, tables)), *tables))
     return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
 
 
@@ -120,8 +121,8 @@ class _Deposit(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(trace: Trace, grid: Grid, derivative: bool, *tables: Tensor) -> Tensor:
-        out = bins.Bins(grid, trace.rays.link.frame_count)
+    def forward(trace: Trace, layout: bins.Layout, derivative: bool, *tables: Tensor) -> Tensor:
+        out = bins.Bins(layout)
         trace.recorded = trace.deposit(out, record=derivative)
         if derivative:
             _ = trace.boundary_points  # prepared while the paths are walked
@@ -129,7 +130,7 @@ class _Deposit(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # type: ignore[override]
-        ctx.trace, ctx.grid, _, *tables = inputs
+        ctx.trace, ctx.layout, _, *tables = inputs
         ctx.likes, ctx.backend = [plain(table) for table in tables], backend()
 
     @staticmethod
@@ -198,7 +199,7 @@ def _pulled(ctx: Any, wanted: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ..
         seed = to_float(grad)
 
         def gather(*path: Any) -> tuple[Any, Any, Any, Any]:
-            return bins.gather(seed, ctx.grid, *path)
+            return bins.gather(seed, ctx.layout, *path)
 
         boundary = trace.boundary(inputs)
         for records in [trace.recorded] if trace.recorded else trace.records():
@@ -221,7 +222,7 @@ def _pushed(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tensor:
         given = dict(zip(names, tangents, strict=True))
         tables = _attached(trace, names)
         inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
-        out = bins.Bins(ctx.grid, trace.rays.link.frame_count)
+        out = bins.Bins(ctx.layout)
 
         def point_tangents() -> None:
             for name, table in tables.items():

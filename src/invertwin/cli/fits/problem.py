@@ -25,7 +25,7 @@ from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
 from invertwin.models import ChainMap, ExactMap, ForwardModel, SurrogateMap
-from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
+from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Object, Scene, rigid
@@ -33,6 +33,7 @@ from invertwin.seeds import derived_seed
 
 FULL, INTERIOR = "full", "interior_only"
 
+_OF_RADAR = ("radar_pose", "radar_path")
 _POINTS_PER_M2 = 2_000.0
 _RECORDINGS = 2**16  # key of the seeds of recordings, beyond those of sensors
 
@@ -347,9 +348,9 @@ def sharp_models(problem: Problem) -> list[SurrogateMap]:
 def observations_of(problem: Problem) -> list[Observation]:
     """What is fitted of every sensor: data, model and what is unknown of the sensor."""
     poses = {
-        name: Unknown(lambda _: RadarPose(), getattr(table, "rate", None))
+        name: Unknown(partial(_of_radar, table), table.rate, partial(shape_terms, table))
         for name, table in fitted_of(problem.run).items()
-        if table.kind == "radar_pose"
+        if table.kind in _OF_RADAR
     }
     found = []
     for model, (name, sight) in zip(models_of(problem), problem.sights.items(), strict=True):
@@ -362,11 +363,15 @@ def observations_of(problem: Problem) -> list[Observation]:
     return found
 
 
+def _of_radar(table: Any, _: Radar) -> nn.Module:
+    return table.build()
+
+
 def unknowns_of(run: RunFile) -> dict[str, Unknown]:
     """What is fitted of the scene, by name."""
     makers = build.builders(run.parameters, run.scene)
     return {
         name: Unknown(makers[name], getattr(table, "rate", None), partial(shape_terms, table))
         for name, table in fitted_of(run).items()
-        if table.kind != "radar_pose"
+        if table.kind not in _OF_RADAR
     }

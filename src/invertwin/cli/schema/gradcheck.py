@@ -40,7 +40,7 @@ class Gradcheck(Table):
     @property
     def of(self) -> Literal["scene", "sensor"]:
         """What changes with θ."""
-        moved = ("radar_pose", "camera_pose", "transmitter", "panel")
+        moved = ("radar_pose", "radar_path", "camera_pose", "transmitter", "panel")
         return "sensor" if self.parameter.kind in moved else "scene"
 
     @property

@@ -1,0 +1,300 @@
+"""Sweeps over frequency as captures: Touchstone files of analysers, phase histories of SAR."""
+
+import csv
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+from invertwin.capture.capture import Capture
+from invertwin.capture.described_arrays import (
+    arranged,
+    element_array,
+    load_array,
+    load_description,
+)
+from invertwin.capture.signature_files import load_touchstone
+from invertwin.errors import InputError
+from invertwin.radar.radar import Radar
+from invertwin.radar.waveform import SteppedFrequency
+from invertwin.scene import look_at
+from invertwin.scene.checks import checked_tensor
+from invertwin.untrusted import read_npy, read_text, reader, reading
+
+TOUCHSTONE = re.compile(r"\.s\d+p", re.IGNORECASE)
+"""Ending of a Touchstone file."""
+_PARAMETER = re.compile(r"S([1-9])([1-9])")
+_KEYS = {
+    "data": {"file", "files", "variable", "dimensions", "conjugate"},
+    "sweep": {"parameter", "background", "frequencies", "start_frequency", "step", "dwell"},
+    "radar": {
+        *("positions", "look_at", "tx_positions", "rx_positions"),
+        *("range_origin", "range_center"),
+    },
+}
+_DWELL = 1e-3  # s, of an analyser whose filter is 1 kHz wide
+_EVEN = 0.01  # of a step: how far a frequency may be off; then a phase is right to 4°
+
+
+def describes_sweeps(path: str | Path) -> bool:
+    """Whether a TOML description is one of sweeps: it has a section ``[sweep]``.
+
+    Args:
+        path: the TOML file.
+
+    Raises:
+        InputError: no such file.
+    """
+    text = read_text(path, "a TOML description")
+    return re.search(r"^\s*\[sweep\]", text, re.MULTILINE) is not None
+
+
+@reader("sweeps over frequency")
+def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
+    """Read sweeps over equally spaced frequencies: one signal per frame.
+
+    `path` is one Touchstone file (.s1p, .s2p), the sweep of a radar at the origin: S11 of one port,
+    else S21. Or it is a description, in SI units. That of an analyser::
+
+        [data]
+        files = "rail_*.s2p"          # in the order of their names; or a list; or file = "one.s2p"
+
+        [sweep]
+        parameter = "S21"             # by default S11 of one port, else S21
+        background = "empty.s2p"      # a sweep of the empty room, subtracted
+
+        [radar]
+        positions = "rail.csv"        # x, y, z [m] of every file; or a list of points
+        look_at = [0.0, 0.0, 2.0]     # boresight; without it the axes of the world
+        tx_positions = [[-0.1, 0, 0]] # about each position, in the radar frame
+        rx_positions = [[0.1, 0, 0]]
+        range_origin = -0.45          # what cables add to all ranges is taken off
+
+    That of a phase history, whose values may be names of variables of the data file::
+
+        [data]
+        file = "pass.mat"             # or .npy, .npz, .h5, .hdf5
+        variable = "data.fp"
+        dimensions = ["sample", "frame"]
+        conjugate = true              # phases fall with delay, exp(−2πj f τ)
+
+        [sweep]
+        frequencies = "data.freq"     # or start_frequency and step
+
+        [radar]
+        positions = ["data.x", "data.y", "data.z"]
+        range_origin = "data.r0"      # of every frame; or range_center = [0.0, 0.0, 0.0]
+
+    ``range_origin`` and ``range_center`` are those of `Radar`: what has range 0 in the data, by
+    motion compensation. Names that end in .csv or .npy are files beside the description.
+
+    Args:
+        path: the file.
+        trusted: read HDF5 and MATLAB files in this process, not in a child process.
+
+    Raises:
+        InputError: no file, a damaged one, unknown or missing keys, files that do not fit each
+            other, or frequencies that are not equally spaced.
+    """
+    path = Path(path)
+    if TOUCHSTONE.fullmatch(path.suffix):
+        description: dict[str, dict[str, Any]] = {"data": {"file": path.name}}
+    else:
+        description = load_description(path, _KEYS)
+    data, sweep, radar = (description.get(name, {}) for name in ("data", "sweep", "radar"))
+    files = _files(path.parent, data)
+    tx, rx = (
+        element_array(radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper())
+        for end in ("tx", "rx")
+    )
+    source = _Source(files[0], trusted)
+    if TOUCHSTONE.fullmatch(files[0].suffix):
+        frequencies, beat = _touchstone(files, sweep, path.parent)
+    else:
+        if len(files) > 1:
+            raise InputError(
+                f"expected one data file or Touchstone files, got {len(files)} of {files[0].name}; "
+                "put the arrays into one"
+            )
+        senders = len(tx.positions)
+        array = load_array(files[0], data.get("variable"), trusted=trusted)
+        order = data.get("dimensions", ["frame", "tx", "rx", "sample"])
+        samples = torch.from_numpy(arranged(array, order, senders))
+        if samples.shape[1] != 1:
+            raise InputError(
+                f"expected one sweep a frame, got {samples.shape[1]} chirps; name that dimension "
+                '"frame"'
+            )
+        beat = samples[:, 0].conj() if data.get("conjugate", False) else samples[:, 0]
+        beat = beat.resolve_conj()
+        frequencies = _frequencies(source, sweep, beat.shape[-1])
+    start, step = _spacing(frequencies)
+    waveform = SteppedFrequency(start, step, len(frequencies), sweep.get("dwell", _DWELL))
+    places = _places(source, radar.get("positions"), len(beat))
+    toward = radar.get("look_at")
+    turned = None if toward is None else look_at(places, toward)
+    device = Radar(tx, rx, waveform, places, turned)
+    return Capture.from_beat(beat, _centered(device, source, radar))
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Where a description finds what it names: in its data file, or in files beside it."""
+
+    file: Path
+    trusted: bool
+
+    def values(self, given: Any) -> Any:
+        """Numbers as they are given, or those of the name."""
+        if not isinstance(given, str):
+            return given
+        beside = self.file.parent / given
+        if beside.suffix == ".npy":
+            return read_npy(beside)
+        if TOUCHSTONE.fullmatch(self.file.suffix) or self.file.suffix == ".npy":
+            raise InputError(
+                f"expected numbers, or the name of a .csv or .npy file, got {given!r}; "
+                f"{self.file.name} has no variables"
+            )
+        return load_array(self.file, given, trusted=self.trusted)
+
+
+def _files(folder: Path, data: dict[str, Any]) -> list[Path]:
+    """The data files of a description, at least one."""
+    if ("file" in data) == ("files" in data):
+        raise InputError(
+            f"expected either file or files in [data], got {'both' if data else 'neither'}; "
+            "name what holds the samples"
+        )
+    if "file" in data:
+        return [folder / str(data["file"])]
+    named = data["files"]
+    found = (
+        sorted(folder.glob(named)) if isinstance(named, str) else [folder / str(n) for n in named]
+    )
+    if not found:
+        raise InputError(f"expected files {named!r} beside the description, got none; check them")
+    return found
+
+
+def _touchstone(
+    files: list[Path], sweep: dict[str, Any], folder: Path
+) -> tuple[Float64[Tensor, " sample"], Complex128[Tensor, "frame 1 1 sample"]]:
+    """Frequencies, and the beat signal of every file less the background."""
+    frequencies, first = _parameter(files[0], sweep)
+    rows = [first, *(_same(_parameter(file, sweep), frequencies, file) for file in files[1:])]
+    response = torch.stack(rows)
+    if "background" in sweep:
+        file = folder / str(sweep["background"])
+        response = response - _same(_parameter(file, sweep), frequencies, file)
+    # The beat signal is conj(H), as that of OFDM.
+    return frequencies, response.conj().resolve_conj()[:, None, None]
+
+
+def _parameter(file: Path, sweep: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    """Frequencies of a Touchstone file, and one of its scattering parameters."""
+    found = load_touchstone(file)
+    ports = found.parameters.shape[1]
+    name = str(sweep.get("parameter", "S11" if ports == 1 else "S21"))
+    match = _PARAMETER.fullmatch(name)
+    out, into = (int(port) for port in match.groups()) if match else (0, 0)
+    if not (1 <= out <= ports and 1 <= into <= ports):
+        raise InputError(
+            f"expected a parameter such as S11 of the {ports} ports of {file.name}, got {name!r}; "
+            "S21 is what port 2 receives of what port 1 sends"
+        )
+    return found.frequencies, found.parameters[:, out - 1, into - 1]
+
+
+def _same(found: tuple[Tensor, Tensor], frequencies: Tensor, file: Path) -> Tensor:
+    """The response of a file, if it was swept over the same frequencies."""
+    own, response = found
+    if len(own) != len(frequencies) or bool(((own - frequencies).abs() > 1e-9 * own).any()):
+        raise InputError(
+            f"expected the {len(frequencies)} frequencies of the first file in {file.name}, got "
+            f"{len(own)} from {float(own[0]):g} to {float(own[-1]):g} Hz; sweep all files alike, "
+            "the background too"
+        )
+    return response
+
+
+def _frequencies(
+    source: _Source, sweep: dict[str, Any], samples: int
+) -> Float64[Tensor, " sample"]:
+    """Frequencies of the samples of a phase history."""
+    if "frequencies" in sweep:
+        given = np.ravel(source.values(sweep["frequencies"]))
+        return checked_tensor(given, (samples,), "frequencies", "give one in Hz per sample")
+    if not {"start_frequency", "step"} <= set(sweep):
+        raise InputError(
+            "expected frequencies, or start_frequency and step, in [sweep], got neither; add them "
+            "in Hz"
+        )
+    count = torch.arange(samples, dtype=torch.float64)
+    return float(sweep["start_frequency"]) + float(sweep["step"]) * count
+
+
+def _spacing(frequencies: Float64[Tensor, " sample"]) -> tuple[float, float]:
+    """First frequency and step of equally spaced ones [Hz]."""
+    count = len(frequencies)
+    if count < 2:
+        raise InputError(
+            f"expected at least 2 frequencies, got {count}; ranges come from a sweep over them"
+        )
+    first = float(frequencies[0])
+    step = (float(frequencies[-1]) - first) / (count - 1)
+    line = first + step * torch.arange(count, dtype=torch.float64)
+    if not (step > 0 and (frequencies - line).abs().max() <= _EVEN * step):
+        steps = frequencies.diff()
+        raise InputError(
+            f"expected ascending, equally spaced frequencies, got steps from "
+            f"{float(steps.min()):g} to {float(steps.max()):g} Hz; sweep linearly in one segment, "
+            "or interpolate the samples"
+        )
+    return first, step
+
+
+def _places(source: _Source, given: Any, frames: int) -> Float64[Tensor, "frame 3"]:
+    """The radar's position in every frame."""
+    if given is None and frames > 1:
+        raise InputError(
+            f"expected positions of {frames} frames in [radar], got none; say where the antennas "
+            "were at each"
+        )
+    if given is None:
+        return torch.zeros(1, 3, dtype=torch.float64)
+    if isinstance(given, str) and given.lower().endswith(".csv"):
+        given = _rows(source.file.parent / given)
+    elif isinstance(given, list) and any(isinstance(name, str) for name in given):
+        given = np.stack([np.ravel(source.values(name)) for name in given], axis=-1)
+    do = "give x, y, z in metres of every frame"
+    return checked_tensor(source.values(given), (frames, 3), "positions in [radar]", do)
+
+
+def _rows(file: Path) -> list[list[float]]:
+    """x, y, z of a CSV file whose first line says which column is which."""
+    what = "lines of x,y,z [m] after a line of these heads"
+    text = read_text(file, what)
+    with reading(file, what, "write them with points as decimal marks"):
+        return [[float(row[axis]) for axis in "xyz"] for row in csv.DictReader(text.splitlines())]
+
+
+def _centered(device: Radar, source: _Source, radar: dict[str, Any]) -> Radar:
+    """The radar with the range origin of its data."""
+    if "range_origin" in radar and "range_center" in radar:
+        raise InputError("expected range_origin or range_center in [radar], got both; remove one")
+    if "range_center" in radar:
+        return device.centered(radar["range_center"])
+    if "range_origin" not in radar:
+        return device
+    given = np.ravel(source.values(radar["range_origin"])).astype(float)
+    if given.size == 1:
+        given = np.full(device.frame_count, given[0])
+    do = "give one range in metres, or one per frame"
+    origin = checked_tensor(given, (device.frame_count,), "range_origin in [radar]", do)
+    return replace(device, range_origin=origin)

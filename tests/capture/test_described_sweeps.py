@@ -1,0 +1,269 @@
+"""Touchstone sweeps and phase histories as captures."""
+
+import math
+import re
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import torch
+
+from invertwin.capture import Capture, backproject, is_sweeps, read
+from invertwin.capture.described_sweeps import read_sweeps
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.radar import SteppedFrequency, range_profile
+
+FREQUENCIES = 4e9 + 10e6 * np.arange(101)  # 15 m unambiguous, 0.15 m cells
+TARGET, WALL = np.array([0.3, 0.0, 3.0]), np.array([-1.0, 0.5, 6.0])
+TX, RX = np.array([-0.1, 0.0, 0.0]), np.array([0.1, 0.0, 0.0])
+RAIL = [np.array([x, 0.0, 0.0]) for x in np.linspace(-0.4, 0.4, 17)]
+
+
+def response(place, *points, cables=0.0):
+    """H = Σ a exp(−2πj f τ) of the points as two antennas see them."""
+    found = np.zeros(len(FREQUENCIES), complex)
+    for point in points:
+        length = np.linalg.norm(point - place - TX) + np.linalg.norm(point - place - RX)
+        delay = (length + 2 * cables) / SPEED_OF_LIGHT
+        found += 1e-3 * np.exp(-2j * np.pi * FREQUENCIES * delay)
+    return found
+
+
+def touchstone(file, s21, frequencies=FREQUENCIES):
+    """Writes two ports whose other parameters are something else, as S11, S21, S12, S22."""
+    lines = ["# GHz S RI R 50"]
+    for f, s in zip(frequencies, s21, strict=True):
+        lines.append(f"{f / 1e9:.9f} 0.5 0.1 {s.real:.12e} {s.imag:.12e} 0.2 0.2 -0.4 0.3")
+    file.write_text("\n".join(lines) + "\n")
+
+
+DESCRIPTION = """\
+[data]
+files = "rail_*.s2p"
+
+[sweep]
+background = "empty.s2p"
+
+[radar]
+positions = "rail.csv"
+look_at = [0.0, 0.0, 3.0]
+tx_positions = [[-0.1, 0.0, 0.0]]
+rx_positions = [[0.1, 0.0, 0.0]]
+"""
+
+
+@pytest.fixture
+def rail(tmp_path):
+    """Sweeps along a rail that look ahead, of a wall behind a target; the wall alone, from one."""
+    for number, place in enumerate(RAIL):
+        touchstone(tmp_path / f"rail_{number:02d}.s2p", response(place, TARGET) + 5e-3)
+    touchstone(tmp_path / "empty.s2p", np.full(len(FREQUENCIES), 5e-3 + 0j))
+    lines = ["file,x,y,z", *(f"{n},{x},{y},{z}" for n, (x, y, z) in enumerate(RAIL))]
+    (tmp_path / "rail.csv").write_text("\n".join(lines) + "\n")
+    path = tmp_path / "rail.toml"
+    path.write_text(DESCRIPTION.replace("look_at = [0.0, 0.0, 3.0]\n", ""))
+    return path
+
+
+def test_one_file_is_one_frame_at_the_origin(tmp_path):
+    touchstone(tmp_path / "one.S2P", response(np.zeros(3), TARGET))
+    assert is_sweeps(tmp_path / "one.S2P")
+    capture = read(tmp_path / "one.S2P")
+    assert isinstance(capture, Capture)
+    radar = capture.radar()
+    assert radar.positions.tolist() == [[0.0, 0.0, 0.0]]
+    waveform = radar.waveform
+    assert isinstance(waveform, SteppedFrequency)
+    assert waveform.start_frequency == pytest.approx(4e9)
+    assert waveform.step == pytest.approx(10e6)
+    assert waveform.samples == 101
+    grid = radar.grid(1.0, 6.0, oversample=8)
+    shown = range_profile(capture.beat, radar, grid)[0, 0, 0].abs()
+    length = np.linalg.norm(TARGET - TX) + np.linalg.norm(TARGET - RX)
+    assert float(grid.ranges[shown.argmax()]) == pytest.approx(length / 2, abs=0.01)
+    assert float(shown.max()) == pytest.approx(1e-3, rel=0.01)
+
+
+def test_one_port_is_a_reflection(tmp_path):
+    (tmp_path / "one.s1p").write_text("# MHz S MA\n100 0.5 90\n110 0.5 45\n120 0.5 0\n")
+    beat = read_sweeps(tmp_path / "one.s1p").beat[0, 0, 0]
+    assert beat.tolist() == pytest.approx([-0.5j, 0.5 * np.exp(-0.25j * np.pi), 0.5])
+
+
+def test_a_rail_of_sweeps_images_the_target(rail):
+    """With the background off and the antennas where they were: brightest at the target."""
+    capture = read_sweeps(rail)
+    radar = capture.radar()
+    assert radar.shape == (17, 1, 1)
+    assert torch.allclose(radar.positions, torch.tensor(np.array(RAIL)))
+    x, z = torch.meshgrid(
+        torch.linspace(-1, 1, 81).double(), torch.linspace(2, 5, 61).double(), indexing="ij"
+    )
+    points = torch.stack([x, 0 * x, z], dim=-1)
+    image = backproject(capture, points).abs()
+    found = points.flatten(0, 1)[image.argmax()]
+    assert (found - torch.tensor(TARGET)).norm() < 0.03
+    assert float(image.max()) == pytest.approx(1e-3, rel=0.02)
+
+
+def test_a_background_is_subtracted(rail):
+    with_it = read_sweeps(rail).beat
+    rail.write_text(rail.read_text().replace('background = "empty.s2p"', ""))
+    without = read_sweeps(rail).beat
+    assert torch.allclose(without - with_it, torch.full_like(with_it, 5e-3), atol=1e-9)
+
+
+def test_parameters_are_named_by_ports(rail):
+    rail.write_text(rail.read_text().replace("[sweep]", '[sweep]\nparameter = "S11"'))
+    beat = read_sweeps(rail).beat  # the same with and without a target
+    assert beat.abs().max() < 1e-12
+    rail.write_text(rail.read_text().replace("S11", "S31"))
+    with pytest.raises(InputError, match=r"such as S11 of the 2 ports of rail_00.s2p, got 'S31'"):
+        read_sweeps(rail)
+
+
+def test_boresight_is_turned_to_a_point(rail):
+    rail.write_text(DESCRIPTION)
+    radar = read_sweeps(rail).radar()
+    assert radar.rotations is not None
+    toward = torch.tensor([0.0, 0.0, 3.0]) - radar.positions
+    assert torch.allclose(
+        radar.rotations[:, :, 2], toward / toward.norm(dim=1, keepdim=True), atol=1e-9
+    )
+
+
+def test_cables_are_an_origin(tmp_path):
+    """0.45 m of cable more than the calibration knows, each way."""
+    touchstone(tmp_path / "one.s2p", response(np.zeros(3), TARGET, cables=0.45))
+    (tmp_path / "one.toml").write_text(
+        '[data]\nfile = "one.s2p"\n[sweep]\n[radar]\nrange_origin = -0.45\n'
+        "tx_positions = [[-0.1, 0, 0]]\nrx_positions = [[0.1, 0, 0]]\n"
+    )
+    capture = read_sweeps(tmp_path / "one.toml")
+    at = torch.tensor([[0.3, 0.0, 3.0], [0.3, 0.0, 3.45]], dtype=torch.float64)
+    image = backproject(capture, at)
+    assert abs(image[0] - 1e-3) < 3e-5
+    assert abs(image[1]) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "match"),
+    [
+        (np.geomspace(4e9, 5e9, 101), "equally spaced frequencies, got steps from"),
+        (FREQUENCIES[:1], "at least 2 frequencies, got 1"),
+    ],
+)
+def test_other_sweeps_are_refused(tmp_path, frequencies, match):
+    touchstone(tmp_path / "one.s2p", np.ones(len(frequencies)), frequencies)
+    with pytest.raises(InputError, match=match):
+        read_sweeps(tmp_path / "one.s2p")
+
+
+def test_files_must_be_swept_alike(rail):
+    touchstone(rail.parent / "empty.s2p", np.ones(101), FREQUENCIES + 1e6)
+    with pytest.raises(InputError, match=r"frequencies of the first file in empty.s2p.*alike"):
+        read_sweeps(rail)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ('files = "rail_*.s2p"', 'files = "rails_*.s2p"', "expected files 'rails_"),
+        ('files = "rail_*.s2p"', "", "either file or files in \\[data\\], got neither"),
+        ('positions = "rail.csv"', "", "expected positions of 17 frames"),
+        ('positions = "rail.csv"', "positions = [[0, 0, 0]]", "positions in \\[radar\\]"),
+        ('positions = "rail.csv"', 'positions = "x"', "rail_00.s2p has no variables"),
+        ('positions = "rail.csv"', 'positions = "empty.csv"', "got no file"),
+        ("[sweep]", "[sweep]\nbands = 2", "sections data, sweep, radar with the keys"),
+        ("[radar]", "[radar]\nrange_origin = 1\nrange_center = [0, 0, 0]", "got both"),
+        ("[radar]", "[radar]\nrange_origin = [1, 2]", "range_origin in \\[radar\\]"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_descriptions_that_do_not_fit_are_one_line(rail, old, new, match):
+    rail.write_text(rail.read_text().replace(old, new))
+    with pytest.raises(InputError, match=match):
+        read_sweeps(rail)
+
+
+# A pass of 10° at 1 km, as phase histories of SAR are stored: z up, centred on the scene.
+GOTCHA = """\
+[data]
+file = "{file}"
+variable = "{of}fp"
+dimensions = ["sample", "frame"]
+conjugate = true
+
+[sweep]
+frequencies = "{of}freq"
+
+[radar]
+positions = ["{of}x", "{of}y", "{of}z"]
+range_origin = "{of}r0"
+"""
+
+
+def history(point):
+    """exp(−4πj f (|p − x| − r0)/c) of a point, and where the antenna was."""
+    turn = np.radians(np.linspace(-5, 5, 64))
+    x, y, z = 800 * np.sin(turn), -800 * np.cos(turn), np.full(64, 600.0)
+    r0 = np.sqrt(x**2 + y**2 + z**2)
+    frequencies = 9.7e9 + 1.5e6 * np.arange(128)
+    away = np.sqrt((x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2)
+    fp = np.exp(-4j * np.pi * frequencies[:, None] * (away - r0) / SPEED_OF_LIGHT)
+    return {"fp": fp, "freq": frequencies, "x": x, "y": y, "z": z, "r0": r0, "th": turn}
+
+
+@pytest.mark.parametrize("kind", ["npz", "h5", "mat", "struct"])
+def test_phase_histories_image_a_point(tmp_path, kind):
+    point = [11.0, -6.5, 0.0]
+    arrays, of = history(point), "data." if kind == "struct" else ""
+    file = tmp_path / f"pass.{'mat' if kind == 'struct' else kind}"
+    if kind == "npz":
+        np.savez(file, **arrays)
+    elif kind == "h5":
+        with h5py.File(file, "w") as opened:
+            for name, array in arrays.items():
+                opened[name] = array
+    else:
+        scipy.io.savemat(file, {"data": arrays} if of else arrays)
+    path = tmp_path / "pass.toml"
+    path.write_text(GOTCHA.format(file=file.name, of=of))
+    assert is_sweeps(path)
+    capture = read_sweeps(path, trusted=kind != "struct")
+    assert capture.radar().origins.tolist() == pytest.approx([1000.0] * 64)
+    assert capture.radar().range_limits[0] == pytest.approx(-49.97, abs=0.01)
+    step = torch.linspace(-2, 2, 41, dtype=torch.float64)
+    around = torch.nn.functional.pad(torch.cartesian_prod(step, step), (0, 1))
+    places = torch.tensor(point, dtype=torch.float64) + around
+    image = backproject(capture, places).abs()
+    # A cell is 0.09 m across and 0.98 m away.
+    assert around[image.argmax()].abs().max() <= 0.1 + 1e-9
+    assert float(image.max()) == pytest.approx(1.0, abs=0.05)
+    capture.save(tmp_path / "pass.nc")
+    assert torch.equal(Capture.load(tmp_path / "pass.nc").radar().origins, capture.radar().origins)
+
+
+def test_a_centre_stands_for_the_origins(tmp_path):
+    np.savez(tmp_path / "pass.npz", **history([1.0, 2.0, 0.0]))
+    path = tmp_path / "pass.toml"
+    text = GOTCHA.format(file="pass.npz", of="")
+    path.write_text(text.replace('range_origin = "r0"', "range_center = [0.0, 0.0, 0.0]"))
+    assert read_sweeps(path).radar().origins.tolist() == pytest.approx([1000.0] * 64)
+    path.write_text(text.replace('frequencies = "freq"', ""))
+    with pytest.raises(InputError, match="frequencies, or start_frequency and step"):
+        read_sweeps(path)
+    path.write_text(text.replace('frequencies = "freq"', "start_frequency = 9.7e9\nstep = 1.5e6"))
+    assert math.isclose(read_sweeps(path).radar().waveform.center_frequency, 9.7e9 + 63.5 * 1.5e6)
+
+
+def test_descriptions_as_the_docs_have_them(rail, repository):
+    page = (repository / "docs" / "sweeps.md").read_text()
+    analyser, passes = re.findall(r"^```ini\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    rail.write_text(analyser)
+    assert read_sweeps(rail).radar().shape == (17, 1, 1)
+    scipy.io.savemat(rail.parent / "pass.mat", {"data": history([1.0, 2.0, 0.0])})
+    rail.write_text(passes)
+    assert float(read_sweeps(rail, trusted=True).radar().origins[0]) == pytest.approx(1000.0)
