@@ -179,7 +179,8 @@ def _at(path: str, part: Part) -> Part:
 def _triangles(run: RunFile, scene: Scene) -> Part:
     counts = {name: len(item.mesh.faces) for name, item in scene.objects.items()}
     name = max(counts, key=lambda name: counts[name])
-    key, total = "scene_file.file", sum(counts.values())
+    total = sum(counts.values())
+    key = "room.furniture" if run.scene_file is None else "scene_file.file"
     if name in run.scene:
         size = next(size for size in _SIZES if hasattr(run.scene[name], size))
         key = f"scene.{name}.{size}"

@@ -159,7 +159,7 @@ def _explain(error: ErrorDetails) -> str:
             )
         case "unknown_object":
             at = ".".join(filter(None, (path, context["path"])))
-            return unknown_object(at, context["name"], list(error["input"]["scene"]))
+            return unknown_object(at, context["name"], context["known"])
         case "union_tag_not_found":
             keys = context["discriminator"].removesuffix("()").split(",")
             present = list(error["input"]) if isinstance(error["input"], dict) else []

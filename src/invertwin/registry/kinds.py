@@ -34,7 +34,16 @@ from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, mod
 
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Letters
-from invertwin.registry.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
+from invertwin.registry.section import (
+    TAG_MARK,
+    InputPath,
+    KeyInputError,
+    Section,
+    about,
+    fail,
+    key,
+    tag_by,
+)
 
 PLUGINS = "invertwin.plugins"
 _MEANINGS = {
@@ -89,6 +98,8 @@ class _Checked(Table):
     def _accepted(self) -> "_Checked":
         try:
             self.build()
+        except KeyInputError as error:
+            fail(error.text, error.path)
         except InputError as error:
             fail(str(error))
         return self
