@@ -128,6 +128,18 @@ def radar(**changes):
             ["reconstruct.depth: ", "greater than or equal to 1", "got 0"],
         ),
         (
+            run(data={"kind": "simulated", "points_per_m2": {"leter": 1e3, "*": 1e2}}),
+            ["data.points_per_m2.leter: ", "(letter)", "did you mean `letter`?"],
+        ),
+        (
+            run(data={"kind": "simulated", "points_per_m2": {"letter": 0.0}}),
+            ["data.points_per_m2.letter: ", "greater than 0"],
+        ),
+        (
+            run(data={"kind": "simulated", "points_per_m2": [1e3]}),
+            ["data.points_per_m2: ", "expected a number", "got [1000.0]"],
+        ),
+        (
             run(data={"kind": "simulated", "points_per_m2": 1e3, "depth": 17}),
             ["data.depth: ", "less than or equal to 16", "got 17"],
         ),

@@ -9,6 +9,7 @@ from annotated_types import MinLen
 from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
+from invertwin.channel.sampling import REST
 from invertwin.cli.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.recordings import SimulatedData
@@ -346,6 +347,12 @@ class _RunFile(Section):
             if getattr(table, "object", None) is not None:
                 used.append((f"{path}.object", table.object))
         used += [("image.objects", name) for name in getattr(self.image, "objects", [])]
+        data = {"data": self.data}
+        data |= {f"observations.{name}.data": t.data for name, t in self.observations.items()}
+        for path, table in data.items():
+            found = getattr(table, "points_per_m2", None)
+            named = [name for name in found if name != REST] if isinstance(found, dict) else []
+            used += [(f"{path}.points_per_m2.{name}", name) for name in named]
         for section in type(self).model_fields:
             name = getattr(getattr(self, section), "object", None)
             if name is not None:
