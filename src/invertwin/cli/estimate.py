@@ -8,8 +8,7 @@ from typing import Any
 import torch
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid
-from invertwin.channel.field.rough_points import densities_of
+from invertwin.channel import Grid, densities_of
 from invertwin.cli.run_file import about, need
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.schema.signature import count_of

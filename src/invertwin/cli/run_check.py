@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from invertwin.channel import Sampling
-from invertwin.channel.field.rough_points import densities_of
+from invertwin.channel import Sampling, densities_of
 from invertwin.cli import build
 from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
 from invertwin.cli.fits.problem import FULL, sensors_of, settings_of, stages_of, varied_run

@@ -13,8 +13,7 @@ from rich.console import Console
 from torch import nn
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid, Sampling
-from invertwin.channel.sampling import Densities
+from invertwin.channel import Densities, Grid, Sampling
 from invertwin.cli import build
 from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.recordings import measured

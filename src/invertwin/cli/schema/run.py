@@ -9,7 +9,7 @@ from annotated_types import MinLen
 from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from invertwin.channel.sampling import REST
+from invertwin.channel import REST
 from invertwin.cli.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.recordings import SimulatedData
