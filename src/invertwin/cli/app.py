@@ -284,9 +284,8 @@ def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
         from invertwin.cli.fits.spreading import Workers
         from invertwin.cli.run_reconstruct import run_reconstruct
 
-        workers = None
-        if isinstance(options, Fits) and (options.engine == "ray" or options.workers is not None):
-            workers = Workers(options.engine, options.workers or 1)
+        fits = isinstance(options, Fits)
+        workers = Workers.asked(options.engine, options.workers) if fits else None
         with about_file(file):
             tables, outcome = run_reconstruct(runs[file.stem], folder, console, workers)
         print_tables(tables)

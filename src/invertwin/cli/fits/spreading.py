@@ -40,6 +40,16 @@ class Workers:
     engine: Engine
     count: int
 
+    @classmethod
+    def asked(cls, engine: Engine, count: int | None) -> "Workers | None":
+        """What the options `--engine` and `--workers` ask for; None without them.
+
+        Args:
+            engine: Of the option.
+            count: Of the option; None where it is not given.
+        """
+        return None if engine == "processes" and count is None else cls(engine, count or 1)
+
 
 @dataclass(frozen=True)
 class Job:
