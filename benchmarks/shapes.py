@@ -52,7 +52,7 @@ from invertwin.cli import build
 from invertwin.cli.fits.fitting import fit
 from invertwin.cli.fits.problem import FULL, problem_of
 from invertwin.cli.fits.spreading import Workers
-from invertwin.cli.run_file import load_run, to_toml, validate
+from invertwin.cli.run_file import load_run, stated, to_toml, validate
 from invertwin.cli.schema import RunFile
 from invertwin.engines import spread
 from invertwin.runs import open_run
@@ -142,7 +142,7 @@ def all_cars(
     if workers is None:
         done = enumerate(map(fitted, runs))
     else:
-        texts = [to_toml(own) for own in runs]
+        texts = [stated(own) for own in runs]
         done = spread(fitted_text, texts, engine=workers.engine, workers=workers.count)
     for at, fits in done:
         number = list(missing)[at]

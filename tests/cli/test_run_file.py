@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cli.small import RUN
-from invertwin.cli.run_file import load_run, validate
+from invertwin.cli.run_file import load_run, stated, validate
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
@@ -255,3 +255,13 @@ def test_all_typos_are_told_at_once_beside_wrong_values(tmp_path):
     }
     # A key that is misspelt is not missing, too.
     assert "got nothing" not in str(found.value)
+
+
+def test_what_is_stated_stays_apart_from_defaults():
+    read = validate(run(seed=4), Path("run.toml"))
+    again = validate(tomllib.loads(stated(read)), Path("run.toml"))
+    assert again == read
+    assert again.model_fields_set == read.model_fields_set
+    assert "loss" not in again.model_fields_set
+    other = validate(tomllib.loads(stated(read.model_copy(update={"seed": 5}))), Path("run.toml"))
+    assert other.seed == 5

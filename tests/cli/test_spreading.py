@@ -1,7 +1,5 @@
 """Fits by other processes are those that this one makes, and are made once."""
 
-import tomllib
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +10,6 @@ from cli.test_radio import STARTS as RADIO_STARTS
 from invertwin.cli import run_reconstruct
 from invertwin.cli.fits import spreading
 from invertwin.cli.fits.spreading import part_name
-from invertwin.cli.run_file import to_toml, validate
 from invertwin.folders import PARTS
 
 SHORT = RUN.replace("steps = 8", "steps = 3")
@@ -97,8 +94,7 @@ def goes_on(run, mode, start, folder):
 
 
 def test_a_worker_goes_on_from_the_calibration():
-    text = to_toml(validate(tomllib.loads(SHORT), Path("run.toml")))
-    job = spreading.Job(goes_on, text, "full", 1, {CALIBRATED: b"seed "})
+    job = spreading.Job(goes_on, SHORT, "full", 1, {CALIBRATED: b"seed "})
     assert spreading.fitted_files(job) == {f"{PARTS}/full_01.json": b"seed 3"}
 
 

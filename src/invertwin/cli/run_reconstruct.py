@@ -39,7 +39,7 @@ from invertwin.cli.fits.spreading import QUIET, Workers, fit_elsewhere, refused
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table, finish, picture
-from invertwin.cli.run_file import to_toml, validate
+from invertwin.cli.run_file import stated, validate
 from invertwin.cli.run_placement import run_placement
 from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile, SimulatedData
@@ -152,7 +152,7 @@ def run_reconstruct(
 
 def _fit_one(run: RunFile, mode: str, number: int, folder: RunFolder) -> None:
     """What a worker does of a run: one fit, which leaves its files in the folder."""
-    problem, _ = calibrated(_recorded(to_toml(run)), folder, QUIET)
+    problem, _ = calibrated(_recorded(stated(run)), folder, QUIET)
     problem, _ = guessed(problem, QUIET)
     start, own = starts_of(problem)[number], recorded_for(problem, number, QUIET)
     fit(own, start, number, mode, folder, QUIET, None)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from invertwin.cli.run_file import to_toml, validate
+from invertwin.cli.run_file import stated, validate
 from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile
 from invertwin.engines import Engine, spread
@@ -93,7 +93,7 @@ def fit_elsewhere(
     """
     if len(fits) == 1:
         raise refused("one fit")
-    text, begun = to_toml(run), f"{PARTS}/calibration.pt"
+    text, begun = stated(run), f"{PARTS}/calibration.pt"
     path = folder.path / UNFINISHED / begun
     files = {begun: path.read_bytes()} if path.exists() else {}
     jobs = [
