@@ -1,9 +1,11 @@
 """Shapes of twenty cars from radar: what does a learned prior know that free vertices do not?
 
-    python benchmarks/shapes.py [-o DIR] [--cars N]
+    python benchmarks/shapes.py [-o DIR] [--cars N] [--workers N | --engine ray]
 
 Prints a table and writes `metrics.json` and `shapes.png` into DIR (default `out/shapes`). Cars that
-an interrupted run has finished are not fitted again.
+an interrupted run has finished are not fitted again. `--workers N` fits N cars at a time in
+processes of one thread; `--engine ray` gives them to a Ray cluster. The fits are the same; their
+times are those of one thread beside others.
 
 Radar, data, fits and metrics are those of `experiments/shape_car_prior_public.toml`; every car has
 a shape, start, speckle and noise of its own. The cars are drawn from the public learned space of
@@ -33,6 +35,7 @@ import json
 import math
 import statistics
 import tempfile
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -48,8 +51,10 @@ from scipy.spatial.transform import Rotation
 from invertwin.cli import build
 from invertwin.cli.fits.fitting import fit
 from invertwin.cli.fits.problem import FULL, problem_of
-from invertwin.cli.run_file import load_run, to_toml
+from invertwin.cli.fits.spreading import Workers
+from invertwin.cli.run_file import load_run, stated, to_toml, validate
 from invertwin.cli.schema import RunFile
+from invertwin.engines import spread
 from invertwin.runs import open_run
 
 RUN = Path(__file__).parents[1] / "experiments" / "shape_car_prior_public.toml"
@@ -113,20 +118,39 @@ def key_of(run: RunFile) -> str:
     return hashlib.sha256(to_toml(run).encode() + mean).hexdigest()
 
 
-def all_cars(out: Path, numbers: Sequence[int], run: RunFile) -> dict[int, Car]:
+def fitted_text(text: str) -> Car:
+    """All fits of a car by its run file: what a worker does."""
+    return fitted(validate(tomllib.loads(text), RUN))
+
+
+def all_cars(
+    out: Path, numbers: Sequence[int], run: RunFile, workers: Workers | None = None
+) -> dict[int, Car]:
     """The fits of the cars; those that are in the folder are read."""
     (out / "cars").mkdir(parents=True, exist_ok=True)
     found: dict[int, Car] = {}
+    missing: dict[int, RunFile] = {}
     for number in numbers:
-        own = run_of(number, run)
-        path, key = out / "cars" / f"{number:02d}.json", key_of(own)
+        own, path = run_of(number, run), out / "cars" / f"{number:02d}.json"
         known: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-        if known.get("key") != key:
-            known = {"key": key, "fits": fitted(own)}
-            path.write_text(json.dumps(known, indent=1) + "\n")
-        found[number] = known["fits"]
-        print(f"car {number}: {_line(found[number])}", flush=True)
-    return found
+        if known.get("key") == key_of(own):
+            found[number] = known["fits"]
+            print(f"car {number}: {_line(found[number])}")
+        else:
+            missing[number] = own
+    runs = list(missing.values())
+    if workers is None:
+        done = enumerate(map(fitted, runs))
+    else:
+        texts = [stated(own) for own in runs]
+        done = spread(fitted_text, texts, engine=workers.engine, workers=workers.count)
+    for at, fits in done:
+        number = list(missing)[at]
+        kept = {"key": key_of(runs[at]), "fits": fits}
+        (out / "cars" / f"{number:02d}.json").write_text(json.dumps(kept, indent=1) + "\n")
+        found[number] = fits
+        print(f"car {number}: {_line(fits)}", flush=True)
+    return {number: found[number] for number in numbers}
 
 
 def _line(car: Car) -> str:
@@ -210,10 +234,12 @@ def picture(cars: dict[int, Car], worst: int, path: Path) -> None:
     FigureCanvasAgg(figure).print_png(path)
 
 
-def measure(out: Path, count: int = CARS, run: RunFile | None = None) -> dict[str, Any]:
+def measure(
+    out: Path, count: int = CARS, run: RunFile | None = None, workers: Workers | None = None
+) -> dict[str, Any]:
     """All metrics and the picture; fewer cars and shorter fits in tests only."""
     start = perf_counter()
-    cars = all_cars(out, range(1, count + 1), load_run(RUN) if run is None else run)
+    cars = all_cars(out, range(1, count + 1), load_run(RUN) if run is None else run, workers)
     metrics: dict[str, Any] = {**summary(cars), "count": count, "seconds": perf_counter() - start}
     worst = metrics["worst"]["car"]
     picture(cars, worst, out / "shapes.png")
@@ -244,8 +270,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("out/shapes"))
     parser.add_argument("--cars", type=int, default=CARS)
+    parser.add_argument("--workers", type=int)
+    parser.add_argument("--engine", choices=("processes", "ray"), default="processes")
     given = parser.parse_args()
-    metrics = measure(given.out, given.cars)
+    metrics = measure(given.out, given.cars, workers=Workers.asked(given.engine, given.workers))
     for key in SHOWN:
         print(f"{key} = {metrics[key]:.3g} (worst car {metrics['worst'][key]:.3g})")
     for line in verdicts(metrics):

@@ -124,6 +124,25 @@ def test_finished_cars_are_read_unless_the_run_file_has_changed(shapes, tmp_path
     assert fits == [1, 2, 3, 1]
 
 
+def test_cars_that_others_fit_are_those_that_are_missing(shapes, tmp_path, monkeypatch):
+    run = shapes.load_run(shapes.RUN)
+    monkeypatch.setattr(shapes, "fitted", lambda own: GOOD if own.seed < 3 else BAD)
+    shapes.measure(tmp_path, 1, run)
+    asked = []
+
+    def spread(work, jobs, *, engine, workers):
+        asked.append((engine, workers, len(jobs)))
+        for at in reversed(range(len(jobs))):  # others end in any order
+            yield at, work(jobs[at])
+
+    monkeypatch.setattr(shapes, "spread", spread)
+    found = shapes.measure(tmp_path, 3, run, shapes.Workers("ray", 1))
+    assert asked == [("ray", 1, 2)]
+    assert list(found["cars"]) == ["1", "2", "3"]
+    assert found["worst"]["car"] == 3
+    assert shapes.measure(tmp_path, 3, run)["cars"] == found["cars"]
+
+
 def test_infinite_numbers_are_null_in_the_file(shapes, tmp_path, monkeypatch):
     monkeypatch.setattr(shapes, "fitted", lambda own: BAD)
     metrics = shapes.measure(tmp_path, 1)

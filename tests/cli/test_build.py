@@ -14,7 +14,13 @@ from invertwin.errors import InputError
 from invertwin.inversion import displaced, residual
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
-from invertwin.scene import PerfectConductor, RoughDielectric, rotation_angle, rotation_from_vector
+from invertwin.scene import (
+    PerfectConductor,
+    RoughDielectric,
+    room,
+    rotation_angle,
+    rotation_from_vector,
+)
 
 ROUGH = {"kind": "rough_dielectric", "permittivity": 4.0, "lobe_width_deg": 30.0}
 ELEMENT = {"kind": "positions", "positions": [[0, 0, 0]]}
@@ -291,6 +297,46 @@ def test_truth_of_a_scene_file_places_from_where_the_file_does(tmp_path):
 def test_scene_file_errors_name_the_key(tmp_path, changes, said):
     with pytest.raises(InputError, match=said):
         build.scene(read_room(tmp_path, **changes))
+
+
+def test_a_room_stands_before_the_other_objects():
+    table = {"width": 4.5, "furniture": ["sofa", "table"], "materials": {"floor": ROUGH}}
+    run = read(room=table, truth={"sofa": {"material": ROUGH}, "table": {"position": [1, 0, 2]}})
+    assert validate(tomllib.loads(to_toml(run)), Path("run.toml")) == run
+    scene, truth, made = build.scene(run), build.true_scene(run), room(4.5, furniture=["sofa"])
+    assert scene.names == (*made, "table", "box")
+    for name in made:
+        assert torch.equal(scene[name].vertices, made[name].vertices)
+        assert torch.equal(truth[name].vertices, made[name].vertices)
+        same = scene[name].material == made[name].material
+        assert same == (name != "floor"), name
+    floor, sofa = scene["floor"].material, truth["sofa"].material
+    assert isinstance(floor, RoughDielectric)
+    assert isinstance(sofa, RoughDielectric)
+    assert (floor.permittivity, sofa.permittivity) == (4.0, 4.0)
+    assert truth["table"].transform[:3, 3].tolist() == [1, 0, 2]
+
+
+def test_a_room_may_be_all_that_there_is():
+    assert build.scene(read(scene={}, room={})).names == tuple(room())
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"room": {"width": 3.0}}, r"run\.toml: room: expected width"),
+        ({"room": {"furniture": ["piano"]}}, r"room: expected furniture among table"),
+        (
+            {"room": {"furniture": [], "materials": {"sofa": ROUGH}}},
+            r"room\.materials\.sofa: expected an object of the room \(floor, ",
+        ),
+        ({"room": {}, "truth": {"sofia": {}}}, r"truth\.sofia: .*mean `sofa`"),
+        ({"room": {}, "scene": {"sofa": make_box()}}, r"scene\.sofa: .*choose another"),
+    ],
+)
+def test_errors_of_a_room_name_the_key(changes, said):
+    with pytest.raises(InputError, match=said):
+        build.scene(read(**changes))
 
 
 def test_table_pattern_in_degrees_and_decibels():

@@ -7,6 +7,7 @@ import sys
 import time
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from invertwin.cli.run_dataset import sample_run, shard_content
 from invertwin.cli.run_file import load_run, to_toml, validate
 from invertwin.cli.shape_tables import joint_places
 from invertwin.cli.variation import steps_of, with_values
-from invertwin.datasets import Samples
+from invertwin.datasets import Samples, object_labels
 from invertwin.datasets.shards import members_of
 from invertwin.engines import spread
 from invertwin.errors import InputError
@@ -415,6 +416,65 @@ def test_paths_are_written_where_they_are_asked_for(tmp_path):
     assert {name for name in members if name.startswith("paths")} == {
         f"paths_{name}.npy" for name in ("frame", "delay", "coefficient", "first", "last")
     }
+
+
+ROOM = """
+[room]
+furniture = ["table", "chair_1", "sofa"]
+materials = {}
+
+[truth.sofa]
+position = [-1.5, 0.0, 3.0]
+
+[[vary]]
+key = ["room.width", "room.depth"]
+kind = "uniform"
+low = 4.5
+high = 6.0
+
+[[vary]]
+key = "room.furniture[1]"
+kind = "presence"
+
+[[vary]]
+key = "room.materials.floor"
+kind = "choice"
+values = [{ kind = "rough_dielectric", itu = "wood" }, { kind = "rough_conductor" }]
+
+[[vary]]
+key = "truth.sofa.position[2]"
+kind = "uniform"
+low = 1.5
+high = 3.0
+"""
+
+
+def test_rooms_are_drawn_and_their_furniture_is_labelled():
+    run = validate(tomllib.loads(RUN + ROOM), ANYWHERE)
+    floors, counts = set(), set()
+    for index in range(12):
+        item: Any = sample_run(run, index)
+        objects, made = labels_of(item), item.room
+        floors.add(made.materials["floor"].kind)
+        counts.add(len(made.furniture))
+        assert ("chair_1" in objects) == (len(made.furniture) == 3)
+        assert objects["ball"]["class"] == "thing"
+        width, place = made.width, item.truth["sofa"].position[2]
+        assert 4.5 <= width == made.depth <= 6.0
+        right = objects["wall_right"]["oriented_box"]["center"]
+        assert right == pytest.approx([width / 2, 1.3, width / 2])
+        sofa = objects["sofa"]["oriented_box"]
+        assert sofa["center"][2] == pytest.approx(place)
+        assert 1.5 <= place <= 3.0
+        assert sofa["size"] == pytest.approx([0.85, 0.822, 1.9], abs=0.01)
+    assert floors == {"rough_dielectric", "rough_conductor"}
+    assert counts == {2, 3}
+
+
+def labels_of(run):
+    scene = build.true_scene(run)
+    seen = {name: torch.zeros(1, len(item.mesh.faces)) for name, item in scene.objects.items()}
+    return {row["name"]: row for row in object_labels(scene, seen, {"ball": "thing"}, {})}
 
 
 def test_json_of_labels_is_strict(whole):

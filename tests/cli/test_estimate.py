@@ -6,13 +6,13 @@ import tomllib
 import pytest
 
 from cli.small import GRADCHECK, RUN, STARTS, call
+from invertwin.cli import build, run_check, run_gradcheck, run_simulate
 from invertwin.cli import estimate as estimates
-from invertwin.cli import run_check, run_gradcheck, run_simulate
 from invertwin.cli.fits import problem
-from invertwin.cli.run_file import validate
+from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.running import time_left
 from invertwin.errors import PhysicsWarning
-from invertwin.scene import shapes
+from invertwin.scene import Mesh, shapes
 from invertwin.scene.files import save_mesh
 
 PAINT = 'material = { kind = "rough_dielectric", permittivity = 4.0 }\n'
@@ -130,6 +130,25 @@ def test_check_says_memory_and_time_and_leaves_nothing(run_file, monkeypatch, ca
     assert "GB free" in said
     assert f"{8 * 24_000:.2g} rays" in said
     assert [path.name for path in run_file.parent.iterdir()] == ["small.toml"]
+
+
+def test_points_of_every_object_are_counted(run_file, monkeypatch, capsys):
+    own = 'points_per_m2 = { plate = 3e3, "*" = 1e3 }'
+    run_file.write_text(RUN.replace("points_per_m2 = 2e3", own))
+    run = load_run(run_file)
+    scene = build.scene(run)
+    areas = {
+        name: Mesh(item.vertices, item.mesh.faces).area for name, item in scene.objects.items()
+    }
+    radar = build.radar(run.radar)
+    sensor = estimates.Sensor(run, radar, build.grid(run.grid, radar))
+    counts = {part.key: part.count for part in estimates.of_sensor(sensor, scene)[0]}
+    expected = 3e3 * areas["plate"] + 1e3 * areas["wall"]
+    assert counts["data.points_per_m2"] == pytest.approx(expected)
+    assert call(monkeypatch, "check", run_file) == 0
+    run_file.write_text(RUN.replace("points_per_m2 = 2e3", "points_per_m2 = { plate = 3e3 }"))
+    assert call(monkeypatch, "reconstruct", run_file) == 2
+    assert "data.points_per_m2: expected points_per_m2 of every" in capsys.readouterr().err
 
 
 def test_times_as_people_say_them():

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cli.small import RUN
-from invertwin.cli.run_file import load_run, validate
+from invertwin.cli.run_file import load_run, stated, validate
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
@@ -128,6 +128,18 @@ def radar(**changes):
             ["reconstruct.depth: ", "greater than or equal to 1", "got 0"],
         ),
         (
+            run(data={"kind": "simulated", "points_per_m2": {"leter": 1e3, "*": 1e2}}),
+            ["data.points_per_m2.leter: ", "(letter)", "did you mean `letter`?"],
+        ),
+        (
+            run(data={"kind": "simulated", "points_per_m2": {"letter": 0.0}}),
+            ["data.points_per_m2.letter: ", "greater than 0"],
+        ),
+        (
+            run(data={"kind": "simulated", "points_per_m2": [1e3]}),
+            ["data.points_per_m2: ", "expected a number", "got [1000.0]"],
+        ),
+        (
             run(data={"kind": "simulated", "points_per_m2": 1e3, "depth": 17}),
             ["data.depth: ", "less than or equal to 16", "got 17"],
         ),
@@ -243,3 +255,13 @@ def test_all_typos_are_told_at_once_beside_wrong_values(tmp_path):
     }
     # A key that is misspelt is not missing, too.
     assert "got nothing" not in str(found.value)
+
+
+def test_what_is_stated_stays_apart_from_defaults():
+    read = validate(run(seed=4), Path("run.toml"))
+    again = validate(tomllib.loads(stated(read)), Path("run.toml"))
+    assert again == read
+    assert again.model_fields_set == read.model_fields_set
+    assert "loss" not in again.model_fields_set
+    other = validate(tomllib.loads(stated(read.model_copy(update={"seed": 5}))), Path("run.toml"))
+    assert other.seed == 5

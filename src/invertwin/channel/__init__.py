@@ -6,6 +6,7 @@ from invertwin.channel.field.echoes import trace_echoes as trace_echoes
 from invertwin.channel.field.field import trace_field as trace_field
 from invertwin.channel.field.lit import PanelCells as PanelCells
 from invertwin.channel.field.lit import lit_fractions as lit_fractions
+from invertwin.channel.field.rough_points import densities_of as densities_of
 from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle
 from invertwin.channel.field.speckle import draw_speckle as draw_speckle
@@ -36,6 +37,8 @@ from invertwin.channel.reference.cross_sections import (
 )
 from invertwin.channel.reference.cross_sections import TrihedralSection as TrihedralSection
 from invertwin.channel.reference.power import trace_power as trace_power
+from invertwin.channel.sampling import REST as REST
+from invertwin.channel.sampling import Densities as Densities
 from invertwin.channel.sampling import Sampling as Sampling
 from invertwin.channel.sight import Curves as Curves
 from invertwin.channel.sight import Sight as Sight

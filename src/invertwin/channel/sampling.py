@@ -1,5 +1,6 @@
 """How much work a trace does: one value that travels from the user to the kernels."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -9,6 +10,12 @@ from invertwin.errors import InputError
 from invertwin.limits import MOST, Count
 
 _DEEPEST = 16
+
+REST = "*"
+"""In densities by object: all objects that are not named."""
+
+Densities = float | Mapping[str, float]
+"""Points per m² of all objects, or of each by its name."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +32,9 @@ class Sampling:
         interior_edges: False leaves out the shadows that surfaces cast on each other, for
             ablation.
         contacts: False leaves out what moves where surfaces cross or touch, for ablation.
-        points_per_m2: Fixed points on rough surfaces, which carry fields of one bounce.
+        points_per_m2: Fixed points on rough surfaces, which carry fields of one bounce: one
+            number, or numbers by the names of objects, such as ``{"person": 4000.0, "*": 200.0}``;
+            ``"*"`` is for all others. The expected power is the same for all of them.
         rough_paths: Fixed rough paths of several bounces that are drawn of each length; at most a
             quarter of them are kept.
         memory_budget: Bytes of power samples alive at a time. More samples go in chunks, and the
@@ -42,7 +51,7 @@ class Sampling:
     boundary: bool = True
     interior_edges: bool = True
     contacts: bool = True
-    points_per_m2: float = 20_000.0
+    points_per_m2: Densities = 20_000.0
     rough_paths: int = 200_000
     memory_budget: float = 0.25e9
     backend: str | None = None
@@ -59,7 +68,12 @@ class Sampling:
                 f"{self.samples} and {self.boundary_samples}; give the number of rays over all "
                 "frames"
             )
-        if not self.points_per_m2 > 0 or self.rough_paths < 1:
+        if isinstance(self.points_per_m2, Mapping):
+            object.__setattr__(self, "points_per_m2", dict(self.points_per_m2))
+            densities = list(self.points_per_m2.values())
+        else:
+            densities = [self.points_per_m2]
+        if not all(density > 0 for density in densities) or self.rough_paths < 1:
             raise InputError(
                 "expected points_per_m2 > 0 and rough_paths >= 1, got "
                 f"{self.points_per_m2} and {self.rough_paths}; try 2e4 points per m²"

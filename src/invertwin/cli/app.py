@@ -18,6 +18,7 @@ from invertwin.cli.options import (
     Dataset,
     FileArgument,
     FilesArgument,
+    Fits,
     Look,
     Options,
     Resumable,
@@ -122,8 +123,8 @@ def dataset(options: Dataset, file: FileArgument) -> None:
 
 
 @app.command()
-@with_options(Resumable)
-def reconstruct(options: Resumable, file: FileArgument) -> None:
+@with_options(Fits)
+def reconstruct(options: Fits, file: FileArgument) -> None:
     """Fit the parameters of a scene to radar data."""
     _reconstruct(file, options, Path("out", file.stem))
 
@@ -280,10 +281,13 @@ def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
     with run_folder(options, default, runs) as folder:
         if folder.complete:
             return
+        from invertwin.cli.fits.spreading import Workers
         from invertwin.cli.run_reconstruct import run_reconstruct
 
+        fits = isinstance(options, Fits)
+        workers = Workers.asked(options.engine, options.workers) if fits else None
         with about_file(file):
-            tables, outcome = run_reconstruct(runs[file.stem], folder, console)
+            tables, outcome = run_reconstruct(runs[file.stem], folder, console, workers)
         print_tables(tables)
         console.print(outcome, markup=False, soft_wrap=True)
 

@@ -23,28 +23,37 @@ from invertwin.scene.files import CONCRETE, load_scene_xml
 
 
 def scene(run: RunFile) -> Scene:
-    """The scene of the `[scene.<name>]` tables and of the `[scene_file]`.
+    """The scene of the `[scene.<name>]` tables, of the `[scene_file]` and of the `[room]`.
 
     Raises:
-        InputError: A file is missing or broken, a shape is impossible, or the run file names an
-            object that is not there.
+        InputError: A file is missing or broken, a shape is impossible, two objects have one name,
+            or the run file names an object that is not there.
     """
     built: dict[str, Object] = {}
     if run.scene_file is not None:
         with about("scene_file"):
             built.update(_from_file(run.scene_file).objects)
+    if run.room is not None:
+        with about("room"):
+            for name, item in run.room.build().items():
+                _require_new(name, built)
+                built[name] = item
     for name, table in run.scene.items():
         with about(f"scene.{name}"):
-            if name in built:
-                raise InputError(
-                    "expected a name that the scene file does not use, got one of its objects; "
-                    "choose another"
-                )
+            _require_new(name, built)
             built[name] = table.build()
     for path, name in run.references():
         if name not in built:
             raise InputError(unknown_object(path, name, list(built)))
     return Scene(built)
+
+
+def _require_new(name: str, built: Mapping[str, Object]) -> None:
+    if name in built:
+        raise InputError(
+            f'expected names that differ from those of the scene file and the room, got "{name}" '
+            "twice; choose another"
+        )
 
 
 def true_scene(run: RunFile) -> Scene:
@@ -58,9 +67,11 @@ def true_scene(run: RunFile) -> Scene:
             if name in run.scene:
                 item = run.scene[name].model_copy(update=changes).build(**shape)
             else:
-                # Objects of a file stand where it puts them: they are scaled and placed from there.
-                made_of = changes.pop("material", None)
-                item, place = found[name], Placement(**changes)
+                # Objects of a file have no position of their own: they are scaled and placed from
+                # where it puts them. Furniture has one, which stays where no other is stated.
+                made_of, item = changes.pop("material", None), found[name]
+                changes.setdefault("position", item.transform[:3, 3].tolist())
+                place = Placement(**changes)
                 mesh = Mesh(item.mesh.vertices * place.scale, item.mesh.faces)
                 item = replace(item, mesh=shape.get("mesh", mesh), pose=place.pose())
                 if made_of is not None:

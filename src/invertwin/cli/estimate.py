@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid
+from invertwin.channel import Grid, densities_of
 from invertwin.cli.run_file import about, need
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.schema.signature import count_of
@@ -179,7 +179,8 @@ def _at(path: str, part: Part) -> Part:
 def _triangles(run: RunFile, scene: Scene) -> Part:
     counts = {name: len(item.mesh.faces) for name, item in scene.objects.items()}
     name = max(counts, key=lambda name: counts[name])
-    key, total = "scene_file.file", sum(counts.values())
+    total = sum(counts.values())
+    key = "room.furniture" if run.scene_file is None else "scene_file.file"
     if name in run.scene:
         size = next(size for size in _SIZES if hasattr(run.scene[name], size))
         key = f"scene.{name}.{size}"
@@ -236,9 +237,11 @@ def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
 
 def _of_simulation(data: SimulatedData, scene: Scene, frames: int) -> Iterator[tuple[Part, float]]:
     """Paths of exact signals, and how many there are over all frames."""
-    rough = [item for item in scene.objects.values() if not item.material.coherent]
-    area = sum(Mesh(item.vertices, item.mesh.faces).area for item in rough)
-    points = area * data.points_per_m2
+    with about("data.points_per_m2"):
+        rough = densities_of(scene, data.points_per_m2)
+    areas = {name: Mesh(scene[name].vertices, scene[name].mesh.faces).area for name in rough}
+    area = sum(areas.values())
+    points = sum(areas[name] * density for name, density in rough.items())
     each = _POINT + frames * _ROW
     name = f"points on {area:.3g} m² of rough surfaces"
     yield Part(name, points, points * each, "data.points_per_m2"), points * frames

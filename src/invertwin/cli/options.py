@@ -67,6 +67,12 @@ class Resumable(Options):
     ] = False
 
 
+EngineOption = Annotated[
+    Literal["processes", "ray"],
+    typer.Option("--engine", help="Processes of this machine, or tasks of a Ray cluster."),
+]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Dataset(Resumable):
     """Who simulates a data set, and which part of it."""
@@ -81,10 +87,23 @@ class Dataset(Resumable):
         str | None,
         typer.Option("--shard", help="i/n: part i of n, into a folder of its own inside."),
     ] = None
-    engine: Annotated[
-        Literal["processes", "ray"],
-        typer.Option("--engine", help="Processes of this machine, or tasks of a Ray cluster."),
-    ] = "processes"
+    engine: EngineOption = "processes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fits(Resumable):
+    """Who makes the fits of a run."""
+
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers",
+            min=1,
+            help="Processes of one thread that fit starts and variants beside each other; "
+            "default: here, one after another.",
+        ),
+    ] = None
+    engine: EngineOption = "processes"
 
 
 @dataclass(frozen=True, kw_only=True)

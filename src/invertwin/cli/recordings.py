@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
-from pydantic import model_validator
+from pydantic import GetCoreSchemaHandler, model_validator
 
 from invertwin.capture import (
     Capture,
@@ -20,15 +20,25 @@ from invertwin.cli.sensors import Posed
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.boards import Mounting
-from invertwin.registry.kinds import Group, Registry, Table, registry
+from invertwin.registry.kinds import Group, Registry, Table, number_or_list, registry
 from invertwin.registry.section import Depth, InputPath, Section, Seed, about, fail, key
+
+
+class _Densities:
+    """Annotates points per m²: a number, or a table with one for each object."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(number_or_list(Positive, dict[str, Positive]))
 
 
 class SimulatedData(Section):
     """Exact signals of the true scene, with noise."""
 
     kind: Literal["simulated"]
-    points_per_m2: Positive = key("rough points per m²")
+    points_per_m2: Annotated[Any, _Densities] = key(
+        'rough points per m²: a number, or a table by object, "*" for all others'
+    )
     samples: Count = key("coherent paths", 200_000)
     depth: Depth = key("most bounces of a path; with [chirps] it is one", 3)
     rough_paths: Count = key("paths to draw of two bounces, and of each larger number", 200_000)

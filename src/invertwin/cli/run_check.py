@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from invertwin.channel import Sampling
+from invertwin.channel import Sampling, densities_of
 from invertwin.cli import build
 from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
 from invertwin.cli.fits.problem import FULL, sensors_of, settings_of, stages_of, varied_run
@@ -239,7 +239,10 @@ def _signals(sensor: Sensor, truth: Scene, count: int) -> float:
     data, whole = need(sensor.run, "data", "a simulation"), of_sensor(sensor, truth)[1]
     share = min(1.0, count / whole)
     fewer = {
-        "points_per_m2": data.points_per_m2 * share,
+        "points_per_m2": {
+            name: density * share
+            for name, density in densities_of(truth, data.points_per_m2).items()
+        },
         "samples": max(1, round(data.samples * share)),
         "rough_paths": max(1, round(data.rough_paths * share)),
         "every_start": False,

@@ -116,6 +116,11 @@ def to_toml(run: Any) -> str:
     return tomli_w.dumps(run.model_dump(exclude_none=True))
 
 
+def stated(run: Any) -> str:
+    """The run file without what it leaves to defaults, some of which depend on other sections."""
+    return tomli_w.dumps(run.model_dump(exclude_unset=True, exclude_none=True))
+
+
 def unknown_object(path: str, name: str, known: Sequence[str]) -> str:
     """What is wrong with a key that names an object which the scene does not have."""
     return (
@@ -159,7 +164,7 @@ def _explain(error: ErrorDetails) -> str:
             )
         case "unknown_object":
             at = ".".join(filter(None, (path, context["path"])))
-            return unknown_object(at, context["name"], list(error["input"]["scene"]))
+            return unknown_object(at, context["name"], context["known"])
         case "union_tag_not_found":
             keys = context["discriminator"].removesuffix("()").split(",")
             present = list(error["input"]) if isinstance(error["input"], dict) else []

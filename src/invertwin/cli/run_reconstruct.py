@@ -3,7 +3,10 @@
 import math
 import shutil
 import time
+import tomllib
 from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -13,6 +16,7 @@ from invertwin.cli.fits.initial import guessed
 from invertwin.cli.fits.mover import run_mover
 from invertwin.cli.fits.problem import (
     FULL,
+    Problem,
     known_of,
     problem_of,
     recorded_anew,
@@ -31,9 +35,11 @@ from invertwin.cli.fits.scores import (
     without_history,
 )
 from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
+from invertwin.cli.fits.spreading import QUIET, Workers, fit_elsewhere, refused
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table, finish, picture
+from invertwin.cli.run_file import stated, validate
 from invertwin.cli.run_placement import run_placement
 from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile, SimulatedData
@@ -45,15 +51,29 @@ from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry.density import without_clouds
 
 
-def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
+def run_reconstruct(
+    run: RunFile, folder: RunFolder, console: Console, workers: Workers | None = None
+) -> tuple[list[Table], str]:
     """Fit from every start, write the folder; return the tables to print and the outcome.
 
     Starts that an interrupted run has finished are not fitted again.
+
+    Args:
+        run: The run file.
+        folder: For the results.
+        console: Shows progress.
+        workers: Who fits; None = this process, one start after another.
+
+    Raises:
+        InputError: A wrong run file, or workers where there is one fit.
     """
-    if isinstance(next(iter(run.parameters), None), Mover):
-        return run_mover(run, folder, console)
     if run.map is not None:
-        return run_radio(run, folder, console)
+        return run_radio(run, folder, console, workers)
+    mover = isinstance(next(iter(run.parameters), None), Mover)
+    if workers is not None and (mover or run.placement is not None):
+        raise refused("a mover" if mover else "a metasurface")
+    if mover:
+        return run_mover(run, folder, console)
     if run.placement is not None:
         return run_placement(run, folder, console)
     begin = time.perf_counter()
@@ -64,6 +84,9 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     whole, problem = problem, varied(problem, FULL)
     check_measures(problem, without_clouds(starts[0]))
     single = len(starts) * len(modes) == 1
+    if workers is not None:
+        fits = [(mode, i) for mode in modes for i in range(len(starts))]
+        fit_elsewhere(_fit_one, run, folder, console, workers, fits)
     rows: dict[str, list[dict[str, Any]]] = {}
     outcomes: dict[int, Callable[[], Reconstruction]] = {}
     for mode in modes:
@@ -125,6 +148,20 @@ def run_reconstruct(run: RunFile, folder: RunFolder, console: Console) -> tuple[
     title, outcome = run.title or "Reconstruction", status(run, metrics)
     tables = finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note)
     return tables, outcome
+
+
+def _fit_one(run: RunFile, mode: str, number: int, folder: RunFolder) -> None:
+    """What a worker does of a run: one fit, which leaves its files in the folder."""
+    problem, _ = calibrated(_recorded(stated(run)), folder, QUIET)
+    problem, _ = guessed(problem, QUIET)
+    start, own = starts_of(problem)[number], recorded_for(problem, number, QUIET)
+    fit(own, start, number, mode, folder, QUIET, None)
+
+
+@lru_cache(maxsize=1)
+def _recorded(text: str) -> Problem:
+    """A worker simulates the data of a run once for all its fits."""
+    return problem_of(validate(tomllib.loads(text), Path("run.toml")), QUIET)
 
 
 def _finite(loss: float | None) -> float:

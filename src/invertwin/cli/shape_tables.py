@@ -1,6 +1,7 @@
 """Shapes of run files: objects and their parts, and what is fitted of them."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -88,6 +89,31 @@ class ObjectTable(Placement, _Body):
         still = self.velocity is None
         velocity = None if still else torch.tensor(self.velocity, dtype=torch.float64)
         return Object(mesh, material, self.pose(), velocity)
+
+
+class RoomTable(Table):
+    """A furnished room, whose objects stand beside those of `[scene.<name>]`."""
+
+    materials: dict[str, Annotated[Any, OneOf("material")]] = key(
+        "materials by the room's objects, in place of their own", {}
+    )
+
+    def build(self, given: Any = None, /, **more: Any) -> dict[str, Object]:
+        """Its objects by name.
+
+        Raises:
+            InputError: A room that the library refuses, or materials of what is not in it.
+        """
+        found: dict[str, Object] = super().build(given, **more)
+        for name, table in self.materials.items():
+            with about(f"materials.{name}"):
+                if name not in found:
+                    raise InputError(
+                        f"expected an object of the room ({', '.join(found)}), got none of this "
+                        "name; correct it"
+                    )
+                found[name] = replace(found[name], material=table.build({Mesh: found[name].mesh}))
+        return found
 
 
 class ParameterTable(Table):

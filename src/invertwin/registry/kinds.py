@@ -34,7 +34,16 @@ from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, mod
 
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Letters
-from invertwin.registry.section import TAG_MARK, InputPath, Section, about, fail, key, tag_by
+from invertwin.registry.section import (
+    TAG_MARK,
+    InputPath,
+    KeyInputError,
+    Section,
+    about,
+    fail,
+    key,
+    tag_by,
+)
 
 PLUGINS = "invertwin.plugins"
 _MEANINGS = {
@@ -89,6 +98,8 @@ class _Checked(Table):
     def _accepted(self) -> "_Checked":
         try:
             self.build()
+        except KeyInputError as error:
+            fail(error.text, error.path)
         except InputError as error:
             fail(str(error))
         return self
@@ -466,17 +477,23 @@ def load_plugins() -> Registry:
 def number_or_list(*kinds: Any) -> Any:
     """A type that is told by its form, a list, a table or else, so that errors name no member."""
 
-    def form(value: Any) -> str:
-        kind = "list" if isinstance(value, list) else "table"
-        return TAG_MARK + (kind if isinstance(value, list | dict | Section) else "number")
-
     def tag(kind: Any) -> str:
         bare = get_args(kind)[0] if get_origin(kind) is Annotated else kind
         if get_origin(bare) is list:
             return "list"
-        return "table" if isinstance(bare, type) and issubclass(bare, Section) else "number"
+        table = get_origin(bare) is dict or (isinstance(bare, type) and issubclass(bare, Section))
+        return "table" if table else "number"
 
-    members = [Annotated[kind, Tag(TAG_MARK + tag(kind))] for kind in kinds]
+    tags = [tag(kind) for kind in kinds]
+
+    def form(value: Any) -> str:
+        kind = "table" if isinstance(value, dict | Section) else "number"
+        kind = "list" if isinstance(value, list) else kind
+        return TAG_MARK + (kind if kind in tags else tags[0])
+
+    members = [
+        Annotated[kind, Tag(TAG_MARK + name)] for kind, name in zip(kinds, tags, strict=True)
+    ]
     return Annotated[_any_of(members), Discriminator(form)]
 
 

@@ -1,15 +1,47 @@
 """Rough points: fixed material points whose phases give a rough surface its speckle."""
 
 import zlib
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 
 from invertwin.channel.reference.radar_equation import SurfacePaths
+from invertwin.channel.sampling import REST, Densities
+from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 
-def draw_rough_points(scene: Scene, points_per_m2: float, seed: int) -> SurfacePaths:
+def densities_of(scene: Scene, points_per_m2: Densities) -> dict[str, float]:
+    """Points per m² of every rough object.
+
+    Args:
+        scene: Surfaces.
+        points_per_m2: One number, or numbers by name.
+
+    Raises:
+        InputError: A name that the scene does not have, or a rough object without a number.
+    """
+    rough = [name for name, item in scene.objects.items() if not item.material.coherent]
+    if not isinstance(points_per_m2, Mapping):
+        return dict.fromkeys(rough, points_per_m2)
+    unknown = [name for name in points_per_m2 if name not in (*scene.names, REST)]
+    if unknown:
+        raise InputError(
+            f"expected points_per_m2 of objects of the scene ({', '.join(scene.names)}), or of "
+            f'"{REST}" for all others, got {unknown[0]!r}; use one of these names'
+        )
+    found = {name: points_per_m2.get(name, points_per_m2.get(REST)) for name in rough}
+    missing = [name for name, density in found.items() if density is None]
+    if missing:
+        raise InputError(
+            f"expected points_per_m2 of every rough object, got none of {', '.join(missing)}; "
+            f'add them, or "{REST}" for all that are not named'
+        )
+    return {name: density for name, density in found.items() if density is not None}
+
+
+def draw_rough_points(scene: Scene, points_per_m2: Densities, seed: int) -> SurfacePaths:
     """Draw the material points of all rough objects, as paths of one point.
 
     They belong to the surfaces: never drawn again between chirps, poses, looks or iterations. The
@@ -17,29 +49,35 @@ def draw_rough_points(scene: Scene, points_per_m2: float, seed: int) -> SurfaceP
 
     Args:
         scene: Surfaces to cover.
-        points_per_m2: Their number per m².
+        points_per_m2: Their number per m², of all objects or by name.
         seed: Hash key.
+
+    Raises:
+        InputError: See ``densities_of``.
     """
-    found: list[np.ndarray] = [np.zeros((4, 0))]
+    densities = densities_of(scene, points_per_m2)
+    found: list[np.ndarray] = [np.zeros((5, 0))]
     offset = 0
     for name, item in scene.objects.items():
         triangles = item.vertices.detach()[item.mesh.faces]
         edges = triangles[:, 1:] - triangles[:, :1]
         area = 0.5 * torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=1).numpy()
-        if not item.material.coherent:
+        if name in densities:
             key = np.uint64(zlib.crc32(name.encode()) ^ (seed * 0x9E3779B97F4A7C15 & (2**64 - 1)))
             face = np.arange(len(area), dtype=np.uint64)
-            expected = area * points_per_m2
+            expected = area * densities[name]
             count = np.floor(expected + _hash(key, face, face * 0, 0)).astype(np.int64)
             face = np.repeat(face, count)
             number = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
             b1, b2, turn = (_hash(key, face, number.astype(np.uint64), k) for k in (1, 2, 3))
             fold = b1 + b2 > 1
             b1, b2 = np.where(fold, 1 - b1, b1), np.where(fold, 1 - b2, b2)
-            found.append(np.stack([face.astype(np.int64) + offset, b1, b2, 2 * np.pi * turn]))
+            # A point stands for the area that is its own at the density of its object.
+            weight = np.full(len(face), 1 / densities[name])
+            phase = 2 * np.pi * turn
+            found.append(np.stack([face.astype(np.int64) + offset, b1, b2, weight, phase]))
         offset += len(area)
-    face, b1, b2, phase = torch.from_numpy(np.concatenate(found, axis=1))
-    weight = torch.full_like(phase, 1 / points_per_m2)
+    face, b1, b2, weight, phase = torch.from_numpy(np.concatenate(found, axis=1))
     return SurfacePaths(face.long()[:, None], b1[:, None], b2[:, None], weight, phase)
 
 

@@ -32,6 +32,9 @@ def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Spe
         link: Antennas, which suggest what rough paths are worth drawing.
         sampling: Points per m², number and depth of rough paths.
         seed: Seed of places and phases.
+
+    Raises:
+        InputError: Points per m² of what is not in the scene, or not of all its rough objects.
     """
     with tracing(sampling.backend):
         paths = draw_rough_paths(

@@ -30,6 +30,7 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
+from invertwin.cli.fits.spreading import part_name
 from invertwin.cli.running import time_left
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
@@ -114,7 +115,7 @@ def fit(
     Returns:
         The row of the fit, and a function that gives its outcome.
     """
-    part = f"{PARTS}/{mode}_{index:02d}"
+    part = part_name(mode, index)
     checkpoint = checkpoint or f"{part}.pt"
     own = varied(problem, mode)
     stages = schedule_of(own)

@@ -13,7 +13,7 @@ from rich.console import Console
 from torch import nn
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid, Sampling
+from invertwin.channel import Densities, Grid, Sampling
 from invertwin.cli import build
 from invertwin.cli.estimate import Sensor, require_room
 from invertwin.cli.recordings import measured
@@ -304,7 +304,7 @@ def sampling_of(run: RunFile) -> Sampling:
     return Sampling(**counts, points_per_m2=points_per_m2(run))
 
 
-def points_per_m2(run: RunFile) -> float:
+def points_per_m2(run: RunFile) -> Densities:
     """Points per m² of rough surfaces in exact signals: those of simulated data, or enough."""
     return run.data.points_per_m2 if isinstance(run.data, SimulatedData) else _POINTS_PER_M2
 

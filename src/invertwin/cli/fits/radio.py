@@ -18,6 +18,7 @@ from invertwin.cli import build
 from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.fitting import watched
 from invertwin.cli.fits.problem import FULL, settings_of, stages_of, varied_run
+from invertwin.cli.fits.spreading import QUIET, Workers, fit_elsewhere, part_name
 from invertwin.cli.radio_tables import ReceivedData, ReceivedFile
 from invertwin.cli.report import Table, finish, picture, quantities, texts
 from invertwin.cli.run_file import about, need
@@ -25,7 +26,6 @@ from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile
 from invertwin.cli.shape_tables import given_for
 from invertwin.errors import InputError
-from invertwin.folders import PARTS
 from invertwin.inversion import (
     Checkpoint,
     Observation,
@@ -84,15 +84,26 @@ class Heard:
         return found if self.places is None else replace(found, places=self.places)
 
 
-def run_radio(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
+def run_radio(
+    run: RunFile, folder: RunFolder, console: Console, workers: Workers | None = None
+) -> tuple[list[Table], str]:
     """Fit from every start, write the folder; return the tables to print and the outcome.
 
     Starts that an interrupted run has finished are not fitted again.
+
+    Args:
+        run: The run file.
+        folder: For the results.
+        console: Shows progress.
+        workers: Who fits; None = this process, one start after another.
     """
     begin = time.perf_counter()
     heard = _heard(run, console)
     starts = _starts(heard)
     modes = [FULL, *run.variants]
+    if workers is not None:
+        fits = [(mode, number) for mode in modes for number in range(len(starts))]
+        fit_elsewhere(_fit_one, run, folder, console, workers, fits)
     rows: dict[str, list[dict[str, Any]]] = {}
     again: list[Callable[[], Reconstruction]] = []
     for mode in modes:
@@ -134,6 +145,12 @@ def run_radio(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
     return finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note), (
         outcome
     )
+
+
+def _fit_one(run: RunFile, mode: str, number: int, folder: RunFolder) -> None:
+    """What a worker does of a run: one fit, which leaves its files in the folder."""
+    heard = _heard(run, QUIET)
+    _fitted(heard, _starts(heard)[number], number, mode, folder, QUIET)
 
 
 def _heard(run: RunFile, console: Console) -> Heard:
@@ -212,7 +229,7 @@ def _fitted(
 ) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
     """The row of a fit, or what an interrupted run has kept of it, and what gives its outcome."""
     run = varied_run(heard.run, mode)
-    stages, part = _stages(heard, run), f"{PARTS}/{mode}_{number:02d}"
+    stages, part = _stages(heard, run), part_name(mode, number)
     again = partial(_fit, heard, run, stages, start, number, folder, f"{part}.pt")
     kept = folder.read_json(f"{part}.json")
     if kept is not None:

@@ -9,6 +9,7 @@ from annotated_types import MinLen
 from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
+from invertwin.channel import REST
 from invertwin.cli.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.fit_tables import SurrogateTable
 from invertwin.cli.recordings import SimulatedData
@@ -30,7 +31,7 @@ from invertwin.cli.schema.placement import Placement
 from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTable
 from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
-from invertwin.cli.shape_tables import LearnedTable
+from invertwin.cli.shape_tables import LearnedTable, RoomTable
 from invertwin.cli.variation import check_varied
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check
@@ -38,6 +39,7 @@ from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
 from invertwin.registry.section import InputPath, Section, Seed, Vector, Words, fail, key
+from invertwin.scene.room import room
 from invertwin.signatures import rcs
 
 # How a run calls its own fits, and how names of its metrics end.
@@ -54,6 +56,7 @@ _AS_GIVEN: dict[str, Any] = {"exclude_unset": True, "exclude_none": True}
 AnyMaterial = Annotated[Any, OneOf("material")]
 AnyModel = Annotated[Any, OneOf("model")]
 AnyData = Annotated[Any, OneOf("data")]
+AnyRoom = Annotated[Any, TableOf(room, RoomTable, checked=True)]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
 AnyGradcheck = Annotated[Any, TableOf(Check, Gradcheck)]
 AnyRcs = Annotated[
@@ -127,6 +130,7 @@ class _RunFile(Section):
     seed: Seed = key("seed of all random numbers", 0)
     scene: dict[str, Annotated[Any, OneOf("object")]] = key("[scene.<name>]: an object each", {})
     scene_file: SceneFile | None = key("objects from a file", None)
+    room: AnyRoom | None = key("a furnished room: floor, ceiling, walls, furniture", None)
     truth: dict[str, Truth] = key("[truth.<name>]: where an object really is", {})
     radar: AnyRadar | None = key("what measures; not with a capture", None)
     grid: AnyGrid | None = key("the map that is compared", None)
@@ -182,14 +186,14 @@ class _RunFile(Section):
     @model_validator(mode="after")
     def _names_exist(self) -> "_RunFile":
         if self.scene_file is None:
-            if not self.scene:
+            known = [*self.scene, *({} if self.room is None else self.room.build())]
+            if not known:
                 fail("expected at least 1 object, got none; add [scene.<name>]", "scene")
             # The names of a scene file are known once it is read.
             for path, name in self.references():
-                if name not in self.scene:
-                    raise PydanticCustomError(
-                        "unknown_object", "unknown object", {"path": path, "name": name}
-                    )
+                if name not in known:
+                    context = {"path": path, "name": name, "known": known}
+                    raise PydanticCustomError("unknown_object", "unknown object", context)
         return self
 
     @model_validator(mode="after")
@@ -343,6 +347,12 @@ class _RunFile(Section):
             if getattr(table, "object", None) is not None:
                 used.append((f"{path}.object", table.object))
         used += [("image.objects", name) for name in getattr(self.image, "objects", [])]
+        data = {"data": self.data}
+        data |= {f"observations.{name}.data": t.data for name, t in self.observations.items()}
+        for path, table in data.items():
+            found = getattr(table, "points_per_m2", None)
+            named = [name for name in found if name != REST] if isinstance(found, dict) else []
+            used += [(f"{path}.points_per_m2.{name}", name) for name in named]
         for section in type(self).model_fields:
             name = getattr(getattr(self, section), "object", None)
             if name is not None:

@@ -1,0 +1,150 @@
+"""Fits of a run by other processes or a Ray cluster: every start and variant is a piece of work.
+
+A worker builds the problem from the run file anew, and gives back the files that the fit would
+have left here. Then the run goes on as one that was interrupted after its fits.
+"""
+
+import tempfile
+import tomllib
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from invertwin.cli.run_file import stated, validate
+from invertwin.cli.running import progress
+from invertwin.cli.schema import RunFile
+from invertwin.engines import Engine, spread
+from invertwin.errors import InputError, PhysicsWarning
+from invertwin.folders import PARTS, UNFINISHED
+from invertwin.progress import told
+from invertwin.runs import RunFolder, open_run
+
+QUIET = Console(quiet=True)
+FitOne = Callable[[RunFile, str, int, RunFolder], object]
+"""Run file, way to fit, number of the start, folder → a fit that leaves its files there."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who fits.
+
+    Attributes:
+        engine: Processes of this machine, or tasks of a Ray cluster.
+        count: Processes.
+    """
+
+    engine: Engine
+    count: int
+
+    @classmethod
+    def asked(cls, engine: Engine, count: int | None) -> "Workers | None":
+        """What the options `--engine` and `--workers` ask for; None without them.
+
+        Args:
+            engine: Of the option.
+            count: Of the option; None where it is not given.
+        """
+        return None if engine == "processes" and count is None else cls(engine, count or 1)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One fit.
+
+    Attributes:
+        fit_one: Fits; a function of a module.
+        text: The run file.
+        mode: The run's own way to fit, or a variant.
+        start: Number of the start.
+        files: What the fit goes on from, such as the calibration, by path in the folder.
+    """
+
+    fit_one: FitOne
+    text: str
+    mode: str
+    start: int
+    files: Mapping[str, bytes]
+
+
+def fit_elsewhere(
+    fit_one: FitOne,
+    run: RunFile,
+    folder: RunFolder,
+    console: Console,
+    workers: Workers,
+    fits: Sequence[tuple[str, int]],
+) -> None:
+    """Let others make the fits that are not in the folder yet, and put their files there.
+
+    Args:
+        fit_one: Makes one; a function of a module.
+        run: The run file.
+        folder: Gets the files.
+        console: Shows progress.
+        workers: Who fits.
+        fits: Way to fit and number of the start of each.
+
+    Raises:
+        InputError: What a fit refuses, or only one fit.
+    """
+    if len(fits) == 1:
+        raise refused("one fit")
+    text, begun = stated(run), f"{PARTS}/calibration.pt"
+    path = folder.path / UNFINISHED / begun
+    files = {begun: path.read_bytes()} if path.exists() else {}
+    jobs = [
+        Job(fit_one, text, mode, start, files)
+        for mode, start in fits
+        if folder.read_json(f"{part_name(mode, start)}.json") is None
+    ]
+    found = spread(fitted_files, jobs, engine=workers.engine, workers=workers.count)
+    with progress(console), closing(found) as done:
+        for _ in told(jobs, "fits"):
+            _, made = next(done)
+            # A row says that its fit is done, so it comes last.
+            for name in sorted(made, key=lambda name: name.endswith(".json")):
+                folder.write_bytes(name, made[name])
+
+
+def refused(got: str) -> InputError:
+    """The error where there is nothing to spread.
+
+    Args:
+        got: What there is.
+    """
+    return InputError(
+        f"expected several starts or variants for --engine ray or --workers, got {got}; leave "
+        "the option out"
+    )
+
+
+def part_name(mode: str, start: int) -> str:
+    """How the files of a fit begin, in the run's folder.
+
+    Args:
+        mode: The run's own way to fit, or a variant.
+        start: Number of the start.
+    """
+    return f"{PARTS}/{mode}_{start:02d}"
+
+
+def fitted_files(job: Job) -> dict[str, bytes]:
+    """The files of a fit by their path in the run's folder: what a worker does.
+
+    Args:
+        job: The fit.
+    """
+    run = validate(tomllib.loads(job.text), Path("run.toml"))
+    with tempfile.TemporaryDirectory() as scratch, warnings.catch_warnings():
+        warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
+        with open_run(Path(scratch, "fit"), {"run": job.text}) as folder:
+            for name, content in job.files.items():
+                folder.write_bytes(name, content)
+            job.fit_one(run, job.mode, job.start, folder)
+            inside = folder.path / UNFINISHED
+            made = [str(path.relative_to(inside)) for path in (inside / PARTS).iterdir()]
+            return {name: (inside / name).read_bytes() for name in made if name not in job.files}
