@@ -295,7 +295,7 @@ def conventional(
 ) -> list[tuple[float, float]]:
     """Middles of boxes around clusters of detections [m].
 
-    Source of the clusters: Ester et al., "A density-based algorithm for discovering clusters", 1996.
+    Source of clusters: Ester et al., "A density-based algorithm for discovering clusters", 1996.
 
     Args:
         capture: The recording.
