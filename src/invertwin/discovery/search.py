@@ -19,6 +19,7 @@ _ROUNDS = 3  # of births
 _NEAR = 0.5  # gap between what may be one [m]
 _HOPE = 100.0  # evidence that a fit may gain
 _SHORT, _LONG = 25, 50  # steps of fits
+_PATIENCE = 3  # groups in a row that explain nothing
 _DIM = 1e-3  # of all strength: dimmer groups wait for the next round
 
 
@@ -139,11 +140,16 @@ class Search:
         total = float(strength.sum())
         parts = [part for part in parts if float(part.sum()) > _DIM * total]
         known, born = list(shapes), list[tuple[Tensor, Figure]]()
+        gain, vain = float(self.fitted.gains(known).sum()), 0
         for part in parts[: _MOST - len(shapes)]:
             one = self.best(known, self.options(part))
-            if float((self.fitted.gains([*known, one]) - self.fitted.gains(known)).sum()) > 0:
+            new = float(self.fitted.gains([*known, one]).sum())
+            if new > gain:
+                gain, vain = new, 0
                 known.append(one)
                 born.append((part, one))
+            elif (vain := vain + 1) == _PATIENCE:
+                break  # dimmer groups tell no more
         return [one for _, one in self.united(shapes, born)]
 
     def united(
