@@ -18,6 +18,7 @@ from invertwin.cli.options import (
     Dataset,
     FileArgument,
     FilesArgument,
+    Find,
     Fits,
     Look,
     Options,
@@ -177,6 +178,19 @@ def look(options: Look) -> None:
     with run_folder(options, default) as folder:
         with progress(console):
             tables = run_look(options, folder)
+        print_tables(tables)
+
+
+@app.command()
+@with_options(Find)
+def twin(options: Find) -> None:
+    """Find what stands in a recording, with no start: things, places, sizes, confidences."""
+    from invertwin.cli.run_twin import run_twin
+
+    default = Path("out") / f"{options.recording.name.split('.')[0]}_twin"
+    with run_folder(options, default) as folder:
+        with progress(console):
+            tables = run_twin(options, folder)
         print_tables(tables)
 
 

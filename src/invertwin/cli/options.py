@@ -107,8 +107,8 @@ class Fits(Resumable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look(Where):
-    """What to look at, as the options of `invertwin look` say it."""
+class Recorded(Where):
+    """A recording, and what it takes to read it."""
 
     recording: Annotated[
         Path,
@@ -134,6 +134,12 @@ class Look(Where):
     lanes: Annotated[
         int | None, typer.Option(help="2 or 4 LVDS lanes, where the settings do not say.")
     ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look(Recorded):
+    """What to look at, as the options of `invertwin look` say it."""
+
     chirp: Annotated[
         int | None, typer.Option(min=0, help="The one that the capture keeps; default: mean.")
     ] = None
@@ -154,6 +160,33 @@ class Look(Where):
         tuple[float, float, float] | None,
         typer.Option(help="x y z in m of a reflector: calibrates the channels on it."),
     ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Find(Recorded):
+    """What to make a twin of, as the options of `invertwin twin` say it."""
+
+    low: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Corner of the ground that is searched, m; default: all that is seen."),
+    ] = None
+    high: Annotated[tuple[float, float] | None, typer.Option(help="Opposite corner, m.")] = None
+    range_max: Annotated[
+        float | None, typer.Option(help="m; default: the last range with echoes.")
+    ] = None
+    up: Annotated[Literal["y", "z"], typer.Option(help="The world axis that points up.")] = "y"
+    level: Annotated[
+        float | None, typer.Option(help="Height of the ground, m; default: 0.6 below the radars.")
+    ] = None
+    height: Annotated[
+        float | None,
+        typer.Option(
+            help="Above the ground, where echoes are looked for, m; default: the radars'."
+        ),
+    ] = None
+    rays: Annotated[int, typer.Option(min=100, help="Of every frame in fits.")] = 2000
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of rays.")] = 0
+    backend: BackendOption = None
 
 
 def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -69,6 +69,16 @@ def load_run(path: Path) -> Any:
     return validate(raw, path)
 
 
+def is_run_file(path: Path) -> bool:
+    """Whether a file is TOML with a task; descriptions of recordings have none."""
+    if path.suffix.lower() != ".toml":
+        return False
+    try:
+        return "task" in tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+
+
 def need(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
     """A section that a command cannot do without.
 

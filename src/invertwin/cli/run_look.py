@@ -16,7 +16,7 @@ from invertwin.capture import (
     read,
 )
 from invertwin.channel import Grid
-from invertwin.cli.options import Look
+from invertwin.cli.options import Look, Recorded
 from invertwin.cli.report import Table, finish, picture, quantities, texts
 from invertwin.errors import InputError
 from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
@@ -47,7 +47,7 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     Raises:
         InputError: A recording or options that do not fit each other; nothing has been written.
     """
-    reader, recording = _read(look)
+    reader, recording = read_recording(look)
     recording, metrics = _calibrated(look, recording, folder)
     capture, chirps = _capture(look, recording), None
     if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
@@ -101,7 +101,7 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     )
 
 
-def _read(look: Look) -> tuple[str, Recording]:
+def read_recording(look: Recorded) -> tuple[str, Recording]:
     """The name of the reader, and what it has read."""
     path, ending = look.recording, look.recording.suffix.lower()
     if not path.exists():
@@ -123,7 +123,7 @@ def _read(look: Look) -> tuple[str, Recording]:
     return readers[ending], read(path, look.config, board=board, lanes=look.lanes)
 
 
-def _read_public(look: Look, folder: Path) -> tuple[str, Recording]:
+def _read_public(look: Recorded, folder: Path) -> tuple[str, Recording]:
     known = load_plugins().recordings
     for file, (kind, board) in known.items():
         if (folder / file).is_file() and look.recording.name in (file, folder.name):
@@ -135,7 +135,7 @@ def _read_public(look: Look, folder: Path) -> tuple[str, Recording]:
     )
 
 
-def _board(look: Look, board: str | None) -> Mounting:
+def _board(look: Recorded, board: str | None) -> Mounting:
     if board is None:
         raise InputError(
             "expected a --board, got none; name the preset that recorded, and its --elevation"

@@ -181,7 +181,7 @@ def register(registry: Registry) -> None:
         ("along", along),
     ):
         registry.add("motion", name, make, checked=False)
-    for name in ("plate", "box", "sphere", "dihedral", "trihedral", "text"):
+    for name in ("plate", "box", "sphere", "cylinder", "dihedral", "trihedral", "text"):
         registry.add("shape", name, getattr(shapes, name))
     registry.add("shape", "prior", learned)
     registry.add("shape", "body", body)

@@ -5,4 +5,5 @@ from invertwin.discovery.outcome import Thing as Thing
 from invertwin.discovery.outcome import Twin as Twin
 from invertwin.discovery.primitives import Figure as Figure
 from invertwin.discovery.primitives import Primitive as Primitive
+from invertwin.discovery.recordings import still_capture as still_capture
 from invertwin.discovery.recordings import twin as twin

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
+from invertwin.channel import Grid
 from invertwin.discovery.primitives import Figure, Primitive
 from invertwin.inversion.initial import Ground
 from invertwin.scene import Object, Scene
@@ -86,6 +87,7 @@ class Twin:
         picture: Where echoes come from, and what was never seen.
         predicted: Maps of the things with the background; None where only places were found.
         observed: Maps of the recording.
+        grid: Their bins.
         notes: What to know of it, in sentences.
     """
 
@@ -95,6 +97,7 @@ class Twin:
     picture: Picture | None = None
     predicted: Float[Tensor, "frame range u v"] | None = None
     observed: Float[Tensor, "frame range u v"] | None = field(default=None, repr=False)
+    grid: Grid | None = None
     notes: tuple[str, ...] = ()
 
     @property

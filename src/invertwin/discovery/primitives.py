@@ -45,7 +45,7 @@ class Matte(Material):
 
     def written(self) -> RoughDielectric | RoughConductor:
         """The nearest material that a run file can name."""
-        share = float(self.brightness)
+        share = float(self.brightness.detach())
         if share > _WHITE:
             return RoughConductor()
         root = math.sqrt(max(share, 1e-6))

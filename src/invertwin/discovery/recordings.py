@@ -19,7 +19,7 @@ from invertwin.discovery.outcome import Picture, Thing, Twin, brightest_first
 from invertwin.discovery.places import dense, movers, points_along
 from invertwin.discovery.primitives import upright
 from invertwin.discovery.search import Lattice, Search
-from invertwin.discovery.sharp_image import responses, thinned
+from invertwin.discovery.sharp_image import Response, responses, thinned
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
@@ -71,13 +71,9 @@ def twin(
     """
     plane = ground or Ground()
     checked_count(rays, "rays", 100)
-    capture = recording
-    if isinstance(recording, ChirpCapture):
-        # What moves fades in the mean over the chirps, and is found apart.
-        capture = replace(recording, moving=False).capture()
-        if recording.real:
-            range_max = min(range_max or math.inf, recording.max_range)
-    assert isinstance(capture, Capture)
+    capture = still_capture(recording)
+    if isinstance(recording, ChirpCapture) and recording.real:
+        range_max = min(range_max or math.inf, recording.max_range)
     radar = capture.radar()
     base = float(radar.positions.detach()[:, plane.vertical].mean())
     floor = (
@@ -112,11 +108,27 @@ def twin(
         still.picture,
         still.predicted,
         still.observed,
+        still.grid,
         still.notes,
     )
 
 
+def still_capture(recording: Capture | ChirpCapture) -> Capture:
+    """A recording with one signal a frame, in which what moves fades.
+
+    Args:
+        recording: Of any kind.
+    """
+    if isinstance(recording, Capture):
+        return recording
+    return replace(recording, moving=False).capture()
+
+
 _NOTHING = "nothing is above the noise"
+_IMAGE_BETTER = (
+    "the image explains frames that were held out better than the things do: shapes may be wrong, "
+    "trust the image"
+)
 
 
 def _standing(
@@ -156,7 +168,13 @@ def _standing(
     if not shapes:
         seen = Picture(flat, picture, _views(radar, places, None))
         nothing = level_map.expand_as(power)
-        return Twin((), ground, level, seen, nothing, power, (_NOTHING,))
+        return Twin((), ground, level, seen, nothing, power, grid, (_NOTHING,))
+    notes: tuple[str, ...] = ()
+    if held:
+        aside = one.frames(held)
+        seen_there = responses(aside.radar, coarse, places)
+        if _explained(aside, seen_there, picture) > float(aside.gains(shapes).sum()):
+            notes = (_IMAGE_BETTER,)
     shapes, found = one.fitted(shapes, _STEPS)
     errors, sure = deviations(one, found), presence(one, shapes)
     kinds = kind_probabilities(one, shapes)
@@ -180,7 +198,24 @@ def _standing(
         Picture(flat, picture, views),
         one.predicted(shapes) + level_map,
         power,
+        grid,
+        notes,
     )
+
+
+def _explained(one: Assembly, response: Response, strength: Tensor) -> float:
+    """By how much an image makes maps likelier than the background alone.
+
+    Args:
+        one: Maps.
+        response: Of the image's places, to thinned maps.
+        strength: The image.
+    """
+    power, coarse = thinned(one.power, one.radar, one.model.grid)
+    stride = round(coarse.range_step / one.model.grid.range_step)
+    loss = HeavyTailed(one.loss.level[::stride], one.loss.degrees)
+    rows = loss.rows(torch.zeros_like(power), power) - loss.rows(response.maps(strength), power)
+    return float(rows.sum()) / shared_bins(one.radar, coarse)
 
 
 def _own(errors: dict[str, float], prefix: str) -> dict[str, float]:

@@ -125,6 +125,7 @@ class Search:
             return []
         shapes = self.merged(self.kinds(shapes))
         shapes, _ = self.fitted.fitted(shapes, _LONG)
+        shapes = self.settled(self.heights(shapes))
         return self.alive(shapes)
 
     def births(self, shapes: Sequence[Figure]) -> list[Figure]:
@@ -254,6 +255,31 @@ class Search:
             )
         return found
 
+    def heights(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes of the likeliest heights.
+
+        What is above the radars has nearly the same ranges as what is below, so that a height may
+        rest in a minimum of its own.
+
+        Args:
+            shapes: After a fit.
+        """
+        found = list(shapes)
+        for number, shape in enumerate(found):
+            options = [
+                replace(
+                    shape, height=shape.height * part, brightness=shape.brightness * part**-power
+                )
+                for part in _PARTS
+                for power in (0.5, 1.0)
+            ]
+            rest = found[:number], found[number + 1 :]
+            found[number] = max(
+                [shape, *options],
+                key=lambda one, rest=rest: self.evidence([*rest[0], one, *rest[1]]),
+            )
+        return found
+
     def merged(self, shapes: Sequence[Figure]) -> list[Figure]:
         """Shapes, with one box in place of two where that is likelier.
 
@@ -281,6 +307,7 @@ class Search:
                 found = new
 
 
+_PARTS = (0.4, 0.55, 0.75, 1.35)  # of a height that are tried
 _TURNS = tuple(k * math.pi / 16 for k in range(8))
 
 

@@ -247,7 +247,8 @@ class Registry:
     def names(self, group: str) -> list[str]:
         """The kinds of a group, or of "task"."""
         if group == "task":
-            own = ["simulate", "reconstruct", "gradcheck", "rcs", "dataset", "loss-scan", "demo"]
+            own = ["simulate", "reconstruct", "gradcheck", "rcs", "dataset", "twin"]
+            own += ["loss-scan", "demo"]
             return list(dict.fromkeys([*own, *self.commands]))
         return list(self._kinds(group))
 

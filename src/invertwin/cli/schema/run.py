@@ -30,6 +30,7 @@ from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.schema.placement import Placement
 from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTable
 from invertwin.cli.schema.signature import Rcs
+from invertwin.cli.schema.twin import TwinTable
 from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.shape_tables import LearnedTable, RoomTable
 from invertwin.cli.variation import check_varied
@@ -156,6 +157,7 @@ class _RunFile(Section):
         "several poses to begin from at every start; the best end counts", None
     )
     plan: Plan | None = key("what `invertwin plan` compares and tries", None)
+    twin: TwinTable | None = key("the ground that `invertwin twin` searches", None)
     initial: AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
     )

@@ -1,0 +1,192 @@
+"""`invertwin twin`: what stands in a recording, found with no start."""
+
+import math
+import time
+from dataclasses import replace
+from typing import Any
+
+import tomli_w
+import torch
+
+from invertwin.capture import Capture, ChirpCapture
+from invertwin.cli import build
+from invertwin.cli.options import Find
+from invertwin.cli.recordings import SimulatedData
+from invertwin.cli.report import Picture, Table, finish, picture, texts
+from invertwin.cli.run_file import about_file, is_run_file, load_run, need
+from invertwin.cli.run_look import read_recording
+from invertwin.cli.run_simulate import exact
+from invertwin.discovery import Twin, still_capture, twin
+from invertwin.discovery.primitives import Primitive
+from invertwin.inversion.initial import Ground
+from invertwin.inversion.metrics import compare_shapes
+from invertwin.plotting import found as pictures
+from invertwin.plotting import spectrum
+from invertwin.runs import RunFolder
+from invertwin.scene import RoughDielectric, Scene, joined, save_mesh
+
+_SURE = 0.5  # confidence of things that are counted
+
+
+def run_twin(find: Find, folder: RunFolder) -> list[Table]:
+    """Read a recording, search it, write the twin; return the tables to print.
+
+    Raises:
+        InputError: A recording or options that do not fit each other; nothing has been written.
+    """
+    begin = time.perf_counter()
+    options: dict[str, Any] = {
+        "low": find.low,
+        "high": find.high,
+        "range_max": find.range_max,
+        "level": find.level,
+        "height": find.height,
+    }
+    options = {name: value for name, value in options.items() if value is not None}
+    truth, up, rays = None, find.up, find.rays
+    if is_run_file(find.recording):
+        recording, truth, table = _of_run_file(find)
+        up, rays = table.pop("up", up), table.pop("rays", rays)
+        options = table | options
+    else:
+        _, recording = read_recording(find)
+    found = twin(recording, ground=Ground(up), rays=rays, seed=find.seed, **options)
+    sure = [thing for thing in found.things if thing.confidence > _SURE]
+    metrics: dict[str, Any] = {
+        "task": "twin",
+        "things": [thing.row() for thing in found.things],
+        "count": len(sure),
+        "unsure": len(found.things) - len(sure),
+        "notes": list(found.notes),
+    }
+    if found.picture is not None:
+        metrics["never_seen_share"] = float((found.picture.views == 0).double().mean())
+    scene = found.scene
+    if scene is not None and found.predicted is not None and found.observed is not None:
+        explained = found.observed.double().log() - found.predicted.double().log()
+        metrics["residual_log_std"] = float(explained.std())
+    if truth is not None and scene is not None:
+        metrics |= _scores(scene, truth)
+    metrics["wall_seconds"] = time.perf_counter() - begin
+    if scene is not None:
+        save_mesh(folder.file("twin.glb"), scene)
+        folder.write_text("twin.toml", tomli_w.dumps(_described(found)))
+    parts: list[Table | Picture] = [_table(found)]
+    parts += [
+        picture(folder, "ground", pictures.ground(found), "The ground from above", "ground"),
+        *_maps(found, folder, recording),
+    ]
+    said = "; ".join(found.notes) or f"{len(sure)} things, {metrics['unsure']} unsure ones"
+    title = find.recording.name
+    still = still_capture(recording)
+    still.save(folder.file("capture.nc"))
+    return finish(folder, metrics, title, f"{said}.", parts, again="twin capture.nc")
+
+
+def _of_run_file(
+    find: Find,
+) -> tuple[Capture | ChirpCapture, Scene | None, dict[str, Any]]:
+    """The data of a run file, what is true of them, and what it says of the search."""
+    with about_file(find.recording):
+        run = load_run(find.recording)
+        given = {} if run.twin is None else run.twin.model_dump(exclude_none=True)
+        data = need(run, "data", "a twin")
+        if not isinstance(data, SimulatedData):
+            return data.build(), None, given
+        radar = build.radar(need(run, "radar", "simulated data"))
+        grid = build.grid(need(run, "grid", "simulated data"), radar)
+        truth = build.true_scene(run)
+        capture = Capture.from_beat(exact(run, truth, radar, grid).beat, radar)
+        return capture, truth, given
+
+
+def _scores(scene: Scene, truth: Scene) -> dict[str, Any]:
+    whole = [
+        joined(
+            [replace(item.mesh, vertices=item.vertices.detach()) for item in one.objects.values()]
+        )
+        for one in (scene, truth)
+    ]
+    return {
+        "chamfer_m": compare_shapes(whole[0], whole[1], voxel=None).chamfer,
+        "true_count": len(truth.names),
+    }
+
+
+def _table(found: Twin) -> Table:
+    up = found.ground.vertical
+    heads = ["thing", "kind", "confidence", *(f"{'xyz'[axis]} [m]" for axis in range(3))]
+    heads += ["± [m]", "yaw [°]", "length, width, height [m]", "range rate [m/s]"]
+    rows: list[list[Any]] = []
+    for thing in found.things:
+        figure = thing.figure
+        errors = [thing.deviations.get("xyz"[axis]) for axis in range(3) if axis != up]
+        known = [error for error in errors if error is not None]
+        size, yaw, rate = None, None, None
+        if figure is not None:
+            size = [figure.length, figure.width, figure.height]
+            yaw = math.degrees(figure.yaw) if figure.boxed else None
+        if thing.velocity is not None:
+            rate = float(thing.velocity.norm())
+        share = f"{thing.kind} {thing.probabilities.get(thing.kind, 1.0):.2f}"
+        row = [thing.name, share, thing.confidence, *thing.position.tolist()]
+        rows.append([*row, max(known) if known else None, yaw, size, rate])
+    return Table("Things", heads, rows, texts("notes")["things"])
+
+
+def _maps(found: Twin, folder: RunFolder, recording: Any) -> list[Picture]:
+    if found.predicted is None or found.observed is None or found.grid is None:
+        return []
+    shown = {"recording": found.observed, "twin": found.predicted}
+    ratio = found.observed.double() / found.predicted.double()
+    shown["recording over twin"] = ratio.to(found.observed)
+    return [picture(folder, "maps", spectrum(shown, found.grid), "Maps", "twin_maps")]
+
+
+def _described(found: Twin) -> dict[str, Any]:
+    """A run file that simulates the things that have a shape, and fits their poses on."""
+    assert found.grid is not None
+    scene: dict[str, Any] = {}
+    axis = found.ground.vertical
+    for thing in found.things:
+        if (figure := thing.figure) is None:
+            continue
+        turn = [0.0, 0.0, 0.0]
+        turn[axis] = math.degrees(figure.yaw)
+        sides = [figure.length] * 3
+        sides[found.ground.level[1]] = figure.width
+        sides[axis] = figure.height
+        shape: dict[str, Any] = {"shape": "sphere", "radius": 0.5 * figure.length}
+        if figure.boxed:
+            shape = {"shape": "box", "size": sides, "rotation_deg": turn}
+        elif figure.kind == "cylinder":
+            shape = {"shape": "cylinder", "radius": 0.5 * figure.length, "height": figure.height}
+            if found.ground.up == "z":
+                shape["rotation_deg"] = [90.0, 0.0, 0.0]
+        material = Primitive(thing.name, figure, found.ground, found.level).matte.written()
+        described: dict[str, Any] = {"kind": "rough_conductor"}
+        if isinstance(material, RoughDielectric):
+            value = float(torch.as_tensor(material.permittivity))
+            described = {"kind": "rough_dielectric", "permittivity": value}
+        scene[thing.name] = {
+            **shape,
+            "position": thing.position.tolist(),
+            "material": described,
+        }
+    grid = found.grid
+    last = grid.range_start + grid.range_step * (grid.range_count - 1)
+    return {
+        "task": "reconstruct",
+        "title": "What was found",
+        "scene": scene,
+        "data": {"kind": "capture", "file": "capture.nc"},
+        "grid": {
+            "range_min": grid.range_start,
+            "range_max": last,
+            "u_max": min(1.0, float(grid.u.abs().max())) if grid.u_count > 1 else 1.0,
+            "v_max": min(1.0, float(grid.v.abs().max())) if grid.v_count > 1 else 1.0,
+        },
+        "parameters": [{"kind": "translation", "object": name} for name in scene],
+        "loss": {"kind": "likelihood"},
+        "reconstruct": {"depth": 1, "steps": 40, "samples": 100_000},
+    }

@@ -1,0 +1,62 @@
+"""What a twin of a recording shows of the ground: echoes, things, and what was never seen."""
+
+import math
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from invertwin.discovery.outcome import Twin
+from invertwin.discovery.search import outline
+from invertwin.plotting.figures import color, numbers
+
+
+def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
+    """The ground from above: where echoes come from, things with two deviations, blind places.
+
+    Args:
+        twin: With a picture.
+        dynamic_range: Level of the brightest colour above the darkest [dB].
+    """
+    figure = Figure(figsize=(7.5, 6.2), layout="constrained")
+    axes = figure.subplots()
+    names = [f"{'xyz'[axis]} [m]" for axis in twin.ground.level]
+    axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
+    if twin.picture is not None and len(twin.picture.places):
+        places, strength = numbers(twin.picture.places), numbers(twin.picture.strength)
+        top = max(float(strength.max()), 1e-300)
+        level = np.clip(10 * np.log10(np.maximum(strength, 1e-30) / top), -dynamic_range, 0)
+        blind = numbers(twin.picture.views) == 0
+        side = 72 * 5 / max(float(np.ptp(places, axis=0).max()), 1e-6) * _step(places)
+        style = {"s": max(side, 1.0) ** 2, "marker": "s", "linewidths": 0}
+        dots = axes.scatter(*places[~blind].T, c=level[~blind], cmap="magma", **style)
+        axes.scatter(*places[blind].T, color="0.75", label="never seen", **style)
+        figure.colorbar(dots, label="echoes, dB below the strongest", shrink=0.8)
+    for thing in twin.things:
+        at = [float(thing.position[axis]) for axis in twin.ground.level]
+        tint = color(0) if thing.confidence > 0.5 else "0.5"
+        if thing.figure is not None:
+            corners = numbers(outline(thing.figure, twin.ground))
+            axes.plot(*np.concatenate([corners, corners[:1]]).T, color=tint, linewidth=1.5)
+        spread = [thing.deviations.get("xyz"[axis]) for axis in twin.ground.level]
+        if None not in spread:
+            sizes = [4 * float(value or 0.0) for value in spread]
+            axes.add_patch(Ellipse((at[0], at[1]), sizes[0], sizes[1], fill=False, color=tint))
+        if thing.velocity is not None:
+            speed = [float(thing.velocity[axis]) for axis in twin.ground.level]
+            if math.hypot(*speed) > 0:
+                axes.annotate(
+                    "", (at[0] + speed[0], at[1] + speed[1]), at, arrowprops={"arrowstyle": "->"}
+                )
+        axes.annotate(
+            f"{thing.name}: {thing.kind}", at, fontsize=7, xytext=(4, 4), textcoords="offset points"
+        )
+    if twin.picture is not None and bool((twin.picture.views == 0).any()):
+        axes.legend(fontsize=7, loc="upper right")
+    return figure
+
+
+def _step(places: np.ndarray) -> float:
+    """The distance of neighbouring places along the second axis."""
+    gaps = np.diff(np.unique(places[:, 1]))
+    return float(gaps.min()) if len(gaps) else 0.1
