@@ -163,12 +163,13 @@ class Room:
                 across = uniform(0.16, 0.6)
                 size = across, uniform(0.4, 1.5), across
             elif kind == "sphere":
-                size = (uniform(0.2, 0.6),) * 3
+                across = uniform(0.2, 0.6)
+                size = across, across, across
                 lift = uniform(0.5 * size[1], 1.0)
             else:
                 span = _standing().vertices
                 wide, tall, deep = (span.amax(0) - span.amin(0)).tolist()
-                size = wide, tall, deep
+                size = float(wide), float(tall), float(deep)
             thing = Thing(
                 kind,
                 (uniform(-1.8, 1.8), uniform(-1.8, 1.8)),

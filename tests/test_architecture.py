@@ -32,6 +32,7 @@ CAMERA = CHANNEL - {"doctor", "threads"} | {"camera"}
 DATASETS = RADAR | {"datasets"}
 MODELS = SIMULATION | CAPTURE | LINKS | CAMERA | {"signatures", "models"}
 INVERSION = MODELS | {"inversion"}
+DISCOVERY = INVERSION | {"discovery"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
 ALLOWED = {
@@ -58,15 +59,16 @@ ALLOWED = {
     "datasets": DATASETS,
     "models": MODELS,
     "inversion": INVERSION,
+    "discovery": DISCOVERY,
     "runs": FOUNDATION | {"runs"},
-    "plotting": INVERSION | {"plotting"},
+    "plotting": DISCOVERY | {"plotting"},
     "registry": FOUNDATION | {"registry"},
-    "cli": INVERSION
+    "cli": DISCOVERY
     | SIGNATURES
     | DATASETS
     | {"doctor", "threads", "engines", "runs", "plotting", "registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
-    "__init__": INVERSION | SIGNATURES | {"doctor", "threads"},
+    "__init__": DISCOVERY | SIGNATURES | {"doctor", "threads"},
 }
 RAY_TRACER = {"mitsuba", "drjit"}
 KNOW_THE_RAY_TRACER = {"channel"}

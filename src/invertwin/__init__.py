@@ -3,7 +3,7 @@
 Data flows one way. ``scene`` turns parameters θ (``scene/parameters.py``) into meshes, materials
 and antennas; ``channel`` traces them into paths; ``radar`` makes beat signals and spectra of paths,
 or their smooth mean, the surrogate; ``links`` makes responses of paths between antennas;
-``inversion`` compares spectra with a capture and moves θ.
+``inversion`` compares spectra with a capture and moves θ; ``discovery`` finds what there is.
 ``simulation.py`` is the way from scene to spectrum on one page. Beside it, ``capture`` holds
 measured data, ``datasets`` simulated ones with labels, ``plotting`` draws figures, ``registry``
 says what run files may name and ``cli`` has the commands.

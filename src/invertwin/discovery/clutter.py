@@ -64,7 +64,9 @@ def shared_bins(radar: Radar, grid: Grid) -> float:
 def _sum_of_squares(weight: Tensor, cycles: Tensor, step: float, count: int) -> float:
     lags = step * torch.arange(-count + 1, count, dtype=torch.float64)
     field = torch.polar(weight.expand(len(lags), -1), 2 * math.pi * lags[:, None] * cycles).sum(1)
-    return float((field.abs() / weight.sum()).square().sum())
+    # Of all pairs of bins of the axis, this share is so far apart.
+    share = 1 - lags.abs() / (step * count)
+    return float((share * (field.abs() / weight.sum()).square()).sum())
 
 
 @dataclass(frozen=True, eq=False)

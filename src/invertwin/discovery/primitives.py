@@ -117,7 +117,8 @@ class Primitive(nn.Module):
 
     def __init__(self, name: str, start: Figure, ground: Ground, level: float = 0.0) -> None:
         super().__init__()
-        self.object, self.kind, self.ground, self.level = name, start.kind, ground, level
+        self.kind: Kind = start.kind
+        self.object, self.ground, self.level = name, ground, level
         self.round = start.kind in ("sphere", "point")
         low, high = _SIZES
         sizes = [min(max(v, low), high) for v in (start.length, start.width, start.height)]

@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.capture import Capture, ChirpCapture
-from invertwin.channel import Grid
-from invertwin.channel.sight import Sight
+from invertwin.channel import Grid, Sight
 from invertwin.discovery.assembly import Assembly, sampling_of
 from invertwin.discovery.certainty import deviations, kind_probabilities, presence
 from invertwin.discovery.clutter import HeavyTailed, background, shared_bins

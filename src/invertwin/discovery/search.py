@@ -227,9 +227,9 @@ class Search:
         Args:
             shapes: All of them.
         """
-        found = list(shapes)
+        found: list[Figure] = [*shapes]
         while found:
-            without = [found[:k] + found[k + 1 :] for k in range(len(found))]
+            without: list[list[Figure]] = [[*found[:k], *found[k + 1 :]] for k in range(len(found))]
             weakest = max(without, key=self.evidence)
             if self.better(found, weakest):
                 break
@@ -248,11 +248,9 @@ class Search:
         }
         found = list(shapes)
         for number in range(len(found)):
-            rest = found[:number], found[number + 1 :]
+            rest = [*found[:number], *found[number + 1 :]]
             options = [found[number], *(rows[number] for rows in fitted.values())]
-            found[number] = max(
-                options, key=lambda one, rest=rest: self.evidence([*rest[0], one, *rest[1]])
-            )
+            found[number] = max(options, key=lambda one, rest=rest: self.evidence([*rest, one]))
         return found
 
     def heights(self, shapes: Sequence[Figure]) -> list[Figure]:
@@ -273,10 +271,10 @@ class Search:
                 for part in _PARTS
                 for power in (0.5, 1.0)
             ]
-            rest = found[:number], found[number + 1 :]
+            rest = [*found[:number], *found[number + 1 :]]
             found[number] = max(
                 [shape, *options],
-                key=lambda one, rest=rest: self.evidence([*rest[0], one, *rest[1]]),
+                key=lambda one, rest=rest: self.evidence([*rest, one]),
             )
         return found
 
@@ -307,7 +305,7 @@ class Search:
                 found = new
 
 
-_PARTS = (0.4, 0.55, 0.75, 1.35)  # of a height that are tried
+_PARTS = (0.4, 0.55, 0.75, 1.35, 2.0)  # of a height that are tried
 _TURNS = tuple(k * math.pi / 16 for k in range(8))
 
 
@@ -368,7 +366,7 @@ def apart(first: Figure, second: Figure, ground: Ground) -> float:
     for shape in (first, second):
         corners = outline(shape, ground)
         sides.append((corners + share * (corners.roll(1, 0) - corners)).flatten(0, 1))
-    return float(torch.cdist(*sides).min())
+    return float(torch.cdist(sides[0], sides[1]).min())
 
 
 def outline(shape: Figure, ground: Ground, count: int = 16) -> Float64[Tensor, "corner 2"]:

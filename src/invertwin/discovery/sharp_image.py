@@ -43,7 +43,7 @@ class Response:
 
 def thinned(
     power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
-) -> tuple[Float64[Tensor, "frame range u v"], Grid]:
+) -> tuple[Float64[Tensor, "frame some_range some_u some_v"], Grid]:
     """One bin of a map for each cell of range and direction: nearly independent ones.
 
     Args:
@@ -127,7 +127,7 @@ def responses(radar: Radar, grid: Grid, places: Float64[Tensor, "place 3"]) -> R
                 shape=(int(np.prod(grid.shape)), len(places)),
             )
         )
-    return Response(sparse.vstack(frames, format="csr"), shape)
+    return Response(sparse.csr_matrix(sparse.vstack(frames)), shape)
 
 
 def sharpened(
@@ -159,12 +159,12 @@ def sharpened(
         Radar cross-section of every place [m²].
     """
     matrix = response.matrix
-    back = matrix.T
+    back = sparse.csc_matrix(matrix.T)
     data = power.numpy().astype(np.float32).reshape(-1)
     known = rest.numpy().astype(np.float32).reshape(-1)
     total = np.asarray(matrix.sum(axis=0)).ravel()
     excess = np.maximum(data - known, 0.0)
-    strength = np.full(matrix.shape[1], excess.sum() / total.sum(), dtype=np.float32)
+    strength = np.full(len(total), excess.sum() / total.sum(), dtype=np.float32)
     strength[total <= 0] = 0.0
     for _ in told(range(steps), "sharp image"):
         mean = matrix @ strength + known

@@ -33,7 +33,8 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         axes.scatter(*places[blind].T, color="0.75", label="never seen", **style)
         figure.colorbar(dots, label="echoes, dB below the strongest", shrink=0.8)
     for thing in twin.things:
-        at = [float(thing.position[axis]) for axis in twin.ground.level]
+        x, y = (float(thing.position[axis]) for axis in twin.ground.level)
+        at = (x, y)
         tint = color(0) if thing.confidence > 0.5 else "0.5"
         if thing.figure is not None:
             corners = numbers(outline(thing.figure, twin.ground))
@@ -41,13 +42,11 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         spread = [thing.deviations.get("xyz"[axis]) for axis in twin.ground.level]
         if None not in spread:
             sizes = [4 * float(value or 0.0) for value in spread]
-            axes.add_patch(Ellipse((at[0], at[1]), sizes[0], sizes[1], fill=False, color=tint))
+            axes.add_patch(Ellipse(at, sizes[0], sizes[1], fill=False, color=tint))
         if thing.velocity is not None:
             speed = [float(thing.velocity[axis]) for axis in twin.ground.level]
             if math.hypot(*speed) > 0:
-                axes.annotate(
-                    "", (at[0] + speed[0], at[1] + speed[1]), at, arrowprops={"arrowstyle": "->"}
-                )
+                axes.annotate("", (x + speed[0], y + speed[1]), at, arrowprops={"arrowstyle": "->"})
         axes.annotate(
             f"{thing.name}: {thing.kind}", at, fontsize=7, xytext=(4, 4), textcoords="offset points"
         )

@@ -1,0 +1,91 @@
+"""Shapes on the ground as unknowns."""
+
+import math
+
+import pytest
+import torch
+
+from invertwin.discovery.primitives import Figure, Matte, Primitive, upright
+from invertwin.errors import InputError
+from invertwin.inversion.initial import Ground
+from invertwin.inversion.uncertainty import coordinates
+from invertwin.scene import RoughConductor, RoughDielectric, rotation_from_vector
+
+BOX = Figure("box", (0.3, -0.4), 0.3, 0.8, 0.2, 1.1, 0.05)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
+def test_a_shape_has_the_numbers_it_was_made_of(kind: str, up: str):
+    ground = Ground(up)
+    figure = Figure(kind, (0.3, -0.4), 0.3, 0.8, 0.8 if kind != "box" else 0.2, 1.1, 0.05)
+    one = Primitive("thing", figure, ground, level=0.5)
+    found = one.figure
+    for name, value in vars(figure).items():
+        if name not in ("kind", "place"):
+            assert getattr(found, name) == pytest.approx(value), name
+    vertices = one.item.vertices.detach()
+    middle = 0.5 * (vertices.amax(0) + vertices.amin(0))
+    assert (middle - upright(figure, ground, 0.5)).norm() < 1e-9
+    if kind != "sphere":
+        assert float(vertices[:, ground.vertical].min()) == pytest.approx(0.5)
+        assert float(vertices[:, ground.vertical].max()) == pytest.approx(1.6)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_box_is_turned_as_the_ground_turns(up: str):
+    ground = Ground(up)
+    turned, straight = (
+        Primitive("thing", Figure("box", (0.0, 0.0), yaw, 0.8, 0.2, 1.0), ground).item.vertices
+        for yaw in (0.3, 0.0)
+    )
+    middle = straight.detach().mean(0)
+    expected = (straight.detach() - middle) @ ground.turn(0.3).T + middle
+    assert (turned.detach() - expected).abs().max() < 1e-12
+    vector = torch.zeros(3, dtype=torch.float64)
+    vector[ground.vertical] = 0.3
+    assert torch.allclose(ground.turn(0.3), rotation_from_vector(vector))
+
+
+def test_coordinates_are_the_numbers_of_the_figure():
+    """A step along a coordinate changes its number by as much."""
+    for figure in (BOX, Figure("sphere", (0.0, 1.0), 0.0, 0.4, 0.4, 0.9, 0.2)):
+        one = Primitive("thing", figure, Ground())
+        names = {"x": "place", "z": "place"}
+        for row in coordinates(one):
+            name = row.name.removeprefix("thing.")
+            moved = Primitive("thing", figure, Ground())
+            with torch.no_grad():
+                for parameter, tangent in row.tangents.items():
+                    moved.get_parameter(parameter).add_(tangent, alpha=1e-6)
+            before, after = (getattr(p.figure, names.get(name, name)) for p in (one, moved))
+            if name in names:
+                before, after = before["xz".index(name)], after["xz".index(name)]
+            assert (after - before) / 1e-6 == pytest.approx(1.0, rel=1e-3), row.name
+
+
+@pytest.mark.parametrize(
+    ("figure", "named"),
+    [
+        (BOX, "box"),
+        (Figure("box", (0.0, 0.0), 0.0, 1.5, 0.03, 1.0), "wall"),
+        (Figure("box", (0.0, 0.0), 0.0, 0.05, 0.04, 1.0), "box"),
+        (Figure("sphere", (0.0, 0.0), 0.0, 0.03, 0.03, 1.0), "point"),
+        (Figure("cylinder", (0.0, 0.0), 0.0, 0.3, 0.3, 1.0), "cylinder"),
+    ],
+)
+def test_small_and_thin_things_have_names_of_their_own(figure: Figure, named: str):
+    assert figure.named == named
+
+
+def test_the_nearest_material_reflects_as_much_at_normal_incidence():
+    written = Matte(torch.tensor(0.2, dtype=torch.float64)).written()
+    assert isinstance(written, RoughDielectric)
+    root = math.sqrt(float(torch.as_tensor(written.permittivity)))
+    assert ((root - 1) / (root + 1)) ** 2 == pytest.approx(0.2)
+    assert isinstance(Matte(torch.tensor(3.0, dtype=torch.float64)).written(), RoughConductor)
+
+
+def test_sizes_must_be_positive():
+    with pytest.raises(InputError, match="length"):
+        Figure("box", (0.0, 0.0), 0.0, -0.1, 0.2, 1.0)
