@@ -75,6 +75,8 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     points = None
     if chirps is not None:
         points = points_of(chirps.beat, radar, grid, chirps.chirps, look.frame)
+    elif "beat" in capture.dataset:
+        points = points_of(capture.beat[:, None], radar, grid, None, look.frame)
     if radar.frame_count > 1:
         profiles = capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
@@ -208,6 +210,7 @@ def _maps(
             "chirps": chirps.chirps.count,
             "velocity_span_m_s": velocity_span(chirps.device, chirps.chirps),
             **maps.strongest.metrics("peak"),
+            "moves": maps.mover is not None,
             **({} if maps.mover is None else maps.mover.metrics("mover")),
         }
     spectrum = capture.frames([frame]).spectrum(grid)[0].double()
