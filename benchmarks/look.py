@@ -17,9 +17,9 @@ a raw file.
 
 Faulty ones are such recordings at 10 to 40 dB, with one fault of a random severity. The least that
 counts: Q holds less than 1 % of I's power; copies by interleaving 30 dB above the noise of all
-samples together; phases that break by 45° within the middle half of a ramp, in all chirps or in a
+samples together, and 20 dB above other echoes there; phases that break by 45° within the middle half of a ramp, in all chirps or in a
 quarter; 1 to 3 samples that drop out, or packets of 8 to 32; leakage 3 dB above what else is
-shown; the strongest value 10 % beyond the converter's range; settings of which one or two are wrong.
+shown; 1 % of the values beyond the converter's range; settings of which one or two are wrong.
 """
 
 import argparse
@@ -74,7 +74,7 @@ class Drawn:
         elements: TX in the order of sending, and RX.
         beat: Samples [frame, chirp, tx, rx, sample], noise included.
         snr: Mean signal over noise power in a sample.
-        full_scale: Of the converter.
+        headroom: Full scale of the converter over the largest value.
     """
 
     scene: str
@@ -82,7 +82,7 @@ class Drawn:
     elements: Elements
     beat: Tensor
     snr: float
-    full_scale: float
+    headroom: float
 
 
 def drawn_settings(chance: Chance) -> tuple[ChirpSettings, Elements]:
@@ -114,7 +114,7 @@ def drawn_settings(chance: Chance) -> tuple[ChirpSettings, Elements]:
 
 
 def reflectors(
-    scene: str, radar: Radar, farthest: float, chance: Chance
+    scene: str, radar: Radar, farthest: float, most_clutter_db: float, chance: Chance
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Ranges and directions [point, (R, u, v)], amplitudes and range rates of a scene's points."""
     cell = radar.waveform.range_resolution
@@ -125,11 +125,15 @@ def reflectors(
     u, v = size * np.cos(angle), size * np.sin(angle) * (chance.random() < 0.5)
     levels = chance.uniform(-25, 0, count) * (scene not in ("pair", "mirrored"))
     if scene == "clutter":
-        levels -= 10
+        # All but the first together.
+        together = 10 * math.log10(float((10 ** (levels[1:] / 10)).sum()))
+        levels += float(chance.uniform(-20, most_clutter_db)) - together
     levels[0] = 0.0
     if scene in ("pair", "mirrored"):
         u[1], v[1], ranges[1] = -u[0], -v[0], ranges[0]
     if scene == "mirrored":
+        last = max(radar.waveform.max_range - nearest, 1.1 * nearest)
+        ranges[0] = chance.uniform(nearest, last)
         ranges[1] = radar.waveform.max_range - ranges[0]
     rates = chance.uniform(-4, 4, count) * (scene == "movers")
     phases = chance.uniform(0, 2 * math.pi, count)
@@ -181,13 +185,13 @@ def objects(radar: Radar, farthest: float, chance: Chance) -> Paths:
     return paths.weighted(1e-3 / strength)
 
 
-def drawn(scene: str, chance: Chance, least_snr_db: float, leak: bool = False) -> Drawn:
+def drawn(scene: str, chance: Chance, *, sound: bool, leak: bool = False) -> Drawn:
     """A recording of a scene.
 
     Args:
         scene: One of `SCENES`.
         chance: Draws everything.
-        least_snr_db: Signal over noise in a sample is that to 40 dB.
+        sound: Whether it stays as it is: then with less signal, or more clutter.
         leak: Whether leakage is stronger than what else is shown.
     """
     settings, elements = drawn_settings(chance)
@@ -198,11 +202,12 @@ def drawn(scene: str, chance: Chance, least_snr_db: float, leak: bool = False) -
         warnings.simplefilter("ignore", PhysicsWarning)
         radar = Radar(*elements, settings.waveform, place)
         farthest = settings.waveform.max_range / (2 if settings.real else 1)
+        clutter = 10.0 if sound else -10.0
         if scene == "objects":
             paths = objects(radar, farthest, chance)
         else:
-            paths = paths_of(radar, *reflectors(scene, radar, farthest, chance))
-        snr_db = float(chance.uniform(least_snr_db, 40))
+            paths = paths_of(radar, *reflectors(scene, radar, farthest, clutter, chance))
+        snr_db = float(chance.uniform(0 if sound else 10, 40))
         front = Impairments(
             leakage=leakage(settings, leak, chance),
             gain_std_db=float(chance.uniform(0, 1.5)),
@@ -214,13 +219,8 @@ def drawn(scene: str, chance: Chance, least_snr_db: float, leak: bool = False) -
         level = float(paths.coefficient.abs().square().sum()) / radar.frame_count
         noise = torch.from_numpy(chance.normal(size=(*beat.shape, 2)))
         beat += math.sqrt(level / 2 * 10 ** (-snr_db / 10)) * torch.view_as_complex(noise)
-    largest = float(torch.view_as_real(beat).abs().max())
-    return Drawn(scene, settings, elements, beat, 10 ** (snr_db / 10), largest * headroom(chance))
-
-
-def headroom(chance: Chance) -> float:
-    """Full scale over the largest value: up to 20 dB."""
-    return float(10 ** chance.uniform(0.01, 1.0))
+    headroom = float(10 ** chance.uniform(0.01, 1.0))
+    return Drawn(scene, settings, elements, beat, 10 ** (snr_db / 10), headroom)
 
 
 def leakage(settings: ChirpSettings, strong: bool, chance: Chance) -> Leakage | None:
@@ -245,33 +245,46 @@ def leakage(settings: ChirpSettings, strong: bool, chance: Chance) -> Leakage | 
     return Leakage(delay, -60 + float(chance.uniform(-30, 20 if hidden else -6)))
 
 
-def by_type(case: Drawn, chance: Chance) -> None:
-    """I alone, as complex numbers; or Q a copy of I, with up to 1 % of other power."""
+def by_type(case: Drawn, chance: Chance) -> bool:
+    """I alone, as complex numbers; or Q a copy of I, or with up to 1 % of its power."""
     case.settings = replace(case.settings, real=False)
     part = case.beat.real
     copy = float(chance.choice([0.0, 0.0, 1.0]))
-    rest = math.sqrt(float(chance.choice([0.0, chance.uniform(0, 0.01)])))
-    case.beat = torch.complex(part, copy * part + rest * case.beat.imag * (1 - copy))
+    rest = case.beat.imag * (part.square().mean() / case.beat.imag.square().mean()).sqrt()
+    rest *= math.sqrt(float(chance.choice([0.0, chance.uniform(0, 0.01)]))) * (1 - copy)
+    case.beat = torch.complex(part, copy * part + rest)
+    return True
 
 
-def interleaved(case: Drawn, chance: Chance) -> None:
-    """Odd samples with another gain or another time, or lost and replaced by the one before."""
+def interleaved(case: Drawn, chance: Chance) -> bool:
+    """Odd samples with another gain or another time, or lost and replaced by the one before.
+
+    It counts where the strongest echo's copy is 30 dB above the noise of all samples together, and
+    20 dB above what else is at its place, where a single echo can be told at all.
+    """
     beat, count = case.beat, case.settings.samples
-    if case.settings.real:
-        beat = beat.real.to(beat.dtype)
-    seen = case.snr * beat[:1].numel()
-    weakest = max(10 ** (30 / 20) / math.sqrt(seen), 10 ** (-40 / 20))
-    share = float(10 ** chance.uniform(math.log10(weakest), 0)) if weakest < 1 else 1.0
+    spectrum = torch.fft.fft(beat)
+    window = torch.from_numpy(np.blackman(count))
+    power = torch.fft.fft(beat * window).abs().square().flatten(0, 3).mean(0)
+    strongest = int(power[: count // 2].argmax() if case.settings.real else power.argmax())
+    copy = (count // 2 - strongest if case.settings.real else strongest + count // 2) % count
+    there = float(torch.stack([power.roll(-copy)[k] for k in (-3, -2, -1, 0, 1, 2, 3)]).max())
+    lost = (copy - strongest + count // 2) % count - count // 2
+    weakest = max(
+        10 ** (30 / 20) / math.sqrt(case.snr * beat[:1].numel()),
+        10 * math.sqrt(there / float(power[strongest])),
+    )
+    if weakest > 1 or abs(lost) < 8 or (case.settings.real and count < 64):
+        return False
+    share = float(10 ** chance.uniform(math.log10(weakest), 0))
     odd = torch.arange(count) % 2 == 1
     kind = chance.choice(["gain", "time", "doubled", "zeros"])
     if kind == "gain":
         beat = beat * torch.where(odd, 1 - share, 1 + share)
     elif kind == "time":
-        # Twice the copy's share, of a cycle of the strongest frequency.
-        spectrum = torch.fft.fft(beat)
-        strongest = spectrum.abs().square().flatten(0, 3).mean(0).argmax()
+        # The copy's share is the tangent of half the turn.
         cycles = torch.fft.fftfreq(count, dtype=torch.float64)
-        lag = math.atan(share) / math.pi / max(float(cycles[strongest].abs()), 0.02)
+        lag = math.atan(share) / math.pi / float(cycles[strongest].abs())
         late = torch.fft.ifft(spectrum * torch.exp(2j * math.pi * cycles * lag))
         beat = torch.where(odd, late, beat)
     elif kind == "doubled":
@@ -279,9 +292,10 @@ def interleaved(case: Drawn, chance: Chance) -> None:
     else:
         beat = beat * ~odd
     case.beat = beat
+    return True
 
 
-def dropped(case: Drawn, chance: Chance) -> None:
+def dropped(case: Drawn, chance: Chance) -> bool:
     """Packets of 8 to 32 zeros in a tenth of the chirps, or 1 to 3 samples that slip."""
     beat, count = case.beat.clone(), case.settings.samples
     rows = beat.flatten(0, 1)
@@ -296,9 +310,10 @@ def dropped(case: Drawn, chance: Chance) -> None:
         # The next chirp's samples come after the last ones.
         rows[..., count - slip :] = rows.roll(-1, 0)[..., :slip].clone()
     case.beat = rows.reshape(beat.shape)
+    return True
 
 
-def broken(case: Drawn, chance: Chance) -> None:
+def broken(case: Drawn, chance: Chance) -> bool:
     """The phase jumps by 45 to 180°."""
     beat, count = case.beat.clone(), case.settings.samples
     rows = beat.flatten(0, 1)
@@ -308,19 +323,28 @@ def broken(case: Drawn, chance: Chance) -> None:
     at = int(chance.integers(count // 4, 3 * count // 4))
     rows[chosen, ..., at:] *= np.exp(1j * turn)
     case.beat = rows.reshape(beat.shape)
+    return True
 
 
-def clipped(case: Drawn, chance: Chance) -> None:
-    """The largest value is 1.1 to 4 times the full scale."""
-    parts = case.beat.real if case.settings.real else torch.view_as_real(case.beat)
-    case.full_scale = float(parts.abs().max() / chance.uniform(1.1, 4.0))
+def clipped(case: Drawn, chance: Chance) -> bool:
+    """The full scale is too low for 1 to 40 % of the values."""
+    levels = parts_of(case).abs().flatten().sort().values
+    clipped = int((1 - chance.uniform(0.01, 0.4)) * len(levels))
+    case.headroom = float(levels[clipped] / levels[-1])
+    return True
+
+
+def parts_of(case: Drawn) -> Tensor:
+    """What the converter sees."""
+    return case.beat.real if case.settings.real else torch.view_as_real(case.beat)
 
 
 def digitised(case: Drawn) -> ChirpData:
     """Counts of the converter."""
+    full_scale = case.headroom * float(parts_of(case).abs().max())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)
-        return adc_counts(case.beat, case.settings, case.full_scale)
+        return adc_counts(case.beat, case.settings, full_scale)
 
 
 def seen(case: Drawn, chance: Chance) -> Capture | ChirpCapture:

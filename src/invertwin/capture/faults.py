@@ -64,9 +64,11 @@ def faults_of(
     radar = recording.radar()
     waveform = sampled(radar)
     beat = _few(beat).to(torch.complex128)
-    found = [saturation(beat, real=real), lost_samples(beat, real=real), mirror_images(beat)]
+    found = [saturation(beat, real=real), lost_samples(beat, real=real)]
     if not any(found):
-        found += [ghosts(_by_rate(beat), waveform, real=real), phase_break(beat, real=real)]
+        # Both of them break phases and make ghosts, too.
+        found += [phase_break(beat, real=real), ghosts(_by_rate(beat), waveform, real=real)]
+    found.append(mirror_images(beat))
     shown = shown_ranges(recording, range_min, range_max)
     found.append(leakage(beat, waveform, radar.window, shown, real=real))
     return [fault for fault in found if fault is not None]
@@ -174,42 +176,44 @@ def lost_samples(beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: 
     )
 
 
-# Bins beside range zero, beside half of the unambiguous range, and beside a mirror: a tone there
-# is its own mirror image.
+# Bins beside range zero, and beside half of the unambiguous range, where a tone is its own image.
 _OWN_IMAGE = 6
 _ON_ONE_LINE = 0.98
+_EVERYWHERE = 0.5
 
 
 def mirror_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault | None:
     """Complex by type only: every frequency has its mirror image at the negative one.
 
     ``X(−f) = e^{2jα} conj X(f)`` where I and Q lie on one line. Coherence
-    ``|Σ X(f) X(−f)| / Σ (|X(f)|² + |X(−f)|²)/2`` is 1 then, weighted by power and also in the
-    median of all frequencies, where proper noise has some 0. A pair of reflectors whose echoes
-    mirror each other has the first, not the second. 0.98 is where Q has 1 % of I's power.
+    ``|Σ X(f) X(−f)| / Σ (|X(f)|² + |X(−f)|²)/2`` is 1 then. Together all frequencies must have
+    0.98, as where Q has 1 % of I's power; each alone must have 0.5, also where noise is all there
+    is. A pair of reflectors whose echoes mirror each other has the first, but its noise has not
+    the second.
 
     Args:
         beat: Samples.
     """
     frames, _, tx, rx, count = beat.shape
     edge = min(_OWN_IMAGE, count // 8)
+    if edge < 2:
+        return None
     chosen = beat[:, :64].permute(2, 3, 0, 1, 4).reshape(tx * rx, -1, count)
     spectrum = torch.fft.fft(chosen * _low_sidelobes(count))
-    near = torch.arange(edge, count // 2 - edge + 1)
-    if len(near) < 3:
-        return None
+    near = torch.arange(edge, count // 2)
     one, other = spectrum[..., near], spectrum[..., -near]
-    products = (one * other).sum(1)
     level = 0.5 * (one.abs().square() + other.abs().square()).sum(1)
-    if float(level.sum()) <= 1e-9 * float(spectrum.abs().square().sum()):
+    own = near > count // 2 - edge
+    if float(level[:, ~own].sum()) <= 1e-9 * float(spectrum.abs().square().sum()):
         return None
+    products = (one * other).sum(1)
     # The line may lie differently in each channel, as after a calibration.
-    total = products.sum(-1, keepdim=True)
+    total = products[:, ~own].sum(1, keepdim=True)
     turned = (products * torch.polar(torch.ones_like(total.real), -total.angle())).real
-    weighted = float(turned.sum() / level.sum())
+    weighted = float(turned[:, ~own].sum() / level[:, ~own].sum())
     tiny = torch.finfo(torch.float64).tiny
-    usual = float((turned.sum(0) / level.sum(0).clamp_min(tiny)).median())
-    if weighted < _ON_ONE_LINE or usual < _ON_ONE_LINE:
+    least = float((turned.sum(0) / level.sum(0).clamp_min(tiny)).min())
+    if weighted < _ON_ONE_LINE or least < _EVERYWHERE:
         return None
     return Fault(
         "complex only by type",
@@ -219,10 +223,12 @@ def mirror_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault
     )
 
 
-# The ghost's power over the noise's in the cells that see it, all channels summed: below, a ghost
-# is none that counts. What else may differ from the echo: noise, and a part of the ghost.
+# The ghost's energy over the power of noise in one cell: below, a ghost is none that counts. What
+# else may differ from the echo: noise, and a part of the ghost.
 _GHOST_OVER_NOISE = 100.0
 _UNLIKE = 0.03
+_ISOLATED = 10.0
+_EMPTY, _FLOOR = 0.2, 1e-10  # share of a spectrum without echoes; what its window leaves
 _WEAKEST_ECHO = 1e-4  # of the strongest one's power, that is searched for ghosts
 
 
@@ -235,8 +241,8 @@ def ghosts(
     rate. The copy has the echo's line shape, channels and range rates, times one factor g; of real
     samples, and where I and Q alternate, also the conjugate at ``½ − f``. Such a copy is told from
     an echo of its own by what is left once ``g`` times the echo is taken away: noise, and at most
-    3 % of the copy. The copy's energy is at least 100 times the noise's, below which chance
-    agreement is frequent.
+    3 % of the copy. The copy's energy is at least 100 times what noise and other echoes have beside
+    it, below which chance agreement is frequent.
 
     Args:
         rates: Of ``_by_rate``.
@@ -246,11 +252,10 @@ def ghosts(
     count = rates.shape[-1]
     tapered = rates * _low_sidelobes(count)
     power = torch.fft.fft(tapered, 4 * count).abs().square().flatten(0, 1).mean(0)
-    looks = rates.shape[0] * rates.shape[1]
-    filled = power[: 2 * count] if real else power
-    noise = max(noise_power(filled, looks), 1e-10 * float(power.max()))
+    looks, top = rates.shape[0] * rates.shape[1], float(power.max())
+    noise = max(noise_power(power[: 2 * count] if real else power, looks, _EMPTY), _FLOOR * top)
     highest = (power >= power.roll(1)) & (power > power.roll(-1))
-    strong = highest & (power > _WEAKEST_ECHO * power.max()) & (power > _GHOST_OVER_NOISE * noise)
+    strong = highest & (power > _WEAKEST_ECHO * top) & (power > _GHOST_OVER_NOISE * noise)
     kinds = ((0.5, 1.0, False), (0.5, -1.0, True)) if not real else ((0.5, -1.0, True),)
     for place in torch.nonzero(strong)[:, 0].tolist():
         echo = place / (4 * count)
@@ -259,14 +264,17 @@ def ghosts(
             at = (offset + sign * echo) % 1
             if abs((at - echo + 0.5) % 1 - 0.5) * count < _OWN_IMAGE:
                 continue
+            around = max(noise, _beside(power, at))
+            if _at(power, at) < _ISOLATED * around:
+                continue
             copy = _lines(tapered, at)
             like = own.flip(-1).conj() if conjugate else own
             factor = torch.vdot(like.flatten(), copy.flatten()) / like.abs().square().sum()
             explained = float(factor.abs().square() * like.abs().square().sum())
             left = float((copy - factor * like).abs().square().sum())
-            chance = noise * copy.numel() * (1 + 4 / math.sqrt(looks))
+            chance = around * copy.numel() * (1 + 4 / math.sqrt(looks))
             if (
-                explained > _GHOST_OVER_NOISE * noise
+                explained > _GHOST_OVER_NOISE * around
                 and left < chance + _UNLIKE * explained
                 and float(factor.abs()) < 1.05
             ):
@@ -331,6 +339,17 @@ def phase_break(
         return None
     chirp, place = divmod(int(each.argmax()), each.shape[1])
     return _broken(place + order, found, f"chirp {chirp % beat.shape[1]}")
+
+
+def _at(power: Float64[Tensor, " bin"], frequency: float) -> float:
+    return float(power[round(frequency * len(power)) % len(power)])
+
+
+def _beside(power: Float64[Tensor, " bin"], frequency: float) -> float:
+    """Power on the quieter side of a line: as much as on it where a break has spread an echo."""
+    count = len(power) // 4
+    reach = min(_OWN_IMAGE, count // 6) / count
+    return min(_at(power, frequency - reach), _at(power, frequency + reach))
 
 
 def _broken(sample: int, ratio: float, where: str) -> Fault:
@@ -398,14 +417,16 @@ def leakage(
     power = spectrum.abs().square().flatten(0, 3).mean(0)
     ranges = torch.arange(finer * count) * (cell / finer)
     near = ranges if real else torch.minimum(ranges, farthest - ranges)
+    around = _NEAR_CELLS * cell
     seen = (ranges >= shown[0]) & (ranges <= shown[1])
-    zone = near <= max(_BOARD, _NEAR_CELLS * cell)
-    source = int(torch.where(zone, power, 0.0).argmax())
+    zone = (ranges <= max(_BOARD, around)) | (near <= around)
+    highest = (power >= power.roll(1)) & (power >= power.roll(-1))
+    source = int(torch.where(zone & highest, power, 0.0).argmax())
     strongest = int(torch.where(seen, power, 0.0).argmax())
     apart = (ranges - ranges[source])[:, None] + cell * torch.tensor([-0.5, 0.0, 0.5])
     response = waveform.range_response(apart.flatten().double(), window).reshape(apart.shape)
     skirt = power[source] * response.amax(1)
-    over_board = float(near[strongest]) <= _BOARD
+    over_board = float(ranges[strongest]) <= _BOARD
     if not over_board and float(power[strongest]) > _SKIRT * float(skirt[strongest]):
         return None
     free = seen & ~zone & (power > _SKIRT * skirt)

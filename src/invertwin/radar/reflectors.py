@@ -95,14 +95,16 @@ def points_csv(points: PointCloud) -> str:
     return "\n".join(lines) + "\n"
 
 
-def noise_power(power: Float64[Tensor, "*cell"], looks: int) -> float:
-    """Mean power of noise from the median of cells, of which less than half hold signals.
+def noise_power(power: Float[Tensor, "*cell"], looks: int, empty: float = 0.5) -> float:
+    """Mean power of noise from a quantile of cells: the median, where half of them hold no signal.
 
     Args:
         power: Means of several looks.
         looks: Independent looks in a mean.
+        empty: Share of cells without signal, the quantile.
     """
-    return float(power.median()) * looks / float(gammaincinv(looks, 0.5))
+    level = float(power.double().flatten().kthvalue(math.ceil(empty * power.numel())).values)
+    return level * looks / float(gammaincinv(looks, empty))
 
 
 def _cells(
