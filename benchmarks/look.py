@@ -19,7 +19,7 @@ Faulty ones are such recordings at 10 to 40 dB, with one fault of a random sever
 counts: Q holds less than 1 % of I's power; copies by interleaving 30 dB above the noise of all
 samples together, and 20 dB above other echoes there; phases that break by 45° within the middle half of a ramp, in all chirps or in a
 quarter; 1 to 3 samples that drop out, or packets of 8 to 32; leakage 3 dB above what else is
-shown; 1 % of the values beyond the converter's range; settings of which one or two are wrong.
+shown; 1 % of the values 2 % beyond the converter's range; settings of which one or two are wrong.
 """
 
 import argparse
@@ -327,10 +327,10 @@ def broken(case: Drawn, chance: Chance) -> bool:
 
 
 def clipped(case: Drawn, chance: Chance) -> bool:
-    """The full scale is too low for 1 to 40 % of the values."""
+    """1 to 40 % of the values are 2 % and more beyond the full scale."""
     levels = parts_of(case).abs().flatten().sort().values
     clipped = int((1 - chance.uniform(0.01, 0.4)) * len(levels))
-    case.headroom = float(levels[clipped] / levels[-1])
+    case.headroom = float(levels[clipped] / levels[-1]) / 1.02
     return True
 
 

@@ -79,8 +79,8 @@ def shown_ranges(
 ) -> tuple[float, float]:
     """Ranges in which echoes are looked for [m].
 
-    Leakage outshines what is within 3 cells of range zero. The unambiguous range of complex samples
-    ends there too: its last 3 cells are those before zero.
+    Leakage outshines what is within 3 cells of range zero. The unambiguous range ends there too:
+    its last 3 cells are those before zero, and those of real samples are mirrored ones.
 
     Args:
         recording: With samples.
@@ -90,7 +90,7 @@ def shown_ranges(
     waveform = sampled(recording.radar())
     near = _NEAR_CELLS * waveform.range_resolution
     real = isinstance(recording, ChirpCapture) and recording.real
-    far = 0.5 * waveform.max_range if real else waveform.max_range - near
+    far = waveform.max_range * (0.5 if real else 1.0) - near
     return near if range_min is None else range_min, far if range_max is None else range_max
 
 
@@ -178,7 +178,7 @@ def lost_samples(beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: 
 
 # Bins beside range zero, and beside half of the unambiguous range, where a tone is its own image.
 _OWN_IMAGE = 6
-_ON_ONE_LINE = 0.98
+_ON_ONE_LINE = 0.97
 _EVERYWHERE = 0.5
 
 
@@ -187,7 +187,7 @@ def mirror_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault
 
     ``X(−f) = e^{2jα} conj X(f)`` where I and Q lie on one line. Coherence
     ``|Σ X(f) X(−f)| / Σ (|X(f)|² + |X(−f)|²)/2`` is 1 then. Together all frequencies must have
-    0.98, as where Q has 1 % of I's power; each alone must have 0.5, also where noise is all there
+    0.97, below which Q has 1.5 % of I's power; each alone must have 0.5, also where noise is all there
     is. A pair of reflectors whose echoes mirror each other has the first, but its noise has not
     the second.
 
@@ -387,7 +387,8 @@ def _gamma_shape(quartiles: float, most: float) -> float:
 
 
 _BOARD = 0.3  # m, half the length of ways from transmitters to receivers over a board and its cover
-_SKIRT = 4.0
+# Over the window's sidelobes; ends of a chirp, which do not meet, raise those of analytic signals.
+_SKIRT, _REAL_SKIRT = 4.0, 16.0
 
 
 def leakage(
@@ -402,7 +403,7 @@ def leakage(
 
     Ways over a board and its cover are shorter than 0.6 m, 2 ns. Beside its range, leakage has
     the window's sidelobes, also at the far end of the unambiguous range. What is not four times
-    as strong as these is taken for them.
+    as strong as these, of real samples 16 times, is taken for them, and so is what only falls from there: no peak.
 
     Args:
         beat: Samples.
@@ -425,11 +426,13 @@ def leakage(
     strongest = int(torch.where(seen, power, 0.0).argmax())
     apart = (ranges - ranges[source])[:, None] + cell * torch.tensor([-0.5, 0.0, 0.5])
     response = waveform.range_response(apart.flatten().double(), window).reshape(apart.shape)
-    skirt = power[source] * response.amax(1)
+    skirt = (_REAL_SKIRT if real else _SKIRT) * power[source] * response.amax(1)
     over_board = float(ranges[strongest]) <= _BOARD
-    if not over_board and float(power[strongest]) > _SKIRT * float(skirt[strongest]):
+    flank = not bool(highest[strongest]) and float(power[source]) > float(power[strongest])
+    above = bool(power[strongest] > skirt[strongest])
+    if not over_board and not flank and above:
         return None
-    free = seen & ~zone & (power > _SKIRT * skirt)
+    free = seen & ~zone & (power > skirt)
     advice = "nothing else is above its sidelobes"
     if bool(free.any()):
         best = int(torch.where(free, power, 0.0).argmax())
