@@ -39,7 +39,8 @@ from torch import Tensor
 
 import invertwin as iw
 from invertwin.capture import Capture, ChirpCapture, ChirpData, ChirpSettings, adc_counts, faults_of
-from invertwin.capture.ti import read_recording, write_samples
+from invertwin.capture.ti import changed, read_recording, write_samples
+from invertwin.capture.ti.layouts import fits_layout, frame_words, layout
 from invertwin.channel import Paths, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
@@ -178,9 +179,7 @@ def objects(radar: Radar, farthest: float, chance: Chance) -> Paths:
     wall = iw.Object(plate(2.0, 1.5), PAINT, rigid(translation=[0.0, 0.0, 0.8 * farthest]))
     scene = iw.Scene({"box": thing, "wall": wall})
     sampling = iw.Sampling(depth=1, points_per_m2=400)
-    paths = trace_field(
-        scene, radar.link(), sampling=sampling, seed=int(chance.integers(2**31))
-    )
+    paths = trace_field(scene, radar.link(), sampling=sampling, seed=int(chance.integers(2**31)))
     strength = float(paths.coefficient.abs().square().sum().sqrt()) / radar.frame_count**0.5
     return paths.weighted(1e-3 / strength)
 
@@ -239,7 +238,9 @@ def leakage(settings: ChirpSettings, strong: bool, chance: Chance) -> Leakage | 
             delay = float(chance.uniform(0.1e-9, 2e-9))
             cells = 0.5 * SPEED_OF_LIGHT * delay / settings.waveform.range_resolution
             shown, hidden = cells > 3, cells < 1
-        return Leakage(delay, -60 + float(chance.uniform(3, 40) if shown else chance.uniform(55, 59.9)))
+        return Leakage(
+            delay, -60 + float(chance.uniform(3, 40) if shown else chance.uniform(55, 59.9))
+        )
     if chance.random() < 0.3:
         return None
     return Leakage(delay, -60 + float(chance.uniform(-30, 20 if hidden else -6)))
@@ -356,3 +357,55 @@ def seen(case: Drawn, chance: Chance) -> Capture | ChirpCapture:
         recording = scaled.recorded(case.elements)
         alone = case.settings.loops == 1 and not case.settings.real
         return recording.capture() if alone else recording
+
+
+def stated(case: Drawn, chance: Chance) -> tuple[ChirpSettings, dict[str, Any]] | None:
+    """Settings of another recording that a device could have, and the changes to the right ones.
+
+    None where they describe the same blocks and the same size, or one that was stopped: then no
+    sample tells.
+    """
+    right = case.settings
+    numbers = {
+        "lanes": right.lanes,
+        "real": right.real,
+        "receivers": len(right.receivers),
+        "transmitters": len(right.transmit_order),
+        "samples": right.samples,
+        "loops": right.loops,
+        "frames": right.frames,
+    }
+    choices: dict[str, list[Any]] = {
+        "lanes": [2, 4],
+        "real": [False, True],
+        "receivers": [1, 2, 3, 4],
+        "transmitters": [1, 2, 3],
+        "samples": [n * right.samples // 4 for n in (1, 2, 3, 5, 6, 8, 16)] + [100, 200, 240],
+        "loops": [n * max(right.loops, 4) // 4 for n in (1, 2, 3, 6, 8, 16)],
+    }
+    names = chance.permutation(list(choices))[: chance.integers(1, 3)]
+    wrong = {str(name): choices[name][int(chance.integers(len(choices[name])))] for name in names}
+    wrong = {name: value for name, value in wrong.items() if value != numbers[name]}
+    try:
+        other = changed(replace(right, ramp_end_time=2 * right.ramp_time), wrong)
+        other = replace(other, ramp_end_time=right.ramp_time)
+    except InputError:
+        return None
+    same = layout(other) == layout(right)
+    sizes = [frame_words(one) * (one.frames or 1) for one in (other, right)]
+    if not wrong or fits_layout(other) is not None or (same and sizes[0] >= sizes[1]):
+        return None
+    return other, {name: numbers[name] for name in numbers if name in wrong}
+
+
+def refusal(case: Drawn, settings: ChirpSettings) -> str | None:
+    """What reading the recording's raw file with such settings says; None = it is read."""
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", PhysicsWarning)
+        path = Path(folder) / "adc.bin"
+        write_samples(path, digitised(case))
+        try:
+            read_recording(path, settings)
+        except InputError as error:
+            return str(error)
+    return None

@@ -13,6 +13,7 @@ from invertwin.capture.chirps import adc_counts as adc_counts
 from invertwin.capture.chirps import settings_of as settings_of
 from invertwin.capture.faults import Fault as Fault
 from invertwin.capture.faults import faults_of as faults_of
+from invertwin.capture.faults import shown_ranges as shown_ranges
 from invertwin.capture.reading import read as read
 from invertwin.capture.signature_files import MeasuredSection as MeasuredSection
 from invertwin.capture.signature_files import Touchstone as Touchstone

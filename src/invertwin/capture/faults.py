@@ -103,9 +103,7 @@ _LEAST_HITS = 8
 _FEW_CODES = 200  # of the largest value, below which a pure tone piles up too
 
 
-def saturation(
-    beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: bool
-) -> Fault | None:
+def saturation(beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: bool) -> Fault | None:
     """Values that pile up at the ends of their range, whatever the converter's full scale is.
 
     A tone of amplitude A that is clipped at A/s has ``acos(1/s)/π`` of its values at either end
@@ -143,7 +141,9 @@ _FALSE = 1e-4  # probability that a sound recording in noise is called faulty
 _LEAST_RUN = 8
 
 
-def lost_samples(beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: bool) -> Fault | None:
+def lost_samples(
+    beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: bool
+) -> Fault | None:
     """Runs of zeros within chirps that are too long to be rounded noise.
 
     With a share z of zeros elsewhere, one of n samples begins L zeros with a probability below
@@ -359,8 +359,6 @@ def _broken(sample: int, ratio: float, where: str) -> Fault:
         "times the median): the ramp was not one, or samples are missing; check the synthesiser's "
         "settling, and samples per chirp in the settings",
     )
-
-
 
 
 def _stands_out(values: Tensor, usual: Tensor, looks: int) -> float | None:

@@ -114,6 +114,14 @@ class Look(Where):
     lanes: Annotated[
         int | None, typer.Option(help="2 or 4 LVDS lanes, where the settings do not say.")
     ] = None
+    change: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="Corrects a setting of a .bin, such as samples=128; also lanes, real, receivers, "
+            "transmitters, loops, frames.",
+        ),
+    ] = None
     chirp: Annotated[
         int | None, typer.Option(min=0, help="The one that the capture keeps; default: mean.")
     ] = None

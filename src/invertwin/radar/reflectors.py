@@ -70,7 +70,9 @@ def points_of(
     noise = noise_power(flat, looks)
     rows: list[list[float]] = []
     for v, r in told(_cells(flat, radar, grid, looks), "points"):
-        rate = float(rates[v]) + _vertex(flat[[v - 1, v, (v + 1) % len(flat)], r]) * span / len(flat)
+        rate = float(rates[v]) + _vertex(flat[[v - 1, v, (v + 1) % len(flat)], r]) * span / len(
+            flat
+        )
         near = [max(r - 1, 0), r, min(r + 1, grid.range_count - 1)]
         place = float(grid.ranges[r]) + _vertex(flat[v, near]) * grid.range_step
         rows += [
@@ -127,7 +129,9 @@ def _cells(
     return chosen
 
 
-def _detected(flat: Float64[Tensor, "velocity range"], looks: int) -> Bool[Tensor, "velocity range"]:
+def _detected(
+    flat: Float64[Tensor, "velocity range"], looks: int
+) -> Bool[Tensor, "velocity range"]:
     if len(flat) >= _FEW_RATES:
         return cell_averaging_cfar(flat, looks=looks)
     rows = [ordered_statistics_cfar(row[None], looks=looks, **_ALONG_RANGE) for row in flat]
