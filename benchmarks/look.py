@@ -5,21 +5,25 @@
 Prints a table and writes `metrics.json` into DIR (default `out/look`).
 
 - `detected`: share of the faulty recordings whose fault is found. `detected_by.<fault>`: of each.
-- `first`: share whose fault, or the right settings, is named first.
+- `named`, `first`: share whose fault, or the right settings, is named, and named first.
+  `named_settings`, `first_settings`: of wrong settings.
 - `false_alarms`: share of the sound recordings of which anything is said.
 
 Sound recordings: boards with 8 to 16 channels, 32 to 256 samples, 1 to 32 chirps of each
 transmitter in turn, converters of 12 to 16 bits, I and Q or real samples, 0 to 40 dB of signal
 over noise in each sample, errors of the channels, leakage weaker than the echoes that are shown.
-Scenes: one strong echo, several, movers, pairs of reflectors that mirror each other in direction or in
-direction and range, clutter of 300 reflectors, a box before a wall. One in three goes through
-a raw file.
+Scenes: one strong echo, several, movers, pairs of reflectors that mirror each other in direction or
+in direction and range, clutter of 300 reflectors, a box before a wall. One in three goes through a
+raw file and its settings first.
 
-Faulty ones are such recordings at 10 to 40 dB, with one fault of a random severity. The least that
-counts: Q holds less than 1 % of I's power; copies by interleaving 30 dB above the noise of all
-samples together, and 20 dB above other echoes there; phases that break by 45° within the middle half of a ramp, in all chirps or in a
-quarter; 1 to 3 samples that drop out, or packets of 8 to 32; leakage 3 dB above what else is
-shown; 1 % of the values 2 % beyond the converter's range; settings of which one or two are wrong.
+Faulty ones are such recordings at 10 to 40 dB, with clutter 10 dB below the strongest echo or less,
+and one fault of a random severity. The least that counts: Q holds less than 1 % of I's power;
+copies by interleaving 30 dB above the noise of all samples together, and 20 dB above other echoes
+there; phases that break by 45° within the middle half of a ramp, in all chirps or in a quarter; 1
+to 3 samples that drop out there, or packets of 8 to 32; leakage 3 dB above what else is shown; 1 %
+of the values 2 % beyond the converter's range; one or two settings that are those of another
+recording: lanes, real samples, numbers of receivers, transmitters, samples or loops. Settings with
+the right blocks and a larger size count as a recording that was stopped, and none is drawn.
 """
 
 import argparse
@@ -121,7 +125,8 @@ def reflectors(
     cell = radar.waveform.range_resolution
     nearest = max(5 * cell, 0.5)
     count = {"one": 1, "pair": 2, "mirrored": 2, "clutter": 300}.get(scene) or chance.integers(2, 7)
-    ranges = chance.uniform(nearest, max(0.9 * farthest, 1.1 * nearest), count)
+    last = min(0.9 * farthest, farthest - 5 * cell)
+    ranges = chance.uniform(nearest, max(last, 1.1 * nearest), count)
     angle, size = chance.uniform(0, 2 * math.pi, count), 0.7 * np.sqrt(chance.random(count))
     u, v = size * np.cos(angle), size * np.sin(angle) * (chance.random() < 0.5)
     levels = chance.uniform(-25, 0, count) * (scene not in ("pair", "mirrored"))
@@ -225,7 +230,7 @@ def drawn(scene: str, chance: Chance, *, sound: bool, leak: bool = False) -> Dra
 def leakage(settings: ChirpSettings, strong: bool, chance: Chance) -> Leakage | None:
     """Leakage at 0.1 to 2 ns. The strongest echo has −60 dB.
 
-    Weak leakage is 6 dB and more below the echoes, or up to 20 dB above where it falls into the
+    Weak leakage is 20 dB and more below the echoes, or up to 20 dB above where it falls into the
     cells that are not shown. Strong leakage is 3 to 40 dB above where it is shown, else 55 to
     70 dB: its sidelobes are shown.
     """
@@ -243,7 +248,7 @@ def leakage(settings: ChirpSettings, strong: bool, chance: Chance) -> Leakage | 
         )
     if chance.random() < 0.3:
         return None
-    return Leakage(delay, -60 + float(chance.uniform(-30, 20 if hidden else -6)))
+    return Leakage(delay, -60 + float(chance.uniform(-40, 20 if hidden else -20)))
 
 
 def by_type(case: Drawn, chance: Chance) -> bool:
@@ -409,3 +414,103 @@ def refusal(case: Drawn, settings: ChirpSettings) -> str | None:
         except InputError as error:
             return str(error)
     return None
+
+
+APPLIED = {
+    "complex only by type": by_type,
+    "ghosts": interleaved,
+    "dropped samples": dropped,
+    "phase break": broken,
+    "saturation": clipped,
+}
+# Samples that slip break the phase.
+ALSO = {"dropped samples": {"dropped samples", "phase break"}}
+
+
+def judged_sound(number: int, seed: int) -> dict[str, Any]:
+    """What is said of a sound recording."""
+    chance = np.random.default_rng((seed, 0, number))
+    scene = SCENES[number % len(SCENES)]
+    case = drawn(scene, chance, sound=True)
+    refused = refusal(case, case.settings) if number % 3 == 0 else None
+    said = [fault.name for fault in faults_of(seen(case, chance))]
+    return {"scene": scene, "said": said + (["settings"] if refused else [])}
+
+
+def judged_faulty(number: int, seed: int) -> dict[str, Any]:
+    """What is said of a recording with a fault."""
+    chance = np.random.default_rng((seed, 1, number))
+    fault = list(FAULTS)[number % len(FAULTS)]
+    while True:
+        scene = str(chance.choice(SCENES))
+        case = drawn(scene, chance, sound=False, leak=fault == "leakage")
+        if fault == "settings":
+            other = stated(case, chance)
+            if other is None:
+                continue
+            said = refusal(case, other[0])
+            right = ", ".join(f"{name}={value}" for name, value in other[1].items())
+            named = said is not None and any(f" {right}{end}" in said for end in (" (", " or "))
+            first = said is not None and f"what fits: {right} " in said
+            return {"fault": fault, "found": said is not None, "named": named, "first": first}
+        if fault == "leakage" or APPLIED[fault](case, chance):
+            names = [found.name for found in faults_of(seen(case, chance))]
+            right = ALSO.get(fault, {fault})
+            found, first = bool(right & set(names)), bool(right & set(names[:1]))
+            return {"fault": fault, "found": found, "named": found, "first": first}
+
+
+def measure(recordings: int, seed: int) -> dict[str, Any]:
+    """All metrics.
+
+    Args:
+        recordings: Of either kind.
+        seed: Of all random numbers.
+    """
+    begin = perf_counter()
+    sound = [judged_sound(number, seed) for number in range(recordings)]
+    faulty = [judged_faulty(number, seed) for number in range(recordings)]
+
+    def share(key: str, of: str | None = None) -> float:
+        rows = [row[key] for row in faulty if of in (None, row["fault"])]
+        return sum(rows) / len(rows)
+
+    return {
+        "detected": share("found"),
+        "false_alarms": sum(bool(row["said"]) for row in sound) / len(sound),
+        "named": share("named"),
+        "first": share("first"),
+        "detected_by": {fault: share("found", fault) for fault in FAULTS},
+        "named_settings": share("named", "settings"),
+        "first_settings": share("first", "settings"),
+        "false_alarms_by": dict(Counter(name for row in sound for name in row["said"])),
+        "recordings": recordings,
+        "seed": seed,
+        "seconds": perf_counter() - begin,
+    }
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/look"))
+    parser.add_argument("--recordings", type=int, default=RECORDINGS)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    metrics = measure(given.recordings, given.seed)
+    table = MetricTable("Faulty recordings", REQUIRED)
+    table.row("detected", metrics["detected"], ".3f", f"of {given.recordings} faulty recordings")
+    by = ", ".join(metrics["false_alarms_by"]) or "nothing"
+    alarms = f"of {given.recordings} sound ones; said of them: {by}"
+    table.row("false_alarms", metrics["false_alarms"], ".3f", alarms)
+    table.row("named", metrics["named"], ".3f", "the fault or the right settings are named")
+    table.row("first", metrics["first"], ".3f", "they are named first")
+    for fault, value in metrics["detected_by"].items():
+        table.row(f"detected_by.{fault}", value, ".3f", FAULTS[fault])
+    table.row("named_settings", metrics["named_settings"], ".3f", "the right ones are named")
+    table.row("first_settings", metrics["first_settings"], ".3f", "they are named first")
+    write(metrics, table.grid, given.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,17 +6,15 @@ every fault has a shape of its own that echoes would have by a rare coincidence 
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from jaxtyping import Bool, Complex, Complex128, Float64, Int64
-from scipy.special import gammaincinv, gammainccinv
+from jaxtyping import Complex, Complex128, Float64
+from scipy.special import gammainccinv, gammaincinv
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.prediction import covariances, predictor, residuals
-from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar.radar import sampled
 from invertwin.radar.reflectors import noise_power
 from invertwin.radar.waveform import SampledWaveform, unit_window
@@ -187,14 +185,14 @@ def mirror_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault
 
     ``X(−f) = e^{2jα} conj X(f)`` where I and Q lie on one line. Coherence
     ``|Σ X(f) X(−f)| / Σ (|X(f)|² + |X(−f)|²)/2`` is 1 then. Together all frequencies must have
-    0.97, below which Q has 1.5 % of I's power; each alone must have 0.5, also where noise is all there
-    is. A pair of reflectors whose echoes mirror each other has the first, but its noise has not
-    the second.
+    0.97, below which Q has 1.5 % of I's power; each alone must have 0.5, also where noise is all
+    there is. A pair of reflectors whose echoes mirror each other has the first, but its noise has
+    not the second.
 
     Args:
         beat: Samples.
     """
-    frames, _, tx, rx, count = beat.shape
+    tx, rx, count = beat.shape[2:]
     edge = min(_OWN_IMAGE, count // 8)
     if edge < 2:
         return None
@@ -291,7 +289,9 @@ def ghosts(
 
 
 _ORDER = 8  # of the prediction
+_SETTLING = 8  # part of a ramp
 _LEAST_RATIO = 4.0
+_FEW_CHIRPS = 4
 
 
 def phase_break(
@@ -302,7 +302,8 @@ def phase_break(
     Tones are predicted from the samples before. Where the phase jumps or samples are missing, the
     residual stands out. Residuals elsewhere tell how much they scatter, as a gamma distribution
     of the shape that their quartiles have. The limit is exceeded by chance with a probability of
-    1e-4, and is at least 4 times the median.
+    1e-4, and is at least 4 times the median. The first eighth of a ramp, in which synthesiser and
+    converter settle, is left out.
 
     Args:
         beat: Samples.
@@ -315,21 +316,20 @@ def phase_break(
     if real:
         beat = beat.real.to(beat.dtype)
     rates = _by_rate(beat)
-    products = covariances(rates.flatten(0, 1), order)
+    first = max(order, count // _SETTLING)
+    rows = rates.flatten(0, 1)[:, first - order :]
+    products = covariances(rows, order)
     kept = torch.ones(len(products), dtype=torch.bool)
-    left, place = torch.zeros(len(products), dtype=torch.float64), 0
     for _ in range(2):
-        left = residuals(products, predictor(products, kept))
-        place = int(left.argmax())
+        place = int(residuals(products, predictor(products, kept)).argmax())
         kept[:] = True
         kept[max(place - 1, 0) : place + order + 1] = False
     left = residuals(products, predictor(products, kept))
-    looks = rates.shape[0] * rates.shape[1]
-    found = _stands_out(left, left[kept], looks)
+    found = _stands_out(left, left[kept], len(rows))
     if found is not None:
-        return _broken(int(left.argmax()) + order, found, "all chirps")
-    chirps = beat.flatten(0, 1).flatten(1, 2)
-    if len(chirps) < 4:
+        return _broken(int(left.argmax()) + first, found, "all chirps")
+    chirps = beat.flatten(0, 1).flatten(1, 2)[..., first - order :]
+    if len(chirps) < _FEW_CHIRPS:
         return None
     coefficients = predictor(covariances(chirps.flatten(0, 1), order), torch.ones_like(kept))
     past = chirps.unfold(-1, order + 1, 1).flip(-1)
@@ -338,7 +338,7 @@ def phase_break(
     if found is None:
         return None
     chirp, place = divmod(int(each.argmax()), each.shape[1])
-    return _broken(place + order, found, f"chirp {chirp % beat.shape[1]}")
+    return _broken(place + first, found, f"chirp {chirp % beat.shape[1]}")
 
 
 def _at(power: Float64[Tensor, " bin"], frequency: float) -> float:
@@ -355,9 +355,9 @@ def _beside(power: Float64[Tensor, " bin"], frequency: float) -> float:
 def _broken(sample: int, ratio: float, where: str) -> Fault:
     return Fault(
         "phase break",
-        f"sample {sample} of {where} does not follow from the samples before it (residual {ratio:.3g} "
-        "times the median): the ramp was not one, or samples are missing; check the synthesiser's "
-        "settling, and samples per chirp in the settings",
+        f"sample {sample} of {where} does not follow from the samples before it (residual "
+        f"{ratio:.3g} times the median): the ramp was not one, or samples are missing; check when "
+        "the synthesiser settles, and the samples per chirp in the settings",
     )
 
 
@@ -401,7 +401,8 @@ def leakage(
 
     Ways over a board and its cover are shorter than 0.6 m, 2 ns. Beside its range, leakage has
     the window's sidelobes, also at the far end of the unambiguous range. What is not four times
-    as strong as these, of real samples 16 times, is taken for them, and so is what only falls from there: no peak.
+    as strong as these, of real samples 16 times, is taken for them, and so is what only falls from
+    there: no peak.
 
     Args:
         beat: Samples.
@@ -426,7 +427,9 @@ def leakage(
     response = waveform.range_response(apart.flatten().double(), window).reshape(apart.shape)
     skirt = (_REAL_SKIRT if real else _SKIRT) * power[source] * response.amax(1)
     over_board = float(ranges[strongest]) <= _BOARD
-    flank = not bool(highest[strongest]) and float(power[source]) > float(power[strongest])
+    # At the first range that is shown, falling from one that is not.
+    first = float(ranges[strongest]) < shown[0] + cell and not bool(highest[strongest])
+    flank = first and bool(power[source] > power[strongest])
     above = bool(power[strongest] > skirt[strongest])
     if not over_board and not flank and above:
         return None

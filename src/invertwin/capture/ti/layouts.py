@@ -126,8 +126,8 @@ def fits_layout(settings: ChirpSettings) -> str | None:
     count = settings.samples * len(settings.receivers)
     if settings.lanes == 2 and not settings.real and count % 2:
         return (
-            f"an even number of samples per chirp through 2 lanes, got {count}; they come in pairs, "
-            "the settings are those of another recording"
+            f"an even number of samples per chirp through 2 lanes, got {count}; they come in "
+            "pairs, the settings are those of another recording"
         )
     return None
 
@@ -362,16 +362,16 @@ def advice(found: list[Candidate]) -> str:
         or not (clear or one.evidence.cost - first.evidence.cost >= CHEAPER)
         or first.evidence.breaks < CLEAR
     ]
-    if clear:
-        near = _repeating(near)
-    fewest = min(len(one.changes) for one in near)
-    near = [one for one in near if len(one.changes) == fewest]
+    groups: dict[int, list[Candidate]] = {}
+    for one in _repeating(near) if clear else near:
+        groups.setdefault(_blocks(one.settings) if clear else 0, []).append(one)
+    near = sorted((one for group in groups.values() for one in _simplest(group)), key=_size)
     shown = " or ".join(map(str, near[:_MOST_NAMED]))
     said = "its samples do not tell where blocks end"
     if clear:
         said = (
-            f"prediction fails {first.evidence.breaks:.3g} times more at the ends of its blocks than "
-            "anywhere within"
+            f"prediction fails {first.evidence.breaks:.3g} times more at the ends of its blocks "
+            "than anywhere within"
         )
         if dearer < math.inf:
             said += f"; other blocks that do so cost {dearer / math.log(2):.2g} bits a word more"
@@ -379,6 +379,16 @@ def advice(found: list[Candidate]) -> str:
     if len(near) > 1:
         do = "the samples do not tell these apart: find out which, and correct the settings"
     return f"what fits: {shown} ({said}); {do}, or look with --set {_option(near[0])}"
+
+
+def _size(candidate: Candidate) -> int:
+    return len(candidate.changes)
+
+
+def _simplest(group: list[Candidate]) -> list[Candidate]:
+    """Those with the fewest changes."""
+    fewest = min(map(_size, group))
+    return [one for one in group if _size(one) == fewest]
 
 
 def _repeating(near: list[Candidate]) -> list[Candidate]:
