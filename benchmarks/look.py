@@ -20,7 +20,7 @@ Faulty ones are such recordings at 10 to 40 dB, with clutter 10 dB below the str
 and one fault of a random severity. The least that counts: Q holds less than 1 % of I's power;
 copies by interleaving 30 dB above the noise of all samples together, and 20 dB above other echoes
 there; phases that break by 45° within the middle half of a ramp, in all chirps or in a quarter; 1
-to 3 samples that drop out there, or packets of 8 to 32; leakage 3 dB above what else is shown; 1 %
+to 3 samples that drop out there, with as much effect, or packets of 8 to 32; leakage 3 dB above what else is shown; 1 %
 of the values 2 % beyond the converter's range; one or two settings that are those of another
 recording: lanes, real samples, numbers of receivers, transmitters, samples or loops. Settings with
 the right blocks and a larger size count as a recording that was stopped, and none is drawn.
@@ -50,6 +50,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar import BOARDS, Impairments, Leakage, Radar
 from invertwin.radar.boards import Elements
+from invertwin.radar.radar import sampled
 from invertwin.scene import RoughDielectric, box, plate, rigid
 
 REQUIRED: Required = {"detected": (">=", 0.95), "false_alarms": ("<=", 0.02)}
@@ -67,6 +68,7 @@ FAULTS = {
 }
 PAINT = RoughDielectric(permittivity=4.0)
 Chance = np.random.Generator
+_LEAST_TURN = 45.0  # degrees
 
 
 @dataclass
@@ -122,7 +124,7 @@ def reflectors(
     scene: str, radar: Radar, farthest: float, most_clutter_db: float, chance: Chance
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Ranges and directions [point, (R, u, v)], amplitudes and range rates of a scene's points."""
-    cell = radar.waveform.range_resolution
+    cell, unambiguous = radar.waveform.range_resolution, sampled(radar).max_range
     nearest = max(5 * cell, 0.5)
     count = {"one": 1, "pair": 2, "mirrored": 2, "clutter": 300}.get(scene) or chance.integers(2, 7)
     last = min(0.9 * farthest, farthest - 5 * cell)
@@ -138,9 +140,9 @@ def reflectors(
     if scene in ("pair", "mirrored"):
         u[1], v[1], ranges[1] = -u[0], -v[0], ranges[0]
     if scene == "mirrored":
-        last = max(radar.waveform.max_range - nearest, 1.1 * nearest)
+        last = max(unambiguous - nearest, 1.1 * nearest)
         ranges[0] = chance.uniform(nearest, last)
-        ranges[1] = radar.waveform.max_range - ranges[0]
+        ranges[1] = unambiguous - ranges[0]
     rates = chance.uniform(-4, 4, count) * (scene == "movers")
     phases = chance.uniform(0, 2 * math.pi, count)
     amplitudes = 10 ** (levels / 20) * np.exp(1j * phases)
@@ -302,7 +304,10 @@ def interleaved(case: Drawn, chance: Chance) -> bool:
 
 
 def dropped(case: Drawn, chance: Chance) -> bool:
-    """Packets of 8 to 32 zeros in a tenth of the chirps, or 1 to 3 samples that slip."""
+    """Packets of 8 to 32 zeros in a tenth of the chirps, or 1 to 3 samples that slip.
+
+    A slip counts where it turns the strongest echo by 45° or more.
+    """
     beat, count = case.beat.clone(), case.settings.samples
     rows = beat.flatten(0, 1)
     if chance.random() < 0.5:
@@ -312,6 +317,11 @@ def dropped(case: Drawn, chance: Chance) -> bool:
             rows[row, ..., begin : begin + length] = 0
     else:
         slip, at = int(chance.integers(1, 4)), int(chance.integers(count // 4, 3 * count // 4))
+        power = torch.fft.fft(rows).abs().square().flatten(0, -2).mean(0)
+        strongest = int(power[: count // 2].argmax() if case.settings.real else power.argmax())
+        turned = (strongest * slip / count + 0.5) % 1 - 0.5
+        if abs(turned) < _LEAST_TURN / 360:
+            return False
         rows[..., at : count - slip] = rows[..., at + slip :].clone()
         # The next chirp's samples come after the last ones.
         rows[..., count - slip :] = rows.roll(-1, 0)[..., :slip].clone()
@@ -325,7 +335,7 @@ def broken(case: Drawn, chance: Chance) -> bool:
     rows = beat.flatten(0, 1)
     share = float(chance.choice([1.0, 1.0, 0.25]))
     chosen = chance.permutation(len(rows))[: math.ceil(share * len(rows))]
-    turn = math.radians(float(chance.uniform(45, 180))) * chance.choice([-1, 1])
+    turn = math.radians(float(chance.uniform(_LEAST_TURN, 180))) * chance.choice([-1, 1])
     at = int(chance.integers(count // 4, 3 * count // 4))
     rows[chosen, ..., at:] *= np.exp(1j * turn)
     case.beat = rows.reshape(beat.shape)

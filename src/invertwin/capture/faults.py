@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex, Complex128, Float64
+from jaxtyping import Bool, Complex, Complex128, Float64, Int64
 from scipy.special import gammainccinv, gammaincinv
 from torch import Tensor
 
@@ -20,7 +20,7 @@ from invertwin.radar.reflectors import noise_power
 from invertwin.radar.waveform import SampledWaveform, unit_window
 
 _NEAR_CELLS = 3  # from range zero, in which leakage outshines everything
-_MOST_SAMPLES = 2**20  # that are looked at
+_MOST_SAMPLES, _MOST_CHANNELS = 2**20, 64  # that are looked at
 _RATES = 3  # strongest range rates of a frame in which a pattern is looked for
 
 
@@ -56,13 +56,14 @@ def faults_of(
     if isinstance(recording, Capture):
         if "beat" not in recording.dataset:
             return []
-        beat, real = recording.beat[:, None], False
+        beat = recording.beat[:, None]
+        real = _analytic(beat)
     else:
         beat, real = recording.beat, recording.real
     radar = recording.radar()
     waveform = sampled(radar)
-    beat = _few(beat).to(torch.complex128)
     found = [saturation(beat, real=real), lost_samples(beat, real=real)]
+    beat = _few(beat)
     if not any(found):
         # Both of them break phases and make ghosts, too.
         found += [phase_break(beat, real=real), ghosts(_by_rate(beat), waveform, real=real)]
@@ -139,9 +140,7 @@ _FALSE = 1e-4  # probability that a sound recording in noise is called faulty
 _LEAST_RUN = 8
 
 
-def lost_samples(
-    beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: bool
-) -> Fault | None:
+def lost_samples(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool) -> Fault | None:
     """Runs of zeros within chirps that are too long to be rounded noise.
 
     With a share z of zeros elsewhere, one of n samples begins L zeros with a probability below
@@ -156,13 +155,10 @@ def lost_samples(
     zero = rows.flatten(0, 1) == 0
     if not zero.numel() or not bool(zero.any()):
         return None
-    # Length of the run of zeros that ends at each sample.
-    place = torch.arange(1, zero.shape[1] + 1)
-    run = place - torch.where(zero, 0, place).cummax(1).values
-    longest = int(run.max())
-    long = torch.zeros_like(zero)
-    for row, end in torch.nonzero(run >= _LEAST_RUN).tolist():
-        long[row, end - int(run[row, end]) + 1 : end + 1] = True
+    # Of the run that each sample is in: how far it has come, and how far it goes.
+    before, after = _run_so_far(zero), _run_so_far(zero.flip(1)).flip(1)
+    length = torch.where(zero, before + after - 1, 0)
+    longest, long = int(length.max()), length >= _LEAST_RUN
     rest = int((zero & ~long).sum())
     share = max(rest, 1) / max(int((~long).sum()), 1)
     if longest < _LEAST_RUN or zero.numel() * share**longest > _FALSE:
@@ -172,6 +168,12 @@ def lost_samples(
         f"{int(long.sum())} of {zero.numel()} samples are zeros in runs of up to {longest}: "
         "packets were lost on the way; record again with a faster disk or link",
     )
+
+
+def _run_so_far(zero: Bool[Tensor, "row sample"]) -> Int64[Tensor, "row sample"]:
+    """How many zeros in a row end at each sample."""
+    place = torch.arange(1, zero.shape[1] + 1)
+    return place - torch.where(zero, 0, place).cummax(1).values
 
 
 # Bins beside range zero, and beside half of the unambiguous range, where a tone is its own image.
@@ -290,7 +292,7 @@ def ghosts(
 
 _ORDER = 8  # of the prediction
 _SETTLING = 8  # part of a ramp
-_LEAST_RATIO = 4.0
+_LEAST_RATIO = 3.0
 _FEW_CHIRPS = 4
 
 
@@ -299,10 +301,10 @@ def phase_break(
 ) -> Fault | None:
     """A sample that does not follow from the ones before it, in all chirps or in one.
 
-    Tones are predicted from the samples before. Where the phase jumps or samples are missing, the
-    residual stands out. Residuals elsewhere tell how much they scatter, as a gamma distribution
+    Tones are predicted from the samples before, and after. Where the phase jumps or samples are
+    missing, the residual of all windows that hold the place stands out. Residuals elsewhere tell how much they scatter, as a gamma distribution
     of the shape that their quartiles have. The limit is exceeded by chance with a probability of
-    1e-4, and is at least 4 times the median. The first eighth of a ramp, in which synthesiser and
+    1e-4, and is at least 3 times the median. The first eighth of a ramp, in which synthesiser and
     converter settle, is left out.
 
     Args:
@@ -320,20 +322,24 @@ def phase_break(
     rows = rates.flatten(0, 1)[:, first - order :]
     products = covariances(rows, order)
     kept = torch.ones(len(products), dtype=torch.bool)
-    for _ in range(2):
-        place = int(residuals(products, predictor(products, kept)).argmax())
+    left, place = torch.zeros(0), 0
+    for _ in range(3):
+        left = _over(residuals(products, predictor(products, kept)), order)
+        place = int(left.argmax())
         kept[:] = True
-        kept[max(place - 1, 0) : place + order + 1] = False
-    left = residuals(products, predictor(products, kept))
-    found = _stands_out(left, left[kept], len(rows))
+        kept[place : place + order] = False
+    away = torch.ones(len(left), dtype=torch.bool)
+    away[max(place - order + 1, 0) : place + order] = False
+    found = _stands_out(left, left[away], len(rows)) if bool(away.any()) else None
     if found is not None:
-        return _broken(int(left.argmax()) + first, found, "all chirps")
+        return _broken(place + first, found, "all chirps")
     chirps = beat.flatten(0, 1).flatten(1, 2)[..., first - order :]
     if len(chirps) < _FEW_CHIRPS:
         return None
     coefficients = predictor(covariances(chirps.flatten(0, 1), order), torch.ones_like(kept))
     past = chirps.unfold(-1, order + 1, 1).flip(-1)
-    each = (past @ coefficients).abs().square().mean(1)
+    both = [(past @ part).abs().square() for part in (coefficients, coefficients.conj().flip(0))]
+    each = _over(0.5 * (both[0] + both[1]).mean(1), order)
     found = _stands_out(each, each.flatten(), chirps.shape[1])
     if found is None:
         return None
@@ -350,6 +356,11 @@ def _beside(power: Float64[Tensor, " bin"], frequency: float) -> float:
     count = len(power) // 4
     reach = min(_OWN_IMAGE, count // 6) / count
     return min(_at(power, frequency - reach), _at(power, frequency + reach))
+
+
+def _over(values: Tensor, count: int) -> Tensor:
+    """Means over the windows of prediction that a break at each place cuts."""
+    return values.unfold(-1, count, 1).mean(-1)
 
 
 def _broken(sample: int, ratio: float, where: str) -> Fault:
@@ -449,10 +460,23 @@ def leakage(
     )
 
 
-def _few(beat: Complex[Tensor, "frame chirp tx rx sample"]) -> Tensor:
-    """As many frames, in equal steps, as are looked at."""
-    frames = max(1, min(len(beat), _MOST_SAMPLES // max(beat[0].numel(), 1)))
-    return beat[torch.linspace(0, len(beat) - 1, frames).long()]
+def _few(
+    beat: Complex[Tensor, "frame chirp tx rx sample"],
+) -> Complex128[Tensor, "frame chirp tx rx sample"]:
+    """As many transmitters, chirps and frames, the latter in equal steps, as are looked at."""
+    _, chirps, tx, rx, count = beat.shape
+    senders = max(1, min(tx, _MOST_CHANNELS // rx))
+    loops = max(1, min(chirps, _MOST_SAMPLES // (senders * rx * count)))
+    frames = max(1, min(len(beat), _MOST_SAMPLES // (loops * senders * rx * count)))
+    chosen = torch.linspace(0, len(beat) - 1, frames).long()
+    return beat[chosen][:, :loops, :senders].to(torch.complex128)
+
+
+def _analytic(beat: Complex[Tensor, "frame chirp tx rx sample"]) -> bool:
+    """Whether samples were real ones: no power in the farther half of the unambiguous range."""
+    count = beat.shape[-1]
+    power = torch.fft.fft(beat[:1]).abs().square().flatten(0, 3).sum(0)
+    return bool(power[count // 2 + 1 :].sum() < _FLOOR * power.sum())
 
 
 def _by_rate(

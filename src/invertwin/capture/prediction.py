@@ -43,11 +43,14 @@ def predictor(
 def residuals(
     products: Complex128[Tensor, "place lag lag"], coefficients: Complex128[Tensor, " lag"]
 ) -> Float64[Tensor, " place"]:
-    """Mean power of what prediction leaves at each place.
+    """Mean power of what prediction leaves at each place, forwards and backwards in time.
+
+    The same tones, read backwards, follow from the conjugate coefficients.
 
     Args:
         products: Of ``covariances``.
         coefficients: Of ``predictor``.
     """
-    form = torch.einsum("k,nkl,l->n", coefficients.conj(), products, coefficients)
-    return form.real.clamp_min(0.0)
+    both = torch.stack([coefficients, coefficients.conj().flip(0)])
+    form = torch.einsum("dk,nkl,dl->n", both.conj(), products, both)
+    return 0.5 * form.real.clamp_min(0.0)

@@ -27,7 +27,7 @@ from invertwin.radar.waveform import unit_window
 # With fewer range rates the cells that train a threshold lie along range alone. Half of them may
 # then hold other reflectors.
 _FEW_RATES = 13
-_ALONG_RANGE = {"guard": (0, 4), "training": (0, 16), "rank": 0.5}
+_GUARD, _TRAINING, _RANK = (0, 4), (0, 16), 0.5
 # What stronger reflectors leave at a point, in power, below which it counts as their sidelobe.
 _ABOVE_SIDELOBES = 4.0
 # A further direction in one cell has at least this part of the strongest one's power: errors of
@@ -134,7 +134,12 @@ def _detected(
 ) -> Bool[Tensor, "velocity range"]:
     if len(flat) >= _FEW_RATES:
         return cell_averaging_cfar(flat, looks=looks)
-    rows = [ordered_statistics_cfar(row[None], looks=looks, **_ALONG_RANGE) for row in flat]
+    rows = [
+        ordered_statistics_cfar(
+            row[None], guard=_GUARD, training=_TRAINING, rank=_RANK, looks=looks
+        )
+        for row in flat
+    ]
     return torch.cat(rows)
 
 
