@@ -20,10 +20,11 @@ Faulty ones are such recordings at 10 to 40 dB, with clutter 10 dB below the str
 and one fault of a random severity. The least that counts: Q holds less than 1 % of I's power;
 copies by interleaving 30 dB above the noise of all samples together, and 20 dB above other echoes
 there; phases that break by 45° within the middle half of a ramp, in all chirps or in a quarter; 1
-to 3 samples that drop out there, with as much effect, or packets of 8 to 32; leakage 3 dB above what else is shown; 1 %
-of the values 2 % beyond the converter's range; one or two settings that are those of another
-recording: lanes, real samples, numbers of receivers, transmitters, samples or loops. Settings with
-the right blocks and a larger size count as a recording that was stopped, and none is drawn.
+to 3 samples that drop out there and turn the strongest echo by as much, or packets of 8 to 32;
+leakage 3 dB above what else is shown; 1 % of the values 2 % beyond the converter's range; one or
+two settings that are those of another recording: lanes, real samples, numbers of receivers,
+transmitters, samples or loops. Settings with the right blocks and a larger size are those of a
+recording that was stopped; none of them is drawn.
 """
 
 import argparse

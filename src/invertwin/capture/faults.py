@@ -102,7 +102,7 @@ _LEAST_HITS = 8
 _FEW_CODES = 200  # of the largest value, below which a pure tone piles up too
 
 
-def saturation(beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: bool) -> Fault | None:
+def saturation(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool) -> Fault | None:
     """Values that pile up at the ends of their range, whatever the converter's full scale is.
 
     A tone of amplitude A that is clipped at A/s has ``acos(1/s)/π`` of its values at either end
@@ -292,7 +292,7 @@ def ghosts(
 
 _ORDER = 8  # of the prediction
 _SETTLING = 8  # part of a ramp
-_LEAST_RATIO = 3.0
+_LEAST_RATIO = 4.0
 _FEW_CHIRPS = 4
 
 
@@ -302,10 +302,10 @@ def phase_break(
     """A sample that does not follow from the ones before it, in all chirps or in one.
 
     Tones are predicted from the samples before, and after. Where the phase jumps or samples are
-    missing, the residual of all windows that hold the place stands out. Residuals elsewhere tell how much they scatter, as a gamma distribution
-    of the shape that their quartiles have. The limit is exceeded by chance with a probability of
-    1e-4, and is at least 3 times the median. The first eighth of a ramp, in which synthesiser and
-    converter settle, is left out.
+    missing, the residual of all windows that hold the place stands out. Residuals elsewhere tell
+    how much they scatter, as a gamma distribution of the shape that their quartiles have. The limit
+    is exceeded by chance with a probability of 1e-4, and is at least 4 times the median. The first
+    eighth of a ramp, in which synthesiser and converter settle, is left out.
 
     Args:
         beat: Samples.
@@ -318,8 +318,8 @@ def phase_break(
     if real:
         beat = beat.real.to(beat.dtype)
     rates = _by_rate(beat)
-    first = max(order, count // _SETTLING)
-    rows = rates.flatten(0, 1)[:, first - order :]
+    settled = count // _SETTLING
+    first, rows = settled + order, rates.flatten(0, 1)[:, settled:]
     products = covariances(rows, order)
     kept = torch.ones(len(products), dtype=torch.bool)
     left, place = torch.zeros(0), 0
@@ -332,8 +332,8 @@ def phase_break(
     away[max(place - order + 1, 0) : place + order] = False
     found = _stands_out(left, left[away], len(rows)) if bool(away.any()) else None
     if found is not None:
-        return _broken(place + first, found, "all chirps")
-    chirps = beat.flatten(0, 1).flatten(1, 2)[..., first - order :]
+        return _broken(place + first, found, "chirps")
+    chirps = beat.flatten(0, 1).flatten(1, 2)[..., settled:]
     if len(chirps) < _FEW_CHIRPS:
         return None
     coefficients = predictor(covariances(chirps.flatten(0, 1), order), torch.ones_like(kept))

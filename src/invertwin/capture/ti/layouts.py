@@ -22,7 +22,8 @@ from invertwin.errors import InputError
 LANE_COUNT = 4
 _MOST_WORDS = 2**17  # that are looked at
 _ORDER = 6  # of the prediction of complex samples
-_FEWEST_SAMPLES = 8
+_FEWEST_SAMPLES = 8  # of a block
+_FEWEST = 256  # samples that tell something
 _MOST_NAMED = 6
 _MOST_ELEMENTS = 4
 # Failure of prediction at borders over that within, and nats a word that other blocks cost more:
@@ -257,7 +258,7 @@ def evidence(words: np.ndarray, settings: ChirpSettings) -> Evidence:
     # A real tone is two complex ones.
     order = min(_ORDER * (2 if settings.real else 1), count // 4)
     blocks = rows.shape[1] // count
-    if order < 2 or blocks < 3:
+    if count < _FEWEST_SAMPLES or blocks < 3 or rows.numel() < _FEWEST:
         return NOTHING
     # Blocks, each with the end of the one before.
     cut = rows[:, count - order : blocks * count].unfold(1, count + order, count)
