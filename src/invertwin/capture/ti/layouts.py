@@ -334,7 +334,12 @@ def better(found: list[Candidate], stated: Evidence) -> list[Candidate]:
 
 
 def silent_lanes_contradict(words: np.ndarray, settings: ChirpSettings) -> bool:
-    """Whether lanes of receivers that are not stated hold samples."""
+    """Whether lanes of receivers that are not stated hold samples.
+
+    Args:
+        words: Of the file.
+        settings: As stated.
+    """
     return settings.lanes == LANE_COUNT and not set(_active(words)) <= set(settings.receivers)
 
 
