@@ -204,8 +204,11 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
         (["adc.bin", "-c", "bench.cfg", "-b", "IWR6843ISK"], ["elevation=+1 or -1"]),
         (["adc.bin", "-c", "bench.cfg", "-b", "xWR1642"], ["TX numbers of xWR1642 from 1 to 2"]),
         (["odd.bin", "-c", "bench.cfg", *BOARD], ["odd number of bytes"]),
-        (["adc.bin", "-c", "three.cfg", *BOARD], ["what fits: ", "4 receivers"]),
-        (["adc.bin", "-c", "long.cfg", *BOARD], ["what fits: ", "samples=64"]),
+        (
+            ["adc.bin", "-c", "three.cfg", *BOARD],
+            ["what fits: ", "receivers=4", "--set receivers=4"],
+        ),
+        (["adc.bin", "-c", "long.cfg", *BOARD], ["what fits: samples=64 (", "--set samples=64"]),
         (["adc.bin", "-c", "bench.cfg", *BOARD, "--lanes", "4"], ["2 LVDS lanes", "lanes=4"]),
         (["adc.bin", "-c", "bench.cfg", *BOARD, "--lanes", "3"], ["lanes=3"]),
         (
@@ -213,6 +216,9 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
             ["lanes to be one of 2, 4, got 3"],
         ),
         (["adc.bin", "-c", "plain.cfg", *BOARD], ["2 or 4 LVDS lanes", "set lanes"]),
+        (["adc.bin", "-c", "bench.cfg", *BOARD, "--set", "samples"], ["NAME=NUMBER", "'samples'"]),
+        (["adc.bin", "-c", "bench.cfg", *BOARD, "--set", "x=1"], ["lanes, real,", "'x'"]),
+        (["adc.toml", "--set", "samples=64"], ["--set with a .bin", "adc.toml"]),
         (["adc.toml", "--frame", "2"], ["--frame from 0 to 1"]),
         (["adc.toml", "--chirp", "16"], ["number from 0 to 15"]),
         (["adc.toml", "--range-max", "900"], ["--range-max within"]),
@@ -247,13 +253,70 @@ def test_what_is_cut_or_saturated_is_warned_of(recording, monkeypatch, capfd):
     error = capfd.readouterr().err
     assert "cut.bin ends within a frame: 1 whole frames are read" in error
     assert error.count("saturated") == 1
-    assert read_metrics(recording / "seen")["frames"] == 1
+    found = read_metrics(recording / "seen")
+    assert found["frames"] == 1
+    assert [said.split()[0] for said in found["warnings"]] == ["reading:", "reading:"]
 
 
 def _saturated() -> ChirpData:
     samples = mover().samples.clone()
     samples[0, 0, 0, 0, :5] = 32767
     return ChirpData(samples, SETTINGS)
+
+
+def test_a_setting_is_corrected(recording, monkeypatch):
+    """As the refusal says to do."""
+    write_cfg("long.cfg", replace(SETTINGS, samples=66, ramp_end_time=40e-6))
+    arguments = ["look", "adc.bin", "-c", "long.cfg", *BOARD, "--set", "samples=64", "-o", "seen"]
+    assert call(monkeypatch, *arguments) == 0
+    found = read_metrics(recording / "seen")
+    assert found["samples"] == 64
+    assert found["mover_range_m"] == pytest.approx(3.0, abs=0.06)
+    assert found["warnings"] == []
+
+
+def test_one_chirp_has_points_of_several_reflectors(recording, monkeypatch):
+    """Two at one range and one farther away; range rates are not known."""
+    parts = ((3.0, 0.3, 1.0), (3.0, -0.4, 0.7), (4.5, 0.1, 0.5))
+    one = Chirps(1, CHIRPS.interval)
+    beat = sum(moving_point(RADAR, one, r, 0.0, u, amplitude=a) for r, u, a in parts)
+    noise = torch.randn(beat.shape, generator=torch.Generator().manual_seed(1), dtype=beat.dtype)
+    Capture.from_beat((beat + 0.1 * noise)[:, 0], RADAR).save("one.nc")
+    assert call(monkeypatch, "look", "one.nc", "-o", "seen") == 0
+    head, *lines = (recording / "seen" / "points.csv").read_text().splitlines()
+    rows = [dict(zip(head.split(","), map(float, line.split(",")), strict=True)) for line in lines]
+    assert len(rows) == 3
+    for row, (distance, u, amplitude) in zip(rows, parts, strict=True):
+        assert row["range_m"] == pytest.approx(distance, abs=0.03)
+        assert row["u"] == pytest.approx(u, abs=0.03)
+        assert row["power_db"] == pytest.approx(20 * np.log10(amplitude), abs=1)
+        assert np.isnan(row["velocity_m_s"])
+    assert read_metrics(recording / "seen")["warnings"] == []
+
+
+def test_nothing_moves_in_noise(recording, monkeypatch, capsys):
+    still = moving_point(RADAR, CHIRPS, 3.0, 0.0, 0.3)
+    noise = torch.randn(still.shape, generator=torch.Generator().manual_seed(2), dtype=still.dtype)
+    data = ChirpData((still + 0.3 * noise).to(torch.complex64), SETTINGS)
+    described_arrays.write_chirps("still.toml", data, "still.npy", ARRAYS)
+    assert call(monkeypatch, "look", "still.toml", "-o", "seen") == 0
+    found = read_metrics(recording / "seen")
+    assert found["moves"] is False
+    assert "mover_range_m" not in found
+    assert found["peak_range_m"] == pytest.approx(3.0, abs=0.06)
+    assert "something moves" in capsys.readouterr().out
+
+
+def test_faults_are_warned_of(recording, monkeypatch, capsys):
+    """In the metrics, on the terminal and in the report."""
+    data = mover()
+    samples = data.samples.real.to(torch.complex64)
+    described_arrays.write_chirps("i.toml", ChirpData(samples, SETTINGS), "i.npy", ARRAYS)
+    assert call(monkeypatch, "look", "i.toml", "-o", "seen") == 0
+    (said,) = read_metrics(recording / "seen")["warnings"]
+    assert said.startswith("complex only by type: ")
+    assert "complex only by type" in capsys.readouterr().out
+    assert "mirror image" in (recording / "seen" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,9 @@ from invertwin.capture.chirps import ChirpData as ChirpData
 from invertwin.capture.chirps import ChirpSettings as ChirpSettings
 from invertwin.capture.chirps import adc_counts as adc_counts
 from invertwin.capture.chirps import settings_of as settings_of
+from invertwin.capture.faults import Fault as Fault
+from invertwin.capture.faults import faults_of as faults_of
+from invertwin.capture.faults import shown_ranges as shown_ranges
 from invertwin.capture.reading import is_sweeps as is_sweeps
 from invertwin.capture.reading import read as read
 from invertwin.capture.signature_files import MeasuredSection as MeasuredSection

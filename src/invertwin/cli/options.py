@@ -134,6 +134,14 @@ class Recorded(Where):
     lanes: Annotated[
         int | None, typer.Option(help="2 or 4 LVDS lanes, where the settings do not say.")
     ] = None
+    change: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="Corrects a setting of a .bin, such as samples=128; also lanes, real, receivers, "
+            "transmitters, loops, frames.",
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)

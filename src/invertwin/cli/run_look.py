@@ -1,5 +1,9 @@
 """`invertwin look`: pictures of a recording as it is, and the recording as a capture."""
 
+import json
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +16,16 @@ from invertwin.capture import (
     ChirpCapture,
     described_arrays,
     estimate_channels,
+    faults_of,
     is_sweeps,
     read,
+    shown_ranges,
+    ti,
 )
 from invertwin.channel import Grid
 from invertwin.cli.options import Look, Recorded
 from invertwin.cli.report import Table, finish, picture, quantities, texts
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
 from invertwin.radar import (
     SampledWaveform,
@@ -37,8 +44,6 @@ from invertwin.runs import RunFolder
 
 Recording = Capture | ChirpCapture
 _ENDINGS = ".bin, .setup.json, .toml, .s1p, .s2p, .nc or .npz"
-# Leakage from transmitters to receivers outshines what is nearer than this many range cells.
-_NEAREST_CELLS = 3
 
 
 def run_look(look: Look, folder: RunFolder) -> list[Table]:
@@ -47,7 +52,10 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     Raises:
         InputError: A recording or options that do not fit each other; nothing has been written.
     """
-    reader, recording = read_recording(look)
+    said: list[str] = []
+    with _kept(said):
+        reader, recording = read_recording(look)
+    as_recorded = recording
     recording, metrics = _calibrated(look, recording, folder)
     capture, chirps = _capture(look, recording), None
     if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
@@ -58,7 +66,8 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
             f"expected a --frame from 0 to {radar.frame_count - 1}, got {look.frame}; choose one "
             "of the recording"
         )
-    grid = _grid(look, capture, recording.max_range)
+    grid = _grid(look, capture, recording)
+    said += map(str, faults_of(as_recorded, look.range_min, look.range_max))
     metrics |= {
         "task": "look",
         "reader": reader,
@@ -78,10 +87,13 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     points = None
     if chirps is not None:
         points = points_of(chirps.beat, radar, grid, chirps.chirps, look.frame)
+    elif "beat" in capture.dataset:
+        points = points_of(capture.beat[:, None], radar, grid, None, look.frame)
     if radar.frame_count > 1:
         profiles = capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
         shown["all frames"] = Panel(profiles[:, :, 0, 0].T.double(), grid.ranges, times, "frame")
+    metrics["warnings"] = said
     capture.save(folder.file("capture.nc"))
     if points is not None:
         metrics["points"] = len(points)
@@ -94,11 +106,29 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
         f"{radar.frame_count} frames, read as {reader}.",
         [
             quantities(title, metrics),
+            *([Table("Warnings", ["fault", "evidence"], _rows(said))] if said else []),
             picture(folder, "look", panels(shown), f"Frame {look.frame}", "doppler"),
         ],
         again="look capture.nc",
         note=texts("notes")["look"],
     )
+
+
+@contextmanager
+def _kept(said: list[str]) -> Iterator[None]:
+    """Warnings of a reader go on, and into a list."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", PhysicsWarning)
+        yield
+    for one in caught:
+        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+        if issubclass(one.category, PhysicsWarning):
+            said.append(f"reading: {one.message}")
+
+
+def _rows(said: list[str]) -> list[list[str]]:
+    """Names and evidence of warnings."""
+    return [list(line.split(": ", 1)) for line in said]
 
 
 def read_recording(look: Recorded) -> tuple[str, Recording]:
@@ -120,7 +150,29 @@ def read_recording(look: Recorded) -> tuple[str, Recording]:
         board = described_arrays.described_board(path, look.board, look.elevation, look.azimuth)
     elif ending != ".nc":
         board = _board(look, look.board)
-    return readers[ending], read(path, look.config, board=board, lanes=look.lanes)
+    settings = look.config
+    if look.change:
+        if readers[ending] != "dca1000":
+            raise InputError(
+                f"expected --set with a .bin or .setup.json, got {path.name}; correct its own file"
+            )
+        settings = ti.changed(ti.read_settings(look.config or path), _changes(look.change))
+    return readers[ending], read(path, settings, board=board, lanes=look.lanes)
+
+
+def _changes(given: list[str]) -> dict[str, Any]:
+    """Values by name, as NAME=NUMBER or real=True."""
+    found: dict[str, Any] = {}
+    for text in given:
+        name, _, value = text.partition("=")
+        try:
+            found[name.strip()] = json.loads(value.strip().lower())
+        except json.JSONDecodeError:
+            raise InputError(
+                f"expected --set NAME=NUMBER, such as samples=128, or real=true, got {text!r}; "
+                "write it so"
+            ) from None
+    return found
 
 
 def _read_public(look: Recorded, folder: Path) -> tuple[str, Recording]:
@@ -168,13 +220,14 @@ def _calibrated(
     return calibration.apply(recording), {"channel_spread_db": float(spread)}
 
 
-def _grid(look: Look, capture: Capture, farthest: float) -> Grid:
+def _grid(look: Look, capture: Capture, recording: Recording) -> Grid:
     radar, profiles = capture.radar(), "range_profile" in capture.dataset
-    cell = radar.waveform.range_resolution
-    leakage = _NEAREST_CELLS * cell - float(radar.origins.min())
-    nearest = float(capture.ranges[0]) if profiles else max(leakage, radar.range_limits[0])
-    low = nearest if look.range_min is None else look.range_min
-    high = farthest if look.range_max is None else look.range_max
+    cell, farthest = radar.waveform.range_resolution, recording.max_range
+    if profiles:
+        low = float(capture.ranges[0]) if look.range_min is None else look.range_min
+        high = farthest if look.range_max is None else look.range_max
+    else:
+        low, high = shown_ranges(recording, look.range_min, look.range_max)
     if high > farthest * (1 + 1e-9):
         raise InputError(
             f"expected a --range-max within {farthest:.4g} m, got {high:g}; samples "
@@ -214,6 +267,7 @@ def _maps(
             "chirps": chirps.chirps.count,
             "velocity_span_m_s": velocity_span(chirps.device, chirps.chirps),
             **maps.strongest.metrics("peak"),
+            "moves": maps.mover is not None,
             **({} if maps.mover is None else maps.mover.metrics("mover")),
         }
     spectrum = capture.frames([frame]).spectrum(grid)[0].double()

@@ -24,8 +24,6 @@ from invertwin.radar.doppler_maps import DopplerMaps as DopplerMaps
 from invertwin.radar.doppler_maps import Peak as Peak
 from invertwin.radar.doppler_maps import doppler_maps as doppler_maps
 from invertwin.radar.doppler_maps import peak_of as peak_of
-from invertwin.radar.doppler_maps import points_csv as points_csv
-from invertwin.radar.doppler_maps import points_of as points_of
 from invertwin.radar.doppler_maps import sharp_map as sharp_map
 from invertwin.radar.doppler_maps import snapshots_of as snapshots_of
 from invertwin.radar.impairments import ADC as ADC
@@ -51,6 +49,8 @@ from invertwin.radar.radar import Radar as Radar
 from invertwin.radar.range_profile import add_noise as add_noise
 from invertwin.radar.range_profile import beat_signal as beat_signal
 from invertwin.radar.range_profile import range_profile as range_profile
+from invertwin.radar.reflectors import points_csv as points_csv
+from invertwin.radar.reflectors import points_of as points_of
 from invertwin.radar.spectrum import beamform as beamform
 from invertwin.radar.spectrum import exact_spectrum as exact_spectrum
 from invertwin.radar.surrogate import SURROGATES as SURROGATES

@@ -218,13 +218,32 @@ def _refined(
     frame, _, place, u, v = cell
     ranges = grid.ranges[place] + moved[0] * grid.range_step
     us, vs = grid.u[u] + moved[1] * grid.u_step, grid.v[v] + moved[2] * grid.v_step
-    ahead = (1 - us.square() - vs.square()).clamp(min=0).sqrt()
+    position = world_positions(radar, frame, ranges, us, vs)
+    return PointCloud(frame, ranges, rates, us, vs, power[tuple(cell)], position)
+
+
+def world_positions(
+    radar: Radar,
+    frame: Int64[Tensor, " point"],
+    ranges: Float64[Tensor, " point"],
+    u: Float64[Tensor, " point"],
+    v: Float64[Tensor, " point"],
+) -> Float64[Tensor, "point 3"]:
+    """Positions in the world of points in front of the radar [m].
+
+    Args:
+        radar: With the poses of the frames.
+        frame: The pose that sees each point.
+        ranges: From the middle of the phase centres [m].
+        u: Direction cosines along the radar's x.
+        v: Direction cosines along its y.
+    """
+    ahead = (1 - u.square() - v.square()).clamp(min=0).sqrt()
     link = radar.link()
     origin = (0.5 * (link.tx + link.rx)).detach().cpu()
     length = ranges + radar.origins.cpu()[frame]
-    local = length[:, None] * torch.stack([us, vs, ahead], dim=1)
-    position = origin[frame] + (link.rotations.detach().cpu()[frame] @ local[..., None])[..., 0]
-    return PointCloud(frame, ranges, rates, us, vs, power[tuple(cell)], position)
+    local = length[:, None] * torch.stack([u, v, ahead], dim=1)
+    return origin[frame] + (link.rotations.detach().cpu()[frame] @ local[..., None])[..., 0]
 
 
 def _refuse_gradients(power: Tensor, name: str) -> None:

@@ -6,27 +6,33 @@ from operator import attrgetter
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float, Float64
+from jaxtyping import Bool, Complex, Float, Float64
+from scipy.special import gammainccinv
 from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.progress import told
-from invertwin.radar.detection import PointCloud, cell_averaging_cfar, point_cloud
 from invertwin.radar.direction import capon, music
 from invertwin.radar.doppler import (
     compensate_tdm,
     range_doppler,
-    range_doppler_angle,
     velocity_axis,
 )
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
+from invertwin.radar.reflectors import noise_power
 from invertwin.radar.spectrum import beamform
 
-# Bins of range rate on either side of zero that a window spreads what stands still over.
+# Bins of range rate on either side of zero where slow drift of what stands still is seen, and how
+# far below the still echo of its range such drift stays.
 _STILL_BINS = 2
+_DRIFT = 1e-3
+# Bins of range rate of which one range alone tells its noise.
+_OWN_NOISE = 16
+# Probability that noise alone is taken for something that moves, and the rounding of samples.
+_FALSE_MOVER = 1e-3
+_ROUNDING = 1e-12
 _BINS_AT_ONCE = 2e7  # of range rate, range, u, v
-_MOST_BINS = 1e8  # of range rate, range, u, v that are searched for points
 
 
 @dataclass(frozen=True)
@@ -67,10 +73,10 @@ class DopplerMaps:
         velocities: Range rates [m/s].
         range_doppler: Mean power of the channels [velocity, range].
         everything: Power over range and direction, all range rates summed [range, u, v].
-        movers: Power over range and direction without what stands still [range, u, v]; None = too
-            few chirps.
+        movers: Power over range and direction of the chirps without their mean, which is what
+            stands still [range, u, v]; None = nothing moves.
         strongest: The strongest cell of all.
-        mover: The strongest cell that moves.
+        mover: The strongest cell that moves; None = nothing is above the noise.
     """
 
     grid: Grid
@@ -91,7 +97,12 @@ def doppler_maps(
 ) -> DopplerMaps:
     """Make range-Doppler and range-direction maps of one frame, with ``compensate_tdm``.
 
-    Range rates are those of the unambiguous span.
+    Range rates are those of the unambiguous span. What moves is looked for in the chirps without
+    their mean, so that slow movers are kept too. Something moves where a cell of range rate and
+    range, its channels averaged, is above what noise reaches in any cell of the map with a
+    probability of 0.001. Noise has the median power of the map, or of its own range if that is
+    more, as phase noise makes it. Next to range rate zero, drift 30 dB below what stands still at
+    that range is no motion.
 
     Args:
         beat: Chirps of every transmitter.
@@ -103,29 +114,56 @@ def doppler_maps(
     Raises:
         InputError: As ``range_doppler`` and ``beamform``.
     """
-    radar = radar.frames([frame])
-    cube = range_doppler(beat[frame : frame + 1], radar, grid, chirps)
+    radar, signal = radar.frames([frame]), beat[frame : frame + 1]
+    cube = range_doppler(signal, radar, grid, chirps)
     flat = cube.abs().square().mean((2, 3))[0]
+    everything, strongest = _summed(cube, radar, grid, chirps, torch.ones_like(flat) > 0)
+    moving = range_doppler(signal - signal.mean(1, keepdim=True), radar, grid, chirps)
+    cells = _moving_cells(moving.abs().square().mean((2, 3))[0], flat, len(radar.virtual_positions))
+    movers, mover = None, None
+    if bool(cells.any()):
+        movers, mover = _summed(moving, radar, grid, chirps, cells)
+    velocities = velocity_axis(radar, chirps)
+    return DopplerMaps(grid, velocities, flat, everything, movers, strongest, mover)
+
+
+def _summed(
+    cube: Complex[Tensor, "frame velocity tx rx range"],
+    radar: Radar,
+    grid: Grid,
+    chirps: Chirps,
+    candidates: Bool[Tensor, "velocity range"],
+) -> tuple[Float64[Tensor, "range u v"], Peak]:
+    """Power of all range rates over range and direction, and the strongest cell of some."""
     cube = compensate_tdm(cube, radar, chirps)[0]
     velocities = velocity_axis(radar, chirps)
-    moving = (torch.arange(chirps.count) - chirps.count // 2).abs() > _STILL_BINS
     chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
-    everything, movers = torch.zeros(2, *grid.shape, dtype=torch.float64)
-    peaks = []
+    total = torch.zeros(grid.shape, dtype=torch.float64)
     seen = (grid.u[:, None].square() + grid.v.square()) <= 1
+    peaks: list[Peak] = []
     for rows in told(torch.arange(chirps.count).split(chunk), "range rates"):
         power = beamform(cube[rows], radar.frames([0] * len(rows)), grid).double() * seen
-        everything += power.sum(0)
-        movers += power[moving[rows]].sum(0)
+        total += power.sum(0)
+        power = power * candidates[rows][:, :, None, None]
         peaks += [
             peak_of(part, grid, float(rate))
             for part, rate in zip(power, velocities[rows], strict=True)
         ]
-    fast = [peak for peak, moves in zip(peaks, moving, strict=True) if moves]
-    strongest = max(peaks, key=attrgetter("power"))
-    mover = max(fast, key=attrgetter("power"), default=None)
-    shown = movers if fast else None
-    return DopplerMaps(grid, velocities, flat, everything, shown, strongest, mover)
+    return total, max(peaks, key=attrgetter("power"))
+
+
+def _moving_cells(
+    moving: Float[Tensor, "velocity range"], flat: Float[Tensor, "velocity range"], looks: int
+) -> Bool[Tensor, "velocity range"]:
+    """Cells above what noise and drift explain."""
+    moving, middle = moving.double(), len(flat) // 2
+    rows = [noise_power(row, looks) for row in moving.T] if len(flat) >= _OWN_NOISE else [0.0]
+    level = torch.tensor(rows, dtype=torch.float64).clamp_min(noise_power(moving, looks))
+    factor = float(gammainccinv(looks, _FALSE_MOVER / moving.numel())) / looks
+    least = (factor * level).clamp_min(_ROUNDING * float(flat.max()))
+    slow = (torch.arange(len(flat)) - middle).abs() <= _STILL_BINS
+    drift = torch.where(slow[:, None], _DRIFT * flat[middle].double(), 0.0)
+    return (moving > least) & (moving > drift)
 
 
 def sharp_map(
@@ -175,41 +213,6 @@ def snapshots_of(
     radar = radar.frames([frame])
     cube = range_doppler(beat[frame : frame + 1], radar, grid, chirps, window="rectangular")
     return compensate_tdm(cube, radar, chirps)[0]
-
-
-def points_of(
-    beat: Complex[Tensor, "frame chirp tx rx sample"],
-    radar: Radar,
-    grid: Grid,
-    chirps: Chirps,
-    frame: int,
-) -> PointCloud | None:
-    """Detect points in one frame by a cell-averaging CFAR; None where the map is too large.
-
-    Args:
-        beat: Chirps of every transmitter.
-        radar: With one pose per frame.
-        grid: Ranges and directions that are searched.
-        chirps: Timing.
-        frame: The frame that is searched.
-    """
-    if chirps.count * math.prod(grid.shape) > _MOST_BINS:
-        return None
-    radar, signal = radar.frames([frame]), beat[frame : frame + 1]
-    flat = range_doppler(signal, radar, grid, chirps).abs().square().mean((2, 3))
-    detected = cell_averaging_cfar(flat, looks=len(radar.virtual_positions))
-    power = range_doppler_angle(signal, radar, grid, chirps)
-    return point_cloud(power, detected, radar, grid, chirps)
-
-
-def points_csv(points: PointCloud) -> str:
-    """One line per point, the strongest first."""
-    lines = ["range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m"]
-    for i in points.power.argsort(descending=True).tolist():
-        level = 10 * math.log10(float(points.power[i]))
-        values = [points.range[i], points.velocity[i], points.u[i], points.v[i], level]
-        lines.append(",".join(f"{float(value):.6g}" for value in (*values, *points.position[i])))
-    return "\n".join(lines) + "\n"
 
 
 def peak_of(spectrum: Float[Tensor, "range u v"], grid: Grid, velocity: float = 0.0) -> Peak:

@@ -188,12 +188,12 @@ def test_saturated_samples_are_warned_of(tmp_path):
         ({"loops": 5}, "loops=2"),
         ({"real": True}, "real=False"),
         ({"lanes": 4}, "lanes=2"),
-        ({"receivers": (1, 2, 3, 4)}, "3 receivers"),
-        ({"transmit_order": (1, 2)}, "3 transmitters"),
+        ({"receivers": (1, 2, 3, 4)}, "receivers=3"),
+        ({"transmit_order": (1, 2)}, "transmitters=3"),
         ({"frames": 2}, "frames=3"),
         ({"frames": 6}, "frames=3"),
         ({"samples": 7000}, "samples=10"),
-        ({"samples": 14, "loops": 11}, "no single change"),
+        ({"samples": 14, "loops": 11}, "samples=10, loops=2"),
     ],
 )
 def test_contradictory_settings_say_what_fits(tmp_path, change, fits):
@@ -210,7 +210,7 @@ def test_what_is_no_recording_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"odd number of bytes \(4321\)"):
         read_samples(path, SETTINGS)
     path.write_bytes(b"")
-    with pytest.raises(InputError, match="what fits"):
+    with pytest.raises(InputError, match="no one or two changes of the settings fit"):
         read_samples(path, SETTINGS)
     with pytest.raises(InputError, match="at least one frame of 720 bytes"):
         read_samples(path, replace(SETTINGS, frames=None))

@@ -223,12 +223,41 @@ def test_studio_settings_that_cannot_be_used_are_refused(studio, change, message
         read_studio(studio(change))
 
 
+@pytest.mark.parametrize("named", [False, True])
+def test_lists_of_one_may_be_objects(studio, named):
+    """As MATLAB writes them: the item itself, or items by names."""
+
+    def alone(items):
+        return {f"item{i}": item for i, item in enumerate(items)} if named else items[0]
+
+    path = studio()
+    content = json.loads(path.read_text())
+    (device,) = content["mmWaveDevices"]
+    device["rfConfig"]["rlProfiles"] = alone(device["rfConfig"]["rlProfiles"])
+    if named:
+        device["rfConfig"]["rlChirps"] = alone(device["rfConfig"]["rlChirps"])
+    path.write_text(json.dumps({"mmWaveDevices": alone([device])}))
+    assert read_studio(path) == EXPECTED
+    path.write_text(json.dumps({"mmWaveDevices": "one"}))
+    with pytest.raises(InputError, match="expected the keys of mmWave Studio"):
+        read_studio(path)
+
+
 def test_a_cascade_and_broken_json_are_refused(studio, tmp_path):
     path = studio()
     content = json.loads(path.read_text())
-    path.write_text(json.dumps({"mmWaveDevices": content["mmWaveDevices"] * 4}))
-    with pytest.raises(InputError, match="one device, got 4"):
+    (device,) = content["mmWaveDevices"]
+    path.write_text(json.dumps({"mmWaveDevices": [device] * 2}))
+    with pytest.raises(InputError, match="one device, got 2; name a file"):
         read_studio(path)
+    path.write_text(json.dumps({"mmWaveDevices": []}))
+    with pytest.raises(InputError, match="one device, got none; connect"):
+        read_studio(path)
+    for count in (1, 4):
+        device["rfConfig"]["rlChanCfg_t"]["cascading"] = 1
+        path.write_text(json.dumps({"mmWaveDevices": [device] * count}))
+        with pytest.raises(InputError, match=f"those of a cascade of {count}"):
+            read_studio(path)
     path.write_text(path.read_text()[:-10])
     with pytest.raises(InputError, match="expected JSON"):
         read_studio(path)

@@ -15,6 +15,19 @@ import numpy as np
 import torch
 
 from invertwin.capture.chirps import ChirpData, ChirpSettings
+from invertwin.capture.ti.layouts import (
+    CLEAR,
+    LANE_COUNT,
+    Candidate,
+    advice,
+    better,
+    candidates,
+    evidence,
+    fits_layout,
+    frame_words,
+    layout,
+    silent_lanes_contradict,
+)
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.errors import InputError
@@ -23,7 +36,6 @@ from invertwin.radar.waveform import PhysicsWarning
 from invertwin.untrusted import existing_file, reader
 
 _WORD = np.dtype("<i2")
-_LANE_COUNT = 4
 
 
 @reader("samples as their settings say")
@@ -99,12 +111,13 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
             f"expected 16-bit samples in {name}, got an odd number of bytes ({size}); "
             "the file is damaged or no raw recording, copy it again"
         )
-    frames = _whole_frames(size, settings, name)
-    stream = b"".join(part.read_bytes() for part in paths)
-    words = np.frombuffer(stream, _WORD, frames * _frame_words(settings)).astype(np.float32)
+    words = np.frombuffer(b"".join(part.read_bytes() for part in paths), _WORD)
     if settings.bits < 16:
         # Negative numbers may come without their sign bits.
-        words[words > 2 ** (settings.bits - 1) - 1] -= 2**settings.bits
+        lost = words > 2 ** (settings.bits - 1) - 1
+        words = np.where(lost, words - 2**settings.bits, words).astype(_WORD)
+    frames = _whole_frames(words, settings, name)
+    words = words[: frames * frame_words(settings)].astype(np.float32)
     parts = words.reshape(frames, -1).take(_places(settings), axis=1)
     samples = parts.astype(np.complex64) if settings.real else parts.view(np.complex64)
     data = ChirpData(torch.from_numpy(samples[..., 0]), replace(settings, frames=frames))
@@ -138,7 +151,7 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
             "expected samples without imaginary part from a real ADC, got some with; "
             "take their real part or set real=False"
         )
-    words = np.zeros((len(parts), _frame_words(settings)), _WORD)
+    words = np.zeros((len(parts), frame_words(settings)), _WORD)
     words[:, _places(settings)] = parts[..., :1] if settings.real else parts
     with replacing(path) as part:
         words.tofile(part)
@@ -150,42 +163,34 @@ def _check_layout(settings: ChirpSettings) -> None:
             "expected settings with 2 or 4 LVDS lanes, got none; set lanes: 4 for xWR12xx and "
             "xWR14xx, 2 for xWR16xx, xWR18xx and xWR68xx"
         )
-    if settings.lanes == _LANE_COUNT and max(settings.receivers) > _LANE_COUNT:
-        raise InputError(
-            f"expected receivers 1 to {_LANE_COUNT}, one per lane, got {settings.receivers}; "
-            "the DCA1000 records one device"
-        )
-    count = settings.samples * len(settings.receivers)
-    if settings.lanes == 2 and not settings.real and count % 2:
-        raise InputError(
-            f"expected an even number of samples per chirp through 2 lanes, got {count}; "
-            "they come in pairs, the settings are those of another recording"
-        )
+    why = fits_layout(settings)
+    if why is not None:
+        raise InputError(f"expected {why}")
 
 
-def _frame_words(settings: ChirpSettings) -> int:
-    receivers = _LANE_COUNT if settings.lanes == _LANE_COUNT else len(settings.receivers)
-    parts = 1 if settings.real else 2
-    chirps = settings.loops * len(settings.transmit_order)
-    return chirps * receivers * settings.samples * parts
+def _whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -> int:
+    """Count the frames to read, and warn of what is missing.
 
-
-def _whole_frames(size: int, settings: ChirpSettings, name: str) -> int:
-    """Count the frames to read, and warn of what is missing."""
-    frame = _frame_words(settings) * _WORD.itemsize
+    Settings whose size is not the file's are refused, unless the recording was cut off and its
+    samples do not speak for others; and so are settings that the samples contradict.
+    """
+    size, frame = words.nbytes, frame_words(settings) * _WORD.itemsize
     frames, rest = divmod(size, frame)
     expected = settings.frames
-    if expected is not None and size != expected * frame:
-        fitting = _fitting(size, settings, expected)
-        if size > expected * frame or fitting or not frames:
-            if frames and not rest:
-                fitting = [f"frames={frames}", *fitting]
-            found = " or ".join(fitting) or (
-                "no single change of the settings, find those of this recording"
+    exact = not rest and frames == (expected or frames) and frames > 0
+    cut = frames > 0 and (expected is None or frames < expected)
+    others = _others(words, settings, exact=exact, cut=cut)
+    if others or not exact:
+        if others:
+            wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
+            raise InputError(
+                f"expected the recording of its settings in {name} ({wanted} bytes), got {size} "
+                f"bytes{' whose chirps break elsewhere' if exact else ''}; {advice(others)}"
             )
+        if not exact and expected is not None and not cut:
             raise InputError(
                 f"expected {expected * frame} bytes in {name} ({expected} frames of {frame}), got "
-                f"{size}; what fits: {found}"
+                f"{size}; no one or two changes of the settings fit, find those of this recording"
             )
     if not frames:
         raise InputError(
@@ -209,34 +214,43 @@ def _whole_frames(size: int, settings: ChirpSettings, name: str) -> int:
     return frames
 
 
-def _fitting(size: int, settings: ChirpSettings, frames: int) -> list[str]:
-    """Single changes of the settings with which the size is exact."""
-    other = 6 - (settings.lanes or 2)
-    changes = {
-        f"lanes={other}": replace(settings, lanes=other),
-        f"real={not settings.real}": replace(settings, real=not settings.real),
-    }
-    for key, name in (("receivers", "receivers"), ("transmit_order", "transmitters")):
-        for count in range(1, 5):
-            chosen = {key: tuple(range(1, count + 1))}
-            changes[f"{count} {name}"] = replace(settings, **chosen)
-    unit = _WORD.itemsize * frames
-    found = [text for text, changed in changes.items() if _frame_words(changed) * unit == size]
-    for field in ("samples", "loops"):
-        # A frame grows in proportion to either.
-        whole, rest = divmod(size * getattr(settings, field), _frame_words(settings) * unit)
-        if rest == 0 and whole > 1:
-            found.append(f"{field}={whole}")
-    return found
+def _others(
+    words: np.ndarray, settings: ChirpSettings, *, exact: bool, cut: bool
+) -> list[Candidate]:
+    """Other settings that the file speaks for, best first; none = it may be as stated.
+
+    Args:
+        words: Of the file.
+        settings: As stated.
+        exact: Whether the size is that of the settings.
+        cut: Whether it is that of a recording that was stopped.
+    """
+    sound = evidence(words, settings).breaks >= CLEAR if exact else False
+    if not words.size or (sound and not silent_lanes_contradict(words, settings)):
+        return []
+    found = candidates(words, settings)
+    if not exact and not cut:
+        return found
+    if silent_lanes_contradict(words, settings):
+        return [one for one in found if not silent_lanes_contradict(words, one.settings)]
+    stated = evidence(words, settings)
+    others = better(found, stated)
+    if exact or others:
+        return others
+    # The same blocks in other numbers: no sample tells a stopped recording from another one.
+    alike = [one for one in found if len(one.changes) == 1 and "frames" not in one.changes]
+    if stated.breaks >= CLEAR:
+        alike = [one for one in alike if layout(one.settings) == layout(settings)]
+    return [*(one for one in found if alike and set(one.changes) == {"frames"}), *alike]
 
 
 def _places(settings: ChirpSettings) -> np.ndarray:
     """Which words of a frame are I and Q: numbers from 0 [chirp, tx, rx, sample, I and Q]."""
     s, parts = settings, 1 if settings.real else 2
     chirps = s.loops, len(s.transmit_order)
-    words = np.arange(_frame_words(s))
-    if s.lanes == _LANE_COUNT:
-        sides = words.reshape(*chirps, s.samples, parts, _LANE_COUNT)
+    words = np.arange(frame_words(s))
+    if s.lanes == LANE_COUNT:
+        sides = words.reshape(*chirps, s.samples, parts, LANE_COUNT)
         sides = sides[..., [number - 1 for number in s.receivers]]
         sides = np.moveaxis(sides, (-1, -2), (-3, -1))
     else:

@@ -84,7 +84,7 @@ def setup_files(path: str | Path) -> list[Path]:
     content = _json(path)
     try:
         captured = content["capturedFiles"]
-        names = [str(file["rawFileName"]) for file in captured["files"]]
+        names = [str(file["rawFileName"]) for file in _listed(captured["files"], "rawFileName")]
         base = str(captured.get("fileBasePath", ""))
     except (KeyError, TypeError):
         names, base = [], ""
@@ -114,10 +114,8 @@ def _beside(path: Path, named: str) -> Path:
 
 
 def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
-    devices = content["mmWaveDevices"]
-    do = "recordings of a cascade are not read, give its samples as arrays"
-    _expect(len(devices), 1, "settings of one device", do)
-    radio, record = devices[0]["rfConfig"], devices[0]["rawDataCaptureConfig"]
+    found = _device(content["mmWaveDevices"])
+    radio, record = found["rfConfig"], found["rawDataCaptureConfig"]
     kind = radio.get("waveformType", "legacyFrameChirp")
     _expect(kind, "legacyFrameChirp", "legacyFrameChirp", "other frames are not supported")
     sent = (record.get("rlDevDataPathCfg_t") or {}).get("transferFmtPkt0", "0x1")
@@ -130,8 +128,8 @@ def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
         # 0 = receivers interleaved, as through 4 lanes; 1 = one after the other, as through 2.
         order, what = int(lanes == 2), f"chInterleave {int(lanes == 2)} with {lanes} LVDS lanes"
         _expect(int(layout["chInterleave"]), order, what, "other orders are not supported")
-    profiles = [item["rlProfileCfg_t"] for item in radio["rlProfiles"]]
-    chirps = [item["rlChirpCfg_t"] for item in radio["rlChirps"]]
+    profiles = [item["rlProfileCfg_t"] for item in _listed(radio["rlProfiles"], "rlProfileCfg_t")]
+    chirps = [item["rlChirpCfg_t"] for item in _listed(radio["rlChirps"], "rlChirpCfg_t")]
     frame, output = radio["rlFrameCfg_t"], radio["rlAdcOutCfg_t"]["fmt"]
     return settings(
         {int(profile["profileId"]): profile for profile in profiles},
@@ -153,6 +151,42 @@ def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
         bits=BITS[int(output["b2AdcBits"])],
         lanes=lanes,
     )
+
+
+def _device(written: Any) -> dict[str, Any]:
+    """The one device of the settings."""
+    devices = _listed(written, "rfConfig")
+    if not devices:
+        raise InputError(
+            "expected settings of one device, got none; connect the device in mmWave Studio, then "
+            "save the settings again"
+        )
+    modes = [
+        _integer((device["rfConfig"].get("rlChanCfg_t") or {}).get("cascading", 0))
+        for device in devices
+    ]
+    if any(modes):
+        raise InputError(
+            f"expected settings of one device, got those of a cascade of {len(devices)} (cascading "
+            f"{', '.join(map(str, modes))}); its raw files are not read, give its samples as arrays"
+        )
+    do = "name a file with the device that recorded alone; give samples of several as arrays"
+    _expect(len(devices), 1, "settings of one device", do)
+    return devices[0]
+
+
+def _listed(written: Any, key: str) -> list[dict[str, Any]]:
+    """The items of a list. MATLAB writes a list of one as the item itself, others by names.
+
+    Args:
+        written: A list, an item, or an object of items.
+        key: What every item has.
+    """
+    if isinstance(written, dict):
+        written = [written] if key in written else list(written.values())
+    if not isinstance(written, list) or not all(isinstance(item, dict) for item in written):
+        raise TypeError(f"{key} in {type(written).__name__}")
+    return written
 
 
 def _expect(found: Any, known: Any, what: str, do: str) -> None:

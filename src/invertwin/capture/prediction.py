@@ -1,0 +1,56 @@
+"""Linear prediction of samples from the samples before them: what breaks in a signal stands out.
+
+Sums of few tones, as beat signals are, follow from their past but for noise:
+``x[n] = Σ a_k x[n − k]``. Source: Makhoul, Linear prediction: a tutorial review, 1975.
+"""
+
+import torch
+from jaxtyping import Bool, Complex128, Float64
+from torch import Tensor
+
+_LOADING = 1e-9  # of the mean power: exact tones have singular equations
+
+
+def covariances(
+    rows: Complex128[Tensor, "row sample"], order: int
+) -> Complex128[Tensor, "place lag lag"]:
+    """Mean products of each sample with the ones before it, at every place after the first ones.
+
+    Args:
+        rows: Signals that follow the same tones.
+        order: How many samples before.
+    """
+    past = rows.unfold(-1, order + 1, 1).flip(-1)  # [row, place, lag]
+    return torch.einsum("rnk,rnl->nkl", past.conj(), past) / len(rows)
+
+
+def predictor(
+    products: Complex128[Tensor, "place lag lag"], kept: Bool[Tensor, " place"]
+) -> Complex128[Tensor, " lag"]:
+    """Coefficients with the least mean residual at the places that are kept, the first one 1.
+
+    Args:
+        products: Of ``covariances``.
+        kept: Places that count.
+    """
+    mean = products[kept].sum(0)
+    level = mean.diagonal().real.mean().clamp_min(torch.finfo(torch.float64).tiny)
+    inner = mean[1:, 1:] + _LOADING * level * torch.eye(len(mean) - 1, dtype=mean.dtype)
+    past = -torch.linalg.solve(inner, mean[1:, 0])
+    return torch.cat([torch.ones(1, dtype=mean.dtype), past])
+
+
+def residuals(
+    products: Complex128[Tensor, "place lag lag"], coefficients: Complex128[Tensor, " lag"]
+) -> Float64[Tensor, " place"]:
+    """Mean power of what prediction leaves at each place, forwards and backwards in time.
+
+    The same tones, read backwards, follow from the conjugate coefficients.
+
+    Args:
+        products: Of ``covariances``.
+        coefficients: Of ``predictor``.
+    """
+    both = torch.stack([coefficients, coefficients.conj().flip(0)])
+    form = torch.einsum("dk,nkl,dl->n", both.conj(), products, both)
+    return 0.5 * form.real.clamp_min(0.0)

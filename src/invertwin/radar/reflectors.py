@@ -1,0 +1,233 @@
+"""Points of one frame: where reflectors are, several in one range too, without their sidelobes."""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Complex, Complex128, Float, Float64, Int64
+from scipy.ndimage import maximum_filter
+from scipy.special import gammaincinv
+from torch import Tensor
+
+from invertwin.channel import Grid
+from invertwin.progress import told
+from invertwin.radar.detection import (
+    PointCloud,
+    cell_averaging_cfar,
+    ordered_statistics_cfar,
+    world_positions,
+)
+from invertwin.radar.doppler import compensate_tdm, range_doppler, velocity_axis, velocity_span
+from invertwin.radar.motion import Chirps
+from invertwin.radar.radar import Radar
+from invertwin.radar.range_profile import range_profile
+from invertwin.radar.spectrum import beamform
+from invertwin.radar.waveform import unit_window
+
+# With fewer range rates the cells that train a threshold lie along range alone. Half of them may
+# then hold other reflectors.
+_FEW_RATES = 13
+_GUARD, _TRAINING, _RANK = (0, 4), (0, 16), 0.5
+# What stronger reflectors leave at a point, in power, below which it counts as their sidelobe.
+_ABOVE_SIDELOBES = 4.0
+# A further direction in one cell has at least this part of the strongest one's power: errors of
+# gains and phases of a board's channels leave that much.
+_WEAKEST_BESIDE = 0.1
+_FALSE_DIRECTION = 1e-3
+
+
+def points_of(
+    beat: Complex[Tensor, "frame chirp tx rx sample"],
+    radar: Radar,
+    grid: Grid,
+    chirps: Chirps | None,
+    frame: int,
+) -> PointCloud:
+    """Find the reflectors in one frame by a constant false-alarm rate.
+
+    Cells of range and range rate that stand out are points, unless the windows' sidelobes of
+    stronger points explain them. Directions of a cell are taken out one after the other, the
+    strongest first, all amplitudes fitted together, until noise is left or a tenth of the
+    strongest; so one range may hold several points.
+
+    Args:
+        beat: Chirps of every transmitter, or one.
+        radar: With one pose per frame.
+        grid: Ranges and directions that are searched.
+        chirps: Timing; None = one chirp, whose points have the range rate NaN.
+        frame: The frame that is searched.
+    """
+    radar, signal = radar.frames([frame]), beat[frame : frame + 1]
+    if chirps is None:
+        cube = range_profile(signal[:, 0], radar, grid)[:, None]
+        rates, span = torch.full((1,), math.nan, dtype=torch.float64), 0.0
+    else:
+        cube = compensate_tdm(range_doppler(signal, radar, grid, chirps), radar, chirps)
+        rates, span = velocity_axis(radar, chirps), velocity_span(radar, chirps)
+    cube = cube[0].to(torch.complex128)
+    looks = len(radar.virtual_positions)
+    flat = cube.abs().square().mean((1, 2))
+    noise = noise_power(flat, looks)
+    rows: list[list[float]] = []
+    for v, r in told(_cells(flat, radar, grid, looks), "points"):
+        rate = float(rates[v]) + _vertex(flat[[v - 1, v, (v + 1) % len(flat)], r]) * span / len(
+            flat
+        )
+        near = [max(r - 1, 0), r, min(r + 1, grid.range_count - 1)]
+        place = float(grid.ranges[r]) + _vertex(flat[v, near]) * grid.range_step
+        rows += [
+            [place, rate, *direction]
+            for direction in _directions(cube[v, :, :, r], radar, grid, noise)
+        ]
+    table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5)
+    ranges, found, u, v, power = table.T
+    frames = torch.zeros(len(table), dtype=torch.int64)
+    return PointCloud(
+        frames + frame, ranges, found, u, v, power, world_positions(radar, frames, ranges, u, v)
+    )
+
+
+def points_csv(points: PointCloud) -> str:
+    """One line per point, the strongest first."""
+    lines = ["range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m"]
+    for i in points.power.argsort(descending=True).tolist():
+        level = 10 * math.log10(float(points.power[i]))
+        values = [points.range[i], points.velocity[i], points.u[i], points.v[i], level]
+        lines.append(",".join(f"{float(value):.6g}" for value in (*values, *points.position[i])))
+    return "\n".join(lines) + "\n"
+
+
+def noise_power(power: Float[Tensor, "*cell"], looks: int, empty: float = 0.5) -> float:
+    """Mean power of noise from a quantile of cells: the median, where half of them hold no signal.
+
+    Args:
+        power: Means of several looks.
+        looks: Independent looks in a mean.
+        empty: Share of cells without signal, the quantile.
+    """
+    level = float(power.double().flatten().kthvalue(math.ceil(empty * power.numel())).values)
+    return level * looks / float(gammaincinv(looks, empty))
+
+
+def _cells(
+    flat: Float64[Tensor, "velocity range"], radar: Radar, grid: Grid, looks: int
+) -> list[tuple[int, int]]:
+    """Bins of range rate and range that hold reflectors, the strongest first."""
+    around = maximum_filter(flat.numpy(), 3, mode=("wrap", "nearest"))  # type: ignore[arg-type]
+    found = _detected(flat, looks) & (flat == torch.from_numpy(around)) & (flat > 0)
+    places = torch.nonzero(found)
+    places = places[flat[found].argsort(descending=True)]
+    left = torch.ones(len(places), dtype=torch.bool)
+    reach, chosen = torch.zeros(len(places), dtype=torch.float64), []
+    for i, (v, r) in enumerate(places.tolist()):
+        if flat[v, r] <= _ABOVE_SIDELOBES * reach[i].square():
+            left[i] = False
+            continue
+        chosen.append((v, r))
+        response = _response(places - places[i], len(flat), radar, grid)
+        reach += (flat[v, r] * response).sqrt()
+    return chosen
+
+
+def _detected(
+    flat: Float64[Tensor, "velocity range"], looks: int
+) -> Bool[Tensor, "velocity range"]:
+    if len(flat) >= _FEW_RATES:
+        return cell_averaging_cfar(flat, looks=looks)
+    rows = [
+        ordered_statistics_cfar(
+            row[None], guard=_GUARD, training=_TRAINING, rank=_RANK, looks=looks
+        )
+        for row in flat
+    ]
+    return torch.cat(rows)
+
+
+def _response(
+    apart: Int64[Tensor, "cell 2"], count: int, radar: Radar, grid: Grid
+) -> Float64[Tensor, " cell"]:
+    """Highest power of a point in cells apart from its own, by the windows over chirps and samples.
+
+    A point is up to half a bin beside the middle of its cell, where sidelobes are no longer zero.
+    """
+    weight = unit_window("hamming", count).to(torch.complex128)
+    beside = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
+    rates, ranges = (apart.double()[..., None] + beside).unbind(1)
+    turns = rates[..., None] / count * torch.arange(count)
+    over_rates = (torch.exp(2j * math.pi * turns) @ weight).abs().square()
+    distance = (ranges * grid.range_step).flatten()
+    over_ranges = radar.waveform.range_response(distance, radar.window).reshape(ranges.shape)
+    return over_rates.amax(1) * over_ranges.amax(1)
+
+
+def _directions(
+    cell: Complex128[Tensor, "tx rx"], radar: Radar, grid: Grid, noise: float
+) -> list[list[float]]:
+    """Directions u, v and powers in one cell, the strongest first."""
+    channels, left = cell.flatten(), cell
+    one = replace(grid, range_start=0.0, range_count=1)
+    seen = grid.u[:, None].square() + grid.v.square() <= 1
+    false = -math.log(_FALSE_DIRECTION / float(seen.sum()))
+    places: list[tuple[float, float]] = []
+    powers: list[float] = []
+    for _ in range(max(1, len(channels) // 2)):
+        power = beamform(left[None, :, :, None], radar, one)[0, 0].double() * seen
+        at = int(power.argmax())
+        u, v = float(grid.u[at // grid.v_count]), float(grid.v[at % grid.v_count])
+        u, v = _refined(left.flatten(), radar, grid, u, v)
+        models = torch.stack([_plane_wave(radar, grid, *place) for place in [*places, (u, v)]], 1)
+        amplitudes = torch.linalg.lstsq(models, channels[:, None]).solution
+        found = amplitudes.abs().square()[:, 0].tolist()
+        if powers and found[-1] < max(_WEAKEST_BESIDE * powers[0], false * noise / len(channels)):
+            break
+        if any(_beside(radar, (u, v), place) for place in places):
+            break
+        places, powers = [*places, (u, v)], found
+        left = (channels[:, None] - models @ amplitudes).reshape(cell.shape)
+        if grid.u_count == grid.v_count == 1:
+            break
+    return [[*place, power] for place, power in zip(places, powers, strict=True)]
+
+
+def _beside(radar: Radar, one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two directions are less than a beam apart."""
+    du, dv = (abs(a - b) / w for a, b, w in zip(one, other, radar.beamwidth, strict=True))
+    return math.hypot(du, dv) < 1
+
+
+def _plane_wave(radar: Radar, grid: Grid, u: float, v: float) -> Complex128[Tensor, " channel"]:
+    """Channels of an echo from a direction; along an axis that is not resolved, all alike."""
+    x, y, _ = radar.virtual_positions.T
+    path = u * x * (grid.u_count > 1) + v * y * (grid.v_count > 1)
+    phase = -2 * math.pi / radar.waveform.wavelength * path.double()
+    return torch.polar(torch.ones_like(phase), phase)
+
+
+def _refined(
+    channels: Complex128[Tensor, " channel"], radar: Radar, grid: Grid, u: float, v: float
+) -> tuple[float, float]:
+    """The direction near one of the grid in which the channels add up best."""
+    place = [u, v]
+    for shrink in (1.0, 4.0):
+        for axis, (count, width) in enumerate(
+            ((grid.u_count, grid.u_step), (grid.v_count, grid.v_step))
+        ):
+            if count == 1:
+                continue
+            levels = []
+            for step in (-1, 0, 1):
+                moved = list(place)
+                moved[axis] += step * width / shrink
+                wave = _plane_wave(radar, grid, moved[0], moved[1])
+                levels.append(torch.vdot(wave, channels).abs().square())
+            place[axis] += _vertex(torch.stack(levels)) * width / shrink
+    return max(-1.0, min(1.0, place[0])), max(-1.0, min(1.0, place[1]))
+
+
+def _vertex(levels: Float64[Tensor, "3"]) -> float:
+    """Peak of the parabola through the logarithms of three levels: within half a step."""
+    before, middle, after = levels.clamp_min(torch.finfo(torch.float64).tiny).log().tolist()
+    curvature = before - 2 * middle + after
+    if curvature >= 0:
+        return 0.0
+    return max(-0.5, min(0.5, 0.5 * (before - after) / curvature))

@@ -1,0 +1,62 @@
+"""Points of one frame: several in one range, of one chirp too, and no sidelobes."""
+
+import pytest
+import torch
+
+from invertwin.radar import FMCW, Chirps, Radar, points_csv, points_of
+from invertwin.radar.boards import board
+from invertwin.radar.reflectors import noise_power
+from oracles.moving_point import moving_point
+
+ARRAYS = board("IWR6843ISK").arrays(elevation=1)
+RADAR = Radar(*ARRAYS, FMCW(60e9, 1.28e9, 32e-6, 64), torch.zeros(1, 3, dtype=torch.float64))
+GRID = RADAR.grid(0.4, 7.0)
+# Range, range rate, u, v, amplitude; the first two share a range.
+POINTS = (
+    (3.0, 0.0, 0.3, 0.0, 1.0),
+    (3.0, 0.0, -0.4, 0.0, 0.7),
+    (4.5, 0.0, 0.1, 0.2, 0.5),
+    (2.0, 0.3, 0.0, 0.0, 0.3),
+)
+
+
+def noise(shape: torch.Size) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return torch.randn(shape, generator=generator, dtype=torch.complex128)
+
+
+@pytest.mark.parametrize("count", [1, 4, 32])
+@pytest.mark.parametrize("level", [0.3, 1e-3])
+def test_each_reflector_is_a_point(count, level):
+    """At any noise: sidelobes of the strong ones are not among them."""
+    chirps = Chirps(count, 40e-6)
+    beat = torch.stack([moving_point(RADAR, chirps, *p[:4], amplitude=p[4]) for p in POINTS]).sum(0)
+    beat = beat + level * noise(beat.shape)
+    found = points_of(beat, RADAR, GRID, None if count == 1 else chirps, 0)
+    assert len(found) == len(POINTS)
+    rows = found.power.argsort(descending=True).tolist()
+    for i, (distance, rate, u, v, amplitude) in zip(rows, POINTS, strict=True):
+        assert float(found.range[i]) == pytest.approx(distance, abs=0.03)
+        assert float(found.u[i]) == pytest.approx(u, abs=0.04)
+        assert float(found.v[i]) == pytest.approx(v, abs=0.06)
+        assert float(found.power[i].sqrt()) == pytest.approx(amplitude, rel=0.2)
+        assert float(found.position[i, 0]) == pytest.approx(distance * u, abs=0.15)
+        if count == 1:
+            assert bool(found.velocity[i].isnan())
+        elif count == 32:
+            assert float(found.velocity[i]) == pytest.approx(rate, abs=0.1)
+
+
+@pytest.mark.parametrize("count", [1, 32])
+def test_noise_has_no_points(count):
+    chirps = Chirps(count, 40e-6)
+    beat = noise(torch.Size([1, count, 3, 4, 64]))
+    found = points_of(beat, RADAR, GRID, None if count == 1 else chirps, 0)
+    assert len(found) <= 1
+    assert points_csv(found).startswith("range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m\n")
+
+
+def test_noise_power_of_any_quantile():
+    looks = noise(torch.Size([8, 40_000])).abs().square().mean(0)
+    for empty in (0.2, 0.5):
+        assert noise_power(looks, 8, empty) == pytest.approx(1.0, rel=0.02)
