@@ -92,7 +92,7 @@ def shown_ranges(
     # Ranges that count from a scene begin before it.
     near = max(leaking - float(radar.origins.min()), radar.range_limits[0])
     real = isinstance(recording, ChirpCapture) and recording.real
-    far = waveform.max_range * (0.5 if real else 1.0)
+    far = radar.range_limits[1] * (0.5 if real else 1.0)
     if not bool(radar.origins.any()):
         far -= leaking
     return near if range_min is None else range_min, far if range_max is None else range_max
