@@ -1,0 +1,69 @@
+"""The benchmark of rooms in small: what counts as found, and rooms that are drawn."""
+
+import math
+
+import pytest
+import torch
+
+from invertwin.discovery import Figure
+
+
+def test_rooms_hold_one_to_six_things_that_do_not_touch(rooms):
+    drawn = [rooms.Room.draw(number) for number in range(12)]
+    assert [len(room.things) for room in drawn] == [1, 2, 3, 4, 5, 6] * 2
+    assert {thing.kind for room in drawn for thing in room.things} == set(rooms.KINDS)
+    for room in drawn:
+        assert 8 <= len(room.turns) <= 40
+        for k, one in enumerate(room.things):
+            low = float(one.item().vertices[:, 1].min())
+            assert low == pytest.approx(0.0, abs=1e-9) or one.kind == "sphere"
+            for other in room.things[k + 1 :]:
+                assert math.dist(one.place, other.place) > one.reach + other.reach
+    assert rooms.Room.draw(3) == drawn[3]
+
+
+def test_pairs_are_one_to_one_and_near(rooms):
+    true = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0)]
+    found = [(1.1, 0.0), (0.95, 0.0), (0.0, 0.14), (5.0, 5.0)]
+    assert rooms.matched(true, found) == [(0, 2), (1, 1)]
+    assert rooms.matched(true, []) == []
+
+
+@pytest.mark.parametrize(
+    ("length", "width", "yaw", "off"),
+    [(0.8, 0.3, 0.5, 0.0), (0.3, 0.8, 0.5 - math.pi / 2, 0.0), (0.8, 0.3, 0.7, 0.2)],
+)
+def test_yaw_is_that_of_the_longer_side(rooms, length, width, yaw, off):
+    true = rooms.Thing("box", (0.0, 0.0), 0.5, (0.8, 1.0, 0.3), 0.5, 4.0)
+    found = Figure("box", (0.0, 0.0), yaw, length, width, 1.0)
+    assert rooms.yaw_error(true, found) == pytest.approx(off, abs=1e-9)
+
+
+def test_shares_count_all_rooms(rooms):
+    def row(kinds, found, pairs):
+        return {
+            "kinds": kinds,
+            "found": found,
+            "matched": [
+                {"kind": k, "called": k, "error": 0.01, "scores": [1.0, 3.0], "yaw_error": 0.02}
+                for k in pairs
+            ],
+            "conventional": {"found": 2, "errors": [0.1]},
+            "seconds": 10.0,
+        }
+
+    found = rooms.measure([row(["box", "box"], 2, ["box"]), row(["wall"], 1, ["wall"])])
+    assert found["recall"] == pytest.approx(2 / 3)
+    assert found["precision"] == pytest.approx(2 / 3)
+    assert found["count_right"] == 1.0
+    assert found["within_two_deviations"] == 0.5
+    assert found["yaw_error_deg"] == pytest.approx(math.degrees(0.02))
+    assert found["conventional"]["recall"] == pytest.approx(2 / 3)
+    assert found["conventional"]["precision"] == 0.5
+
+
+def test_the_usual_chain_finds_a_ball(rooms):
+    ball = rooms.Thing("sphere", (0.4, -0.3), 0.0, (0.3, 0.3, 0.3), 0.6, 5.0)
+    room = rooms.Room(0, (ball,), tuple(torch.arange(8).double().tolist()), 20.0)
+    (found,) = rooms.conventional(room.capture())
+    assert math.dist(found, (0.4, -0.3)) < 0.15

@@ -1,0 +1,220 @@
+"""Twins of recordings: what is there is found, and nothing where there is nothing."""
+
+import math
+
+import pytest
+import torch
+
+import invertwin as iw
+from invertwin.capture import Capture, ChirpCapture
+from invertwin.discovery import Twin, still_capture, twin
+from invertwin.discovery.places import dense
+from invertwin.errors import InputError
+from invertwin.inversion.initial import Ground
+from invertwin.radar import Chirps, add_noise
+from invertwin.scene import (
+    AntennaArray,
+    Cosine,
+    RoughDielectric,
+    box,
+    cylinder,
+    linear_array,
+    rigid,
+    rotation_from_vector,
+    sphere,
+)
+
+CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=4e9, duration=50e-6, samples=128)
+HALF = CHIRP.wavelength / 2
+PAINT = RoughDielectric(permittivity=5.0)
+CHAIN = iw.Sampling(depth=1, points_per_m2=500.0, boundary=False)
+HEIGHT = 0.6
+
+
+def around(count: int) -> iw.Radar:
+    """A board at places about the middle, looking at it."""
+    turns = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+    out = torch.stack([turns.cos(), 0 * turns, turns.sin()], dim=1)
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(out)
+    axes = torch.stack([torch.linalg.cross(up, -out), up, -out], dim=-1)
+    patch = Cosine(1.0)
+    return iw.Radar(
+        linear_array(2, 4 * HALF, pattern=patch),
+        linear_array(4, HALF, pattern=patch),
+        CHIRP,
+        1.8 * out + HEIGHT * up,
+        axes,
+    )
+
+
+def thing(mesh, place: tuple[float, float], height: float, yaw: float = 0.0) -> iw.Object:
+    turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
+    where = torch.tensor([place[0], height, place[1]], dtype=torch.float64)
+    return iw.Object(mesh, PAINT, rigid(turn, where))
+
+
+@pytest.fixture(scope="module")
+def room() -> Twin:
+    """A box and a cylinder from twelve places."""
+    radar = around(12)
+    scene = iw.Scene(
+        {
+            "box": thing(box((0.5, 0.9, 0.3)), (-0.35, 0.2), 0.45, 0.5),
+            "post": thing(cylinder(0.12, 1.0), (0.5, -0.3), 0.5),
+        }
+    )
+    grid = radar.grid(0.5, 3.5)
+    found = iw.simulate(scene, radar, grid, seed=3, sampling=CHAIN, snr_db=10.0)
+    capture = Capture.from_beat(found.beat, radar)
+    return twin(capture, low=(-1.2, -1.2), high=(1.2, 1.2), level=0.0)
+
+
+@pytest.mark.slow
+def test_what_stands_in_a_room_is_found(room: Twin):
+    assert len(room.things) == 2
+    by_kind = {one.kind: one for one in room.things}
+    assert set(by_kind) == {"box", "cylinder"}
+    for kind, place in (("box", (-0.35, 0.2)), ("cylinder", (0.5, -0.3))):
+        one = by_kind[kind]
+        assert math.dist(one.position[[0, 2]].tolist(), place) < 0.03
+        assert one.confidence > 0.95
+        for axis, value in ((0, place[0]), (2, place[1])):
+            assert abs(float(one.position[axis]) - value) < 4 * one.deviations["xz"[axis // 2]]
+        assert sum(one.probabilities.values()) == pytest.approx(1.0)
+    figure = by_kind["box"].figure
+    assert figure is not None
+    sides = sorted((figure.length, figure.width))
+    assert sides == pytest.approx([0.3, 0.5], abs=0.05)
+    long_way = figure.yaw if figure.length > figure.width else figure.yaw + math.pi / 2
+    assert abs(math.remainder(long_way - 0.5, math.pi)) < math.radians(4)
+
+
+@pytest.mark.slow
+def test_the_inside_of_a_box_is_never_seen(room: Twin):
+    assert room.picture is not None
+    inside = (room.picture.places - torch.tensor([-0.35, 0.2])).norm(dim=1) < 0.1
+    assert int(inside.sum()) > 5
+    assert int(room.picture.views[inside].max()) == 0
+    assert int(room.picture.views.max()) > 4
+
+
+@pytest.mark.slow
+def test_maps_of_the_twin_explain_the_recording(room: Twin):
+    """Speckle of one look is an exponential draw: its logarithm has a deviation of π/√6."""
+    assert room.observed is not None
+    assert room.predicted is not None
+    spread = (room.observed.double() / room.predicted.double()).log().std()
+    assert float(spread) == pytest.approx(math.pi / math.sqrt(6), rel=0.06)
+    assert room.scene is not None
+    assert room.scene.names == tuple(one.name for one in room.things)
+
+
+def test_noise_is_nothing():
+    radar = around(4)
+    noise = torch.randn(4, 2, 4, 128, dtype=torch.complex128, generator=torch.manual_seed(0))
+    found = twin(Capture.from_beat(1e-6 * noise, radar))
+    assert found.things == ()
+    assert found.notes == ("nothing is above the noise",)
+    assert found.scene is None
+
+
+@pytest.mark.slow
+def test_one_small_ball_is_one_thing():
+    radar = around(8)
+    scene = iw.Scene({"ball": thing(sphere(0.02, 3), (0.3, 0.1), HEIGHT)})
+    sampling = iw.Sampling(depth=1, points_per_m2=2e4, boundary=False)
+    found = iw.simulate(scene, radar, radar.grid(0.5, 3.0), seed=1, sampling=sampling, snr_db=10.0)
+    seen = twin(Capture.from_beat(found.beat, radar), low=(-1.0, -1.0), high=(1.0, 1.0), level=0.0)
+    (one,) = seen.things
+    assert math.dist(one.position[[0, 2]].tolist(), (0.3, 0.1)) < 0.03
+
+
+@pytest.mark.slow
+def test_two_in_one_cell_are_not_more_than_two():
+    radar = around(8)
+    scene = iw.Scene(
+        {
+            "one": thing(sphere(0.02, 3), (0.3, 0.1), HEIGHT),
+            "other": thing(sphere(0.02, 3), (0.3, 0.125), HEIGHT),
+        }
+    )
+    sampling = iw.Sampling(depth=1, points_per_m2=2e4, boundary=False)
+    found = iw.simulate(scene, radar, radar.grid(0.5, 3.0), seed=1, sampling=sampling, snr_db=10.0)
+    seen = twin(Capture.from_beat(found.beat, radar), low=(-1.0, -1.0), high=(1.0, 1.0), level=0.0)
+    assert 1 <= len(seen.things) <= 2
+    for one in seen.things:
+        assert math.dist(one.position[[0, 2]].tolist(), (0.3, 0.1125)) < 0.04
+
+
+@pytest.mark.slow
+def test_what_moves_and_what_stands_at_one_range_are_two():
+    half = HALF
+    still = torch.zeros(1, 3, dtype=torch.float64)
+    radar = iw.Radar(AntennaArray(still), linear_array(8, half), CHIRP, still)
+    moving = iw.Object(
+        sphere(0.1, 3),
+        PAINT,
+        rigid(translation=[0.8, 0.0, 1.6]),
+        velocity=torch.tensor([0.0, 0.0, 1.5], dtype=torch.float64),
+    )
+    resting = iw.Object(sphere(0.1, 3), PAINT, rigid(translation=[-0.8, 0.0, 1.6]))
+    chirps = Chirps(64, 60e-6)
+    sampling = iw.Sampling(depth=1, points_per_m2=3000.0, boundary=False)
+    scene = iw.Scene({"moving": moving, "resting": resting})
+    beat = iw.simulate_chirps(scene, radar, chirps, seed=0, sampling=sampling)
+    beat = add_noise(beat, snr_db=20.0, seed=1)
+    recording = ChirpCapture(beat, radar, chirps)
+    found = twin(recording, level=-0.6, rays=1000)
+    movers = [one for one in found.things if one.velocity is not None]
+    (mover,) = [one for one in movers if one.confidence > 0.5]
+    assert mover.velocity is not None
+    way = math.hypot(0.8, 1.6)
+    assert float(mover.position.norm()) == pytest.approx(way - 0.08, abs=0.1)
+    assert float(mover.velocity.norm()) == pytest.approx(1.5 * 1.6 / way, abs=0.3)
+    assert float(mover.position[0]) > 0.3
+    (rest,) = [one for one in found.things if one.velocity is None and one.confidence > 0.5]
+    assert math.dist(rest.position[[0, 2]].tolist(), (-0.8, 1.6)) < 0.2
+
+
+@pytest.mark.data
+def test_both_reflectors_on_the_rail_are_found(data_folder):
+    from invertwin_studies.recordings import rail_sar
+
+    capture = rail_sar.read(data_folder / "rail_sar")
+    assert dense(capture)
+    found = twin(capture, ground=Ground("z"), level=0.0, height=0.0)
+    survey = torch.tensor([[2.203936, -3.873749], [2.32899, 1.037974]], dtype=torch.float64)
+    sure = [one.position[:2] for one in found.things if one.confidence > 0.5]
+    assert len(sure) == 2
+    away = torch.cdist(survey, torch.stack(sure)).amin(1)
+    assert float(away.max()) < 0.2
+
+
+@pytest.mark.data
+def test_the_strongest_mover_of_the_board_is_found(data_folder):
+    from invertwin.radar.boards import Mounting
+    from invertwin.registry.kinds import load_plugins, registry
+
+    load_plugins()
+    table = registry.table("data", "openradar")
+    recording = table.made_by(str(data_folder / "openradar"), board=Mounting("xWR1642", None, 1))
+    found = twin(recording)
+    strongest = max(found.things, key=lambda one: one.name == "mover_1")
+    assert strongest.velocity is not None
+    assert float(strongest.position.norm()) == pytest.approx(2.93, abs=0.05)
+    assert strongest.confidence > 0.9
+    assert float(strongest.velocity.norm()) > 0.2
+
+
+def test_a_region_that_nothing_sees_is_refused():
+    radar = around(4)
+    beat = torch.randn(4, 2, 4, 128, dtype=torch.complex128, generator=torch.manual_seed(0))
+    beat[..., :] += 50 * torch.exp(2j * torch.pi * 0.3 * torch.arange(128))
+    capture = Capture.from_beat(beat, radar)
+    assert still_capture(capture) is capture
+    with pytest.raises(InputError, match="some radar sees"):
+        twin(capture, low=(50.0, 50.0), high=(51.0, 51.0))
+    with pytest.raises(InputError, match="low below high"):
+        twin(capture, low=(1.0, 1.0), high=(-1.0, 1.0))
+    with pytest.raises(InputError, match="range_max"):
+        twin(capture, range_max=0.01)
