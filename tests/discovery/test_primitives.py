@@ -1,6 +1,7 @@
 """Shapes on the ground as unknowns."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ BOX = Figure("box", (0.3, -0.4), 0.3, 0.8, 0.2, 1.1, 0.05)
 
 @pytest.mark.parametrize("up", ["y", "z"])
 @pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
-def test_a_shape_has_the_numbers_it_was_made_of(kind: str, up: str):
+def test_a_shape_has_the_numbers_it_was_made_of(kind: Any, up: Any):
     ground = Ground(up)
     figure = Figure(kind, (0.3, -0.4), 0.3, 0.8, 0.8 if kind != "box" else 0.2, 1.1, 0.05)
     one = Primitive("thing", figure, ground, level=0.5)
@@ -33,7 +34,7 @@ def test_a_shape_has_the_numbers_it_was_made_of(kind: str, up: str):
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
-def test_a_box_is_turned_as_the_ground_turns(up: str):
+def test_a_box_is_turned_as_the_ground_turns(up: Any):
     ground = Ground(up)
     turned, straight = (
         Primitive("thing", Figure("box", (0.0, 0.0), yaw, 0.8, 0.2, 1.0), ground).item.vertices

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.scene import Mesh, box, dihedral, plate, sphere, text, trihedral
+from invertwin.scene import Mesh, box, cylinder, dihedral, plate, sphere, text, trihedral
 
 
 def crosses(mesh: Mesh) -> torch.Tensor:
@@ -70,6 +70,16 @@ def test_sphere_converges():
     assert torch.allclose(radii, torch.full_like(radii, 0.15), rtol=1e-14)
     errors = [4 / 3 * math.pi - volume(sphere(1.0, n)) for n in (2, 3)]
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.02)
+
+
+def test_cylinder_stands_upright():
+    mesh = cylinder(0.2, 0.9, 64)
+    assert unmatched_edges(mesh) == 0
+    assert extent(mesh)[1] == pytest.approx(0.9)
+    # That of a prism of 64 sides.
+    base = 32 * math.sin(2 * math.pi / 64) * 0.2**2
+    assert volume(mesh) == pytest.approx(0.9 * base)
+    assert torch.linalg.vector_norm(mesh.vertices[:, [0, 2]], dim=1).max() == pytest.approx(0.2)
 
 
 def test_dihedral_is_a_right_angle_open_to_the_radar():

@@ -1,0 +1,138 @@
+"""`invertwin twin`: files, tables, and what it refuses."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+import torch
+
+import invertwin as iw
+from cli.small import call
+from invertwin.capture import Capture
+from invertwin.cli.run_file import load_run
+from invertwin.scene import linear_array
+
+STILL = torch.zeros(1, 3, dtype=torch.float64)
+RUN = """
+task = "twin"
+seed = 2
+
+[scene.low_box]
+shape = "box"
+size = [0.5, 0.9, 0.4]
+position = [0.1, 0.45, 0.2]
+material = { kind = "rough_dielectric", permittivity = 4.0 }
+
+[radar]
+orientation = { look_at = [0.0, 0.6, 0.0] }
+positions = [
+    [1.8, 0.6, 0.0], [1.27, 0.6, 1.27], [0.0, 0.6, 1.8], [-1.27, 0.6, 1.27],
+    [-1.8, 0.6, 0.0], [-1.27, 0.6, -1.27], [0.0, 0.6, -1.8], [1.27, 0.6, -1.27],
+]
+
+[radar.waveform]
+kind = "fmcw"
+start_frequency = 77e9
+bandwidth = 4e9
+duration = 50e-6
+samples = 128
+
+[radar.transmitters]
+kind = "positions"
+positions = [[0.0, 0.0, 0.0]]
+pattern = { kind = "cosine", exponent = 1.0 }
+
+[radar.receivers]
+kind = "linear"
+count = 8
+spacing = 1.898e-3
+pattern = { kind = "cosine", exponent = 1.0 }
+
+[grid]
+range_min = 0.5
+range_max = 3.0
+
+[data]
+kind = "simulated"
+depth = 1
+points_per_m2 = 500.0
+snr_db = 15.0
+
+[twin]
+low = [-1.0, -1.0]
+high = [1.0, 1.0]
+level = 0.0
+rays = 1500
+"""
+
+
+@pytest.mark.slow
+def test_what_is_found_can_be_fitted_on(tmp_path: Path, monkeypatch, capsys):
+    (tmp_path / "box.toml").write_text(RUN)
+    given = ["twin", str(tmp_path / "box.toml"), "-o", str(tmp_path / "found")]
+    assert call(monkeypatch, *given) == 0, capsys.readouterr().err
+    folder = tmp_path / "found"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["count"] == metrics["true_count"] == 1
+    assert metrics["chamfer_m"] < 0.05
+    (thing,) = metrics["things"]
+    assert thing["kind"] == "box"
+    assert thing["position_m"][0] == pytest.approx(0.1, abs=0.03)
+    assert thing["position_m"][2] == pytest.approx(0.2, abs=0.03)
+    assert 0 < thing["deviations"]["x"] < 0.05
+    assert "object_1" in capsys.readouterr().out
+    assert {"twin.glb", "report.html", "ground.png", "maps.png", "capture.nc"} <= {
+        file.name for file in folder.iterdir()
+    }
+    run = load_run(folder / "twin.toml")
+    assert run.scene["object_1"].position == pytest.approx(thing["position_m"])
+    # The capture that it wrote gives the same things again.
+    options = ["--low", "-1", "-1", "--high", "1", "1", "--level", "0", "--rays", "1500"]
+    again = ["twin", str(folder / "capture.nc"), *options, "-o", str(tmp_path / "again")]
+    assert call(monkeypatch, *again) == 0, capsys.readouterr().err
+    (other,) = json.loads((tmp_path / "again" / "metrics.json").read_text())["things"]
+    assert other["position_m"] == pytest.approx(thing["position_m"], abs=1e-3)
+    described = tomllib.loads((folder / "twin.toml").read_text())
+    assert described["data"]["file"] == "capture.nc"
+
+
+def test_noise_has_nothing_in_it(tmp_path: Path, monkeypatch, capsys):
+    chirp = iw.FMCW(start_frequency=77e9, bandwidth=4e9, duration=50e-6, samples=64)
+    radar = iw.Radar(linear_array(1, 1.8e-3), linear_array(4, 1.8e-3), chirp, STILL)
+    beat = torch.randn(1, 1, 4, 64, dtype=torch.complex128, generator=torch.manual_seed(0))
+    Capture.from_beat(1e-6 * beat, radar).save(tmp_path / "noise.nc")
+    given = ["twin", str(tmp_path / "noise.nc"), "-o", str(tmp_path / "found")]
+    assert call(monkeypatch, *given) == 0, capsys.readouterr().err
+    metrics = json.loads((tmp_path / "found" / "metrics.json").read_text())
+    assert metrics["count"] == 0
+    assert metrics["notes"] == ["nothing is above the noise"]
+    assert not (tmp_path / "found" / "twin.glb").exists()
+    assert "nothing is above the noise" in (tmp_path / "found" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "said"),
+    [
+        ("none.nc", [], "no file"),
+        ("noise.toml", [], "noise.toml"),
+        ("raw.bin", [], "--board"),
+        ("raw.bin", ["--board", "xWR9999", "--config", "raw.cfg"], "xWR1642"),
+        ("noise.nc", ["--range-max", "0.01"], "range_max"),
+    ],
+)
+def test_what_it_cannot_do_is_one_line(
+    tmp_path: Path, monkeypatch, capsys, name: str, options: list[str], said: str
+):
+    chirp = iw.FMCW(start_frequency=77e9, bandwidth=4e9, duration=50e-6, samples=64)
+    radar = iw.Radar(linear_array(1, 1.8e-3), linear_array(4, 1.8e-3), chirp, STILL)
+    beat = torch.randn(1, 1, 4, 64, dtype=torch.complex128, generator=torch.manual_seed(0))
+    Capture.from_beat(1e-6 * beat, radar).save(tmp_path / "noise.nc")
+    (tmp_path / "raw.bin").write_bytes(bytes(4096))
+    (tmp_path / "noise.toml").write_text("[samples]\nfile = 'none.npy'\n")
+    given = ["twin", str(tmp_path / name), *options, "-o", str(tmp_path / "found")]
+    assert call(monkeypatch, *given) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert "Traceback" not in err
+    assert not (tmp_path / "found" / "metrics.json").exists()
