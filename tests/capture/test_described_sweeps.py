@@ -2,6 +2,7 @@
 
 import math
 import re
+from typing import Any
 
 import h5py
 import numpy as np
@@ -205,7 +206,7 @@ range_origin = "{of}r0"
 """
 
 
-def history(point):
+def history(point) -> dict[str, Any]:
     """exp(−4πj f (|p − x| − r0)/c) of a point, and where the antenna was."""
     turn = np.radians(np.linspace(-5, 5, 64))
     x, y, z = 800 * np.sin(turn), -800 * np.cos(turn), np.full(64, 600.0)

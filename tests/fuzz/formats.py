@@ -284,7 +284,7 @@ range_origin = "r0"
 def _sweeps() -> list[Files]:
     def history(folder: Path) -> str:
         (folder / "pass.toml").write_text(_PASS)
-        rows = {name: np.arange(3.0) for name in ("x", "y", "z", "r0")}
+        rows: dict[str, Any] = {name: np.arange(3.0) for name in ("x", "y", "z", "r0")}
         fp = np.ones((4, 3), complex)
         np.savez(folder / "pass.npz", fp=fp, freq=1e9 + 1e6 * np.arange(4), **rows)
         return "pass.toml"

@@ -1,5 +1,6 @@
 """The picture of a twin shows things, blind places and movers."""
 
+import numpy as np
 import torch
 
 from invertwin.discovery import Figure, Picture, Thing, Twin
@@ -23,10 +24,10 @@ def test_the_ground_shows_things_movers_and_blind_places():
     assert "object_1: box" in texts
     assert "mover_1: point" in texts
     seen, blind = axes.collections
-    assert len(seen.get_offsets()) == 7
-    assert len(blind.get_offsets()) == 2
+    assert len(np.asarray(seen.get_offsets())) == 7
+    assert len(np.asarray(blind.get_offsets())) == 2
     (ellipse,) = axes.patches
     assert (ellipse.width, ellipse.height) == (0.4, 0.8)
-    outline = axes.lines[0].get_xydata()
+    outline = np.asarray(axes.lines[0].get_xydata())
     assert len(outline) == 5
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "z [m]")

@@ -126,9 +126,10 @@ def test_the_recording_calibrated_on_one_reflector(data_folder):
 def test_a_measured_pass_is_centred_beyond_its_unambiguous_range(data_folder):
     """As sweeps of 5 m of ambiguity, centred between reflectors 7 and 8 m away: the same image."""
     capture = read(data_folder / "rail_sar")
-    assert capture.survey is not None
-    capture = calibrate(capture, capture.survey[0])
-    center = capture.survey.mean(0)
+    survey = capture.survey
+    assert survey is not None
+    capture = calibrate(capture, survey[0])
+    center = survey.mean(0)
     for max_range, centered in ((12.0, False), (5.0, True)):
         step = SPEED_OF_LIGHT / 2 / max_range
         sweep = SteppedFrequency(3.1e9, step, int(1.7e9 / step), 1e-6)
@@ -141,7 +142,7 @@ def test_a_measured_pass_is_centred_beyond_its_unambiguous_range(data_folder):
         back = radar.origins[:, None] * sweep.frequencies
         beat = response.conj() * torch.exp(-4j * torch.pi * back / SPEED_OF_LIGHT)
         swept = Capture.from_beat(beat[:, None, None], radar)
-        for target, error in zip(capture.survey, (0.02, 0.17), strict=True):
+        for target, error in zip(survey, (0.02, 0.17), strict=True):
             line = torch.linspace(-0.3, 0.3, 121, dtype=torch.float64)
             offset = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1))
             image = backproject(swept, target + offset).abs()
