@@ -254,7 +254,13 @@ def coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
 
 
 def map_derivatives(fit: Fit, found: Sequence[Coordinate], number: int) -> list[Tensor]:
-    """For every observation the derivatives of its predicted map [coordinate, …]."""
+    """For every observation the derivatives of its predicted map [coordinate, …].
+
+    Args:
+        fit: At its end.
+        found: What the maps are derived by.
+        number: Other numbers have other random numbers.
+    """
     rows: list[list[Tensor]] = []
     for coordinate in told(found, "derivatives"):
         with forward_ad.dual_level(), along(fit.modules, coordinate.tangents):
