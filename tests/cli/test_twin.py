@@ -85,6 +85,8 @@ def test_what_is_found_can_be_fitted_on(tmp_path: Path, monkeypatch, capsys):
     assert {"twin.glb", "report.html", "ground.png", "maps.png", "capture.nc"} <= {
         file.name for file in folder.iterdir()
     }
+    command = "twin capture.nc --low -1.0 -1.0 --high 1.0 1.0 --level 0.0 --up y --rays 1500"
+    assert command in (folder / "report.html").read_text()
     run = load_run(folder / "twin.toml")
     assert run.scene["object_1"].position == pytest.approx(thing["position_m"])
     # The capture that it wrote gives the same things again.
@@ -117,7 +119,7 @@ def test_noise_has_nothing_in_it(tmp_path: Path, monkeypatch, capsys):
         ("none.nc", [], "no file"),
         ("noise.toml", [], "noise.toml"),
         ("raw.bin", [], "--board"),
-        ("raw.bin", ["--board", "xWR9999", "--config", "raw.cfg"], "xWR1642"),
+        ("raw.bin", ["--board", "xWR9999", "--config", "raw.cfg"], "raw.cfg"),
         ("noise.nc", ["--range-max", "0.01"], "range_max"),
     ],
 )

@@ -80,7 +80,19 @@ def run_twin(find: Find, folder: RunFolder) -> list[Table]:
     title = find.recording.name
     still = still_capture(recording)
     still.save(folder.file("capture.nc"))
-    return finish(folder, metrics, title, f"{said}.", parts, again="twin capture.nc")
+    # Movers are in the chirps alone, which a capture does not keep.
+    name = title if isinstance(recording, ChirpCapture) else "capture.nc"
+    again = " ".join(["twin", name, *_stated(options | {"up": up, "rays": rays})])
+    return finish(folder, metrics, title, f"{said}.", parts, again=again)
+
+
+def _stated(options: dict[str, Any]) -> list[str]:
+    """Options as the command line takes them."""
+    found: list[str] = []
+    for name, value in options.items():
+        values = value if isinstance(value, list | tuple) else [value]
+        found += [f"--{name.replace('_', '-')}", *(str(number) for number in values)]
+    return found
 
 
 def _of_run_file(

@@ -21,17 +21,18 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
     figure = Figure(figsize=(7.5, 6.2), layout="constrained")
     axes = figure.subplots()
     names = [f"{'xyz'[axis]} [m]" for axis in twin.ground.level]
-    axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
+    axes.set(xlabel=names[0], ylabel=names[1], aspect="equal", facecolor="black")
     if twin.picture is not None and len(twin.picture.places):
         places, strength = numbers(twin.picture.places), numbers(twin.picture.strength)
-        top = max(float(strength.max()), 1e-300)
+        # A single glint would leave all else dark.
+        top = max(float(np.quantile(strength, 0.998)), 1e-300)
         level = np.clip(10 * np.log10(np.maximum(strength, 1e-30) / top), -dynamic_range, 0)
         blind = numbers(twin.picture.views) == 0
         side = 72 * 5 / max(float(np.ptp(places, axis=0).max()), 1e-6) * _step(places)
-        style = {"s": max(side, 1.0) ** 2, "marker": "s", "linewidths": 0}
+        style = {"s": max(1.3 * side, 1.0) ** 2, "marker": "s", "linewidths": 0}
         dots = axes.scatter(*places[~blind].T, c=level[~blind], cmap="magma", **style)
         axes.scatter(*places[blind].T, color="0.75", label="never seen", **style)
-        figure.colorbar(dots, label="echoes, dB below the strongest", shrink=0.8)
+        figure.colorbar(dots, label="echoes, dB below bright ones", shrink=0.8)
     for thing in twin.things:
         x, y = (float(thing.position[axis]) for axis in twin.ground.level)
         at = (x, y)
@@ -48,7 +49,12 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
             if math.hypot(*speed) > 0:
                 axes.annotate("", (x + speed[0], y + speed[1]), at, arrowprops={"arrowstyle": "->"})
         axes.annotate(
-            f"{thing.name}: {thing.kind}", at, fontsize=7, xytext=(4, 4), textcoords="offset points"
+            f"{thing.name}: {thing.kind}",
+            at,
+            fontsize=7,
+            xytext=(14, 14),
+            textcoords="offset points",
+            bbox={"boxstyle": "round", "facecolor": "white", "alpha": 0.8, "linewidth": 0},
         )
     if twin.picture is not None and bool((twin.picture.views == 0).any()):
         axes.legend(fontsize=7, loc="upper right")
