@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.channel import Grid, Sight
 from invertwin.discovery.assembly import Assembly, sampling_of
-from invertwin.discovery.certainty import deviations, kind_probabilities, presence
+from invertwin.discovery.certainty import deviations, kind_probabilities, presence, rivals, widened
 from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
 from invertwin.discovery.outcome import Picture, Thing, Twin
 from invertwin.discovery.places import dense, movers, points_along
@@ -167,7 +167,8 @@ def _standing(
             notes = (_IMAGE_BETTER,)
     shapes, found = one.fitted(shapes, _STEPS)
     errors, sure = deviations(one, found), presence(one, shapes)
-    kinds = kind_probabilities(one, shapes)
+    among = rivals(one, shapes)
+    kinds = [kind_probabilities(row) for row in among]
     things = [
         Thing(
             f"object_{k}",
@@ -175,7 +176,7 @@ def _standing(
             kinds[k - 1],
             upright(shape, ground, level),
             shape,
-            _own(errors, f"object_{k}."),
+            widened(_own(errors, f"object_{k}."), among[k - 1], ground),
             sure[k - 1],
         )
         for k, shape in enumerate(shapes, 1)

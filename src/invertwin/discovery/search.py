@@ -10,8 +10,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.primitives import Figure
-from invertwin.discovery.proposals import bright, figures, groups
+from invertwin.discovery.primitives import Figure, turned
+from invertwin.discovery.proposals import CORNER, bright, figures, groups, headings, standing
 from invertwin.discovery.sharp_image import Response, sharpened, thinned
 from invertwin.inversion.initial import Ground
 
@@ -129,7 +129,7 @@ class Search:
                 break
         if not shapes:
             return []
-        shapes = self.merged(self.kinds(shapes))
+        shapes = self.merged(self.turns(self.kinds(shapes)))
         shapes, _ = self.fitted.fitted(shapes, _LONG)
         shapes = self.settled(self.heights(shapes))
         return self.alive(shapes)
@@ -204,10 +204,7 @@ class Search:
         rows = figures(lattice.places, part, self.ground, step=lattice.step, height=lattice.height)
         found: list[Figure] = []
         for row in rows:
-            # A matte wall of area A seen aslant: cross-section 4 β A cos²θ, half of it on average.
-            seen = 0.5 * math.pi * (row.length + row.width) * 1.5 * lattice.height
-            bright = max(float(part.sum()) / seen, 1e-4)
-            found.append(replace(row, brightness=bright))
+            found.append(replace(row, brightness=max(float(part.sum()) / section(row), 1e-4)))
         return found
 
     def best(self, known: Sequence[Figure], options: Iterable[Figure]) -> Figure:
@@ -248,14 +245,32 @@ class Search:
         Args:
             shapes: After a fit.
         """
-        fitted = {
-            kind: self.settled([as_kind(shape, kind) for shape in shapes])
-            for kind in ("box", "cylinder", "sphere")
-        }
+        return self.likeliest(shapes, other_kinds(self.fitted, shapes))
+
+    def turns(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes with a front, each of them turned as is likeliest, after a fit of every turn.
+
+        Args:
+            shapes: After a fit.
+        """
+        turns = (0.5 * math.pi, math.pi, 1.5 * math.pi)
+        others = [facing(shapes, turn, self.ground) for turn in turns]
+        return self.likeliest(shapes, [rows for rows in others if rows])
+
+    def likeliest(
+        self, shapes: Sequence[Figure], others: Sequence[Sequence[Figure]]
+    ) -> list[Figure]:
+        """Every shape as it is, or as it is in other lists after a fit, whichever is likelier.
+
+        Args:
+            shapes: After a fit.
+            others: Lists of as many shapes, which start fits.
+        """
+        fitted = [self.settled(rows) for rows in others]
         found = list(shapes)
         for number in range(len(found)):
             rest = [*found[:number], *found[number + 1 :]]
-            options = [found[number], *(rows[number] for rows in fitted.values())]
+            options = [found[number], *(rows[number] for rows in fitted)]
             found[number] = max(options, key=lambda one, rest=rest: self.evidence([*rest, one]))
         return found
 
@@ -285,7 +300,7 @@ class Search:
         return found
 
     def merged(self, shapes: Sequence[Figure]) -> list[Figure]:
-        """Shapes, with one box in place of two where that is likelier.
+        """Shapes, with one box, person or vehicle in place of two shapes where that is likelier.
 
         Args:
             shapes: After a fit.
@@ -303,7 +318,9 @@ class Search:
             a, b = min(pairs, key=lambda pair: apart(*pair, self.ground))
             tried.add((a, b))
             rest = [shape for shape in found if shape is not a and shape is not b]
-            one = self.best(rest, [around((a, b), turn, self.ground) for turn in _TURNS])
+            boxes = [around((a, b), turn, self.ground) for turn in _TURNS]
+            least = min(boxes, key=lambda one: one.length * one.width)
+            one = self.best(rest, [*boxes, *standing(least)])
             if self.evidence([*rest, one]) < self.evidence(found) - _HOPE:
                 continue
             new = self.settled([*rest, one])
@@ -315,6 +332,68 @@ _PARTS = (0.4, 0.55, 0.75, 1.35, 2.0)  # of a height that are tried
 _TURNS = tuple(k * math.pi / 16 for k in range(8))
 
 
+def section(figure: Figure) -> float:
+    """Radar cross-section of a shape of brightness 1, roughly, as a mean over directions [m²].
+
+    A matte surface of area A seen aslant has 4 A cos²θ, half of it on average.
+
+    Args:
+        figure: The shape.
+    """
+    if figure.kind == "corner":
+        return figure.length**2  # a quarter of its peak
+    if figure.ball:
+        return 0.5 * math.pi * figure.length**2
+    return 0.5 * math.pi * (figure.length + figure.width) * figure.height
+
+
+def other_kinds(one: Assembly, shapes: Sequence[Figure]) -> list[list[Figure]]:
+    """Shapes as other kinds, each time all that could be of that kind, before any fit.
+
+    Args:
+        one: Maps, which tell how a shape with a heading looks best.
+        shapes: As they are.
+    """
+    found = [[as_kind(shape, kind) for shape in shapes] for kind in ("box", "cylinder", "sphere")]
+    for kind in ("person", "vehicle", "corner"):
+        changed = list(shapes)
+        for number, shape in enumerate(shapes):
+            options = [row for row in _headed(shape) if row.kind == kind != shape.kind]
+            if options:
+                rest = [*shapes[:number], *shapes[number + 1 :]]
+                gains = [float(one.gains([*rest, option]).sum()) for option in options]
+                changed[number] = options[gains.index(max(gains))]
+        found.append(changed)
+    return [
+        rows for rows in found if any(new is not old for new, old in zip(rows, shapes, strict=True))
+    ]
+
+
+def facing(shapes: Sequence[Figure], turn: float, ground: Ground) -> list[Figure]:
+    """Shapes, those with a front turned; empty if none has one.
+
+    Args:
+        shapes: As they are.
+        turn: About the vertical [rad].
+        ground: The plane.
+    """
+    fronts = [shape.kind in ("person", "vehicle", "corner") for shape in shapes]
+    pairs = zip(shapes, fronts, strict=True)
+    rows = [turned(one, turn, ground) if front else one for one, front in pairs]
+    return rows if any(fronts) else []
+
+
+def _headed(shape: Figure) -> list[Figure]:
+    """What has a heading, and could be in place of a shape; as bright in all."""
+    box = shape if shape.boxed else as_kind(shape, "box")
+    rows = standing(box)
+    if max(shape.length, shape.width) < CORNER:
+        middle = shape.height if shape.ball else 0.5 * shape.height
+        rows += headings(Figure("corner", shape.place, height=middle))
+    strength = shape.brightness * section(shape)
+    return [replace(row, brightness=strength / section(row)) for row in rows]
+
+
 def as_kind(shape: Figure, kind: str) -> Figure:
     """A shape of another kind, of about the same size.
 
@@ -324,6 +403,8 @@ def as_kind(shape: Figure, kind: str) -> Figure:
     """
     if kind == shape.kind:
         return shape
+    if kind == "box" and shape.boxed:
+        return replace(shape, kind="box")
     if kind == "box":
         side = 0.85 * shape.length
         high = shape.height if shape.kind == "cylinder" else 2 * shape.height
@@ -331,9 +412,9 @@ def as_kind(shape: Figure, kind: str) -> Figure:
     mean = 0.5 * (shape.length + shape.width)
     across = mean if not shape.boxed else 1.1 * mean
     high = shape.height
-    if kind == "sphere" and shape.kind != "sphere":
+    if kind == "sphere" and not shape.ball:
         high = 0.5 * shape.height
-    elif kind == "cylinder" and shape.kind == "sphere":
+    elif kind == "cylinder" and shape.ball:
         high = 2 * shape.height
     return replace(shape, kind=kind, length=across, width=across, height=max(high, 0.05))
 
