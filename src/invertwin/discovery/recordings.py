@@ -19,6 +19,7 @@ from invertwin.discovery.places import dense, movers, points_along
 from invertwin.discovery.primitives import upright
 from invertwin.discovery.search import Lattice, Search
 from invertwin.discovery.sharp_image import Response, responses, thinned
+from invertwin.discovery.tracks import tracks
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
@@ -50,7 +51,8 @@ def twin(
     A sharp image shows where echoes come from. Bright places become shapes that stand on the
     ground; all shapes are fitted together, and evidence decides which kinds there are, which
     become one, and which are not there. Of recordings along a dense track of one channel, points
-    are found where echoes agree in phase. Of trains of chirps, what moves is found as well.
+    are found where echoes agree in phase. Of trains of chirps, what moves is found as well, and
+    followed where there are three frames or more with a known time between them.
 
     Args:
         recording: Of radars at known places.
@@ -86,7 +88,9 @@ def twin(
     if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
         farthest = min(range_max or math.inf, recording.max_range)
         near = _NEAREST * radar.waveform.range_resolution
-        moving = movers(recording, radar.grid(near, farthest))
+        known = recording.frame_period is not None and recording.frame_count > 2
+        grid = radar.grid(near, farthest)
+        moving = tracks(recording, grid, plane) if known else movers(recording, grid)
     if reach is None:
         said = "nothing that stands still is above the noise" if moving else _NOTHING
         return Twin(_surest_first(moving), plane, floor, notes=(said,))

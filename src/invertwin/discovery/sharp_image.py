@@ -52,7 +52,7 @@ def thinned(
         grid: Bins of the maps.
     """
     array = aperture(radar)
-    cells = [radar.waveform.range_resolution, *(_cell(p, radar) for p in (array.x, array.y))]
+    cells = [radar.waveform.range_resolution, *(cell_of(p, radar) for p in (array.x, array.y))]
     steps = [
         max(1, round(cell / step)) if count > 1 else 1
         for cell, step, count in zip(
@@ -71,8 +71,13 @@ def thinned(
     )
 
 
-def _cell(places: Float64[Tensor, " place"], radar: Radar) -> float:
-    """Width of a beam of elements in direction cosines."""
+def cell_of(places: Float64[Tensor, " place"], radar: Radar) -> float:
+    """Width of a beam of elements in direction cosines.
+
+    Args:
+        places: Of the elements along one axis [m].
+        radar: Its wavelength counts.
+    """
     if len(places) == 1:
         return 2.0
     extent = float(places.max() - places.min()) * len(places) / (len(places) - 1)

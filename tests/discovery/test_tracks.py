@@ -1,0 +1,67 @@
+"""What moves is followed from frame to frame."""
+
+import math
+
+import pytest
+import torch
+
+import invertwin as iw
+from invertwin.capture import ChirpCapture
+from invertwin.discovery import twin
+from invertwin.discovery.tracks import tracks
+from invertwin.inversion.initial import Ground
+from invertwin.radar import Chirps, add_noise
+from invertwin.scene import AntennaArray, RoughDielectric, linear_array, rigid, sphere
+
+CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=40e-6, samples=128)
+PERIOD, FRAMES = 0.15, 8
+STARTS = torch.tensor([[-0.8, 0.0, 2.0], [0.9, 0.0, 3.2]], dtype=torch.float64)
+RATES = torch.tensor([[0.8, 0.0, 1.0], [-0.7, 0.0, -1.4]], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def recording() -> ChirpCapture:
+    """Two balls that pass each other, before a board that rests."""
+    still = torch.zeros(1, 3, dtype=torch.float64)
+    radar = iw.Radar(AntennaArray(still), linear_array(8, CHIRP.wavelength / 2), CHIRP, still)
+    chirps = Chirps(32, 300e-6)
+    sampling = iw.Sampling(depth=1, points_per_m2=800.0, boundary=False)
+    beats = []
+    for frame in range(FRAMES):
+        scene = iw.Scene(
+            {
+                f"ball_{k}": iw.Object(
+                    sphere(0.06, 2),
+                    RoughDielectric(permittivity=5.0),
+                    rigid(translation=start + frame * PERIOD * rate),
+                    velocity=rate,
+                )
+                for k, (start, rate) in enumerate(zip(STARTS, RATES, strict=True))
+            }
+        )
+        beat = iw.simulate_chirps(scene, radar, chirps, seed=frame, sampling=sampling)
+        beats.append(add_noise(beat, snr_db=10.0, seed=frame))
+    radar = iw.Radar(radar.transmitters, radar.receivers, CHIRP, still.expand(FRAMES, 3))
+    return ChirpCapture(torch.cat(beats), radar, chirps, frame_period=PERIOD)
+
+
+def test_two_movers_are_followed(recording: ChirpCapture):
+    found = tracks(recording, recording.radar().grid(0.3, 6.0), Ground())
+    assert len(found) == 2
+    for one in found:
+        assert one.track is not None and one.velocity is not None
+        assert len(one.track.times) == FRAMES
+        assert float(one.track.times[-1]) == pytest.approx(PERIOD * (FRAMES - 1))
+        away = [float((one.track.positions[0] - start).norm()) for start in STARTS]
+        number = away.index(min(away))
+        rate, start = RATES[number], STARTS[number]
+        assert (one.velocity - rate).norm() < 0.3
+        for k, time in enumerate(one.track.times):
+            true = start + time * rate
+            # The nearest echo of a ball is its front.
+            true = true * (1 - 0.06 / true.norm())
+            for axis in "xz":
+                off = float(one.track.positions[k, "xyz".index(axis)] - true["xyz".index(axis)])
+                assert abs(off) < 3 * float(one.track.deviations[axis][k])
+        assert torch.equal(one.position, one.track.positions[-1])
+        assert one.row()["track"]["times_s"][0] == 0.0
