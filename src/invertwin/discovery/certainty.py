@@ -111,9 +111,13 @@ def rivals(one: Assembly, shapes: Sequence[Figure]) -> list[list[Rival]]:
         for number, (start, new, old) in enumerate(zip(changed, fitted, shapes, strict=True)):
             if start is old:
                 continue
-            swapped = one.gains([*shapes[:number], new, *shapes[number + 1 :]])
+            # A short fit stirs a shape up before it mends it.
+            options = [
+                (one.gains([*shapes[:number], r, *shapes[number + 1 :]]), r) for r in (start, new)
+            ]
+            swapped, rival = max(options, key=lambda option: float(option[0].sum()))
             right = min(max(surer(together, swapped), 1e-6), 1 - 1e-6)
-            found[number].append(Rival(new, (1 - right) / right))
+            found[number].append(Rival(rival, (1 - right) / right))
     totals = [sum(rival.weight for rival in row) for row in found]
     return [
         [replace(rival, weight=rival.weight / total) for rival in row]

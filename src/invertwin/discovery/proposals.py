@@ -154,7 +154,7 @@ def standing(around: Figure) -> list[Figure]:
         length, width, height = _PERSON
         rows += headings(replace(around, kind="person", length=length, width=width, height=height))
     (low, _, _), (high, wide, height) = SIZES["vehicle"]
-    if 0.5 * low < long < high and short < wide:
+    if 0.8 * low < long < high and short < wide:
         ahead = around.yaw if around.length >= around.width else around.yaw + 0.5 * math.pi
         rows += [
             replace(

@@ -19,6 +19,7 @@ _MOST = 24  # objects
 _ROUNDS = 3  # of births
 _NEAR = 0.5  # gap between what may be one [m]
 _HOPE = 100.0  # evidence that a fit may gain
+_WHOLE = 0.25  # side of the smallest shape that may be two [m]
 _SHORT, _LONG = 25, 50  # steps of fits
 _PATIENCE = 3  # groups in a row that explain nothing
 _DIM = 1e-3  # of all strength: dimmer groups wait for the next round
@@ -129,7 +130,7 @@ class Search:
                 break
         if not shapes:
             return []
-        shapes = self.merged(self.turns(self.kinds(shapes)))
+        shapes = self.split(self.merged(self.turns(self.kinds(shapes))))
         shapes, _ = self.fitted.fitted(shapes, _LONG)
         shapes = self.settled(self.heights(shapes))
         return self.alive(shapes)
@@ -270,7 +271,7 @@ class Search:
         found = list(shapes)
         for number in range(len(found)):
             rest = [*found[:number], *found[number + 1 :]]
-            options = [found[number], *(rows[number] for rows in fitted)]
+            options = [found[number], *(rows[number] for rows in (*others, *fitted))]
             found[number] = max(options, key=lambda one, rest=rest: self.evidence([*rest, one]))
         return found
 
@@ -297,6 +298,30 @@ class Search:
                 [shape, *options],
                 key=lambda one, rest=rest: self.evidence([*rest, one]),
             )
+        return found
+
+    def split(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes, with two boxes in place of one shape where that is likelier.
+
+        Two things that touch are one group of the image, and one shape at first.
+
+        Args:
+            shapes: After a fit.
+        """
+        found, tried = list(shapes), 0
+        while tried < len(found):
+            shape = found[tried]
+            rest = [*found[:tried], *found[tried + 1 :]]
+            tried += 1
+            if max(shape.length, shape.width) < _WHOLE or len(found) == _MOST:
+                continue
+            pairs = halves(shape, self.ground)
+            pair = max(pairs, key=lambda two, rest=rest: self.evidence([*rest, *two]))
+            if self.evidence([*rest, *pair]) < self.evidence(found) - _HOPE:
+                continue
+            new = self.settled([*rest, *pair])
+            if self.better(new, found):
+                found, tried = new, 0
         return found
 
     def merged(self, shapes: Sequence[Figure]) -> list[Figure]:
@@ -438,6 +463,28 @@ def around(shapes: Sequence[Figure], yaw: float, ground: Ground) -> Figure:
     return Figure(
         "box", (c * x - s * y, s * x + c * y), yaw, length, width, tall, brightest.brightness
     )
+
+
+def halves(shape: Figure, ground: Ground) -> list[tuple[Figure, Figure]]:
+    """Two boxes that together fill one shape, cut across either side at three places.
+
+    Args:
+        shape: Which is to be two.
+        ground: The plane.
+    """
+    box = around((shape,), shape.yaw if shape.boxed else 0.0, ground)
+    c, s = math.cos(ground.sense * box.yaw), math.sin(ground.sense * box.yaw)
+    found: list[tuple[Figure, Figure]] = []
+    for side, (x, y) in (("length", (c, s)), ("width", (-s, c))):
+        whole = getattr(box, side)
+        for share in (1 / 3, 1 / 2, 2 / 3):
+            rows: list[Figure] = []
+            for part, away in ((share, share - 1), (1 - share, share)):
+                shift = 0.5 * whole * away
+                place = box.place[0] + shift * x, box.place[1] + shift * y
+                rows.append(replace(box, place=place, **{side: part * whole}))
+            found.append((rows[0], rows[1]))
+    return found
 
 
 def apart(first: Figure, second: Figure, ground: Ground) -> float:
