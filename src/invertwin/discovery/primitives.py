@@ -33,6 +33,9 @@ THIN = 0.06
 """A box that is thinner than this, and three times as long, is a wall [m]."""
 SMALL = 0.06
 """What is smaller than this is a point [m]."""
+NARROW = 9.0
+"""Power of the cosine with which the echo of a trihedral corner falls off the way it opens."""
+_NARROW = NARROW - 2  # beside the cos² of any plate
 _FACE = 0.03  # side of the plate that stands for a corner reflector [m]
 _LEAST, _MOST = (0.01, 0.01, 0.01), (10.0, 10.0, 10.0)
 SIZES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
@@ -54,13 +57,16 @@ class Matte(Material):
 
     Attributes:
         brightness: Scattered over incident power; of every triangle, or of all.
+        falling: Power of the cosine of the angle of incidence with which it falls besides.
     """
 
     brightness: Tensor
+    falling: float = 0.0
 
     def surface(self, frequency: float) -> Surface:
         """The same at every frequency [Hz]."""
-        return Surface(torch.ones(256, dtype=torch.float64), self.brightness)
+        cosine = torch.linspace(0, 1, 256, dtype=torch.float64)
+        return Surface(cosine ** (0.5 * self.falling), self.brightness)
 
 
 @dataclass(frozen=True)
@@ -222,7 +228,7 @@ class Primitive(nn.Module):
         """The object, differentiable by all parameters."""
         mesh, brightness = self.mesh(), self.brightness
         if self.kind == "corner":
-            brightness = brightness * _front(self.ground.up)
+            return Object(mesh, Matte(brightness * _front(self.ground.up), _NARROW))
         return Object(mesh, Matte(brightness))
 
     def forward(self, scene: Scene) -> Scene:
@@ -282,6 +288,18 @@ def upright(figure: Figure, ground: Ground, level: float) -> Float64[Tensor, "3"
     half = figure.height if figure.ball else 0.5 * figure.height
     place[ground.vertical] = level + half
     return place
+
+
+def opening(yaw: float, ground: Ground) -> Float64[Tensor, "2"]:
+    """The way along the ground that a corner opens.
+
+    Args:
+        yaw: Of the corner [rad].
+        ground: The plane.
+    """
+    c, s = math.cos(ground.sense * yaw), math.sin(ground.sense * yaw)
+    ahead = -1.0 if ground.up == "y" else 1.0
+    return ahead * torch.tensor([-s, c], dtype=torch.float64)
 
 
 def turned(figure: Figure, turn: float, ground: Ground) -> Figure:

@@ -10,7 +10,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.primitives import Figure, turned
+from invertwin.discovery.clutter import HeavyTailed
+from invertwin.discovery.primitives import Figure, opening, turned
 from invertwin.discovery.proposals import CORNER, bright, figures, groups, headings, standing
 from invertwin.discovery.sharp_image import Response, sharpened, thinned
 from invertwin.inversion.initial import Ground
@@ -21,6 +22,8 @@ _NEAR = 0.5  # gap between what may be one [m]
 _HOPE = 100.0  # evidence that a fit may gain
 _WHOLE = 0.25  # side of the smallest shape that may be two [m]
 _SHORT, _LONG = 25, 50  # steps of fits
+_GLINTS = 4  # corner reflectors of a round
+_SEEN = 0.8  # cosine off the way a corner opens, up to which it is bright
 _PATIENCE = 3  # groups in a row that explain nothing
 _DIM = 1e-3  # of all strength: dimmer groups wait for the next round
 
@@ -158,7 +161,54 @@ class Search:
                 born.append((part, one))
             elif (vain := vain + 1) == _PATIENCE:
                 break  # dimmer groups tell no more
-        return [one for _, one in self.united(shapes, born)]
+        found = [one for _, one in self.united(shapes, born)]
+        return found + self.glints([*shapes, *found])
+
+    def glints(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Corner reflectors that explain what only some directions see.
+
+        An image of places that reflect alike in all directions does not show them.
+
+        Args:
+            shapes: What is known already.
+        """
+        one, lattice = self.fitted, self.lattice
+        power, coarse = thinned(one.power, one.radar, one.model.grid)
+        stride = round(coarse.range_step / one.model.grid.range_step)
+        level = one.loss.level[::stride]
+        rest, _ = thinned(one.predicted(shapes).double(), one.radar, one.model.grid)
+        loss = HeavyTailed(level, one.loss.degrees)
+        nothing = (power - level[:, None, None]).clamp_min(rest)
+        gain = lattice.response.means(loss.rows(rest, power) - loss.rows(nothing, power))
+        at = one.radar.positions.detach()[:, list(self.ground.level)]
+        way = torch.nn.functional.normalize(at[:, None] - lattice.places, dim=2)
+        yaws = [k * math.pi / 8 for k in range(16)]
+        score = torch.stack(
+            [((way @ opening(yaw, self.ground) > _SEEN) * gain).sum(0) for yaw in yaws]
+        )
+        found = list[Figure]()
+        for _ in range(_GLINTS):
+            best, yaw = score.amax(0), score.argmax(0)
+            place = int(best.argmax())
+            options = [
+                Figure(
+                    "corner",
+                    (float(lattice.places[place, 0]), float(lattice.places[place, 1])),
+                    yaws[int(yaw[place])],
+                    height=part * lattice.height,
+                    brightness=brightness,
+                )
+                for part in (0.6, 1.0, 1.5)
+                for brightness in (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+            ]
+            known = [*shapes, *found]
+            new = self.best(known, options)
+            if self.evidence([*known, new]) <= self.evidence(known):
+                break
+            found.append(new)
+            near = (lattice.places - lattice.places[place]).norm(dim=1) < _NEAR
+            score[:, near] = 0.0
+        return found
 
     def united(
         self, shapes: Sequence[Figure], born: Sequence[tuple[Tensor, Figure]]
@@ -249,7 +299,7 @@ class Search:
         return self.likeliest(shapes, other_kinds(self.fitted, shapes))
 
     def turns(self, shapes: Sequence[Figure]) -> list[Figure]:
-        """Shapes with a front, each of them turned as is likeliest, after a fit of every turn.
+        """Shapes, with people and vehicles turned as is likeliest, after a fit of every turn.
 
         Args:
             shapes: After a fit.
@@ -366,7 +416,7 @@ def section(figure: Figure) -> float:
         figure: The shape.
     """
     if figure.kind == "corner":
-        return figure.length**2  # a quarter of its peak
+        return 0.5 * figure.length**2  # an eighth of its peak
     if figure.ball:
         return 0.5 * math.pi * figure.length**2
     return 0.5 * math.pi * (figure.length + figure.width) * figure.height
@@ -395,14 +445,14 @@ def other_kinds(one: Assembly, shapes: Sequence[Figure]) -> list[list[Figure]]:
 
 
 def facing(shapes: Sequence[Figure], turn: float, ground: Ground) -> list[Figure]:
-    """Shapes, those with a front turned; empty if none has one.
+    """Shapes, with people and vehicles turned; empty if there are none.
 
     Args:
         shapes: As they are.
         turn: About the vertical [rad].
         ground: The plane.
     """
-    fronts = [shape.kind in ("person", "vehicle", "corner") for shape in shapes]
+    fronts = [shape.kind in ("person", "vehicle") for shape in shapes]
     pairs = zip(shapes, fronts, strict=True)
     rows = [turned(one, turn, ground) if front else one for one, front in pairs]
     return rows if any(fronts) else []
@@ -416,7 +466,10 @@ def _headed(shape: Figure) -> list[Figure]:
         middle = shape.height if shape.ball else 0.5 * shape.height
         rows += headings(Figure("corner", shape.place, height=middle))
     strength = shape.brightness * section(shape)
-    return [replace(row, brightness=strength / section(row)) for row in rows]
+    found = [replace(row, brightness=strength / section(row)) for row in rows]
+    # What is bright on one side only looked dim as something round.
+    more = [row for row in found if row.kind == "corner"]
+    return found + [replace(r, brightness=r.brightness * by) for r in more for by in (4.0, 16.0)]
 
 
 def as_kind(shape: Figure, kind: str) -> Figure:

@@ -16,6 +16,7 @@ from invertwin.radar import Radar
 from invertwin.radar.spectrum import aperture
 
 _LEAST = 1e-3  # of a response, relative to its peak: less is left out
+_NONE = 1e-30  # of a response: the place is out of sight [1/m²]
 _FINE = 32  # entries of a kernel's table in one bin
 _MOST = 8e7  # entries of the matrix: 8 bytes each
 
@@ -39,6 +40,19 @@ class Response:
             strength: Radar cross-section of every place [m²].
         """
         return torch.from_numpy(self.matrix @ strength.numpy()).reshape(self.shape)
+
+    def means(self, values: Float64[Tensor, "frame range u v"]) -> Float64[Tensor, "frame place"]:
+        """The mean of values over the bins of every place, frame by frame.
+
+        Args:
+            values: Of all bins.
+        """
+        bins = int(np.prod(self.shape[1:]))
+        found = []
+        for frame, row in enumerate(values.numpy().reshape(len(values), -1)):
+            part = sparse.csc_matrix(self.matrix[frame * bins : (frame + 1) * bins].T)
+            found.append((part @ row) / np.maximum(part @ np.ones(bins), _NONE))
+        return torch.from_numpy(np.stack(found))
 
 
 def thinned(
