@@ -1,13 +1,10 @@
 """What moves is followed from frame to frame."""
 
-import math
-
 import pytest
 import torch
 
 import invertwin as iw
 from invertwin.capture import ChirpCapture
-from invertwin.discovery import twin
 from invertwin.discovery.tracks import tracks
 from invertwin.inversion.initial import Ground
 from invertwin.radar import Chirps, add_noise
@@ -49,7 +46,8 @@ def test_two_movers_are_followed(recording: ChirpCapture):
     found = tracks(recording, recording.radar().grid(0.3, 6.0), Ground())
     assert len(found) == 2
     for one in found:
-        assert one.track is not None and one.velocity is not None
+        assert one.track is not None
+        assert one.velocity is not None
         assert len(one.track.times) == FRAMES
         assert float(one.track.times[-1]) == pytest.approx(PERIOD * (FRAMES - 1))
         away = [float((one.track.positions[0] - start).norm()) for start in STARTS]
