@@ -56,14 +56,19 @@ def search_of(scene: iw.Scene, count: int = 12) -> Search:
 def test_halves_fill_the_whole(up):
     ground = Ground(up)
     pairs = halves(BOX, ground)
-    assert len(pairs) == 6
-    for pair in pairs:
-        assert sum(one.length * one.width for one in pair) == pytest.approx(0.8 * 0.2)
-        whole, parts = outline(BOX, ground), torch.cat([outline(one, ground) for one in pair])
-        # Every corner of the whole is one of a part, and no part reaches beyond.
-        assert float(torch.cdist(whole, parts).amin(1).max()) < 1e-9
-        middle = torch.tensor(BOX.place, dtype=torch.float64)
+    assert len(pairs) == 42
+    middle = torch.tensor(BOX.place, dtype=torch.float64)
+    whole = outline(BOX, ground)
+    for number, pair in enumerate(pairs):
+        area = sum(one.length * one.width for one in pair) / (0.8 * 0.2)
+        parts = torch.cat([outline(one, ground) for one in pair])
+        # No part reaches beyond the whole.
         assert float((parts - middle).norm(dim=1).max()) < 0.5 * math.hypot(0.8, 0.2) + 1e-9
+        if number % 7:
+            assert area < 0.9
+        else:
+            assert area == pytest.approx(1.0)
+            assert float(torch.cdist(whole, parts).amin(1).max()) < 1e-9
     post = Figure("cylinder", (0.0, 0.0), 0.0, 0.4, 0.4, 1.0)
     assert {one.kind for pair in halves(post, ground) for one in pair} == {"box"}
 
@@ -95,7 +100,6 @@ def test_one_shape_about_two_things_is_split():
     search = search_of(scene)
     whole = search.settled([Figure("box", (-0.05, 0.1), 0.0, 1.1, 0.4, 0.9, 0.1)])
     found = search.alive(search.kinds(search.split(whole)))
-    print(found)
     assert len(found) == 2
     assert search.evidence(found) > search.evidence(whole)
     away = torch.cdist(

@@ -20,6 +20,7 @@ _MOST = 24  # objects
 _ROUNDS = 3  # of births
 _NEAR = 0.5  # gap between what may be one [m]
 _HOPE = 100.0  # evidence that a fit may gain
+_SLIM = 0.4  # of a side: how wide the slimmer half of a shape is at first
 _WHOLE = 0.25  # side of the smallest shape that may be two [m]
 _SHORT, _LONG = 25, 50  # steps of fits
 _GLINTS = 4  # corner reflectors of a round
@@ -203,6 +204,9 @@ class Search:
             ]
             known = [*shapes, *found]
             new = self.best(known, options)
+            for _ in range(2):
+                # Narrow in place and heading, so that a fit would start beside its minimum.
+                new = self.best(known, nudged(new, lattice.step))
             if self.evidence([*known, new]) <= self.evidence(known):
                 break
             found.append(new)
@@ -367,7 +371,8 @@ class Search:
                 continue
             pairs = halves(shape, self.ground)
             pair = max(pairs, key=lambda two, rest=rest: self.evidence([*rest, *two]))
-            if self.evidence([*rest, *pair]) < self.evidence(found) - _HOPE:
+            # Cuts are many enough for the right one to be likelier before any fit.
+            if self.evidence([*rest, *pair]) < self.evidence(found):
                 continue
             new = self.settled([*rest, *pair])
             if self.better(new, found):
@@ -472,6 +477,23 @@ def _headed(shape: Figure) -> list[Figure]:
     return found + [replace(r, brightness=r.brightness * by) for r in more for by in (4.0, 16.0)]
 
 
+def nudged(shape: Figure, step: float) -> list[Figure]:
+    """A shape, moved, turned, lifted, or brighter or dimmer by a little.
+
+    Args:
+        shape: As it is.
+        step: Along the ground [m].
+    """
+    x, y = shape.place
+    moves = [(x + a * step, y + b * step) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+    return [
+        *(replace(shape, place=place) for place in moves),
+        *(replace(shape, yaw=shape.yaw + turn) for turn in (-0.2, 0.2)),
+        *(replace(shape, height=shape.height * part) for part in (0.75, 1.3)),
+        *(replace(shape, brightness=shape.brightness * part) for part in (0.6, 1.7)),
+    ]
+
+
 def as_kind(shape: Figure, kind: str) -> Figure:
     """A shape of another kind, of about the same size.
 
@@ -519,24 +541,39 @@ def around(shapes: Sequence[Figure], yaw: float, ground: Ground) -> Figure:
 
 
 def halves(shape: Figure, ground: Ground) -> list[tuple[Figure, Figure]]:
-    """Two boxes that together fill one shape, cut across either side at three places.
+    """Two boxes in place of one shape: cut across either side at three places, one of them slim.
 
     Args:
         shape: Which is to be two.
         ground: The plane.
+
+    Returns:
+        For each cut both whole, and either one slim, along each edge or the middle of the shape.
     """
     box = around((shape,), shape.yaw if shape.boxed else 0.0, ground)
     c, s = math.cos(ground.sense * box.yaw), math.sin(ground.sense * box.yaw)
+
+    def part(along: int, share: float, away: float, wide: float, off: float) -> Figure:
+        """A part of the box, its sides as shares of the whole's, its middle off by halves of it."""
+        sides, shift = [box.length, box.width], [0.0, 0.0]
+        shift[along], shift[1 - along] = 0.5 * sides[along] * away, 0.5 * sides[1 - along] * off
+        sides[along] *= share
+        sides[1 - along] *= wide
+        x, y = c * shift[0] - s * shift[1], s * shift[0] + c * shift[1]
+        place = box.place[0] + x, box.place[1] + y
+        return replace(box, place=place, length=sides[0], width=sides[1])
+
     found: list[tuple[Figure, Figure]] = []
-    for side, (x, y) in (("length", (c, s)), ("width", (-s, c))):
-        whole = getattr(box, side)
+    slim = [(_SLIM, off) for off in (_SLIM - 1, 0.0, 1 - _SLIM)]
+    for along in (0, 1):
         for share in (1 / 3, 1 / 2, 2 / 3):
-            rows: list[Figure] = []
-            for part, away in ((share, share - 1), (1 - share, share)):
-                shift = 0.5 * whole * away
-                place = box.place[0] + shift * x, box.place[1] + shift * y
-                rows.append(replace(box, place=place, **{side: part * whole}))
-            found.append((rows[0], rows[1]))
+            whole, other = (share, share - 1), (1 - share, share)
+            for first, second in (
+                ((1.0, 0.0), (1.0, 0.0)),
+                *((one, (1.0, 0.0)) for one in slim),
+                *(((1.0, 0.0), one) for one in slim),
+            ):
+                found.append((part(along, *whole, *first), part(along, *other, *second)))
     return found
 
 
