@@ -5,6 +5,7 @@ import torch
 
 import invertwin as iw
 from invertwin.capture import ChirpCapture
+from invertwin.discovery import still_capture
 from invertwin.discovery.tracks import tracks
 from invertwin.inversion.initial import Ground
 from invertwin.radar import Chirps, add_noise
@@ -16,13 +17,13 @@ STARTS = torch.tensor([[-0.8, 0.0, 2.0], [0.9, 0.0, 3.2]], dtype=torch.float64)
 RATES = torch.tensor([[0.8, 0.0, 1.0], [-0.7, 0.0, -1.4]], dtype=torch.float64)
 
 
-@pytest.fixture(scope="module")
-def recording() -> ChirpCapture:
-    """Two balls that pass each other, before a board that rests."""
+def recorded(rates: torch.Tensor, own: torch.Tensor) -> ChirpCapture:
+    """Two balls before a board that moves; each frame is made where the board rests."""
     still = torch.zeros(1, 3, dtype=torch.float64)
-    radar = iw.Radar(AntennaArray(still), linear_array(8, CHIRP.wavelength / 2), CHIRP, still)
     chirps = Chirps(32, 300e-6)
     sampling = iw.Sampling(depth=1, points_per_m2=800.0, boundary=False)
+    places = PERIOD * torch.arange(FRAMES, dtype=torch.float64)[:, None] * own
+    radar = iw.Radar(AntennaArray(still), linear_array(8, CHIRP.wavelength / 2), CHIRP, still)
     beats = []
     for frame in range(FRAMES):
         scene = iw.Scene(
@@ -30,19 +31,20 @@ def recording() -> ChirpCapture:
                 f"ball_{k}": iw.Object(
                     sphere(0.06, 2),
                     RoughDielectric(permittivity=5.0),
-                    rigid(translation=start + frame * PERIOD * rate),
-                    velocity=rate,
+                    rigid(translation=start + frame * PERIOD * rate - places[frame]),
+                    velocity=rate - own,
                 )
-                for k, (start, rate) in enumerate(zip(STARTS, RATES, strict=True))
+                for k, (start, rate) in enumerate(zip(STARTS, rates, strict=True))
             }
         )
         beat = iw.simulate_chirps(scene, radar, chirps, seed=frame, sampling=sampling)
         beats.append(add_noise(beat, snr_db=10.0, seed=frame))
-    radar = iw.Radar(radar.transmitters, radar.receivers, CHIRP, still.expand(FRAMES, 3))
+    radar = iw.Radar(radar.transmitters, radar.receivers, CHIRP, places)
     return ChirpCapture(torch.cat(beats), radar, chirps, frame_period=PERIOD)
 
 
-def test_two_movers_are_followed(recording: ChirpCapture):
+def test_two_movers_are_followed():
+    recording = recorded(RATES, torch.zeros(3, dtype=torch.float64))
     found = tracks(recording, recording.radar().grid(0.3, 6.0), Ground())
     assert len(found) == 2
     for one in found:
@@ -63,3 +65,19 @@ def test_two_movers_are_followed(recording: ChirpCapture):
                 assert abs(off) < 3 * float(one.track.deviations[axis][k])
         assert torch.equal(one.position, one.track.positions[-1])
         assert one.row()["track"]["times_s"][0] == 0.0
+
+
+def test_what_only_the_radar_moves_past_is_at_rest():
+    """A drive: the far ball rests, the near one moves; its velocity is that along the ground."""
+    rates = RATES.clone()
+    rates[1] = 0.0
+    own = torch.tensor([0.0, 0.0, 1.2], dtype=torch.float64)
+    recording = recorded(rates, own)
+    (found,) = tracks(recording, recording.radar().grid(0.3, 6.0), Ground())
+    assert found.velocity is not None
+    assert (found.velocity - rates[0]).norm() < 0.4
+    end = STARTS[0] + PERIOD * (FRAMES - 1) * rates[0]
+    assert (found.position - end).norm() < 0.2
+    # The mean of its chirps would lose what rests.
+    still = still_capture(recording)
+    assert torch.equal(still.beat, recording.beat[:, 16])

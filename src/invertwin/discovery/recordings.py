@@ -15,7 +15,7 @@ from invertwin.discovery.assembly import Assembly, sampling_of
 from invertwin.discovery.certainty import deviations, kind_probabilities, presence, rivals, widened
 from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
 from invertwin.discovery.outcome import Picture, Thing, Twin
-from invertwin.discovery.places import dense, movers, points_along
+from invertwin.discovery.places import dense, movers, own_velocities, points_along
 from invertwin.discovery.primitives import upright
 from invertwin.discovery.search import Lattice, Search
 from invertwin.discovery.sharp_image import Response, responses, thinned
@@ -110,11 +110,18 @@ def twin(
 def still_capture(recording: Capture | ChirpCapture) -> Capture:
     """A recording with one signal a frame, in which what moves fades.
 
+    Of a radar that itself moves by a quarter of a wavelength or more in a frame, it is one chirp.
+
     Args:
         recording: Of any kind.
     """
     if isinstance(recording, Capture):
         return recording
+    chirps, radar = recording.chirps, recording.radar()
+    lasts = float(chirps.times(radar.shape[1])[-1].max())
+    way = float(own_velocities(recording).norm(dim=1).max()) * lasts
+    if way > 0.25 * radar.waveform.wavelength:
+        return recording.capture(chirps.count // 2)
     return replace(recording, moving=False).capture()
 
 

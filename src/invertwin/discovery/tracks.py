@@ -93,13 +93,12 @@ def _motion(period: float) -> tuple[Tensor, Tensor]:
 def _measured(one: Thing, recording: ChirpCapture, ground: Ground, frame: int) -> _Seen:
     axes = list(ground.level)
     radar = recording.radar()
-    way = (one.position - radar.positions[frame].detach())[axes]
-    distance = float(way.norm())
-    along = way / distance
+    sight = one.position - radar.positions[frame].detach()
+    along = torch.nn.functional.normalize(sight[axes], dim=0)
     across = torch.stack([-along[1], along[0]])
+    distance = float(sight.norm())
     assert one.velocity is not None
-    rate = float(one.velocity @ (one.position - radar.positions[frame].detach()))
-    rate /= float((one.position - radar.positions[frame].detach()).norm())
+    rate = float(one.velocity @ sight) / distance
     wide = _SHARE * cell_of(aperture(radar).x, radar) * distance
     noise = torch.zeros(3, 3, dtype=torch.float64)
     noise[:2, :2] = one.deviations["range"] ** 2 * torch.outer(along, along)
