@@ -27,6 +27,7 @@ import argparse
 import json
 import math
 import statistics
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +44,7 @@ from torch import Tensor
 import invertwin as iw
 from invertwin.channel import Sight
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import PhysicsWarning
 from invertwin.inversion.initial import linked, principal_rectangle
 from invertwin.radar import add_noise, ordered_statistics_cfar, peaks
 from invertwin.scene import (
@@ -142,7 +144,10 @@ class Thing:
         link, count = radar.link(), 33
         away = radar.positions - self.middle
         band = CHIRP.start_frequency + torch.linspace(0, CHIRP.bandwidth, count).double()
-        found = iw.rcs(corner, away @ self.turn, band, up=(0.0, 1.0, 0.0), edges=1)
+        with warnings.catch_warnings():
+            # Edges seen at grazing are left out: they are 40 dB below what matters.
+            warnings.simplefilter("ignore", PhysicsWarning)
+            found = iw.rcs(corner, away @ self.turn, band, up=(0.0, 1.0, 0.0), edges=1)
         frequency = CHIRP.start_frequency + CHIRP.step * torch.arange(CHIRP.samples).double()
         # Smooth over frequency, with the apex for its origin.
         spline = make_interp_spline(band.numpy(), found.matrix[:, :, 0, 0].numpy())

@@ -94,3 +94,17 @@ def test_the_usual_chain_finds_a_ball(rooms):
     room = rooms.Room(0, (ball,), tuple(torch.arange(8).double().tolist()), 20.0)
     (found,) = rooms.conventional(room.capture())
     assert math.dist(found, (0.4, -0.3)) < 0.15
+
+
+@pytest.mark.slow
+def test_a_corner_beside_a_box_is_a_corner(rooms):
+    corner = rooms.Thing("corner", (0.9, -0.4), -math.pi / 2, (0.05, 0.05, 0.05), 0.5, 1.0)
+    beside = rooms.Thing("box", (-0.5, 0.3), 0.4, (0.5, 0.8, 0.3), 0.4, 5.0)
+    turns = tuple((torch.arange(16).double() * (2 * math.pi / 16)).tolist())
+    row = rooms.Room(0, (beside, corner), turns, 10.0).row()
+    assert row["found"] == 2
+    assert [(pair["kind"], pair["called"]) for pair in row["matched"]] == [
+        ("box", "box"),
+        ("corner", "corner"),
+    ]
+    assert max(pair["error"] for pair in row["matched"]) < 0.05

@@ -19,7 +19,6 @@ from invertwin.scene import (
     RoughDielectric,
     Scene,
     Surface,
-    joined,
     person,
 )
 from invertwin.scene.checks import check_fields
@@ -75,7 +74,7 @@ class Figure:
 
     Attributes:
         kind: Its shape. A wall is a thin box, a point a small sphere. A person stands with hanging
-            arms. A vehicle is a hull with a cabin on it. A corner is a bright plate that reflects
+            arms. A vehicle is a car of usual proportions. A corner is a bright plate that reflects
             on one side: the way a corner reflector opens.
         place: Along the two axes of the ground [m].
         yaw: About the vertical, of all but round shapes [rad]. If it is 0, a vehicle looks along
@@ -352,13 +351,37 @@ def _standing() -> Mesh:
 
 
 def _vehicle() -> Mesh:
-    """A hull with a cabin over its rear two thirds, which looks along x."""
-    hull, cabin = box((1.0, 0.55, 1.0)), box((0.65, 0.5, 0.85))
-    placed = [
-        Mesh(part.vertices + torch.tensor([ahead, high, 0.0], dtype=torch.float64), part.faces)
-        for part, ahead, high in ((hull, 0.0, -0.225), (cabin, -0.12, 0.25))
-    ]
-    return joined(placed)
+    """A car that looks along x: octagons above each other, between them its skin."""
+    sides = 8
+    rings = torch.tensor([_octagon(*layer) for layer in _LAYERS], dtype=torch.float64).flatten(0, 1)
+    faces: list[list[int]] = []
+    for layer in range(len(_LAYERS) - 1):
+        for k in range(sides):
+            a, b = layer * sides + k, layer * sides + (k + 1) % sides
+            faces += [[a, b, a + sides], [b, b + sides, a + sides]]
+    for first in (0, (len(_LAYERS) - 1) * sides):
+        faces += [[first, first + k, first + k + 1] for k in range(1, sides - 1)]
+    return Mesh(rings, torch.tensor(faces))
+
+
+# Height, rear end, front end and width, as shares of those of a car: underbody, sills, bumpers and
+# shoulders, belt line, foot of the screens, roof.
+_LAYERS = (
+    (0.0, -0.30, 0.30, 0.5),
+    (0.15, -0.47, 0.46, 0.94),
+    (0.36, -0.50, 0.50, 1.0),
+    (0.58, -0.48, 0.45, 0.98),
+    (0.66, -0.45, 0.24, 0.92),
+    (1.0, -0.30, -0.02, 0.7),
+)
+
+
+def _octagon(high: float, rear: float, front: float, wide: float) -> list[list[float]]:
+    """Corners of one layer of a car: a rectangle whose corners are cut off."""
+    cut, aside = 0.07, 0.3 * wide
+    rows = [(front, aside), (front - cut, 0.5 * wide), (rear + cut, 0.5 * wide), (rear, aside)]
+    rows += [(x, -z) for x, z in reversed(rows)]
+    return [[x, high - 0.5, z] for x, z in rows]
 
 
 def _plate() -> Mesh:
