@@ -69,7 +69,7 @@ def run_twin(find: Find, folder: RunFolder) -> list[Table]:
     metrics["wall_seconds"] = time.perf_counter() - begin
     if scene is not None:
         save_mesh(folder.file("twin.glb"), scene)
-        folder.write_text("twin.toml", tomli_w.dumps(_described(found)))
+        folder.write_text("twin.toml", tomli_w.dumps(_described(found, folder)))
     parts: list[Table | Picture] = [_table(found)]
     parts += [
         picture(folder, "ground", pictures.ground(found), "The ground from above", "ground"),
@@ -130,7 +130,7 @@ def _scores(scene: Scene, truth: Scene) -> dict[str, Any]:
 def _table(found: Twin) -> Table:
     up = found.ground.vertical
     heads = ["thing", "kind", "confidence", *(f"{'xyz'[axis]} [m]" for axis in range(3))]
-    heads += ["± [m]", "yaw [°]", "length, width, height [m]", "range rate [m/s]"]
+    heads += ["± [m]", "yaw [°]", "length, width, height [m]", "speed [m/s]"]
     rows: list[list[Any]] = []
     for thing in found.things:
         figure = thing.figure
@@ -138,8 +138,8 @@ def _table(found: Twin) -> Table:
         known = [error for error in errors if error is not None]
         size, yaw, rate = None, None, None
         if figure is not None:
-            size = [figure.length, figure.width, figure.height]
-            yaw = math.degrees(figure.yaw) if figure.boxed else None
+            size = None if figure.kind == "corner" else [figure.length, figure.width, figure.height]
+            yaw = math.degrees(figure.yaw) if figure.turned else None
         if thing.velocity is not None:
             rate = float(thing.velocity.norm())
         share = f"{thing.kind} {thing.probabilities.get(thing.kind, 1.0):.2f}"
@@ -157,9 +157,9 @@ def _maps(found: Twin, folder: RunFolder) -> list[Picture]:
     return [picture(folder, "maps", spectrum(shown, found.grid), "Maps", "twin_maps")]
 
 
-def _described(found: Twin) -> dict[str, Any]:
+def _described(found: Twin, folder: RunFolder) -> dict[str, Any]:
     """A run file that simulates the things that have a shape, and fits their poses on."""
-    assert found.grid is not None
+    assert found.grid is not None and found.scene is not None
     scene: dict[str, Any] = {}
     axis = found.ground.vertical
     for thing in found.things:
@@ -171,7 +171,12 @@ def _described(found: Twin) -> dict[str, Any]:
         sides[found.ground.level[1]] = figure.width
         sides[axis] = figure.height
         shape: dict[str, Any] = {"shape": "sphere", "radius": 0.5 * figure.length}
-        if figure.boxed:
+        if figure.kind in ("person", "vehicle", "corner"):
+            item = found.scene.objects[thing.name]
+            mesh = replace(item.mesh, vertices=item.vertices - thing.position)
+            save_mesh(folder.file(f"{thing.name}.ply"), mesh)
+            shape = {"file": f"{thing.name}.ply"}
+        elif figure.boxed:
             shape = {"shape": "box", "size": sides, "rotation_deg": turn}
         elif figure.kind == "cylinder":
             shape = {"shape": "cylinder", "radius": 0.5 * figure.length, "height": figure.height}
