@@ -78,6 +78,9 @@ def run_twin(find: Find, folder: RunFolder) -> list[Table]:
     said = "; ".join(found.notes) or f"{len(sure)} things, {metrics['unsure']} unsure ones"
     title = find.recording.name
     still = still_capture(recording)
+    if found.calibration is not None:
+        found.calibration.save(folder.file("channels.json"))
+        still = found.calibration.apply(still)
     still.save(folder.file("capture.nc"))
     # Movers are in the chirps alone, which a capture does not keep.
     name = title if isinstance(recording, ChirpCapture) else "capture.nc"
@@ -203,6 +206,6 @@ def _described(found: Twin, folder: RunFolder) -> dict[str, Any]:
             "v_max": min(1.0, float(grid.v.abs().max())) if grid.v_count > 1 else 1.0,
         },
         "parameters": [{"kind": "translation", "object": name} for name in scene],
-        "loss": {"kind": "likelihood"},
+        "loss": {"kind": "heavy_tailed"},
         "reconstruct": {"depth": 1, "steps": 40, "samples": 100_000},
     }

@@ -7,6 +7,7 @@ from typing import Any
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
+from invertwin.capture import ChannelCalibration
 from invertwin.channel import Grid
 from invertwin.discovery.primitives import Figure, Primitive
 from invertwin.inversion.initial import Ground
@@ -119,6 +120,7 @@ class Twin:
         observed: Maps of the recording.
         grid: Their bins.
         notes: What to know of it, in sentences.
+        calibration: Of the channels, where the scene itself has told it; the maps have it applied.
     """
 
     things: tuple[Thing, ...]
@@ -129,6 +131,7 @@ class Twin:
     observed: Float[Tensor, "frame range u v"] | None = field(default=None, repr=False)
     grid: Grid | None = None
     notes: tuple[str, ...] = ()
+    calibration: ChannelCalibration | None = None
 
     @property
     def scene(self) -> Scene | None:

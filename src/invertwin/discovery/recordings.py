@@ -13,6 +13,7 @@ from invertwin.capture import Capture, ChirpCapture
 from invertwin.channel import Grid, Sight
 from invertwin.discovery.assembly import Assembly, sampling_of
 from invertwin.discovery.certainty import deviations, kind_probabilities, presence, rivals, widened
+from invertwin.discovery.channels import apart, channels_of_scene
 from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
 from invertwin.discovery.outcome import Picture, Thing, Twin
 from invertwin.discovery.places import dense, movers, own_velocities, points_along
@@ -52,7 +53,8 @@ def twin(
     ground; all shapes are fitted together, and evidence decides which kinds there are, which
     become one, and which are not there. Of recordings along a dense track of one channel, points
     are found where echoes agree in phase. Of trains of chirps, what moves is found as well, and
-    followed where there are three frames or more with a known time between them.
+    followed where there are three frames or more with a known time between them. Where several
+    positions show that the phases of the channels are wrong, they are calibrated first.
 
     Args:
         recording: Of radars at known places.
@@ -84,17 +86,15 @@ def twin(
     )
     plane_at = base if height is None else floor + checked_number(height, "height [m]", 0.0)
     reach = _reach(capture, range_max)
-    moving: list[Thing] = []
-    if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
-        farthest = min(range_max or math.inf, recording.max_range)
-        near = _NEAREST * radar.waveform.range_resolution
-        known = recording.frame_period is not None and recording.frame_count > 2
-        grid = radar.grid(near, farthest)
-        moving = tracks(recording, grid, plane) if known else movers(recording, grid)
     if reach is None:
+        moving = _moving(recording, range_max, plane)
         said = "nothing that stands still is above the noise" if moving else _NOTHING
         return Twin(_surest_first(moving), plane, floor, notes=(said,))
     places, step = _places(radar, plane, plane_at, reach, low, high)
+    told = channels_of_scene(capture, radar.grid(*reach), places)
+    if told is not None:
+        recording, capture = told.apply(recording), told.apply(capture)
+    moving = _moving(recording, range_max, plane)
     if dense(capture):
         # Frames add up only where all of them have an echo.
         far = torch.cdist(places, radar.positions.detach())
@@ -104,7 +104,9 @@ def twin(
         return Twin(_surest_first([*found, *moving]), plane, floor, picture)
     grid = radar.grid(*reach)
     still = _standing(capture, radar, grid, plane, floor, places, step, rays, seed)
-    return replace(still, things=_surest_first([*still.things, *moving]))
+    notes = () if told is None else (_CALIBRATED.format(apart(told)),)
+    things = _surest_first([*still.things, *moving])
+    return replace(still, things=things, notes=(*notes, *still.notes), calibration=told)
 
 
 def still_capture(recording: Capture | ChirpCapture) -> Capture:
@@ -125,6 +127,24 @@ def still_capture(recording: Capture | ChirpCapture) -> Capture:
     return replace(recording, moving=False).capture()
 
 
+def _moving(
+    recording: Capture | ChirpCapture, range_max: float | None, ground: Ground
+) -> list[Thing]:
+    """What moves in trains of chirps; it is followed where the time between frames is known."""
+    if isinstance(recording, Capture) or recording.chirps.count == 1:
+        return []
+    radar = still_capture(recording).radar()
+    near = _NEAREST * radar.waveform.range_resolution
+    grid = radar.grid(near, min(range_max or math.inf, recording.max_range))
+    if recording.frame_period is not None and recording.frame_count > 2:
+        return tracks(recording, grid, ground)
+    return movers(recording, grid)
+
+
+_CALIBRATED = (
+    "the phases of the channels were {:.0f}° apart (root mean square): they were calibrated on the "
+    "scene itself"
+)
 _NOTHING = "nothing is above the noise"
 _IMAGE_BETTER = (
     "the image explains frames that were held out better than the things do: shapes may be wrong, "
