@@ -18,6 +18,7 @@ from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
 from invertwin.registry.kinds import PLUGINS
 from invertwin_studies.recordings import rail_sar
+from public_names import menu
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
@@ -155,21 +156,6 @@ def test_examples_are_short_and_use_public_names(script):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("invertwin"):
             assert node.module in public
             assert {alias.name for alias in node.names} <= menu(node.module)
-
-
-def menu(room: str) -> set[str]:
-    """What a room shows: what its `__init__` imports under its own name, and what it defines."""
-    shown: set[str] = set()
-    source = Path(importlib.import_module(room).__file__ or "").read_text()
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.ImportFrom):
-            shown |= {alias.name for alias in node.names if alias.asname == alias.name}
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            shown.add(node.name)
-        elif isinstance(node, ast.AnnAssign | ast.Assign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            shown |= {target.id for target in targets if isinstance(target, ast.Name)}
-    return {name for name in shown if not name.startswith("_")}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
