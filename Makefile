@@ -77,6 +77,7 @@ docs: .venv/.docs .venv/.llvm
 	@rm -rf out/docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html -d out/docs/doctrees docs out/docs/html
 	$(BIN)/python docs/check_site.py out/docs/html
+	$(BIN)/python docs/public_names.py docs/api/*.md
 	@echo 'the site: out/docs/html/index.html'
 
 check: .venv/.dev

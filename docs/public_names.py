@@ -1,12 +1,15 @@
 """The public menu, and which code of the documentation uses its names.
 
 The site and the tests read it; neither needs what the other stands on.
+
+Usage: python docs/public_names.py docs/api/scene.md …     (checks the examples of pages)
 """
 
 import ast
 import doctest
 import importlib
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -95,3 +98,15 @@ def uses() -> dict[str, list[Path]]:
         for name in used(code(page)):
             found.setdefault(name, []).append(page)
     return found
+
+
+def failures(page: Path) -> int:
+    """How many examples of a page, run in one session, do not give what it says; prints each."""
+    session = doctest.DocTest(
+        examples(page), {"__name__": "__main__"}, page.name, str(page), 0, None
+    )
+    return doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(session).failed
+
+
+if __name__ == "__main__":
+    sys.exit(sum(failures(Path(page)) for page in sys.argv[1:]))

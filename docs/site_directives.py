@@ -56,7 +56,13 @@ class Names(SphinxDirective):  # pyright: ignore[reportUntypedBaseClass]
 
     def entry(self, room: str, name: str) -> str:
         thing = getattr(importlib.import_module(room), name)
-        kind = "class" if inspect.isclass(thing) else "function" if callable(thing) else "data"
+        kind = (
+            "class"
+            if inspect.isclass(thing)
+            else "function"
+            if inspect.isroutine(thing)
+            else "data"
+        )
         here = Path(self.env.doc2path(self.env.docname))
         links = [
             f"[{page.stem}]({os.path.relpath(page, here.parent)})"

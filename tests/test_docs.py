@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import json
 import os
 import pickle
@@ -18,12 +19,13 @@ from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
 from invertwin.registry.kinds import PLUGINS
 from invertwin_studies.recordings import rail_sar
-from public_names import menu
+from public_names import ROOMS, documented, examples, menu, used, uses
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES[1:] if "```python" in page.read_text()]
 NEEDS_DATA = ["measured_data.md"]
+REFERENCE = sorted((REPOSITORY / "docs" / "api").glob("*.md"))
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 
 SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -53,7 +55,7 @@ def run(arguments, folder):
         capture_output=True,
         text=True,
     )
-    assert ended.returncode == 0, ended.stderr[-3000:]
+    assert ended.returncode == 0, (ended.stdout + ended.stderr)[-3000:]
     return ended.stdout
 
 
@@ -92,6 +94,42 @@ def test_readme_snippets_are_short():
 def test_snippets_of_a_page_run(page, tmp_path):
     run(["-c", "\n".join(snippets(page))], tmp_path)
     assert not list(tmp_path.iterdir()), "a snippet leaves a file behind"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", REFERENCE, ids=lambda page: page.stem)
+def test_examples_of_the_reference_hold(page, tmp_path):
+    """Every output is as the page says."""
+    run([str(REPOSITORY / "docs" / "public_names.py"), str(page)], tmp_path)
+    assert not list(tmp_path.iterdir()), "an example leaves a file behind"
+
+
+def test_reference_has_a_page_for_every_room():
+    shown = {
+        page.stem: re.findall(r"^```{names} (\S+)$", page.read_text(), re.M) for page in REFERENCE
+    }
+    assert shown.pop("index") == []
+    assert shown == {"invertwin": ["invertwin"], **{room: [f"invertwin.{room}"] for room in ROOMS}}
+    assert set(importlib.import_module("invertwin").__all__) - {"__version__"} <= {
+        *ROOMS,
+        *documented()["invertwin"],
+    }
+
+
+def test_every_name_of_the_package_has_an_example():
+    page = REPOSITORY / "docs" / "api" / "invertwin.md"
+    shown = used("\n".join(example.source for example in examples(page)))
+    with_a_page = {"dataset"}  # it writes a folder: docs/datasets.md
+    assert set(documented()["invertwin"]) - shown == with_a_page
+    assert with_a_page <= set(uses())
+
+
+def test_every_public_name_says_what_it_is():
+    for room, names in documented().items():
+        for name in names:
+            thing = getattr(importlib.import_module(room), name)
+            named = inspect.isclass(thing) or inspect.isroutine(thing)
+            assert not named or thing.__doc__, f"{room}.{name} has no docstring"
 
 
 def test_recipe_of_the_rail_data_makes_the_file_that_is_read(data_folder, tmp_path):
