@@ -21,6 +21,7 @@ ROOMS = (
     *("scene", "channel", "radar", "links", "camera", "simulation", "signatures", "capture"),
     *("datasets", "models", "inversion", "discovery", "plotting"),
 )
+CELL = re.compile(r"^# %%(.*)\n", re.MULTILINE)
 FENCE = re.compile(r"^```(python|pycon)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -56,6 +57,8 @@ def documented() -> dict[str, list[str]]:
 
 def examples(page: Path) -> list[doctest.Example]:
     """The examples `>>>` of a page, in order."""
+    if page.suffix != ".md":
+        return []
     parser = doctest.DocTestParser()
     return [
         example
@@ -65,12 +68,22 @@ def examples(page: Path) -> list[doctest.Example]:
     ]
 
 
+def cells(page: Path) -> list[str]:
+    """The pieces of code of a page, in order.
+
+    Args:
+        page: A Markdown page, or a tutorial in jupytext's percent form.
+    """
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".md":
+        return [code for kind, code in FENCE.findall(text) if kind == "python"]
+    _, *parts = CELL.split(text)
+    return [code for kind, code in zip(parts[::2], parts[1::2], strict=True) if not kind.strip()]
+
+
 def code(page: Path) -> str:
-    """All code of a page, a tutorial or a script."""
-    if page.suffix == ".py":
-        return page.read_text()
-    plain = [text for kind, text in FENCE.findall(page.read_text()) if kind == "python"]
-    return "\n".join([*plain, *(example.source for example in examples(page))])
+    """All code of a page or a tutorial."""
+    return "\n".join([*cells(page), *(example.source for example in examples(page))])
 
 
 def sources() -> Iterator[Path]:

@@ -19,7 +19,7 @@ from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
 from invertwin.registry.kinds import PLUGINS
 from invertwin_studies.recordings import rail_sar
-from public_names import ROOMS, documented, examples, menu, used, uses
+from public_names import ROOMS, cells, documented, examples, menu, used, uses
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
@@ -28,7 +28,6 @@ NEEDS_DATA = ["measured_data.md"]
 REFERENCE = sorted((REPOSITORY / "docs" / "api").glob("*.md"))
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 
-SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"`(invertwin(?:_studies)?(?:\.\w+)+)`")
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 RUN_FILE = re.compile(r"\b(?:experiments|examples|benchmarks|tests)/[\w/*.]*\w")
@@ -59,15 +58,11 @@ def run(arguments, folder):
     return ended.stdout
 
 
-def snippets(page):
-    return [match.group(1) for match in SNIPPET.finditer(page.read_text())]
-
-
 @pytest.fixture(scope="module")
 def readme(tmp_path_factory):
     """What the README's two snippets print, run in one session."""
     folder = tmp_path_factory.mktemp("readme")
-    return run(["-c", "\n".join(snippets(REPOSITORY / "README.md"))], folder)
+    return run(["-c", "\n".join(cells(REPOSITORY / "README.md"))], folder)
 
 
 @pytest.mark.slow
@@ -81,7 +76,7 @@ def test_readme_simulates_and_finds_the_letter(readme):
 def test_readme_snippets_are_short():
     counts = [
         sum(bool(line.strip()) for line in snippet.splitlines())
-        for snippet in snippets(REPOSITORY / "README.md")
+        for snippet in cells(REPOSITORY / "README.md")
     ]
     assert len(counts) == 2
     assert max(counts) <= 15
@@ -92,7 +87,7 @@ def test_readme_snippets_are_short():
     "page", [p for p in WITH_PYTHON if p.name not in NEEDS_DATA], ids=lambda page: page.name
 )
 def test_snippets_of_a_page_run(page, tmp_path):
-    run(["-c", "\n".join(snippets(page))], tmp_path)
+    run(["-c", "\n".join(cells(page))], tmp_path)
     assert not list(tmp_path.iterdir()), "a snippet leaves a file behind"
 
 
@@ -138,7 +133,7 @@ def test_recipe_of_the_rail_data_makes_the_file_that_is_read(data_folder, tmp_pa
         arrays = {name: file[name] for name in file.files if name != "meta"}
     recorded = arrays | {"range_bins": arrays["range_bins"][None]}  # as the original has it
     (tmp_path / "master_data.pkl").write_bytes(pickle.dumps(recorded))
-    (recipe,) = snippets(REPOSITORY / "docs" / "measured_data.md")
+    (recipe,) = cells(REPOSITORY / "docs" / "measured_data.md")
     run(["-c", recipe], tmp_path)
     with np.load(tmp_path / made) as file:
         for name, values in arrays.items():

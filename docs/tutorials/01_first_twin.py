@@ -70,7 +70,10 @@ fit = iw.reconstruct(
 # %%
 sharp = iw.SurrogateMap(grid, sampling=rays)
 maps = {"recorded": recorded.spectrum.float()}
-maps |= {name: sharp.predict(scene, radar, seed=1) for name, scene in (("start", start), ("found", fit.scene))}
+maps |= {
+    name: sharp.predict(scene, radar, seed=1)
+    for name, scene in (("start", start), ("found", fit.scene))
+}
 iw.plotting.spectrum(maps, grid)
 
 # %% [markdown]

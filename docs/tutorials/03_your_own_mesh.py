@@ -14,7 +14,13 @@ import torch
 import trimesh
 
 import invertwin as iw
-from invertwin.scene import PerfectConductor, RoughDielectric, linear_array, rigid, rotation_from_vector
+from invertwin.scene import (
+    PerfectConductor,
+    RoughDielectric,
+    linear_array,
+    rigid,
+    rotation_from_vector,
+)
 
 # %% [markdown]
 # ## A file
@@ -48,7 +54,12 @@ assert abs(float(height.max() - height.min()) - 0.092) < 1e-6
 
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=128)
-radar = iw.Radar(linear_array(2, 8 * chirp.wavelength), linear_array(16, chirp.wavelength / 2), chirp, [[0.0, 0.0, 0.0]])
+radar = iw.Radar(
+    linear_array(2, 8 * chirp.wavelength),
+    linear_array(16, chirp.wavelength / 2),
+    chirp,
+    [[0.0, 0.0, 0.0]],
+)
 grid = radar.grid(range_min=1.0, range_max=2.2, u_max=0.5)
 data = iw.simulate(scene, radar, grid, seed=1, sampling=iw.Sampling(depth=1, samples=400_000))
 iw.plotting.spectrum(data.spectrum, grid)

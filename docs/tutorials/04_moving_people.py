@@ -9,7 +9,15 @@
 import invertwin as iw
 from invertwin.plotting import Panel
 from invertwin.radar import Chirps, micro_doppler, range_profile
-from invertwin.scene import InMotion, RoughDielectric, Walking, linear_array, person, rigid, standing_height
+from invertwin.scene import (
+    InMotion,
+    RoughDielectric,
+    Walking,
+    linear_array,
+    person,
+    rigid,
+    standing_height,
+)
 
 # %% [markdown]
 # ## A body that walks
@@ -36,7 +44,12 @@ antenna = linear_array(1, chirp.wavelength / 2)
 radar = iw.Radar(antenna, antenna, chirp, positions=[[0.0, 1.0, 0.0]])
 train = Chirps(count=3072, interval=0.25e-3)
 beat = iw.simulate_chirps(
-    walk, radar, train, seed=1, sampling=iw.Sampling(depth=1, points_per_m2=300.0), visibility_every=48
+    walk,
+    radar,
+    train,
+    seed=1,
+    sampling=iw.Sampling(depth=1, points_per_m2=300.0),
+    visibility_every=48,
 )
 
 # %% [markdown]
@@ -46,7 +59,9 @@ beat = iw.simulate_chirps(
 
 # %%
 grid = radar.grid(range_min=2.5, range_max=6.0)
-every = radar.frames([0] * train.count)  # the radar rests: each chirp is a frame from the same place
+every = radar.frames(
+    [0] * train.count
+)  # the radar rests: each chirp is a frame from the same place
 profile = range_profile(beat[0], every, grid)[:, 0, 0]  # chirp, range
 shown = micro_doppler(profile.T, radar, train, length=256, step=24)
 power = shown.power.sum(0)

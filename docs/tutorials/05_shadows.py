@@ -54,7 +54,9 @@ iw.plotting.gradient(shown, grid, power=report.value)
 # In the last picture the wall does not change at all: its own points stand still, and nothing else is left.
 
 # %%
-print(f"invertwin is {report.full.relative_l1:.3f} off, without boundary paths {report.interior.relative_l1:.2f}")
+print(
+    f"invertwin is {report.full.relative_l1:.3f} off, without boundary paths {report.interior.relative_l1:.2f}"
+)
 print(f"noise of the differences: {report.difference_noise:.3f}")
 assert report.full.relative_l1 < 0.05
 assert report.interior.relative_l1 > 0.15

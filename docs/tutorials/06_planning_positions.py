@@ -18,12 +18,17 @@ from invertwin.scene import RoughDielectric, Translation, box, linear_array, rig
 
 # %%
 paint = RoughDielectric(permittivity=4.0)
-truth = iw.Scene({"box": iw.Object(box((0.3, 0.3, 0.3)), paint, rigid(translation=[0.1, 0.0, 2.5]))})
+truth = iw.Scene(
+    {"box": iw.Object(box((0.3, 0.3, 0.3)), paint, rigid(translation=[0.1, 0.0, 2.5]))}
+)
 here = [[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]
 possible = [[0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [-0.8, 0.0, 0.0], [0.0, 0.0, 1.0]]
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
 radar = iw.Radar(
-    linear_array(2, 4 * chirp.wavelength), linear_array(8, chirp.wavelength / 2), chirp, positions=here + possible
+    linear_array(2, 4 * chirp.wavelength),
+    linear_array(8, chirp.wavelength / 2),
+    chirp,
+    positions=here + possible,
 )
 grid = radar.grid(range_min=1.0, range_max=3.6, u_max=0.6)
 
@@ -52,7 +57,9 @@ figure = Figure(figsize=(5, 3.4), layout="constrained")
 axes = figure.subplots()
 axes.plot(*zip(*[(x, z) for x, _, z in here], strict=True), "k^", label="there already")
 places = [possible[one.frame - len(here)] for one in added]
-dots = axes.scatter([x for x, _, _ in places], [z for _, _, z in places], c=[one.share for one in added], s=80)
+dots = axes.scatter(
+    [x for x, _, _ in places], [z for _, _, z in places], c=[one.share for one in added], s=80
+)
 axes.plot(0.1, 2.5, "s", markersize=14, color="0.6", label="box")
 axes.set(xlabel="x [m]", ylabel="z [m]", aspect="equal")
 axes.legend(fontsize=8)

@@ -25,8 +25,13 @@ from invertwin.signatures import aspects, decibels
 corner = iw.Scene({"corner": iw.Object(trihedral(0.1), PerfectConductor())})
 degrees = torch.linspace(160.0, 200.0, 41, dtype=torch.float64)
 found = iw.rcs(corner, aspects(torch.deg2rad(degrees), math.pi / 2), [77e9])
-curves = {"all": found.dbsm[0, :, 0, 0], "three bounces": decibels(found.parts["order 3"])[0, :, 0, 0]}
-iw.plotting.sections({"trihedral of 10 cm at 77 GHz": curves}, degrees - 180, "angle from the axis [°]")
+curves = {
+    "all": found.dbsm[0, :, 0, 0],
+    "three bounces": decibels(found.parts["order 3"])[0, :, 0, 0],
+}
+iw.plotting.sections(
+    {"trihedral of 10 cm at 77 GHz": curves}, degrees - 180, "angle from the axis [°]"
+)
 
 # %%
 wavelength = 299_792_458 / 77e9
@@ -41,11 +46,18 @@ assert abs(float(curves["three bounces"][20]) - formula) < 0.01
 
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=50e-6, samples=64)
-radar = iw.Radar(linear_array(2, 4 * chirp.wavelength), linear_array(8, chirp.wavelength / 2), chirp, [[0.0, 0.0, 0.0]])
+radar = iw.Radar(
+    linear_array(2, 4 * chirp.wavelength),
+    linear_array(8, chirp.wavelength / 2),
+    chirp,
+    [[0.0, 0.0, 0.0]],
+)
 grid = radar.grid(range_min=1.5, range_max=3.0, u_max=0.8)
 place = [0.5, 0.0, 2.2]
 ball = iw.Object(sphere(0.05, 5), PerfectConductor(), rigid(translation=place))
-clean = iw.simulate(iw.Scene({"ball": ball}), radar, grid, seed=1, sampling=iw.Sampling(depth=1, samples=100_000))
+clean = iw.simulate(
+    iw.Scene({"ball": ball}), radar, grid, seed=1, sampling=iw.Sampling(depth=1, samples=100_000)
+)
 errors = channel_errors(radar, gain_std_db=1.0, phase_std=0.6, seed=3)
 measured = iw.Capture.from_beat(clean.beat * errors[None, :, :, None], radar)
 
@@ -59,7 +71,11 @@ centre = torch.tensor(place, dtype=torch.float64)
 front = centre - 0.05 * centre / centre.norm()
 calibration = estimate_channels(measured, front)
 mended = calibration.apply(measured)
-maps = {"with errors": measured.spectrum(grid), "calibrated": mended.spectrum(grid), "without errors": clean.spectrum}
+maps = {
+    "with errors": measured.spectrum(grid),
+    "calibrated": mended.spectrum(grid),
+    "without errors": clean.spectrum,
+}
 iw.plotting.spectrum(maps, grid, relative=False)
 
 # %% [markdown]
@@ -68,7 +84,9 @@ iw.plotting.spectrum(maps, grid, relative=False)
 # %%
 ratio = calibration.gains / errors
 left = (ratio / ratio.mean()).angle().abs().max()
-print(f"largest error of phase: {float(errors.angle().abs().max()):.2f} rad before, {float(left):.3f} rad after")
+print(
+    f"largest error of phase: {float(errors.angle().abs().max()):.2f} rad before, {float(left):.3f} rad after"
+)
 assert float(left) < 0.05
 peaks = {name: 10 * math.log10(float(power.max())) for name, power in maps.items()}
 assert peaks["without errors"] - peaks["with errors"] > 0.5
