@@ -26,6 +26,7 @@ PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES[1:] if "```python" in page.read_text()]
 NEEDS_DATA = ["measured_data.md"]
 REFERENCE = sorted((REPOSITORY / "docs" / "api").glob("*.md"))
+TUTORIALS = sorted((REPOSITORY / "docs" / "tutorials").glob("*.py"))
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 
 NAME = re.compile(r"`(invertwin(?:_studies)?(?:\.\w+)+)`")
@@ -89,6 +90,23 @@ def test_readme_snippets_are_short():
 def test_snippets_of_a_page_run(page, tmp_path):
     run(["-c", "\n".join(cells(page))], tmp_path)
     assert not list(tmp_path.iterdir()), "a snippet leaves a file behind"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_tutorials_hold(page, tmp_path):
+    """Every tutorial checks a value itself."""
+    assert "\nassert " in page.read_text()
+    run(["-c", "\n".join(cells(page))], tmp_path)
+    assert not list(tmp_path.iterdir()), "a tutorial leaves a file behind"
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_tutorials_have_a_picture_and_use_public_names(page):
+    text = page.read_text()
+    assert "iw.plotting." in text or "Figure(" in text
+    assert text.startswith("# %% [markdown]\n# # ")
+    check_public(text)
 
 
 @pytest.mark.slow
@@ -181,11 +199,16 @@ def test_examples_run(script, tmp_path):
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.name)
 def test_examples_are_short_and_use_public_names(script):
     assert len(script.read_text().splitlines()) <= 60
+    check_public(script.read_text())
+
+
+def check_public(text):
+    """Refuse what is not on a menu."""
     public = {
         "invertwin",
-        *(f"invertwin.{room}" for room in importlib.import_module("invertwin").__all__),
+        *(f"invertwin.{room}" for room in [*importlib.import_module("invertwin").__all__, *ROOMS]),
     }
-    for node in ast.walk(ast.parse(script.read_text())):
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("invertwin"):
             assert node.module in public
             assert {alias.name for alias in node.names} <= menu(node.module)

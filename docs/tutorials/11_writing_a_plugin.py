@@ -1,34 +1,42 @@
 # %% [markdown]
 # # Writing a plugin
 #
-# A plugin is a package of yours that adds materials, shapes, losses, models or commands to run files. It is one
-# function that gets a registry. Here we write a material and use it three ways: in Python, in a fit, in a run file.
+# A plugin is a package of yours that adds materials, shapes, losses, models or commands to run files. Here we write one
+# with a material, and use it three ways: in Python, in a fit, in a run file.
 
 # %%
 # %matplotlib inline
-import tomllib
-from dataclasses import dataclass
+import os
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import torch
 
 import invertwin as iw
-from invertwin.cli.run_file import validate
 from invertwin.inversion import Optimizer
-from invertwin.limits import Share
-from invertwin.registry import Registry
-from invertwin.registry.kinds import registry
-from invertwin.scene import Material, Surface, linear_array, rigid, sphere
+from invertwin.scene import linear_array, rigid, sphere
 
 # %% [markdown]
-# ## A material
+# ## A package with a material
 # Foliage sends back the same share of the power at every angle, equally in all directions. A material hands the ray
 # tracer a `Surface`: the square root of its reflectance over the angle, and how much of it is diffuse. The annotation
-# `Share` limits the value to 0 … 1, and the docstring explains the key of the run file.
-
+# `Share` limits the value to 0 … 1, and the docstring explains the key of the run file. `register` gets a registry and
+# adds what the package offers.
 
 # %%
+MODULE = '''
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from invertwin.limits import Share
+from invertwin.registry import Registry
+from invertwin.scene import Material, Surface
+
 @dataclass(frozen=True)
 class Foliage(Material):
     """Leaves: reflect the same share at every angle.
@@ -38,13 +46,37 @@ class Foliage(Material):
     """
 
     share: Share | torch.Tensor = 0.05
-    coherent = False  # a rough surface
+    coherent: ClassVar[bool] = False  # a rough surface
 
     def surface(self, frequency: float) -> Surface:
         share = torch.as_tensor(self.share, dtype=torch.float64)
         amplitude = share.sqrt() * torch.ones(256, dtype=torch.float64)
         return Surface(amplitude, torch.ones((), dtype=torch.float64))
 
+def register(registry: Registry) -> None:
+    registry.add("material", "foliage", Foliage)
+'''
+
+# %% [markdown]
+# The package names this function in its `pyproject.toml`:
+#
+#     [project.entry-points."invertwin.plugins"]
+#     foliage = "foliage:register"
+#
+# `pip install` makes two things of it: the module, and a folder that says so. Here we write both by hand, into a folder
+# that Python looks into.
+
+# %%
+folder = tempfile.TemporaryDirectory()
+site = Path(folder.name)
+(site / "foliage.py").write_text(MODULE)
+(site / "foliage-1.0.dist-info").mkdir()
+(site / "foliage-1.0.dist-info" / "METADATA").write_text("Name: foliage\nVersion: 1.0\n")
+entry = "[invertwin.plugins]\nfoliage = foliage:register\n"
+(site / "foliage-1.0.dist-info" / "entry_points.txt").write_text(entry)
+sys.path.append(folder.name)
+
+from foliage import Foliage  # type: ignore  # noqa: E402
 
 # %% [markdown]
 # ## It works at once
@@ -110,21 +142,10 @@ assert abs(share - 0.05) < 0.015
 
 # %% [markdown]
 # ## A run file that names it
-# `register` is the function that the package names under the entry point `invertwin.plugins`:
-#
-#     [project.entry-points."invertwin.plugins"]
-#     foliage = "my_package:register"
-#
-# An installed package is found by itself. Here we call the function as invertwin would.
-
+# The command line finds the plugin by itself. `check` says what a run needs, without running it.
 
 # %%
-def register(registry: Registry) -> None:
-    registry.add("material", "foliage", Foliage)
-
-
-register(registry)
-run = """
+RUN = """
 task = "simulate"
 [scene.bush]
 shape = "sphere"
@@ -132,9 +153,15 @@ radius = 0.3
 position = [0.0, 0.0, 2.0]
 material = { kind = "foliage", share = 0.07 }
 [radar]
-waveform = { kind = "fmcw", start_frequency = 77e9, bandwidth = 2e9, duration = 50e-6, samples = 128 }
+positions = [[0.0, 0.0, 0.0]]
 transmitters = { kind = "positions", positions = [[0.0, 0.0, 0.0]] }
 receivers = { kind = "linear", count = 16, spacing = 1.93e-3 }
+[radar.waveform]
+kind = "fmcw"
+start_frequency = 77e9
+bandwidth = 2e9
+duration = 50e-6
+samples = 128
 [grid]
 range_min = 1.4
 range_max = 2.4
@@ -142,20 +169,31 @@ range_max = 2.4
 kind = "simulated"
 points_per_m2 = 2e3
 """
-checked = validate(tomllib.loads(run), Path("bush.toml"))
-assert checked.scene["bush"].material.build() == Foliage(0.07)
+
+
+def invertwin(*words: str) -> subprocess.CompletedProcess[str]:
+    """The command line, with the plugin."""
+    places = os.pathsep.join([folder.name, os.environ.get("PYTHONPATH", "")])
+    line = [sys.executable, "-m", "invertwin", *words]
+    known = os.environ | {"PYTHONPATH": places}
+    return subprocess.run(line, env=known, capture_output=True, text=True)
+
+
+(site / "bush.toml").write_text(RUN)
+ended = invertwin("check", str(site / "bush.toml"))
+print(ended.stdout)
+assert ended.returncode == 0, ended.stderr
 
 # %% [markdown]
 # A wrong value is an error of one line that names its place:
 
 # %%
-told = ""
-try:
-    validate(tomllib.loads(run.replace("0.07", "7.0")), Path("bush.toml"))
-except iw.InputError as error:
-    told = str(error)
-print(told)
-assert "scene.bush.material.share" in told
+(site / "wrong.toml").write_text(RUN.replace("0.07", "7.0"))
+ended = invertwin("check", str(site / "wrong.toml"))
+print(ended.stderr)
+assert ended.returncode == 2
+assert "scene.bush.material.share" in ended.stderr
+folder.cleanup()
 
 # %% [markdown]
 # `tests/plugins/example_plugin` is a whole package to start from. [Extending](../extending.md) has the groups.
