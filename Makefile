@@ -18,7 +18,7 @@ MINUTES ?= 30
 LOWEST := .venv-lowest
 WHEEL := .venv-wheel
 
-.PHONY: help demo test test-fast test-gpu fuzz lowest wheel check format bench clean
+.PHONY: help demo test test-fast test-gpu fuzz lowest wheel docs check format bench clean
 
 help:
 	@echo 'make demo       find a hidden letter from its radar echoes (under 5 minutes)'
@@ -28,6 +28,7 @@ help:
 	@echo 'make fuzz       read damaged files of every format for MINUTES=30'
 	@echo 'make lowest     the quick tests with the lowest versions that we allow'
 	@echo 'make wheel      build, check, and run the demo from the wheel in an empty folder'
+	@echo 'make docs       the site in out/docs/html: runs all tutorials, checks all links'
 	@echo 'make check      format, lint, types, import arrows'
 	@echo 'make format     let ruff format and sort'
 	@echo 'make bench      speed and memory, ours and peers'"'"
@@ -70,6 +71,14 @@ wheel: .venv/.release .venv/.llvm
 	@set -e; folder=$$(mktemp -d); root=$$PWD; cd $$folder; \
 	    $$root/$(WHEEL)/bin/invertwin doctor; $$root/$(WHEEL)/bin/invertwin demo; \
 	    rm -r $$folder
+
+# From a clean slate: a tutorial that no longer runs must show. Nothing is fetched.
+docs: .venv/.docs .venv/.llvm
+	@rm -rf out/docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html -d out/docs/doctrees docs out/docs/html
+	$(BIN)/python docs/check_site.py out/docs/html
+	$(BIN)/python docs/public_names.py docs/api/*.md
+	@echo 'the site: out/docs/html/index.html'
 
 check: .venv/.dev
 	$(BIN)/ruff format --check .
@@ -121,6 +130,11 @@ $(BIN)/python:
 .venv/.release: .venv/.run
 	@echo 'set-up: tools that build and check the package'
 	@$(PIP) install --constraint constraints.txt --editable '.[release]'
+	@touch $@
+
+.venv/.docs: .venv/.run
+	@echo 'set-up: what builds the site'
+	@$(PIP) install --constraint constraints.txt --editable '.[docs]'
 	@touch $@
 
 .venv/.bench: .venv/.run

@@ -36,7 +36,7 @@ CHECKPOINT = "checkpoint.pt"
 RESULTS = (
     *("metrics.json", "report.html", "checkpoint*.pt", "twin.*", "raw", "capture.nc", "chirps.*"),
     *("manifest.json", "shard-*.tar"),
-    *("channels.json", "points.csv", "prior.npz", "train.log", "turntable.gif", UNFINISHED),
+    *("channels.json", "points.*", "prior.npz", "train.log", "turntable.gif", UNFINISHED),
     *("scene.png", "spectra*.png", "doppler.png", "loss*.png", "convergence.png", "landscape.png"),
     *("look.png", "recording.png", "twin_*.png", "residuals*.png"),
 )
