@@ -129,6 +129,13 @@ def test_reference_has_a_page_for_every_room():
     }
 
 
+def test_every_page_of_the_reference_has_examples_of_its_room():
+    for room in ROOMS:
+        page = REPOSITORY / "docs" / "api" / f"{room}.md"
+        shown = used("\n".join(example.source for example in examples(page)))
+        assert shown & set(documented()[f"invertwin.{room}"]), f"{page.name} uses none of its names"
+
+
 def test_every_name_of_the_package_has_an_example():
     page = REPOSITORY / "docs" / "api" / "invertwin.md"
     shown = used("\n".join(example.source for example in examples(page)))
