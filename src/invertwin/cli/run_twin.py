@@ -159,7 +159,8 @@ def _maps(found: Twin, folder: RunFolder) -> list[Picture]:
 
 def _described(found: Twin, folder: RunFolder) -> dict[str, Any]:
     """A run file that simulates the things that have a shape, and fits their poses on."""
-    assert found.grid is not None and found.scene is not None
+    assert found.grid is not None
+    assert found.scene is not None
     scene: dict[str, Any] = {}
     axis = found.ground.vertical
     for thing in found.things:
