@@ -129,6 +129,13 @@ def test_reference_has_a_page_for_every_room():
     }
 
 
+def test_every_page_of_the_reference_has_examples_of_its_room():
+    for room in ROOMS:
+        page = REPOSITORY / "docs" / "api" / f"{room}.md"
+        shown = used("\n".join(example.source for example in examples(page)))
+        assert shown & set(documented()[f"invertwin.{room}"]), f"{page.name} uses none of its names"
+
+
 def test_every_name_of_the_package_has_an_example():
     page = REPOSITORY / "docs" / "api" / "invertwin.md"
     shown = used("\n".join(example.source for example in examples(page)))
@@ -183,8 +190,9 @@ def test_run_file_on_the_page_finds_the_ball(tmp_path):
 
 def test_page_on_run_files_names_every_section():
     page = (REPOSITORY / "docs" / "run_files.md").read_text()
-    cells = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
-    named = {re.sub(r"\W*(\w+).*", r"\1", name) for c in cells for name in re.findall("`.+?`", c)}
+    table = page.split("## Which command needs what")[1].split("\n## ")[0]
+    heads = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    named = {re.sub(r"\W*(\w+).*", r"\1", name) for c in heads for name in re.findall("`.+?`", c)}
     assert named == set(RunFile.model_fields)
 
 
