@@ -33,18 +33,18 @@ BOX = Figure("box", (0.3, -0.4), 0.3, 0.8, 0.2, 1.1, 0.05)
 
 def search_of(scene: iw.Scene, radar: iw.Radar | None = None, density: float = 500.0) -> Search:
     """A search of a simulated scene; it has no image."""
-    radar = around(12) if radar is None else radar
-    count, farthest = radar.frame_count, 1.7 * float(radar.positions[0].norm())
-    grid = radar.grid(0.5, farthest)
+    board: iw.Radar = around(12) if radar is None else radar
+    count, farthest = board.frame_count, 1.7 * float(board.positions[0].norm())
+    grid = board.grid(0.5, farthest)
     sampling = replace(CHAIN, points_per_m2=density)
-    beat = iw.simulate(scene, radar, grid, seed=3, sampling=sampling, snr_db=10.0).beat
-    power = iw.Capture.from_beat(beat, radar).spectrum(grid).float()
+    beat = iw.simulate(scene, board, grid, seed=3, sampling=sampling, snr_db=10.0).beat
+    power = iw.Capture.from_beat(beat, board).spectrum(grid).float()
     one = Assembly(
         SurrogateMap(grid, sampling=sampling_of(count, 1500)),
-        radar,
+        board,
         power,
         HeavyTailed(background(power)),
-        shared_bins(radar, grid),
+        shared_bins(board, grid),
         Ground(),
         0.0,
         0,
