@@ -29,6 +29,7 @@ from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
 
 _STEPS = 40  # of the search for the shortest path over two edges
+_LIFTS = (0.1, 0.01, 0.0)  # of the antennas' distance, one after the other
 _LEAST = 1e-9  # of a path's length: edges that touch there have no path between them
 
 
@@ -262,7 +263,10 @@ def _route(edges: Sequence[Edge], tx: Tensor, rx: Tensor) -> _Route:
 def _between(start: Tensor, axis: Tensor, first: Tensor, last: Tensor) -> Tensor:
     """Where the shortest path between two points touches a line, from its start."""
     along = [dot(point - start, axis) for point in (first, last)]
-    aside = [cross(point - start, axis).norm(dim=-1) for point in (first, last)]
+    aside = [
+        (point - start - way[:, None] * axis).norm(dim=-1)
+        for point, way in zip((first, last), along, strict=True)
+    ]
     share = aside[0] / (aside[0] + aside[1]).clamp_min(1e-300)
     return along[0] + (along[1] - along[0]) * share
 
@@ -314,9 +318,25 @@ def _shortest(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
     """Places on two edges of the shortest path: Newton's steps where they shorten it.
 
     The length is convex; elsewhere each place is moved to the shortest way between its neighbours.
+    That would stick where the edges' lines cross. So the second edge and the receiver are lifted
+    into a fourth dimension first, and then let down.
     """
     offsets = torch.zeros(starts.shape[:2], dtype=starts.dtype)
+    size = (rx - tx).norm(dim=1)
+    none = torch.zeros_like(size)[:, None]
+    for lift in _LIFTS:
+        up = lift * size[:, None]
+        offsets = _settled(
+            offsets,
+            torch.cat([starts, torch.stack([none, up], 1)], 2),
+            torch.nn.functional.pad(axes, (0, 1)),
+            torch.cat([tx, none], 1),
+            torch.cat([rx, up], 1),
+        )
+    return offsets
 
+
+def _settled(offsets: Tensor, starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
     def length(at: Tensor) -> Tensor:
         points = _vertices(starts, axes, at, tx, rx)
         return (points[:, 1:] - points[:, :-1]).norm(dim=2).sum(1)
