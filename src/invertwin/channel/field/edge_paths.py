@@ -370,6 +370,8 @@ def _shortest(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
 
 
 def _settled(offsets: Tensor, starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
+    """``_shortest`` from given places on."""
+
     def length(at: Tensor) -> Tensor:
         points = _vertices(starts, axes, at, tx, rx)
         return (points[:, 1:] - points[:, :-1]).norm(dim=2).sum(1)
@@ -397,9 +399,10 @@ def _second(route: _Route, turns: Sequence[Turn], wave_number: float) -> Tensor:
     that grows without bound into the corner where they meet. There it is taken off, by x³/(1 + x³).
     """
     way, legs = turns[0].towards, route.legs
-    sides = [normalize(cross(edge_axis(turn.wedges), way), dim=1) for turn in turns]
+    first, second = turns
+    one, other = (normalize(cross(edge_axis(turn.wedges), way), dim=1) for turn in turns)
     share = legs[:, 0] * legs[:, 2] / ((legs[:, 0] + legs[:, 1]) * (legs[:, 1] + legs[:, 2]))
-    total = double_dyad(*turns, -dot(*sides) * share.sqrt(), wave_number)
+    total = double_dyad(first, second, -dot(one, other) * share.sqrt(), wave_number)
     before, after = route.edges[0].azimuth, route.edges[1].azimuth_in
     if before is not None and after is not None:
         total = torch.where(before.isnan()[:, None, None], total, total / 2)
