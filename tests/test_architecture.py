@@ -62,11 +62,12 @@ ALLOWED = {
     "discovery": DISCOVERY,
     "runs": FOUNDATION | {"runs"},
     "plotting": DISCOVERY | {"plotting"},
+    "viewer": DISCOVERY | {"plotting", "viewer"},
     "registry": FOUNDATION | {"registry"},
     "cli": DISCOVERY
     | SIGNATURES
     | DATASETS
-    | {"doctor", "threads", "engines", "runs", "plotting", "registry", "cli", "__init__"},
+    | {"doctor", "threads", "engines", "runs", "plotting", "viewer", "registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
     "__init__": DISCOVERY | SIGNATURES | {"doctor", "threads"},
 }

@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 from invertwin import __version__
 from invertwin.cli.options import (
+    LOOPBACK,
     BackendOption,
     Dataset,
     FileArgument,
@@ -192,6 +193,29 @@ def twin(options: Find) -> None:
         with progress(console):
             tables = run_twin(options, folder)
         print_tables(tables)
+
+
+@app.command()
+def view(
+    target: Annotated[
+        Path,
+        typer.Argument(help="Run folder, run file or capture (.nc).", show_default=False),
+    ],
+    host: Annotated[str, typer.Option(help="Others than this machine need a token.")] = LOOPBACK,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The first that is tried.")] = 8080,
+    token: Annotated[
+        str | None, typer.Option(help="16 letters or digits that the address must hold.")
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Write an HTML page that needs no server, and end.", show_default=False),
+    ] = None,
+    backend: BackendOption = None,
+) -> None:
+    """Show a run, a scene or a capture in the browser, in three dimensions."""
+    from invertwin.cli.run_view import run_view
+
+    run_view(target, console, host=host, port=port, token=token, record=record)
 
 
 @app.command()

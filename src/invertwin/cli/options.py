@@ -21,6 +21,7 @@ def _use_backend(value: str | None) -> str | None:
     return value
 
 
+LOOPBACK = "127.0.0.1"
 BackendOption = Annotated[
     Literal["auto", "cpu", "cuda"] | None,
     typer.Option(
