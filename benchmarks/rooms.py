@@ -33,12 +33,11 @@ from typing import Any
 import torch
 from report import MetricTable, Required, write
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
 import invertwin as iw
-from invertwin.inversion.initial import principal_rectangle
+from invertwin.inversion.initial import linked, principal_rectangle
 from invertwin.radar import ordered_statistics_cfar, peaks
 from invertwin.scene import (
     Cosine,
@@ -319,9 +318,7 @@ def conventional(
     core = points[counts >= least]
     if not len(core):
         return []
-    inner = KDTree(core.numpy())
-    _, label = connected_components(inner.sparse_distance_matrix(inner, gap), directed=False)
-    labels = torch.from_numpy(label.astype("int64"))
+    labels = linked(core, gap)
     found: list[tuple[float, float]] = []
     for number in range(int(labels.max()) + 1):
         own: Tensor = core[labels == number]

@@ -1,12 +1,13 @@
 """Shapes on the ground as unknowns."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
-from invertwin.discovery.primitives import Figure, Matte, Primitive, upright
+from invertwin.discovery.primitives import Figure, Primitive, upright
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground
 from invertwin.inversion.uncertainty import coordinates
@@ -80,11 +81,11 @@ def test_small_and_thin_things_have_names_of_their_own(figure: Figure, named: st
 
 
 def test_the_nearest_material_reflects_as_much_at_normal_incidence():
-    written = Matte(torch.tensor(0.2, dtype=torch.float64)).written()
+    written = replace(BOX, brightness=0.2).material
     assert isinstance(written, RoughDielectric)
     root = math.sqrt(float(torch.as_tensor(written.permittivity)))
     assert ((root - 1) / (root + 1)) ** 2 == pytest.approx(0.2)
-    assert isinstance(Matte(torch.tensor(3.0, dtype=torch.float64)).written(), RoughConductor)
+    assert isinstance(replace(BOX, brightness=3.0).material, RoughConductor)
 
 
 def test_sizes_must_be_positive():

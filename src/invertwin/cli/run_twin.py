@@ -17,7 +17,6 @@ from invertwin.cli.run_file import about_file, is_run_file, load_run, need
 from invertwin.cli.run_look import read_recording
 from invertwin.cli.run_simulate import exact
 from invertwin.discovery import Twin, still_capture, twin
-from invertwin.discovery.primitives import Primitive
 from invertwin.inversion.initial import Ground
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
@@ -74,7 +73,7 @@ def run_twin(find: Find, folder: RunFolder) -> list[Table]:
     parts: list[Table | Picture] = [_table(found)]
     parts += [
         picture(folder, "ground", pictures.ground(found), "The ground from above", "ground"),
-        *_maps(found, folder, recording),
+        *_maps(found, folder),
     ]
     said = "; ".join(found.notes) or f"{len(sure)} things, {metrics['unsure']} unsure ones"
     title = find.recording.name
@@ -146,7 +145,7 @@ def _table(found: Twin) -> Table:
     return Table("Things", heads, rows, texts("notes")["things"])
 
 
-def _maps(found: Twin, folder: RunFolder, recording: Any) -> list[Picture]:
+def _maps(found: Twin, folder: RunFolder) -> list[Picture]:
     if found.predicted is None or found.observed is None or found.grid is None:
         return []
     shown = {"recording": found.observed, "twin": found.predicted}
@@ -175,7 +174,7 @@ def _described(found: Twin) -> dict[str, Any]:
             shape = {"shape": "cylinder", "radius": 0.5 * figure.length, "height": figure.height}
             if found.ground.up == "z":
                 shape["rotation_deg"] = [90.0, 0.0, 0.0]
-        material = Primitive(thing.name, figure, found.ground, found.level).matte.written()
+        material = figure.material
         described: dict[str, Any] = {"kind": "rough_conductor"}
         if isinstance(material, RoughDielectric):
             value = float(torch.as_tensor(material.permittivity))

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.outcome import normal_tail
 from invertwin.discovery.primitives import Figure
 from invertwin.discovery.search import as_kind
 from invertwin.inversion import Reconstruction
@@ -64,7 +63,7 @@ def surer(with_it: Tensor, without: Tensor) -> float:
     if len(gain) < 4:
         return 1 - min(1.0, math.exp(-max(total, 0.0)))
     spread = float(gain.std()) * math.sqrt(len(gain))
-    return 1 - normal_tail(total / max(spread, 1e-9))
+    return float(torch.special.ndtr(torch.tensor(total / max(spread, 1e-9)).double()))
 
 
 def presence(one: Assembly, shapes: Sequence[Figure]) -> list[float]:

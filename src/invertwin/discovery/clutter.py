@@ -1,17 +1,17 @@
 """Power of echoes that nobody has modelled exactly: its likelihood, and how many bins count."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.errors import InputError
 from invertwin.radar import Radar
+from invertwin.radar.radar import sampled
 from invertwin.radar.spectrum import aperture
-from invertwin.radar.waveform import SampledWaveform, unit_window
+from invertwin.radar.waveform import unit_window
 
 _LEAST = 1e-30  # of power, to keep logarithms finite
 _QUIET = 0.25  # quantile of a range bin that is taken for background
@@ -42,31 +42,64 @@ def shared_bins(radar: Radar, grid: Grid) -> float:
         radar: Its windows count.
         grid: Bins.
     """
-    waveform = radar.waveform
-    if not isinstance(waveform, SampledWaveform):
-        raise InputError(
-            "expected a radar that samples its echoes, got one of pulses; give the twin the "
-            "number of bins that share one draw"
-        )
-    window = unit_window(radar.window, waveform.samples)
-    sample = torch.arange(waveform.samples, dtype=torch.float64) / waveform.max_range
-    total = _sum_of_squares(window.square(), sample, grid.range_step, grid.range_count)
-    array = aperture(radar)
-    for step, count, places, weight in (
-        (grid.u_step, grid.u_count, array.x[array.column], array.weight),
-        (grid.v_step, grid.v_count, array.y[array.row], array.weight),
-    ):
-        if count > 1:
-            total *= _sum_of_squares(weight.square(), places / waveform.wavelength, step, count)
+    total = 1.0
+    for axis in axes_of(radar, grid):
+        if axis.count > 1:
+            lags = torch.arange(-axis.count + 1, axis.count, dtype=torch.float64)
+            # Of all pairs of bins of the axis, this share is so far apart.
+            share = 1 - lags.abs() / axis.count
+            # Noise is as strong in all samples, so that its field has the squares for weights.
+            power = replace(axis, weight=axis.weight.square()).response(lags)
+            total *= float((share * power).sum())
     return total
 
 
-def _sum_of_squares(weight: Tensor, cycles: Tensor, step: float, count: int) -> float:
-    lags = step * torch.arange(-count + 1, count, dtype=torch.float64)
-    field = torch.polar(weight.expand(len(lags), -1), 2 * math.pi * lags[:, None] * cycles).sum(1)
-    # Of all pairs of bins of the axis, this share is so far apart.
-    share = 1 - lags.abs() / (step * count)
-    return float((share * (field.abs() / weight.sum()).square()).sum())
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """One axis of a map: what is summed to make its bins.
+
+    Attributes:
+        weight: The window over samples, or over virtual elements.
+        cycles: Turns of each per metre of range, or per unit of a direction cosine.
+        start, step, count: Of its bins.
+    """
+
+    weight: Float64[Tensor, " sample"]
+    cycles: Float64[Tensor, " sample"]
+    start: float
+    step: float
+    count: int
+
+    def response(self, lags: Float64[Tensor, " lag"]) -> Float64[Tensor, " lag"]:
+        """Power of a point of power one, some bins away from its place.
+
+        Args:
+            lags: In bins.
+        """
+        phase = 2 * math.pi * lags[:, None] * self.step * self.cycles
+        field = torch.polar(self.weight.expand(len(lags), -1), phase).sum(1) / self.weight.sum()
+        return field.abs().square()
+
+
+def axes_of(radar: Radar, grid: Grid) -> list[Axis]:
+    """The axes of a map: range, u and v.
+
+    Args:
+        radar: Its windows and its array count.
+        grid: Bins.
+
+    Raises:
+        InputError: A radar that does not sample its echoes.
+    """
+    waveform, array = sampled(radar), aperture(radar)
+    window = unit_window(radar.window, waveform.samples)
+    sample = torch.arange(waveform.samples, dtype=torch.float64) / waveform.max_range
+    x, y = array.x[array.column] / waveform.wavelength, array.y[array.row] / waveform.wavelength
+    return [
+        Axis(window, sample, grid.range_start, grid.range_step, grid.range_count),
+        Axis(array.weight, x, grid.u_start, grid.u_step, grid.u_count),
+        Axis(array.weight, y, grid.v_start, grid.v_step, grid.v_count),
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
@@ -109,23 +108,5 @@ class Twin:
                 one = Primitive(thing.name, thing.figure, self.ground, self.level)
                 item = one.item
                 mesh = type(item.mesh)(item.mesh.vertices.detach(), item.mesh.faces)
-                objects[thing.name] = Object(mesh, one.matte.written())
+                objects[thing.name] = Object(mesh, thing.figure.material)
         return Scene(objects) if objects else None
-
-
-def brightest_first(things: list[Thing]) -> tuple[Thing, ...]:
-    """Things by confidence, those that move last.
-
-    Args:
-        things: In any order.
-    """
-    return tuple(sorted(things, key=lambda one: (one.velocity is not None, -one.confidence)))
-
-
-def normal_tail(score: float) -> float:
-    """The probability that a standard normal number is larger.
-
-    Args:
-        score: In standard deviations.
-    """
-    return 0.5 * float(torch.special.erfc(torch.tensor(score / 2**0.5, dtype=torch.float64)))

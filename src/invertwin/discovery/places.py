@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import torch
 from jaxtyping import Float64
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from invertwin.capture import Capture, ChirpCapture, backproject
 from invertwin.channel import Grid
 from invertwin.discovery.outcome import Thing
-from invertwin.radar import points_of, range_doppler, velocity_span
+from invertwin.inversion.initial import linked
+from invertwin.radar import noise_power, points_of, range_doppler, velocity_span
 
 _CELLS = 3.0  # of range and rate between echoes of one mover
 _STRONG = 0.1  # of the strongest: dimmer peaks may be sidelobes
@@ -45,12 +44,10 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
     if not len(rows):
         return []
     where = torch.stack([points.range, points.velocity], dim=1)[rows] / scales
-    tree = KDTree(where.numpy())
-    _, label = connected_components(tree.sparse_distance_matrix(tree, 1.0), directed=False)
-    labels = torch.from_numpy(label.astype("int64"))
+    labels = linked(where, 1.0)
     flat = range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
     # Beams over all channels have this much less noise than one channel.
-    noise = float(flat.abs().square().median()) / math.log(2) / len(radar.virtual_positions)
+    noise = noise_power(flat.abs().square(), 1) / len(radar.virtual_positions)
     draws, top = flat.numel(), float(points.power[rows].max())
     found: list[Thing] = []
     origin = radar.positions[frame].detach()
@@ -144,8 +141,7 @@ def points_along(
     """
     image, agree = coherent_image(capture, places)
     count = capture.radar().frame_count
-    # The image's own noise: the median of exponentially distributed power.
-    noise = float(image.median()) / math.log(2)
+    noise = noise_power(image, 1)
     left, found = image.clone(), list[Thing]()
     cell = capture.radar().waveform.range_resolution
     top = float(image.max())

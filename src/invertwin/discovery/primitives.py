@@ -23,6 +23,7 @@ THIN = 0.06
 SMALL = 0.06
 """What is smaller than this is a point [m]."""
 _SIZES = 0.01, 10.0  # of sides [m]
+_BOXED, _BALLS = ("wall", "box"), ("sphere", "point")
 _WHITE = 0.9  # of the reflectance of a material
 
 
@@ -42,14 +43,6 @@ class Matte(Material):
     def surface(self, frequency: float) -> Surface:
         """The same at every frequency [Hz]."""
         return Surface(torch.ones(256, dtype=torch.float64), self.brightness)
-
-    def written(self) -> RoughDielectric | RoughConductor:
-        """The nearest material that a run file can name."""
-        share = float(self.brightness.detach())
-        if share > _WHITE:
-            return RoughConductor()
-        root = math.sqrt(max(share, 1e-6))
-        return RoughDielectric(permittivity=((1 + root) / (1 - root)) ** 2)
 
 
 @dataclass(frozen=True)
@@ -80,7 +73,20 @@ class Figure:
     @property
     def boxed(self) -> bool:
         """Whether it has corners."""
-        return self.kind in ("wall", "box")
+        return self.kind in _BOXED
+
+    @property
+    def ball(self) -> bool:
+        """Whether it is round all over, so that it need not stand on the ground."""
+        return self.kind in _BALLS
+
+    @property
+    def material(self) -> RoughDielectric | RoughConductor:
+        """The nearest material that a run file can name."""
+        if self.brightness > _WHITE:
+            return RoughConductor()
+        root = math.sqrt(max(self.brightness, 1e-6))
+        return RoughDielectric(permittivity=((1 + root) / (1 - root)) ** 2)
 
     @property
     def named(self) -> Kind:
@@ -119,7 +125,7 @@ class Primitive(nn.Module):
         super().__init__()
         self.kind: Kind = start.kind
         self.object, self.ground, self.level = name, ground, level
-        self.round = start.kind in ("sphere", "point")
+        self.round = start.ball
         low, high = _SIZES
         sizes = [min(max(v, low), high) for v in (start.length, start.width, start.height)]
         logs = torch.tensor(sizes, dtype=torch.float64).log() / self._SIZE
@@ -149,7 +155,7 @@ class Primitive(nn.Module):
         x, y = self.place.detach().tolist()
         if self.round:
             height = float(self.size.detach()[2])
-        if self.kind not in ("wall", "box"):
+        if self.kind not in _BOXED:
             width = length
         yaw = self._TURN * float(self.turn.detach())
         return Figure(
@@ -165,7 +171,7 @@ class Primitive(nn.Module):
         sides = [size[0]] * 3
         if not self.round:
             sides[up] = size[2]
-        if self.kind in ("wall", "box"):
+        if self.kind in _BOXED:
             sides[second] = size[1]
         middle = [self.level + 0.5 * size[2]] * 3
         if self.round:
@@ -175,7 +181,7 @@ class Primitive(nn.Module):
         yaw = self._TURN * self.turn
         c, s = yaw.cos(), yaw.sin()
         # The turn of ``Ground.turn``: about y it takes z towards x, about z it takes x towards y.
-        sign = -1.0 if self.ground.up == "y" else 1.0
+        sign = self.ground.sense
         columns = list(local.unbind(-1))
         a, b = columns[first], columns[second]
         columns[first], columns[second] = c * a - sign * s * b, sign * s * a + c * b
@@ -184,12 +190,7 @@ class Primitive(nn.Module):
     @property
     def item(self) -> Object:
         """The object, differentiable by all parameters."""
-        return Object(self.mesh(), self.matte)
-
-    @property
-    def matte(self) -> Matte:
-        """Its material."""
-        return Matte(self.brightness)
+        return Object(self.mesh(), Matte(self.brightness))
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the object in it, in place of one of the same name."""
@@ -242,7 +243,7 @@ def upright(figure: Figure, ground: Ground, level: float) -> Float64[Tensor, "3"
     """
     place = torch.zeros(3, dtype=torch.float64)
     place[list(ground.level)] = torch.tensor(figure.place, dtype=torch.float64)
-    half = figure.height if figure.kind in ("sphere", "point") else 0.5 * figure.height
+    half = figure.height if figure.ball else 0.5 * figure.height
     place[ground.vertical] = level + half
     return place
 
@@ -250,9 +251,9 @@ def upright(figure: Figure, ground: Ground, level: float) -> Float64[Tensor, "3"
 @cache
 def _unit(kind: str, up: str) -> Mesh:
     """A shape of size one about the origin."""
-    if kind in ("wall", "box"):
+    if kind in _BOXED:
         return box(1.0)
-    if kind in ("sphere", "point"):
+    if kind in _BALLS:
         return sphere(0.5, 2)
     upright = cylinder(0.5, 1.0)
     # About x by a quarter turn: y to z.

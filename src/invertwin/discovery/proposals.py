@@ -5,12 +5,10 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float64
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from invertwin.discovery.primitives import Figure
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initial import Ground, linked
 
 _TURNS = 45  # yaws that a rectangle is tried at, over a quarter turn
 _TRIM = 0.05  # share of the weight beyond each side of a rectangle
@@ -46,9 +44,7 @@ def groups(
     lit = weight.nonzero()[:, 0]
     if not len(lit):
         return []
-    tree = KDTree(places[lit].numpy())
-    _, label = connected_components(tree.sparse_distance_matrix(tree, gap), directed=False)
-    labels = torch.from_numpy(label.astype("int64"))
+    labels = linked(places[lit], gap)
     found = []
     for number in range(int(labels.max()) + 1):
         own = torch.zeros_like(weight)
@@ -113,14 +109,13 @@ def figures(
     # The tightest, and the smallest: half a box is best enclosed, a whole one best outlined.
     tightest = max(tried, key=lambda one: one[0][2])
     smallest = min(tried, key=lambda one: float((one[0][1] + step).prod()))
-    sign = -1.0 if ground.up == "y" else 1.0
     rows: list[Figure] = []
     chosen: Sequence[tuple[tuple[Tensor, Tensor, float], float]] = [tightest, smallest]
     for (middle, sides, _), turn in chosen:
         # The image is about a step wider than what is there.
         length, width = (max(float(side), 0.02) for side in sides)
         x, y = middle.tolist()
-        rows.append(Figure("box", (x, y), sign * turn, length, width, 1.5 * height))
+        rows.append(Figure("box", (x, y), ground.sense * turn, length, width, 1.5 * height))
     spread = max(float(smallest[0][1].mean()), 0.02)
     x, y = smallest[0][0].tolist()
     rows.append(Figure("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))

@@ -14,7 +14,7 @@ from invertwin.channel import Grid, Sight
 from invertwin.discovery.assembly import Assembly, sampling_of
 from invertwin.discovery.certainty import deviations, kind_probabilities, presence
 from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
-from invertwin.discovery.outcome import Picture, Thing, Twin, brightest_first
+from invertwin.discovery.outcome import Picture, Thing, Twin
 from invertwin.discovery.places import dense, movers, points_along
 from invertwin.discovery.primitives import upright
 from invertwin.discovery.search import Lattice, Search
@@ -89,7 +89,7 @@ def twin(
         moving = movers(recording, radar.grid(near, farthest))
     if reach is None:
         said = "nothing that stands still is above the noise" if moving else _NOTHING
-        return Twin(brightest_first(moving), plane, floor, notes=(said,))
+        return Twin(_surest_first(moving), plane, floor, notes=(said,))
     places, step = _places(radar, plane, plane_at, reach, low, high)
     if dense(capture):
         # Frames add up only where all of them have an echo.
@@ -97,19 +97,10 @@ def twin(
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
         found, image = points_along(capture, places, 4 * max(step, radar.waveform.wavelength))
         picture = Picture(places[:, list(plane.level)], image, _views(radar, places, None))
-        return Twin(brightest_first([*found, *moving]), plane, floor, picture)
+        return Twin(_surest_first([*found, *moving]), plane, floor, picture)
     grid = radar.grid(*reach)
     still = _standing(capture, radar, grid, plane, floor, places, step, rays, seed)
-    return Twin(
-        brightest_first([*still.things, *moving]),
-        plane,
-        floor,
-        still.picture,
-        still.predicted,
-        still.observed,
-        still.grid,
-        still.notes,
-    )
+    return replace(still, things=_surest_first([*still.things, *moving]))
 
 
 def still_capture(recording: Capture | ChirpCapture) -> Capture:
@@ -161,7 +152,7 @@ def _standing(
     height = float(places[:, ground.vertical].mean()) - level
     lattice = Lattice(flat, step, responses(fitted.radar, coarse, places), max(height, 0.1))
     search = Search(fitted, one.frames(held) if held else None, lattice)
-    picture = search.image([])
+    picture = search.first_image
     shapes = search.run()
     level_map = one.loss.level[:, None, None].to(power)
     if not shapes:
@@ -215,6 +206,11 @@ def _explained(one: Assembly, response: Response, strength: Tensor) -> float:
     loss = HeavyTailed(one.loss.level[::stride], one.loss.degrees)
     rows = loss.rows(torch.zeros_like(power), power) - loss.rows(response.maps(strength), power)
     return float(rows.sum()) / shared_bins(one.radar, coarse)
+
+
+def _surest_first(things: list[Thing]) -> tuple[Thing, ...]:
+    """Things by confidence, those that move last."""
+    return tuple(sorted(things, key=lambda one: (one.velocity is not None, -one.confidence)))
 
 
 def _own(errors: dict[str, float], prefix: str) -> dict[str, float]:
@@ -287,10 +283,10 @@ def _places(
         places = torch.zeros(len(flat), 3, dtype=torch.float64)
         places[:, axes], places[:, ground.vertical] = flat, height
         near = torch.zeros(len(flat), dtype=torch.bool)
-        for k in range(radar.frame_count):
-            way = places - radar.positions.detach()[k]
+        for place, axis in _boresights(radar):
+            way = places - place
             distance = way.norm(dim=1)
-            ahead = way @ radar.link().rotations.detach()[k][:, 2] > 0.05 * distance
+            ahead = way @ axis > 0.05 * distance
             near |= ahead & (distance > ranges[0]) & (distance < ranges[1])
         if int(near.sum()) <= _PLACES:
             break
@@ -305,10 +301,9 @@ def _views(
 ) -> Int64[Tensor, " place"]:
     """How many positions of the radar see each place, past all things."""
     total = torch.zeros(len(places), dtype=torch.int64)
-    for k in range(radar.frame_count):
-        place = radar.positions.detach()[k]
+    for place, axis in _boresights(radar):
         way = places - place
-        seen = way @ radar.link().rotations.detach()[k][:, 2] > 0
+        seen = way @ axis > 0
         if scene is not None:
             sight = Sight(scene, place)
             face = sight.first(way)
@@ -318,3 +313,9 @@ def _views(
             seen &= length > way.norm(dim=1)
         total += seen
     return total
+
+
+def _boresights(radar: Radar) -> list[tuple[Tensor, Tensor]]:
+    """Place and boresight of every frame."""
+    axes = radar.link().rotations.detach()[:, :, 2]
+    return list(zip(radar.positions.detach(), axes, strict=True))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float64
@@ -96,6 +97,11 @@ class Search:
             return True
         return float(self.held.gains(new).sum()) > float(self.held.gains(old).sum())
 
+    @cached_property
+    def first_image(self) -> Float64[Tensor, " place"]:
+        """Where echoes come from, while nothing is known."""
+        return self.image([])
+
     def image(self, shapes: Sequence[Figure]) -> Float64[Tensor, " place"]:
         """What shapes leave unexplained, as an image.
 
@@ -134,7 +140,7 @@ class Search:
         Args:
             shapes: What is known already.
         """
-        strength = self.image(shapes)
+        strength = self.image(shapes) if shapes else self.first_image
         # What a point's own kind of image cannot tell from speckle is left alone.
         weight = bright(strength)
         parts = groups(self.lattice.places, weight, 3.5 * self.lattice.step)
@@ -341,8 +347,7 @@ def around(shapes: Sequence[Figure], yaw: float, ground: Ground) -> Figure:
         ground: The plane.
     """
     corners = torch.cat([outline(shape, ground) for shape in shapes])
-    sign = -1.0 if ground.up == "y" else 1.0
-    c, s = math.cos(sign * yaw), math.sin(sign * yaw)
+    c, s = math.cos(ground.sense * yaw), math.sin(ground.sense * yaw)
     own = corners @ torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
     low, high = own.amin(0), own.amax(0)
     x, y = (0.5 * (low + high)).tolist()
@@ -381,8 +386,7 @@ def outline(shape: Figure, ground: Ground, count: int = 16) -> Float64[Tensor, "
     if not shape.boxed:
         turns = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
         return middle + 0.5 * shape.length * torch.stack([turns.cos(), turns.sin()], dim=1)
-    sign = -1.0 if ground.up == "y" else 1.0
-    c, s = math.cos(sign * shape.yaw), math.sin(sign * shape.yaw)
+    c, s = math.cos(ground.sense * shape.yaw), math.sin(ground.sense * shape.yaw)
     half = 0.5 * torch.tensor([shape.length, shape.width], dtype=torch.float64)
     signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=torch.float64)
     return middle + (signs * half) @ torch.tensor([[c, s], [-s, c]], dtype=torch.float64)

@@ -9,11 +9,11 @@ from scipy import sparse
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.discovery.clutter import Axis, axes_of
 from invertwin.errors import InputError
 from invertwin.progress import told
 from invertwin.radar import Radar
 from invertwin.radar.spectrum import aperture
-from invertwin.radar.waveform import SampledWaveform, unit_window
 
 _LEAST = 1e-3  # of a response, relative to its peak: less is left out
 _FINE = 32  # entries of a kernel's table in one bin
@@ -91,7 +91,7 @@ def responses(radar: Radar, grid: Grid, places: Float64[Tensor, "place 3"]) -> R
         InputError: More places than memory allows, or a radar of pulses.
     """
     link, shape = radar.link(), (radar.frame_count, *grid.shape)
-    tables = [_Kernel.of_range(radar, grid), *_Kernel.of_directions(radar, grid)]
+    tables = [_Kernel.of(axis) for axis in axes_of(radar, grid)]
     estimate = len(places) * radar.frame_count * np.prod([len(table.offsets) for table in tables])
     if estimate > 4 * _MOST:
         raise InputError(
@@ -186,16 +186,12 @@ class _Kernel:
     table: np.ndarray
 
     @classmethod
-    def of_weights(
-        cls, weight: Tensor, cycles: Tensor, axis: tuple[float, float, int]
-    ) -> "_Kernel":
-        start, step, count = axis
+    def of(cls, axis: Axis) -> "_Kernel":
+        start, step, count = axis.start, axis.step, axis.count
         if count == 1:
             return cls(start, step, 1, np.zeros(1, dtype=np.int64), np.ones(1))
         lags = torch.arange(-16 * _FINE, 16 * _FINE + 1, dtype=torch.float64) / _FINE
-        phase = 2 * torch.pi * lags[:, None] * step * cycles
-        field = torch.polar(weight.expand(len(lags), -1), phase).sum(1) / weight.sum()
-        power = field.abs().square()
+        power = axis.response(lags)
         # Up to the first null: what lies beyond is below the background of most recordings.
         middle = 16 * _FINE
         rising = (power[middle + 1 :] > power[middle:-1]).nonzero()
@@ -204,29 +200,6 @@ class _Kernel:
         power[middle + reach + 1 :] = 0.0
         half = reach // _FINE + 1
         return cls(start, step, count, np.arange(-half, half + 1), power.numpy())
-
-    @classmethod
-    def of_range(cls, radar: Radar, grid: Grid) -> "_Kernel":
-        waveform = radar.waveform
-        if not isinstance(waveform, SampledWaveform):
-            raise InputError(
-                "expected a radar that samples its echoes, got one of pulses; use backprojection"
-            )
-        samples = torch.arange(waveform.samples, dtype=torch.float64)
-        window = unit_window(radar.window, waveform.samples)
-        axis = grid.range_start, grid.range_step, grid.range_count
-        return cls.of_weights(window, samples / waveform.max_range, axis)
-
-    @classmethod
-    def of_directions(cls, radar: Radar, grid: Grid) -> "list[_Kernel]":
-        array, length = aperture(radar), radar.waveform.wavelength
-        return [
-            cls.of_weights(array.weight, places / length, axis)
-            for places, axis in (
-                (array.x[array.column], (grid.u_start, grid.u_step, grid.u_count)),
-                (array.y[array.row], (grid.v_start, grid.v_step, grid.v_count)),
-            )
-        ]
 
     def near(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bins near places [place, n], and the response there."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy.ndimage import map_coordinates
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -53,6 +53,11 @@ class Ground:
     def level(self) -> tuple[int, int]:
         """Indices of the two axes of the plane."""
         return (0, 2) if self.up == "y" else (0, 1)
+
+    @property
+    def sense(self) -> float:
+        """1 if a positive yaw turns the first axis of the plane towards the second, else −1."""
+        return -1.0 if self.up == "y" else 1.0
 
     def turn(self, yaw: float) -> Float64[Tensor, "3 3"]:
         """The rotation by a yaw [rad] about the axis that points up."""
@@ -176,6 +181,19 @@ def image_points(
     return nodes[image >= share * image.max()]
 
 
+def linked(points: Float64[Tensor, "point axis"], gap: float) -> Int64[Tensor, " point"]:
+    """Number the groups of points that are linked by steps of at most a gap.
+
+    Args:
+        points: [m], or in units of the gap.
+        gap: longest step between linked points.
+    """
+    tree = KDTree(points.numpy())
+    # Distances of zero are no entries: every point is linked to itself by being a node.
+    _, label = connected_components(tree.sparse_distance_matrix(tree, gap), directed=False)
+    return torch.from_numpy(label.astype("int64"))
+
+
 def largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Tensor, "part 3"]:
     """Find the largest set of points that are linked by steps of at most a gap [m].
 
@@ -183,10 +201,7 @@ def largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Ten
         points: [m].
         gap: longest step between linked points [m].
     """
-    pairs = KDTree(points.numpy()).sparse_distance_matrix(KDTree(points.numpy()), gap)
-    # Distances of zero are no entries: every point is linked to itself by being a node.
-    _, label = connected_components(pairs, directed=False)
-    labels = torch.from_numpy(label.astype("int64"))
+    labels = linked(points, gap)
     return points[labels == torch.bincount(labels).argmax()]
 
 
@@ -249,8 +264,7 @@ def principal_rectangle(
     _, axes = torch.linalg.eigh(torch.cov(flat.T))
     first = axes[:, 1]
     # The image of the first ground axis under a yaw about y is (cos, −sin) in (x, z).
-    sign = -1.0 if ground.up == "y" else 1.0
-    yaw = math.atan2(sign * float(first[1]), float(first[0]))
+    yaw = math.atan2(ground.sense * float(first[1]), float(first[0]))
     return _bounded(points, yaw, ground)
 
 

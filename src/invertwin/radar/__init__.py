@@ -49,6 +49,7 @@ from invertwin.radar.radar import Radar as Radar
 from invertwin.radar.range_profile import add_noise as add_noise
 from invertwin.radar.range_profile import beat_signal as beat_signal
 from invertwin.radar.range_profile import range_profile as range_profile
+from invertwin.radar.reflectors import noise_power as noise_power
 from invertwin.radar.reflectors import points_csv as points_csv
 from invertwin.radar.reflectors import points_of as points_of
 from invertwin.radar.spectrum import beamform as beamform
