@@ -14,7 +14,6 @@ from typer.core import TyperGroup
 
 from invertwin import __version__
 from invertwin.cli.options import (
-    LOOPBACK,
     BackendOption,
     Dataset,
     FileArgument,
@@ -201,7 +200,7 @@ def view(
         Path,
         typer.Argument(help="Run folder, run file or capture (.nc).", show_default=False),
     ],
-    host: Annotated[str, typer.Option(help="Others than this machine need a token.")] = LOOPBACK,
+    host: Annotated[str, typer.Option(help="Others than this machine need a token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="The first that is tried.")] = 8080,
     token: Annotated[
         str | None, typer.Option(help="16 letters or digits that the address must hold.")
@@ -324,8 +323,9 @@ def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
 
         fits = isinstance(options, Fits)
         workers = Workers.asked(options.engine, options.workers) if fits else None
+        view = isinstance(options, Fits) and options.view
         with about_file(file):
-            tables, outcome = run_reconstruct(runs[file.stem], folder, console, workers)
+            tables, outcome = run_reconstruct(runs[file.stem], folder, console, workers, view=view)
         print_tables(tables)
         console.print(outcome, markup=False, soft_wrap=True)
 

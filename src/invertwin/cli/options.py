@@ -21,7 +21,6 @@ def _use_backend(value: str | None) -> str | None:
     return value
 
 
-LOOPBACK = "127.0.0.1"
 BackendOption = Annotated[
     Literal["auto", "cpu", "cuda"] | None,
     typer.Option(
@@ -105,6 +104,9 @@ class Fits(Resumable):
         ),
     ] = None
     engine: EngineOption = "processes"
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the fits in a browser while they go on.")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,16 +1,14 @@
 """`invertwin view`: a run folder, a run file or a capture in the browser, or on a page."""
 
-import json
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from invertwin.capture import Capture, shown_ranges
 from invertwin.channel import Grid
 from invertwin.cli import build
+from invertwin.cli.fits.displays import VIEW
 from invertwin.cli.fits.problem import fitted_objects, sensors_of
 from invertwin.cli.run_file import about_file, load_run
 from invertwin.cli.schema import RunFile
@@ -27,9 +25,6 @@ from invertwin.viewer import (
     display_of,
     page_html,
 )
-
-VIEW = "view.npz"
-"""What a fit leaves in its folder to be viewed."""
 
 
 def run_view(

@@ -10,8 +10,11 @@ from invertwin.viewer.layers import body_of as body_of
 from invertwin.viewer.layers import capture_layers as capture_layers
 from invertwin.viewer.layers import display_of as display_of
 from invertwin.viewer.layers import ellipsoid_layers as ellipsoid_layers
+from invertwin.viewer.layers import scene_layers as scene_layers
 from invertwin.viewer.link import Link as Link
 from invertwin.viewer.page import page_html as page_html
+from invertwin.viewer.page import policy as policy
 from invertwin.viewer.page import view_html as view_html
 from invertwin.viewer.panels import MEASURED as MEASURED
+from invertwin.viewer.panels import SIMULATED as SIMULATED
 from invertwin.viewer.server import Viewer as Viewer

@@ -64,10 +64,12 @@ class Step:
     """Where a fit stood.
 
     Attributes:
+        number: Steps done.
         label: Such as "step 12, loss 0.31".
         bodies: What moves, by the name of its object.
     """
 
+    number: int
     label: str
     bodies: Mapping[str, Body]
 
@@ -192,7 +194,7 @@ class Display:
         header = np.array(json.dumps(plain(self) | {"format": _FORMAT}))
         named = {f"a{number}": array for number, array in enumerate(arrays.values())}
         with Path(path).open("wb") as file:
-            np.savez_compressed(file, header=header, **named)
+            np.savez_compressed(file, allow_pickle=False, header=header, **named)
 
     @classmethod
     def load(cls, path: str | Path) -> "Display":
@@ -219,10 +221,13 @@ class Display:
                 raise ValueError("of another version")
             maps = read.pop("maps")
             steps = [
-                Step(step["label"], {n: Body(**body) for n, body in step["bodies"].items()})
+                Step(**step | {"bodies": {n: Body(**body) for n, body in step["bodies"].items()}})
                 for step in read.pop("steps")
             ]
-            layers = [Layer(**layer) for layer in read.pop("layers")]
+            layers = [
+                Layer(**layer | {"color": tuple(layer["color"])}) for layer in read.pop("layers")
+            ]
+            read |= {key: tuple(read[key]) for key in ("up", "ahead")}
             for body in (*layers, *(body for step in steps for body in step.bodies.values())):
                 _check(body)
             return cls(**read, layers=layers, steps=steps, maps=maps and Maps(**maps))

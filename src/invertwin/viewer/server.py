@@ -2,13 +2,12 @@
 
 import importlib
 import io
-import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -329,9 +328,7 @@ class Viewer:
             maps |= {SIMULATED: floats(link.map(scene, wish.frame))}
         self._panels.show(maps, wish.bin)
         if wish.bin is not None:
-            axes = (link.grid.ranges, link.grid.u) if link else (known.ranges, known.across)
-            away, across = (float(axis[k]) for axis, k in zip(axes, wish.bin, strict=True))
-            self._bin.value = f"range {away:.2f} m, u {across:.3f}"
+            self._bin.value = self._told(*wish.bin)
         if link is None or scene is None:
             return
         now = time.perf_counter()
@@ -342,6 +339,16 @@ class Viewer:
             self._rate.value = f"{self.rate:.1f}"
         if not self._due.wait(_STILL):
             self._show_paths(link.seen(scene, wish.frame), wish.bin)
+
+    def _told(self, row: int, column: int) -> str:
+        """A bin in words."""
+        if self._link is not None:
+            grid = self._link.grid
+            away, across = float(grid.ranges[row]), float(grid.u[column])
+        else:
+            assert self._display.maps is not None
+            away, across = self._display.maps.ranges[row], self._display.maps.across[column]
+        return f"range {away:.2f} m, u {across:.3f}"
 
     def _show_paths(self, seen: Seen, chosen: tuple[int, int] | None) -> None:
         points = floats(seen.points)
@@ -366,7 +373,8 @@ def _started(guard: Guard, host: str, port: int) -> Any:
         viser: Any = importlib.import_module("viser")
     except ImportError:
         raise InputError(
-            'expected the package viser for the viewer, got none; type: pip install "invertwin[view]"'
+            "expected the package viser for the viewer, got none; type: "
+            'pip install "invertwin[view]"'
         ) from None
 
     class Server(viser.ViserServer):

@@ -1,16 +1,17 @@
 """What a fit leaves to be seen in three dimensions: its steps, its twin, the truth, error bars."""
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from invertwin.cli.fits.problem import Problem, fitted_objects
-from invertwin.cli.fits.scores import Fitted
-from invertwin.cli.report import View
+from invertwin.folders import PARTS
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
-from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.viewer import (
@@ -23,7 +24,7 @@ from invertwin.viewer import (
     body_of,
     display_of,
     ellipsoid_layers,
-    view_html,
+    scene_layers,
 )
 
 VIEW = "view.npz"
@@ -99,6 +100,15 @@ class KeptSteps(Callback):
         return found
 
 
+def steps_file(checkpoint: str) -> str:
+    """Where the steps of a fit are kept, as a path in the run's folder.
+
+    Args:
+        checkpoint: That of the fit.
+    """
+    return f"{PARTS}/{Path(checkpoint).stem}_steps.npz"
+
+
 def steps_in(file: Path) -> list[Step]:
     """The steps that a fit has kept.
 
@@ -106,6 +116,36 @@ def steps_in(file: Path) -> list[Step]:
         file: Of `KeptSteps`.
     """
     return list(Display.load(file).steps) if file.exists() else []
+
+
+def display_of_fit(
+    problem: Problem,
+    start: Scene,
+    twin: Scene,
+    maps: Mapping[str, Sequence[Tensor]],
+    metrics: Mapping[str, Any],
+    steps: Sequence[Step],
+) -> Display:
+    """A display of a fit that has ended.
+
+    Args:
+        problem: What was fitted.
+        start: From where.
+        twin: What was found.
+        maps: "measured" and "twin" of every sensor.
+        metrics: Its error bars.
+        steps: Those that were kept.
+    """
+    display = display_of_problem(problem, twin)
+    names = [name for name in fitted_objects(problem.run) if name in start.names]
+    more = scene_layers(start, "start", fitted=names, only=True)
+    shown = {MEASURED: maps["measured"][0], SIMULATED: maps["twin"][0]}
+    return replace(
+        display,
+        layers=[*display.layers, *more, *ellipsoid_layers(twin, metrics)],
+        steps=steps,
+        maps=Maps.of(shown, problem.first.grid),
+    )
 
 
 def display_of_problem(problem: Problem, scene: Scene) -> Display:
@@ -119,6 +159,4 @@ def display_of_problem(problem: Problem, scene: Scene) -> Display:
     known = any(name in problem.known for name in names)
     sights = {name: (sight.radar, sight.grid) for name, sight in problem.sights.items()}
     title = problem.run.title or "Reconstruction"
-    return display_of(
-        scene, sights, title, truth=problem.truth if known else None, fitted=dict.fromkeys(names)
-    )
+    return display_of(scene, sights, title, truth=problem.truth if known else None, fitted=names)

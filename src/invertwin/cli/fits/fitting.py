@@ -16,9 +16,11 @@ from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
+from invertwin.cli.fits.displays import KeptSteps, steps_file
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
+    fitted_objects,
     known_of,
     models_of,
     observations_of,
@@ -51,6 +53,7 @@ from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runs import RunFolder
 from invertwin.scene import Object, Scene
 from invertwin.seeds import derived_seed
+from invertwin.viewer import Step
 
 
 def calibrated(
@@ -100,6 +103,7 @@ def fit(
     folder: RunFolder,
     console: Console,
     checkpoint: str | None,
+    show: Callable[[Step], None] | None = None,
 ) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
     """One fit, or what an interrupted run has kept of it.
 
@@ -111,6 +115,7 @@ def fit(
         folder: Keeps results and checkpoints.
         console: Shows progress.
         checkpoint: Name of the checkpoint; None = one among the parts.
+        show: Is told of steps as they come.
 
     Returns:
         The row of the fit, and a function that gives its outcome.
@@ -119,7 +124,7 @@ def fit(
     checkpoint = checkpoint or f"{part}.pt"
     own = varied(problem, mode)
     stages = schedule_of(own)
-    again = partial(_staged, own, stages, start, index, folder, checkpoint)
+    again = partial(_staged, own, stages, start, index, folder, checkpoint, show)
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
@@ -154,6 +159,7 @@ def _staged(
     index: int,
     folder: RunFolder,
     checkpoint: str,
+    show: Callable[[Step], None] | None,
     shown: Sequence[Report] = (),
 ) -> tuple[Reconstruction, dict[str, Any]]:
     """A fit, or a search about its start; and what the row says of the search."""
@@ -164,7 +170,14 @@ def _staged(
         for k in range(len(stages) - 1):
             folder.file(str(stage_file(Path(file), k)))
         watching = [] if watch is None else [Watch(watch, every)]
-        return [*watching, *shown, _checkpoint(problem, folder, file)]
+        kept = KeptSteps(
+            folder.file(steps_file(file)),
+            [name for name in dict.fromkeys(fitted_objects(run)) if name in start.names],
+            sum(stage.steps for stage in stages),
+            settings_of(run).checkpoint_every,
+            show if shown else None,
+        )
+        return [*watching, *shown, _checkpoint(problem, folder, file), kept]
 
     given = start, observations_of(problem), unknowns_of(run)
     how: dict[str, Any] = {key: build.made(run, key) for key in ("loss", "optimizer")}
