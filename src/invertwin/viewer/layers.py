@@ -131,7 +131,7 @@ def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[Layer]:
     """
     deviations: Mapping[str, float] = metrics.get("standard_deviations", {})
     names, layers = list(deviations), []
-    correlations = np.array(metrics.get("correlations", []), float)
+    correlations = torch.as_tensor(metrics.get("correlations", [])).double().numpy()
     for name in scene.names:
         own = [(axis, f"{name}.{c}") for axis, c in enumerate("xyz") if f"{name}.{c}" in names]
         if not own:

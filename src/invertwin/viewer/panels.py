@@ -109,7 +109,7 @@ class Panels:
                 self._nodes[name].image = _drawn(np.uint8(255 * colors[..., :3]), chosen)
 
 
-def _decibels(power: NDArray[np.float32]) -> NDArray[np.float64]:
+def _decibels(power: NDArray[np.float32]) -> NDArray[Any]:
     peak = float(power.max()) or 1.0
     return (10 * np.log10(np.maximum(power / peak, 1e-30))).clip(_DARKEST, 0.0)
 
