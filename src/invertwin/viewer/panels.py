@@ -15,7 +15,7 @@ _PIXELS = 200  # along the shorter side of a picture, at least
 
 
 class Panels:
-    """Three pictures to the right of the scene, each bin of which can be clicked.
+    """Pictures in a row above the scene, each bin of which can be clicked.
 
     Args:
         server: Of viser.
@@ -24,7 +24,7 @@ class Panels:
         shape: Numbers of ranges and of directions.
 
     Attributes:
-        right: Direction to the right of who looks along the radar.
+        right: The direction in which u grows.
         offset: From the middle of the scene to that of the pictures.
     """
 
@@ -39,14 +39,16 @@ class Panels:
         if not shown:
             return
         self._shape = shape
-        self._size = 0.7 * float(np.linalg.norm(high - low))
+        self._size = 0.5 * (float(np.linalg.norm(high - low)) or 1.0)
         self._axes = self.right, up
-        reach = float(np.abs((high - low) @ np.abs(self.right))) / 2
-        middle = (low + high) / 2
+        self.offset = up * (float((high - low) @ np.abs(up)) / 2 + 0.65 * self._size)
+        self._known: dict[str, tuple[Any, Any]] = {}
         # The picture's right, which is that of u, its foot, and what is behind it.
         turn = _quaternion(np.stack([self.right, -up, -ahead], axis=1))
         for number, name in enumerate(shown):
-            place = middle + self.right * (reach + self._size * (0.7 + 1.1 * number))
+            # The first one stands on the left of who looks along the radar.
+            across = 1.1 * self._size * ((len(shown) - 1) / 2 - number)
+            place = (low + high) / 2 + self.offset + across * self.right
             self._places[name] = place
             self._nodes[name] = server.scene.add_image(
                 f"/maps/{name}",
@@ -62,7 +64,6 @@ class Panels:
             server.scene.add_label(
                 f"/maps/{name}/label", name, position=(0.0, -0.55 * self._size, 0.0)
             )
-        self.offset = np.mean(list(self._places.values()), axis=0) - middle
 
     def on_click(self, choose: Callable[[tuple[int, int]], None]) -> None:
         """Say which bin was clicked.
@@ -105,8 +106,14 @@ class Panels:
             apart = levels[MEASURED] - levels[SIMULATED]
             pictures[RESIDUAL] = colormaps["RdBu_r"](0.5 + apart / (2 * _LARGEST))
         for name, colors in pictures.items():
-            if name in self._nodes:
+            if name in self._nodes and not (name in maps and self._has(name, maps[name], chosen)):
                 self._nodes[name].image = _drawn(np.uint8(255 * colors[..., :3]), chosen)
+
+    def _has(self, name: str, power: NDArray[np.float32], chosen: Any) -> bool:
+        """Whether a picture shows that already; from now on it does."""
+        before, frame = self._known.get(name, (None, None))
+        self._known[name] = power, chosen
+        return before is not None and frame == chosen and bool((before == power).all())
 
 
 def _decibels(power: NDArray[np.float32]) -> NDArray[Any]:

@@ -26,7 +26,7 @@ _NOBODY = "nothing"
 _SHOWN_PATHS = 300  # rays that are drawn
 _TIMES = 20  # updates over which their rate is taken
 _PAUSE = 1.0  # seconds: later updates do not follow each other
-_STILL = 0.1  # seconds after which nothing moves
+_STILL = 0.4  # seconds after which nothing moves
 # Layers of the present position, and their colours.
 _PATHS, _SEEN, _EDGES, _FED = "sampled paths", "what is seen", "boundary paths", "chosen bin"
 _OWN = {_PATHS: (120, 170, 220), _SEEN: (30, 140, 90), _EDGES: (200, 40, 160), _FED: (255, 220, 0)}
@@ -175,11 +175,11 @@ class Viewer:
         self._panels.on_click(lambda found: self._choose(bin=found))
         camera = self._server.initial_camera
         middle = (low + high) / 2
-        camera.look_at = middle + self._panels.offset / 2
-        away = self._size + float(np.linalg.norm(self._panels.offset)) / 2
         up, ahead = np.array(display.up), np.array(display.ahead)
-        camera.position = camera.look_at + away * (
-            0.3 * up - 0.9 * ahead + 0.2 * self._panels.right
+        # The window's own panel covers its right, where u falls.
+        camera.look_at = middle + 0.6 * self._panels.offset - 0.3 * self._size * self._panels.right
+        camera.position = camera.look_at + self._size * (
+            0.15 * up - 1.6 * ahead + 0.25 * self._panels.right
         )
         camera.up = up
 
@@ -302,6 +302,8 @@ class Viewer:
     def _show_step(self, wish: _Wish) -> None:
         if not self._steps or wish.step == self._taken:
             return
+        if wish.moved != _NOBODY:
+            self._mover.value = _NOBODY  # what was moved stands where the step has it
         self._taken, step = wish.step, self._steps[wish.step]
         for layer in self._display.at_step(step).layers:
             if layer.name.removeprefix("twin/") in step.bodies:
@@ -358,9 +360,9 @@ class Viewer:
         fed = floats(seen.feeding(*chosen)) if chosen else np.zeros((0, 3), np.float32)
         found: dict[str, tuple[str, NDArray[np.float32], float]] = {
             _PATHS: ("lines", corners.reshape(-1, 3), 1.0),
-            _SEEN: ("points", points[:, 1], 1.0),
-            _EDGES: ("points", floats(seen.edges), 1.5),
-            _FED: ("points", fed, 3.0),
+            _SEEN: ("points", points[:, 1], 0.4),
+            _EDGES: ("points", floats(seen.edges), 0.7),
+            _FED: ("points", fed, 1.5),
         }
         with self._server.atomic():
             for name, (kind, places, size) in found.items():
