@@ -44,7 +44,7 @@ class Watched:
     """A page whose errors and requests are noted."""
 
     def __init__(self, browser: Any) -> None:
-        self.page = browser.new_page(viewport={"width": 1280, "height": 800})
+        self.page = browser.new_page(viewport={"width": 1024, "height": 640})
         self.errors: list[str] = []
         self.requests: list[str] = []
         self.received: list[bytes] = []

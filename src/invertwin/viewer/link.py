@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invertwin.channel import Grid, Paths, Sampling
-from invertwin.channel import trace_power as trace_power
+from invertwin.channel import Grid, Paths, Sampling, torch_threads, trace_power
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap
 from invertwin.radar import Radar
@@ -107,7 +106,7 @@ class Link:
             scene: What is seen.
             frame: Number of the position.
         """
-        with torch.no_grad():
+        with torch.no_grad(), torch_threads(1):  # small work, which more threads slow
             return self._model.predict(scene, self.radar.frames([frame]), _SEED)[0].amax(2)
 
     def seen(self, scene: Scene, frame: int) -> Seen:
@@ -121,7 +120,7 @@ class Link:
         sampling = Sampling(
             depth=1, samples=_PATHS, boundary_samples=_EDGES, contacts=False, boundary=True
         )
-        with torch.no_grad():
+        with torch.no_grad(), torch_threads(1):  # small work, which more threads slow
             try:
                 paths = trace_power(scene, link, sampling=sampling, seed=_SEED)
             except InputError:  # silhouettes of sheets have no explicit paths
