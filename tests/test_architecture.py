@@ -19,6 +19,7 @@ FOUNDATION = {
         "untrusted",
         "apart",
         "progress",
+        "outward",
     ),
 }
 SCENE = FOUNDATION | {"scene"}
@@ -45,6 +46,7 @@ ALLOWED = {
     "untrusted": {"errors"},
     "apart": {"errors"},
     "progress": set(),
+    "outward": set(),
     "threads": set(),
     "engines": {"errors", "threads"},
     "doctor": FOUNDATION,

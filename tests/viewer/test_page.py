@@ -14,8 +14,8 @@ EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
 
 
 def display() -> Display:
-    points = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    faces = np.int32([[0, 1, 2]])
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    faces = np.array([[0, 1, 2]], np.int32)
     steps = [Step(k, f"{EVIL} {k}", {EVIL: Body(points + k, faces)}) for k in range(5)]
     return Display(EVIL, [Layer(f"twin/{EVIL}", "surface", points, faces)], steps)
 
@@ -42,7 +42,9 @@ def test_the_policy_admits_our_script_alone():
 
 
 def test_steps_hold_numbers_as_they_are_and_triangles_where_they_change():
-    data = json.loads(re.search(r'id="view-data">(.*?)</script>', view_html(display()), re.S)[1])
+    found = re.search(r'id="view-data">(.*?)</script>', view_html(display()), re.S)
+    assert found is not None
+    data = json.loads(found[1])
     body = data["steps"][3]["bodies"][f"twin/{EVIL}"]
     points = np.frombuffer(base64.b64decode(body["points"]), "<f4").reshape(-1, 3)
     assert points.tolist() == [[3, 3, 3], [4, 3, 3], [3, 4, 3]]

@@ -1,17 +1,14 @@
 """The fits themselves: calibration, one fit per start, progress, interruptions."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import nn
 
 from invertwin.capture import calibrate
@@ -33,7 +30,6 @@ from invertwin.cli.fits.problem import (
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
 from invertwin.cli.fits.spreading import part_name
-from invertwin.cli.running import time_left
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import (
@@ -46,8 +42,9 @@ from invertwin.inversion import (
     Watch,
     reconstruct,
     search,
+    watched,
 )
-from invertwin.inversion.callbacks import interrupted_between_steps, stage_file
+from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.certainty import certainty
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runs import RunFolder
@@ -74,7 +71,7 @@ def calibrated(
         bias, clock = RangeBias(), ClockOffset(sight.capture.positions)
         own = replace(problem, run=run.varied(table))
         schedule, (model,) = settings_of(own.run).build(), models_of(own)
-        with watched(console, "calibration", schedule.steps) as shown:
+        with watched("calibration", schedule.steps, console) as shown:
             found = reconstruct(
                 Scene({table.object: target}),
                 Observation(model, sight.radar, sight.capture, parameters=[bias, clock]),
@@ -131,7 +128,7 @@ def fit(
         return row, lambda: again()[0]
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    with watched(console, name, sum(stage.steps for stage in stages)) as shown:
+    with watched(name, sum(stage.steps for stage in stages), console) as shown:
         found, found_ends = again(shown)
     row = {
         "start": index,
@@ -204,33 +201,3 @@ def _values(modules: nn.ModuleList) -> dict[str, Any]:
         found: dict[str, torch.Tensor] = getattr(module, "values", dict)()
         rows |= {name: value.tolist() for name, value in found.items() if value.numel() <= 16}
     return rows
-
-
-@contextmanager
-def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
-    """Progress with the loss and the first parameters: a bar, or lines where no terminal is.
-
-    Ctrl-C waits for the end of the step.
-    """
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    words, lines = TextColumn("{task.description}"), not console.is_terminal
-    bar = Progress(*columns, words, console=console, disable=lines)
-    task = bar.add_task("", total=steps)
-    begin = time.monotonic()
-    with bar, interrupted_between_steps() as heed:
-
-        def show(row: dict[str, Any]) -> None:
-            values = " ".join(
-                np.array2string(np.atleast_1d(value), precision=3, suppress_small=True)
-                for value in list(row["values"].values())[:2]
-                if np.size(value) <= 3
-            )
-            text, done = f"loss {row['loss']:.4f} {values}", row["step"] + 1
-            bar.update(task, completed=done, description=text)
-            if lines and done * 10 // steps > row["step"] * 10 // steps:
-                left = time_left((time.monotonic() - begin) / done * (steps - done))
-                line = f"{name}: step {done} of {steps}, {left} left, {text}"
-                console.print(line, markup=False, soft_wrap=True)
-            heed()
-
-        yield [Report(show)]
