@@ -1,12 +1,15 @@
 """Chromium, driven by Playwright; both are optional, and their tests skip without them."""
 
 import importlib.util
+import io
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 INSTALL = "run: make test-browser"
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -69,3 +72,15 @@ def watched(chromium: Any) -> Iterator[Watched]:
     found = Watched(chromium)
     yield found
     found.page.close()
+
+
+@pytest.fixture
+def blue() -> Callable[[bytes], float]:
+    """The column of the middle of what has the colour of a twin, in a screenshot."""
+
+    def middle(png: bytes) -> float:
+        shown = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float)
+        mask = (shown[..., 2] - shown[..., 0] > 40) & (shown[..., 2] - shown[..., 1] > 15)
+        return float(np.median(np.nonzero(mask)[1]))
+
+    return middle

@@ -73,6 +73,7 @@ def test_a_file_holds_everything_and_triangles_once(tmp_path):
     one, other = (x.steps[1].bodies["a/cube"].vertices for x in (read, made))
     assert np.array_equal(one, other)
     assert read.maps is not None
+    assert made.maps is not None
     assert np.array_equal(read.maps.at(1)["measured"], made.maps.at(1)["measured"])
     assert (read.title, read.up, read.ahead) == (made.title, made.up, made.ahead)
     names = np.load(tmp_path / "view.npz").files
