@@ -21,7 +21,10 @@ def chromium() -> Iterator[Any]:
     for extra in ("viser", "playwright"):
         if importlib.util.find_spec(extra) is None:
             pytest.skip(f"needs the package {extra}; {INSTALL}")
-    from playwright.sync_api import Error, sync_playwright
+    from playwright.sync_api import (  # pyright: ignore[reportMissingImports]
+        Error,
+        sync_playwright,
+    )
 
     # Debian's, or what `playwright install chromium` has fetched.
     found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)

@@ -50,6 +50,7 @@ def run_view(
         return
     with Viewer(display, link, host=host, port=port, token=token) as viewer:
         console.print(f"open {viewer.address} (Ctrl-C ends)", markup=False, soft_wrap=True)
+        console.file.flush()  # a log shows it while the viewer runs
         viewer.wait()
 
 

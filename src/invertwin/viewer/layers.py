@@ -15,7 +15,7 @@ from invertwin.scene import Object, Scene
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.viewer.display import Body, Display, Layer
 
-_GREY, _RADAR = (185, 190, 199), (40, 44, 52)
+_GREY, _RADAR = (185, 190, 199), (110, 120, 140)
 _COLORS = {"truth": (192, 20, 60), "start": (224, 128, 60)}
 _TWIN = (76, 120, 168)
 _MOST_BEAMS = 24  # positions whose beams are drawn
