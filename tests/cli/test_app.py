@@ -102,7 +102,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert names == {
         *(".invertwin.json", "metrics.json", "run.toml", "report.html", "twin.ply"),
         *("checkpoint.pt", "scene.png", "spectra.png", "loss.png", "landscape.png"),
-        "residuals.png",
+        *("residuals.png", "view.npz"),
     }
     metrics = read_metrics(out)
     assert metrics["status"] in ("budget", "converged")
