@@ -21,7 +21,7 @@ from invertwin.radar import Radar, Surrogate
 from invertwin.scene import Scene
 
 _SAMPLING = {"depth", "samples", "boundary_samples", "boundary", "points_per_m2"}
-_SCHEDULE = {"steps", "annealing", "frames_per_step", "tolerance"}
+_SCHEDULE = {"steps", "annealing", "frames_per_step", "held_out", "tolerance"}
 
 
 def fit(

@@ -5,21 +5,48 @@ import math
 import pytest
 import torch
 
+import invertwin as iw
 from invertwin.discovery import Figure
 
 
 def test_rooms_hold_one_to_six_things_that_do_not_touch(rooms):
     drawn = [rooms.Room.draw(number) for number in range(12)]
-    assert [len(room.things) for room in drawn] == [1, 2, 3, 4, 5, 6] * 2
-    assert {thing.kind for room in drawn for thing in room.things} == set(rooms.KINDS)
+    corners = [[one for one in room.things if one.kind == "corner"] for room in drawn]
+    assert [len(found) for found in corners] == [0, 1] * 6
+    assert [len(room.things) for room in drawn] == [1, 3, 3, 5, 5, 7] * 2
+    assert {one.kind for room in drawn for one in room.things} == {*rooms.KINDS, "corner"}
     for room in drawn:
         assert 8 <= len(room.turns) <= 40
         for k, one in enumerate(room.things):
+            if one.kind == "corner":
+                continue
             low = float(one.item().vertices[:, 1].min())
             assert low == pytest.approx(0.0, abs=1e-9) or one.kind == "sphere"
             for other in room.things[k + 1 :]:
                 assert math.dist(one.place, other.place) > one.reach + other.reach
     assert rooms.Room.draw(3) == drawn[3]
+
+
+def test_a_corner_echoes_where_it_opens_unless_something_hides_it(rooms):
+    """Its peak is that of the closed form; the range that of its apex."""
+    corner = rooms.Thing("corner", (0.4, -0.3), -math.pi / 2, (0.05, 0.05, 0.05), 0.6, 1.0)
+    # The middle of the room lies off; the first place is straight ahead, the second behind.
+    room = rooms.Room(0, (corner,), (0.0, math.pi), 20.0)
+    radar = room.radar()
+    away = iw.Scene({"away": rooms.Thing("box", (0, 2), 0.0, (0.3, 0.3, 0.3), 0.15, 4.0).item()})
+    beat = corner.echo(radar, away)
+    power = beat.abs().square().mean((1, 2, 3))
+    assert power[1] < 1e-4 * power[0]
+    peak = 4 * math.pi * 0.05**4 / 3 / rooms.CHIRP.wavelength**2
+    way = radar.positions[0] - corner.middle
+    tilt = way / way.norm() @ radar.link().rotations[0]
+    gain = float(radar.link().tx_pattern.gain(-tilt[None])) ** 2
+    expected = gain * rooms.CHIRP.wavelength**2 * peak / (4 * math.pi) ** 3 / float(way.norm()) ** 4
+    assert float(power[0]) == pytest.approx(expected, rel=0.15)
+    hidden = iw.Scene(
+        {"box": rooms.Thing("box", (1.0, -0.3), 0.0, (0.3, 1.2, 0.9), 0.6, 4.0).item()}
+    )
+    assert float(corner.echo(radar, hidden)[0].abs().max()) == 0.0
 
 
 def test_pairs_are_one_to_one_and_near(rooms):
@@ -67,3 +94,17 @@ def test_the_usual_chain_finds_a_ball(rooms):
     room = rooms.Room(0, (ball,), tuple(torch.arange(8).double().tolist()), 20.0)
     (found,) = rooms.conventional(room.capture())
     assert math.dist(found, (0.4, -0.3)) < 0.15
+
+
+@pytest.mark.slow
+def test_a_corner_beside_a_box_is_a_corner(rooms):
+    corner = rooms.Thing("corner", (0.9, -0.4), -math.pi / 2, (0.05, 0.05, 0.05), 0.5, 1.0)
+    beside = rooms.Thing("box", (-0.5, 0.3), 0.4, (0.5, 0.8, 0.3), 0.4, 5.0)
+    turns = tuple((torch.arange(16).double() * (2 * math.pi / 16)).tolist())
+    row = rooms.Room(0, (beside, corner), turns, 10.0).row()
+    assert row["found"] == 2
+    assert [(pair["kind"], pair["called"]) for pair in row["matched"]] == [
+        ("box", "box"),
+        ("corner", "corner"),
+    ]
+    assert max(pair["error"] for pair in row["matched"]) < 0.05

@@ -317,6 +317,16 @@ def test_a_room_stands_before_the_other_objects():
     assert truth["table"].transform[:3, 3].tolist() == [1, 0, 2]
 
 
+def test_furniture_may_really_move_but_has_no_joints():
+    run = read(room={"furniture": ["sofa"]}, truth={"sofa": {"velocity": [0.5, 0.0, 0.0]}})
+    velocity = build.true_scene(run)["sofa"].velocity
+    assert velocity is not None
+    assert velocity.tolist() == [0.5, 0.0, 0.0]
+    bent = read(room={"furniture": ["sofa"]}, truth={"sofa": {"angles_deg": {"hip": [1, 0, 0]}}})
+    with pytest.raises(InputError, match=r"truth\.sofa: expected angles_deg of a body of \[scene"):
+        build.true_scene(bent)
+
+
 def test_a_room_may_be_all_that_there_is():
     assert build.scene(read(scene={}, room={})).names == tuple(room())
 

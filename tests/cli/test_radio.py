@@ -10,8 +10,9 @@ from cli.small import call, read_metrics
 from invertwin.cli import build
 from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.radio import Heard, spread_of_ends
-from invertwin.cli.run_file import validate
+from invertwin.cli.run_file import to_toml, validate
 from invertwin.errors import InputError
+from invertwin.inversion import SpectrumLoss
 from invertwin.links import Points
 
 RUN = """
@@ -115,6 +116,14 @@ def test_levels_of_a_file(tmp_path, monkeypatch):
     assert "errors_m" not in found
     place = found["parameters"]["transmitter.position"]
     assert place == pytest.approx([1.0, 0.8, 0.2], abs=0.02)
+
+
+def test_a_run_file_as_used_compares_levels_as_the_first_one_did(tmp_path):
+    run = loaded(tmp_path, RUN)
+    again = loaded(tmp_path, to_toml(run))
+    assert (
+        build.made(again, "loss") == build.made(run, "loss") == SpectrumLoss(levels=1, gain="one")
+    )
 
 
 def test_check_says_how_long_a_fit_takes(tmp_path, monkeypatch, capsys):

@@ -16,7 +16,7 @@ def maps(seed: int = 0, shape: tuple[int, ...] = (2, 16, 9, 4)) -> tuple[Tensor,
     return a + 0.1, b * a + 0.05
 
 
-@pytest.mark.parametrize("kind", ["mse", "likelihood"])
+@pytest.mark.parametrize("kind", ["mse", "likelihood", "heavy_tailed"])
 def test_fitted_gain_minimises_the_loss(kind):
     """No other gain of calibrated data does better, and the best of them is as good."""
     a, b = maps()
@@ -28,14 +28,14 @@ def test_fitted_gain_minimises_the_loss(kind):
     assert fitted == pytest.approx(min(tried), rel=2e-3)
 
 
-@pytest.mark.parametrize("kind", ["mse", "likelihood"])
+@pytest.mark.parametrize("kind", ["mse", "likelihood", "heavy_tailed"])
 def test_equal_maps_up_to_a_gain_cost_nothing(kind):
     a, _ = maps()
     assert float(SpectrumLoss(kind=kind)(1e-9 * a, a)) < 1e-6
     assert float(SpectrumLoss(kind=kind, gain="one")(a, a)) < 1e-12
 
 
-@pytest.mark.parametrize("kind", ["mse", "likelihood"])
+@pytest.mark.parametrize("kind", ["mse", "likelihood", "heavy_tailed"])
 @pytest.mark.parametrize("seed", range(3))
 def test_loss_is_positive_and_knows_no_units(kind, seed):
     a, b = maps(seed)
@@ -67,6 +67,7 @@ def test_background_is_taken_out(background):
     [
         {"kind": "mse"},
         {"kind": "likelihood"},
+        {"kind": "heavy_tailed"},
         {"gain": "one"},
         {"background": "level"},
         {"background": "static"},
@@ -100,7 +101,7 @@ def test_levels_see_what_a_single_bin_cannot():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"kind": "l1"}, "expected kind 'mse' or 'likelihood', got 'l1'"),
+        ({"kind": "l1"}, "expected kind among mse, likelihood, heavy_tailed, got 'l1'"),
         ({"levels": 0}, "expected levels >= 1"),
         ({"gain": "free"}, "gain 'fitted' or 'one'"),
         ({"background": "sky"}, "expected background among none, level, static, got 'sky'"),
@@ -121,12 +122,13 @@ def test_bad_maps_are_named(unchecked):
         SpectrumLoss()(a, 0 * b)
 
 
+@pytest.mark.parametrize("kind", ["likelihood", "heavy_tailed"])
 @pytest.mark.parametrize("gain", [0.4, 1.0])
-def test_the_likelihood_has_its_derivative_in_both_modes(gain):
+def test_the_likelihood_has_its_derivative_in_both_modes(gain, kind):
     """Written out in the loss; here against differences, with bins below zero among them."""
     a, b = maps(shape=(2, 5, 4, 3))
     below = (gain * (a - 0.3)).requires_grad_()
-    loss = SpectrumLoss(kind="likelihood", gain="one", levels=2)
+    loss = SpectrumLoss(kind=kind, gain="one", levels=2)
     assert bool((below < 0).any())
     assert torch.autograd.gradcheck(lambda x: loss(x, b), below, check_forward_ad=True)
 
@@ -141,3 +143,42 @@ def test_the_gain_of_the_likelihood_is_that_of_a_long_iteration():
         down = sum(float((x / (gain * x + 0.01)).mean()) for x, _ in pairs)
         gain *= up / down
     assert float(loss._gain(pairs)) == pytest.approx(gain, rel=1e-5)
+
+
+def test_the_heavy_tail_is_the_likelihood_for_many_degrees():
+    a, b = maps()
+    plain, many = SpectrumLoss("likelihood"), SpectrumLoss("heavy_tailed", degrees=1e7)
+    assert float(many(a, b)) == pytest.approx(float(plain(a, b)), rel=1e-5)
+    assert many.fitted_gain(a, b) == pytest.approx(plain.fitted_gain(a, b), rel=1e-5)
+
+
+def test_one_echo_that_the_scene_does_not_hold_moves_the_gain_of_plain_speckle_only():
+    """Speckle of a known map with one stranger a thousand times as bright as anything else."""
+    generator = torch.Generator().manual_seed(0)
+    a = torch.rand(4, 32, 16, 1, generator=generator, dtype=torch.float64) + 0.1
+    looks = -torch.rand(a.shape, generator=generator, dtype=torch.float64).log()
+    known = 2.0 * a * looks
+    alien = known.clone()
+    alien[:, 5, 3] += 1e3
+    gains = {
+        kind: [SpectrumLoss(kind, levels=1).fitted_gain(a, b) for b in (known, alien)]
+        for kind in ("likelihood", "heavy_tailed")
+    }
+    assert gains["likelihood"][1] > 2.5 * gains["likelihood"][0]
+    assert gains["heavy_tailed"][1] == pytest.approx(gains["heavy_tailed"][0], rel=0.03)
+
+
+def test_curvature_of_the_heavy_tail_is_the_mean_second_derivative():
+    """Over many draws of data from its own law, as the Fisher information is."""
+    generator = torch.Generator().manual_seed(1)
+    degrees, shape = 4.0, (2000, 4, 5, 1)
+    a = torch.rand(1, *shape[1:], generator=generator, dtype=torch.float64) + 0.5
+    tangent = torch.rand(1, *shape[1:], generator=generator, dtype=torch.float64) - 0.3
+    u = torch.rand(shape, generator=generator, dtype=torch.float64)
+    data = a * degrees * (u ** (-1 / degrees) - 1)  # by the inverse of its distribution
+    loss = SpectrumLoss("heavy_tailed", levels=1, gain="one", floor=1e-9, degrees=degrees)
+    wide, rows = a.expand(shape).contiguous(), tangent.expand(shape).contiguous()
+    step = 1e-3
+    values = [float(loss(wide + k * step * rows, data)) for k in (-1, 0, 1)]
+    second = (values[0] - 2 * values[1] + values[2]) / step**2
+    assert float(loss.curvature(wide, data, rows[None])) == pytest.approx(second, rel=0.05)

@@ -37,6 +37,7 @@ from invertwin.simulation import simulate
 from scenes import float64
 
 FAST: dict[str, Any] = {"steps": 4, "samples": 2_000, "boundary_samples": 500}
+EXACT = Sampling(depth=1, points_per_m2=3_000.0)  # of what the cases record
 
 
 def moved(fit: Reconstruction) -> torch.Tensor:
@@ -349,6 +350,52 @@ def test_subsets_of_frames(case, monkeypatch):
     )
     assert all(len(frames) == 2 for frames in seen)
     assert {x for frames in seen for x in frames} == set(case.radar.positions[:, 0].tolist())
+
+
+def test_frames_that_are_held_out_are_not_fitted_but_judge(case, monkeypatch):
+    """What fitted frames show has moved, what the held out one shows has not: the start wins."""
+    seen = []
+    true = models.surrogate_spectrum
+
+    def spy(scene, radar, *rest, **options):
+        seen.append(radar.positions[:, 0].tolist())
+        return true(scene, radar, *rest, **options)
+
+    with torch.no_grad():
+        still = simulate(case.scene, case.radar, case.grid, sampling=EXACT, seed=7).beat
+    mixed = case.capture.beat.clone()
+    mixed[3] = still[3]
+    capture = Capture.from_beat(mixed, case.radar)
+    settings = case.settings(steps=60)
+    free = fit(case.scene, case.radar, capture, case.parameters(), **settings)
+    monkeypatch.setattr(models, "surrogate_spectrum", spy)
+    judged = fit(case.scene, case.radar, capture, case.parameters(), held_out=4, **settings)
+    assert free.status != "diverged"
+    assert float(moved(free).norm()) > 0.02
+    assert judged.status == "diverged"
+    assert not moved(judged).any()
+    fitted = case.radar.positions[:3, 0].tolist()
+    assert seen[:60] == [fitted] * 60
+    assert case.radar.positions[:, 0].tolist() in seen[60:]
+
+
+def test_a_fit_that_explains_held_out_frames_goes_on(case):
+    settings = case.settings(steps=60, held_out=4)
+    found = fit(case.scene, case.radar, case.capture, case.parameters(), **settings)
+    assert found.status != "diverged"
+    assert float(case.error(found.scene)[[0, 2]].norm()) < 0.03 < 0.5 * float(case.offset.norm())
+
+
+def test_too_few_frames_to_hold_some_out(case):
+    with pytest.raises(InputError, match="expected at least 5 frames in every observation"):
+        fit(
+            case.scene,
+            case.radar,
+            case.capture,
+            case.parameters(),
+            held_out=5,
+            **case.settings(**FAST),
+        )
 
 
 def test_without_boundary_the_steps_differ(case):

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import torch
 from torch import nn
 
 from invertwin.cli.run_file import about as about
@@ -70,6 +71,13 @@ def true_scene(run: RunFile) -> Scene:
                 # Objects of a file have no position of their own: they are scaled and placed from
                 # where it puts them. Furniture has one, which stays where no other is stated.
                 made_of, item = changes.pop("material", None), found[name]
+                if "angles_deg" in changes:
+                    raise InputError(
+                        f"expected angles_deg of a body of [scene.{name}], got them for a thing of "
+                        "a file or a room; remove them"
+                    )
+                if (velocity := changes.pop("velocity", None)) is not None:
+                    item = replace(item, velocity=torch.tensor(velocity, dtype=torch.float64))
                 changes.setdefault("position", item.transform[:3, 3].tolist())
                 place = Placement(**changes)
                 mesh = Mesh(item.mesh.vertices * place.scale, item.mesh.faces)

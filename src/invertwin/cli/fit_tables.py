@@ -52,8 +52,9 @@ def register(registry: Registry) -> None:
     registry.groups["model"] = Group()
     registry.groups["search"] = Group(base=SearchTable)
     registry.given |= {Grid, Surrogate, Sampling, Object, torch.Generator}
-    registry.add("loss", "mse", SpectrumLoss, without=("floor",))
-    registry.add("loss", "likelihood", SpectrumLoss)
+    registry.add("loss", "mse", SpectrumLoss, without=("floor", "degrees"))
+    registry.add("loss", "likelihood", SpectrumLoss, without=("degrees",))
+    registry.add("loss", "heavy_tailed", SpectrumLoss)
     registry.add("model", "chains", ChainMap, checked=False)
     registry.add("model", "chain_field", ChainField, checked=False)
     for name, make in (("random", nearby), ("grid", pose_grid), ("given", posed)):

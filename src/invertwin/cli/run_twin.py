@@ -69,7 +69,7 @@ def run_twin(find: Find, folder: RunFolder) -> list[Table]:
     metrics["wall_seconds"] = time.perf_counter() - begin
     if scene is not None:
         save_mesh(folder.file("twin.glb"), scene)
-        folder.write_text("twin.toml", tomli_w.dumps(_described(found)))
+        folder.write_text("twin.toml", tomli_w.dumps(_described(found, folder)))
     parts: list[Table | Picture] = [_table(found)]
     parts += [
         picture(folder, "ground", pictures.ground(found), "The ground from above", "ground"),
@@ -78,6 +78,9 @@ def run_twin(find: Find, folder: RunFolder) -> list[Table]:
     said = "; ".join(found.notes) or f"{len(sure)} things, {metrics['unsure']} unsure ones"
     title = find.recording.name
     still = still_capture(recording)
+    if found.calibration is not None:
+        found.calibration.save(folder.file("channels.json"))
+        still = found.calibration.apply(still)
     still.save(folder.file("capture.nc"))
     # Movers are in the chirps alone, which a capture does not keep.
     name = title if isinstance(recording, ChirpCapture) else "capture.nc"
@@ -127,7 +130,7 @@ def _scores(scene: Scene, truth: Scene) -> dict[str, Any]:
 def _table(found: Twin) -> Table:
     up = found.ground.vertical
     heads = ["thing", "kind", "confidence", *(f"{'xyz'[axis]} [m]" for axis in range(3))]
-    heads += ["± [m]", "yaw [°]", "length, width, height [m]", "range rate [m/s]"]
+    heads += ["± [m]", "yaw [°]", "length, width, height [m]", "speed [m/s]"]
     rows: list[list[Any]] = []
     for thing in found.things:
         figure = thing.figure
@@ -135,8 +138,8 @@ def _table(found: Twin) -> Table:
         known = [error for error in errors if error is not None]
         size, yaw, rate = None, None, None
         if figure is not None:
-            size = [figure.length, figure.width, figure.height]
-            yaw = math.degrees(figure.yaw) if figure.boxed else None
+            size = None if figure.kind == "corner" else [figure.length, figure.width, figure.height]
+            yaw = math.degrees(figure.yaw) if figure.turned else None
         if thing.velocity is not None:
             rate = float(thing.velocity.norm())
         share = f"{thing.kind} {thing.probabilities.get(thing.kind, 1.0):.2f}"
@@ -154,9 +157,9 @@ def _maps(found: Twin, folder: RunFolder) -> list[Picture]:
     return [picture(folder, "maps", spectrum(shown, found.grid), "Maps", "twin_maps")]
 
 
-def _described(found: Twin) -> dict[str, Any]:
+def _described(found: Twin, folder: RunFolder) -> dict[str, Any]:
     """A run file that simulates the things that have a shape, and fits their poses on."""
-    assert found.grid is not None
+    assert found.grid is not None and found.scene is not None
     scene: dict[str, Any] = {}
     axis = found.ground.vertical
     for thing in found.things:
@@ -168,7 +171,12 @@ def _described(found: Twin) -> dict[str, Any]:
         sides[found.ground.level[1]] = figure.width
         sides[axis] = figure.height
         shape: dict[str, Any] = {"shape": "sphere", "radius": 0.5 * figure.length}
-        if figure.boxed:
+        if figure.kind in ("person", "vehicle", "corner"):
+            item = found.scene.objects[thing.name]
+            mesh = replace(item.mesh, vertices=item.vertices - thing.position)
+            save_mesh(folder.file(f"{thing.name}.ply"), mesh)
+            shape = {"file": f"{thing.name}.ply"}
+        elif figure.boxed:
             shape = {"shape": "box", "size": sides, "rotation_deg": turn}
         elif figure.kind == "cylinder":
             shape = {"shape": "cylinder", "radius": 0.5 * figure.length, "height": figure.height}
@@ -198,6 +206,6 @@ def _described(found: Twin) -> dict[str, Any]:
             "v_max": min(1.0, float(grid.v.abs().max())) if grid.v_count > 1 else 1.0,
         },
         "parameters": [{"kind": "translation", "object": name} for name in scene],
-        "loss": {"kind": "likelihood"},
+        "loss": {"kind": "heavy_tailed"},
         "reconstruct": {"depth": 1, "steps": 40, "samples": 100_000},
     }

@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
 from invertwin.discovery.primitives import Figure
-from invertwin.discovery.search import as_kind
+from invertwin.discovery.search import facing, other_kinds
 from invertwin.inversion import Reconstruction
+from invertwin.inversion.initial import Ground
 from invertwin.inversion.uncertainty import coordinates, map_derivatives
 
 
@@ -77,29 +79,77 @@ def presence(one: Assembly, shapes: Sequence[Figure]) -> list[float]:
     return [surer(together, one.gains([*shapes[:k], *shapes[k + 1 :]])) for k in range(len(shapes))]
 
 
-def kind_probabilities(one: Assembly, shapes: Sequence[Figure]) -> list[Mapping[str, float]]:
-    """The probability of every kind for every shape, all others as they are.
+@dataclass(frozen=True)
+class Rival:
+    """What a shape may be.
 
-    Other kinds are fitted for a short while first, all shapes together.
+    Attributes:
+        figure: After a fit.
+        weight: Its probability.
+    """
+
+    figure: Figure
+    weight: float
+
+
+def rivals(one: Assembly, shapes: Sequence[Figure]) -> list[list[Rival]]:
+    """What every shape may be, all others as they are; itself first.
+
+    Other kinds, and others that look the other way, are fitted for a short while first, all shapes
+    together.
 
     Args:
         one: Maps.
         shapes: After their fit.
     """
     together = one.gains(shapes)
-    odds = [{shape.named: 1.0} for shape in shapes]
-    for kind in ("box", "cylinder", "sphere"):
-        changed = [as_kind(shape, kind) for shape in shapes]
-        if all(new is old for new, old in zip(changed, shapes, strict=True)):
+    found = [[Rival(shape, 1.0)] for shape in shapes]
+    for changed in (*other_kinds(one, shapes), facing(shapes, math.pi, one.ground)):
+        if not changed:
             continue
         fitted, _ = one.fitted(changed, _SHORT)
-        for number, (new, old) in enumerate(zip(fitted, shapes, strict=True)):
-            if new.kind == old.kind or (new.kind == "box" and old.boxed):
+        for number, (start, new, old) in enumerate(zip(changed, fitted, shapes, strict=True)):
+            if start is old:
                 continue
-            swapped = one.gains([*shapes[:number], new, *shapes[number + 1 :]])
+            # A short fit stirs a shape up before it mends it.
+            options = [
+                (one.gains([*shapes[:number], r, *shapes[number + 1 :]]), r) for r in (start, new)
+            ]
+            swapped, rival = max(options, key=lambda option: float(option[0].sum()))
             right = min(max(surer(together, swapped), 1e-6), 1 - 1e-6)
-            odds[number][new.named] = max(odds[number].get(new.named, 0.0), (1 - right) / right)
-    return [{k: v / sum(row.values()) for k, v in row.items()} for row in odds]
+            found[number].append(Rival(rival, (1 - right) / right))
+    totals = [sum(rival.weight for rival in row) for row in found]
+    return [
+        [replace(rival, weight=rival.weight / total) for rival in row]
+        for row, total in zip(found, totals, strict=True)
+    ]
+
+
+def kind_probabilities(among: Sequence[Rival]) -> dict[str, float]:
+    """The probability of every kind.
+
+    Args:
+        among: What a shape may be.
+    """
+    found = dict[str, float]()
+    for rival in among:
+        found[rival.figure.named] = found.get(rival.figure.named, 0.0) + rival.weight
+    return found
+
+
+def widened(own: Mapping[str, float], among: Sequence[Rival], ground: Ground) -> dict[str, float]:
+    """Standard deviations of a shape's place, with what it would be if it were a rival.
+
+    Args:
+        own: Its deviations if it is what it is called.
+        among: What it may be, itself first.
+        ground: The plane.
+    """
+    found, place = dict(own), among[0].figure.place
+    for number, axis in enumerate(ground.level):
+        away = sum(r.weight * (r.figure.place[number] - place[number]) ** 2 for r in among)
+        found["xyz"[axis]] = math.hypot(own["xyz"[axis]], math.sqrt(away))
+    return found
 
 
 _SHORT = 20  # steps

@@ -8,6 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.inversion import speckle_divergence
 from invertwin.radar import Radar
 from invertwin.radar.radar import sampled
 from invertwin.radar.spectrum import aperture
@@ -106,20 +107,12 @@ def axes_of(radar: Radar, grid: Grid) -> list[Axis]:
 class HeavyTailed:
     """How unlikely maps are, where single bins may be much brighter or dimmer than predicted.
 
-    Speckle of a mean power μ that is itself uncertain: exponential power whose mean has an inverse
-    gamma distribution about μ, of ν degrees. The negative logarithm of its density but for a
-    constant is log μ + (ν + 1) log(1 + D / (ν μ)). For ν → ∞ it is that of plain speckle,
-    log μ + D / μ, under which a few echoes that the scene does not hold outweigh all others:
-    theirs is D / μ, which has no bound; here it is a logarithm.
+    The ``speckle_divergence`` of echoes whose mean is itself uncertain, with a background of its
+    own for every range bin.
 
     Attributes:
         level: Background of every range bin, added to predicted maps.
-        degrees: ν.
-
-    Source: Conte and Longo, "Characterisation of radar clutter as a spherically invariant random
-    process", IEE Proceedings F 134, 1987.
-    Differs from the source: the mean over textures is that of ν degrees about a mean that is
-    modelled, not of a fitted K distribution.
+        degrees: Those of the mean.
     """
 
     level: Float64[Tensor, " range"]
@@ -146,6 +139,4 @@ class HeavyTailed:
         """
         # Power that is predicted is positive but for rounding.
         mean = predicted.clamp_min(0.0) + self.level.to(predicted)[:, None, None]
-        ratio = observed.to(predicted).clamp_min(_LEAST) / mean
-        tail = torch.log1p(ratio / self.degrees) - math.log1p(1 / self.degrees)
-        return (self.degrees + 1) * tail - ratio.log()
+        return speckle_divergence(observed.to(predicted).clamp_min(_LEAST) / mean, self.degrees)

@@ -7,10 +7,37 @@ from typing import Any
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
+from invertwin.capture import ChannelCalibration
 from invertwin.channel import Grid
 from invertwin.discovery.primitives import Figure, Primitive
 from invertwin.inversion.initial import Ground
 from invertwin.scene import Object, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Where a thing was, frame by frame.
+
+    Attributes:
+        times: After the start of the recording [s].
+        positions: [m].
+        velocities: Along the ground [m/s].
+        deviations: Standard deviation of every number at every time, by name, in SI units.
+    """
+
+    times: Float64[Tensor, " time"]
+    positions: Float64[Tensor, "time 3"]
+    velocities: Float64[Tensor, "time 3"]
+    deviations: Mapping[str, Float64[Tensor, " time"]]
+
+    def row(self) -> dict[str, Any]:
+        """The track as plain numbers."""
+        return {
+            "times_s": self.times.tolist(),
+            "positions_m": self.positions.tolist(),
+            "velocities_m_s": self.velocities.tolist(),
+            "deviations": {name: values.tolist() for name, values in self.deviations.items()},
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,13 +46,15 @@ class Thing:
 
     Attributes:
         name: In the twin's scene.
-        kind: The likeliest: wall, box, cylinder, sphere or point.
+        kind: The likeliest, among ``discovery.KINDS``.
         probabilities: Of every kind that was tried.
         position: Its middle [m].
         figure: All numbers of its shape; None = only a place is known.
         deviations: Standard deviation of every number, by name, in SI units.
         confidence: Probability that it is there.
-        velocity: Along the line of sight [m/s]; None = it was found in what stands still.
+        velocity: Along the line of sight, or along the ground if there is a track [m/s]; None =
+            it was found in what stands still.
+        track: Where it was before; None = it was not followed.
     """
 
     name: str
@@ -36,6 +65,7 @@ class Thing:
     deviations: Mapping[str, float]
     confidence: float
     velocity: Float64[Tensor, "3"] | None = None
+    track: Track | None = None
 
     def row(self) -> dict[str, Any]:
         """The thing as plain numbers."""
@@ -57,6 +87,8 @@ class Thing:
             }
         if self.velocity is not None:
             found["velocity_m_s"] = self.velocity.tolist()
+        if self.track is not None:
+            found["track"] = self.track.row()
         return found
 
 
@@ -88,6 +120,7 @@ class Twin:
         observed: Maps of the recording.
         grid: Their bins.
         notes: What to know of it, in sentences.
+        calibration: Of the channels, where the scene itself has told it; the maps have it applied.
     """
 
     things: tuple[Thing, ...]
@@ -98,6 +131,7 @@ class Twin:
     observed: Float[Tensor, "frame range u v"] | None = field(default=None, repr=False)
     grid: Grid | None = None
     notes: tuple[str, ...] = ()
+    calibration: ChannelCalibration | None = None
 
     @property
     def scene(self) -> Scene | None:

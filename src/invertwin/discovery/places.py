@@ -10,13 +10,16 @@ from torch import Tensor
 from invertwin.capture import Capture, ChirpCapture, backproject
 from invertwin.channel import Grid
 from invertwin.discovery.outcome import Thing
+from invertwin.discovery.sharp_image import cell_of
 from invertwin.inversion.initial import linked
 from invertwin.radar import noise_power, points_of, range_doppler, velocity_span
+from invertwin.radar.spectrum import aperture
 
 _CELLS = 3.0  # of range and rate between echoes of one mover
 _STRONG = 0.1  # of the strongest: dimmer peaks may be sidelobes
 _SIDELOBE = 3e-3  # of the strongest mover: dimmer ones may be its sidelobes
 _SURE = 0.5  # of the strongest: brighter peaks are no sidelobes
+_BEAM = 0.3  # of a beam: how well a direction is known
 _CHUNK = 20_000  # points of an image at a time
 
 
@@ -24,6 +27,7 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
     """What moves in one frame, the strongest first, after the mean over the chirps is removed.
 
     Echoes that are near in range and range rate are one thing; its strongest echo says where it is.
+    What has the range rate that the radar's own motion gives to things at rest is left out.
 
     Args:
         recording: A train of chirps.
@@ -38,19 +42,23 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
     if points is None or not len(points.power):
         return []
     cell = 2 * velocity_span(radar, chirps) / chirps.count
-    moves = points.velocity.abs() > cell  # what stands still has lost its mean only
+    origin, own_velocity = radar.positions[frame].detach(), own_velocities(recording)[frame]
+    aways = torch.nn.functional.normalize(points.position.detach().double() - origin, dim=1)
+    rates = points.velocity + aways @ own_velocity
+    # What stands still has lost its mean only; a direction is known to a part of a beam.
+    blur = float(own_velocity.norm()) * cell_of(aperture(radar).x, radar) * _BEAM
+    moves = rates.abs() > cell + blur
     scales = torch.tensor([radar.waveform.range_resolution, cell], dtype=torch.float64) * _CELLS
     rows = moves.nonzero()[:, 0]
     if not len(rows):
         return []
-    where = torch.stack([points.range, points.velocity], dim=1)[rows] / scales
+    where = torch.stack([points.range, rates], dim=1)[rows] / scales
     labels = linked(where, 1.0)
     flat = range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
     # Beams over all channels have this much less noise than one channel.
     noise = noise_power(flat.abs().square(), 1) / len(radar.virtual_positions)
     draws, top = flat.numel(), float(points.power[rows].max())
     found: list[Thing] = []
-    origin = radar.positions[frame].detach()
     for number in range(int(labels.max()) + 1):
         own = rows[labels == number]
         best = own[points.power[own].argmax()]
@@ -59,10 +67,9 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
         weight = points.power[own] / points.power[own].sum()
         spread = [
             float((weight * (values[own] - values[best]).square()).sum().sqrt())
-            for values in (points.range, points.velocity)
+            for values in (points.range, rates)
         ]
         position = points.position[best].detach().double()
-        away = (position - origin) / (position - origin).norm()
         found.append(
             Thing(
                 f"mover_{number + 1}",
@@ -76,7 +83,7 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
                 },
                 max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
                 * min(1.0, power / (_SIDELOBE * top)),
-                float(points.velocity[best]) * away,
+                float(rates[best]) * aways[best],
             )
         )
     strength = {
@@ -84,6 +91,19 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
     }
     found.sort(key=lambda thing: -strength[thing.name])
     return [replace(thing, name=f"mover_{k}") for k, thing in enumerate(found, 1)]
+
+
+def own_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
+    """Velocity of the radar in every frame, from where it was before and after [m/s].
+
+    Args:
+        recording: Without a known time from frame to frame, its radar counts as at rest.
+    """
+    places = recording.radar().positions.detach()
+    if recording.frame_period is None or len(places) < 2:
+        return torch.zeros_like(places)
+    (along,) = torch.gradient(places, spacing=recording.frame_period, dim=0)
+    return along
 
 
 def dense(capture: Capture) -> bool:

@@ -1,7 +1,7 @@
 """Simple shapes that stand on the ground, with all their numbers free: what a twin is made of."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal, get_args
 
@@ -11,19 +11,39 @@ from torch import Tensor, nn
 
 from invertwin.inversion.initial import Ground
 from invertwin.limits import Positive
-from invertwin.scene import Material, Mesh, Object, RoughConductor, RoughDielectric, Scene, Surface
+from invertwin.scene import (
+    Material,
+    Mesh,
+    Object,
+    RoughConductor,
+    RoughDielectric,
+    Scene,
+    Surface,
+    person,
+)
 from invertwin.scene.checks import check_fields
+from invertwin.scene.geometry.gait import hanging
 from invertwin.scene.parameters import Coordinate
 from invertwin.scene.shapes import box, cylinder, sphere
 
-Kind = Literal["wall", "box", "cylinder", "sphere", "point"]
+Kind = Literal["wall", "box", "cylinder", "sphere", "point", "person", "vehicle", "corner"]
 KINDS: tuple[str, ...] = get_args(Kind)
 THIN = 0.06
 """A box that is thinner than this, and three times as long, is a wall [m]."""
 SMALL = 0.06
 """What is smaller than this is a point [m]."""
-_SIZES = 0.01, 10.0  # of sides [m]
-_BOXED, _BALLS = ("wall", "box"), ("sphere", "point")
+NARROW = 9.0
+"""Power of the cosine with which the echo of a trihedral corner falls off the way it opens."""
+_NARROW = NARROW - 2  # beside the cos² of any plate
+_FACE = 0.03  # side of the plate that stands for a corner reflector [m]
+_LEAST, _MOST = (0.01, 0.01, 0.01), (10.0, 10.0, 10.0)
+SIZES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "person": ((0.4, 0.2, 1.2), (0.9, 0.5, 2.1)),
+    "vehicle": ((3.0, 1.4, 1.2), (6.5, 2.3, 2.6)),
+    "corner": ((_FACE, _FACE, 0.01), (_FACE, _FACE, 10.0)),
+}
+"""Least and greatest length, width and height of kinds that have sizes of their own [m]."""
+_BOXED, _BALLS = ("wall", "box", "person", "vehicle"), ("sphere", "point", "corner")
 _WHITE = 0.9  # of the reflectance of a material
 
 
@@ -35,14 +55,17 @@ class Matte(Material):
     exceed 1, which no rough surface does.
 
     Attributes:
-        brightness: Scattered over incident power.
+        brightness: Scattered over incident power; of every triangle, or of all.
+        falling: Power of the cosine of the angle of incidence with which it falls besides.
     """
 
     brightness: Tensor
+    falling: float = 0.0
 
     def surface(self, frequency: float) -> Surface:
         """The same at every frequency [Hz]."""
-        return Surface(torch.ones(256, dtype=torch.float64), self.brightness)
+        cosine = torch.linspace(0, 1, 256, dtype=torch.float64)
+        return Surface(cosine ** (0.5 * self.falling), self.brightness)
 
 
 @dataclass(frozen=True)
@@ -50,12 +73,16 @@ class Figure:
     """The numbers of a shape on the ground.
 
     Attributes:
-        kind: Its shape. A wall is a thin box, a point a small sphere.
+        kind: Its shape. A wall is a thin box, a point a small sphere. A person stands with hanging
+            arms. A vehicle is a car of usual proportions. A corner is a bright plate that reflects
+            on one side: the way a corner reflector opens.
         place: Along the two axes of the ground [m].
-        yaw: About the vertical, of boxes [rad].
+        yaw: About the vertical, of all but round shapes [rad]. If it is 0, a vehicle looks along
+            x; a person and a corner look along −z where y is up, and along y where z is up.
         length: Along its first axis; the diameter of round shapes [m].
-        width: Along its second axis, of boxes [m].
-        height: Of the shape, which stands on the ground; a sphere's is that of its middle [m].
+        width: Along its second axis, of shapes with a yaw [m].
+        height: Of the shape, which stands on the ground; a sphere's and a corner's is that of its
+            middle [m].
         brightness: See ``Matte``.
     """
 
@@ -72,12 +99,17 @@ class Figure:
 
     @property
     def boxed(self) -> bool:
-        """Whether it has corners."""
+        """Whether it fills a rectangle of the ground, with a yaw."""
         return self.kind in _BOXED
 
     @property
+    def turned(self) -> bool:
+        """Whether its yaw means something."""
+        return self.boxed or self.kind == "corner"
+
+    @property
     def ball(self) -> bool:
-        """Whether it is round all over, so that it need not stand on the ground."""
+        """Whether it need not stand on the ground."""
         return self.kind in _BALLS
 
     @property
@@ -92,11 +124,11 @@ class Figure:
     def named(self) -> Kind:
         """The kind that its numbers speak of."""
         long, short = max(self.length, self.width), min(self.length, self.width)
-        if self.boxed:
+        if self.kind in ("wall", "box"):
             return "wall" if short < THIN and long > 3 * short else "box"
-        if self.length < SMALL:
-            return "point"
-        return "sphere" if self.kind == "point" else self.kind
+        if self.kind in ("sphere", "point"):
+            return "point" if self.length < SMALL else "sphere"
+        return self.kind
 
 
 class Primitive(nn.Module):
@@ -126,8 +158,11 @@ class Primitive(nn.Module):
         self.kind: Kind = start.kind
         self.object, self.ground, self.level = name, ground, level
         self.round = start.ball
-        low, high = _SIZES
-        sizes = [min(max(v, low), high) for v in (start.length, start.width, start.height)]
+        self.low, self.high = SIZES.get(start.kind, (_LEAST, _MOST))
+        given = (start.length, start.width, start.height)
+        sizes = [
+            min(max(v, low), high) for v, low, high in zip(given, self.low, self.high, strict=True)
+        ]
         logs = torch.tensor(sizes, dtype=torch.float64).log() / self._SIZE
         if self.round:
             logs[2] = start.height
@@ -140,7 +175,7 @@ class Primitive(nn.Module):
     @property
     def sides(self) -> Float64[Tensor, "3"]:
         """Length, width and height within bounds [m]; the last is none of a sphere's."""
-        low, high = (math.log(value) for value in _SIZES)
+        low, high = (torch.tensor(v, dtype=torch.float64).log() for v in (self.low, self.high))
         return (self._SIZE * self.size).clamp(low, high).exp()
 
     @property
@@ -190,7 +225,10 @@ class Primitive(nn.Module):
     @property
     def item(self) -> Object:
         """The object, differentiable by all parameters."""
-        return Object(self.mesh(), Matte(self.brightness))
+        mesh, brightness = self.mesh(), self.brightness
+        if self.kind == "corner":
+            return Object(mesh, Matte(brightness * _front(self.ground.up), _NARROW))
+        return Object(mesh, Matte(brightness))
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the object in it, in place of one of the same name."""
@@ -217,10 +255,13 @@ class Primitive(nn.Module):
             for axis, along in zip(self.ground.level, place, strict=True)
         ]
         sizes = {"length": (0, found.length), "height": (2, found.height)}
-        if found.boxed:
+        if found.turned:
             along = torch.tensor(1 / self._TURN, dtype=torch.float64)
             rows.append(Coordinate(f"{self.object}.yaw", "rad", {"turn": along}, 0.2))
+        if found.boxed:
             sizes["width"] = (1, found.width)
+        if found.kind == "corner":
+            del sizes["length"]
         for name, (entry, value) in sizes.items():
             along = zero.clone()
             along[entry] = 1.0 if self.round and entry == 2 else 1 / (self._SIZE * value)
@@ -248,16 +289,109 @@ def upright(figure: Figure, ground: Ground, level: float) -> Float64[Tensor, "3"
     return place
 
 
+def opening(yaw: float, ground: Ground) -> Float64[Tensor, "2"]:
+    """The way along the ground that a corner opens.
+
+    Args:
+        yaw: Of the corner [rad].
+        ground: The plane.
+    """
+    c, s = math.cos(ground.sense * yaw), math.sin(ground.sense * yaw)
+    ahead = -1.0 if ground.up == "y" else 1.0
+    return ahead * torch.tensor([-s, c], dtype=torch.float64)
+
+
+def turned(figure: Figure, turn: float, ground: Ground) -> Figure:
+    """A shape that looks another way: turned about the mean of its surface, not about its middle.
+
+    Args:
+        figure: The shape.
+        turn: By which its yaw grows [rad].
+        ground: The plane.
+    """
+    unit = _unit(figure.kind, ground.up).vertices.mean(0)[list(ground.level)]
+    x, y = (unit * torch.tensor([figure.length, figure.width], dtype=torch.float64)).tolist()
+    before, after = ground.sense * figure.yaw, ground.sense * (figure.yaw + turn)
+    rows = [
+        (math.cos(a) * x - math.sin(a) * y, math.sin(a) * x + math.cos(a) * y)
+        for a in (before, after)
+    ]
+    first, second = (p + a - b for p, a, b in zip(figure.place, *rows, strict=True))
+    return replace(figure, place=(first, second), yaw=figure.yaw + turn)
+
+
 @cache
 def _unit(kind: str, up: str) -> Mesh:
     """A shape of size one about the origin."""
-    if kind in _BOXED:
+    if kind in ("wall", "box"):
         return box(1.0)
-    if kind in _BALLS:
+    if kind in ("sphere", "point"):
         return sphere(0.5, 2)
-    upright = cylinder(0.5, 1.0)
+    upright = {"person": _standing, "vehicle": _vehicle, "corner": _plate}.get(kind, _post)()
     # About x by a quarter turn: y to z.
     return upright if up == "y" else Mesh(upright.vertices @ _LAID, upright.faces)
 
 
 _LAID = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+
+
+def _post() -> Mesh:
+    return cylinder(0.5, 1.0)
+
+
+def _standing() -> Mesh:
+    """A person with hanging arms who looks along −z, stretched to a cube."""
+    body = person(spacing=0.05)
+    turns = torch.eye(3, dtype=torch.float64).repeat(len(body.names), 1, 1)
+    for side in ("left", "right"):
+        turns[body.joint(f"{side}_shoulder")] = hanging(side)
+    skin, _ = body.posed(turns)
+    low, high = skin.amin(0), skin.amax(0)
+    return Mesh((skin - 0.5 * (low + high)) / (high - low), body.faces)
+
+
+def _vehicle() -> Mesh:
+    """A car that looks along x: octagons above each other, between them its skin."""
+    sides = 8
+    rings = torch.tensor([_octagon(*layer) for layer in _LAYERS], dtype=torch.float64).flatten(0, 1)
+    faces: list[list[int]] = []
+    for layer in range(len(_LAYERS) - 1):
+        for k in range(sides):
+            a, b = layer * sides + k, layer * sides + (k + 1) % sides
+            faces += [[a, b, a + sides], [b, b + sides, a + sides]]
+    for first in (0, (len(_LAYERS) - 1) * sides):
+        faces += [[first, first + k, first + k + 1] for k in range(1, sides - 1)]
+    return Mesh(rings, torch.tensor(faces))
+
+
+# Height, rear end, front end and width, as shares of those of a car: underbody, sills, bumpers and
+# shoulders, belt line, foot of the screens, roof.
+_LAYERS = (
+    (0.0, -0.30, 0.30, 0.5),
+    (0.15, -0.47, 0.46, 0.94),
+    (0.36, -0.50, 0.50, 1.0),
+    (0.58, -0.48, 0.45, 0.98),
+    (0.66, -0.45, 0.24, 0.92),
+    (1.0, -0.30, -0.02, 0.7),
+)
+
+
+def _octagon(high: float, rear: float, front: float, wide: float) -> list[list[float]]:
+    """Corners of one layer of a car: a rectangle whose corners are cut off."""
+    cut, aside = 0.07, 0.3 * wide
+    rows = [(front, aside), (front - cut, 0.5 * wide), (rear + cut, 0.5 * wide), (rear, aside)]
+    rows += [(x, -z) for x, z in reversed(rows)]
+    return [[x, high - 0.5, z] for x, z in rows]
+
+
+def _plate() -> Mesh:
+    """A plate that faces −z."""
+    return box((1.0, 1.0, 0.1))
+
+
+@cache
+def _front(up: str) -> Float64[Tensor, " triangle"]:
+    """1 for the triangles of a corner's plate that face the way it opens, else 0."""
+    mesh = _unit("corner", up)
+    ahead = mesh.vertices[:, 2] < 0 if up == "y" else mesh.vertices[:, 1] > 0
+    return ahead[mesh.faces].all(1).double()

@@ -2,16 +2,21 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.discovery.primitives import Figure
+from invertwin.discovery.primitives import SIZES, Figure
 from invertwin.inversion.initial import Ground, linked
 
 _TURNS = 45  # yaws that a rectangle is tried at, over a quarter turn
 _TRIM = 0.05  # share of the weight beyond each side of a rectangle
+_PERSON = 0.66, 0.32, 1.75  # usual length, width and height [m]
+_LEAST_PERSON, _SPARE = 0.12, 0.25  # of an extent, and beyond the usual one [m]
+CORNER = 0.15
+"""Side of the largest group that may be a corner reflector [m]."""
 
 
 def bright(strength: Float64[Tensor, " place"], share: float = 0.02) -> Float64[Tensor, " chosen"]:
@@ -93,7 +98,8 @@ def figures(
     step: float,
     height: float,
 ) -> list[Figure]:
-    """What could stand where places are bright: boxes of two turns, and round shapes.
+    """What could stand where places are bright: boxes of two turns, round shapes, and what its
+    extent allows of people, vehicles and corner reflectors.
 
     Args:
         places: On the ground [m].
@@ -120,4 +126,45 @@ def figures(
     x, y = smallest[0][0].tolist()
     rows.append(Figure("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))
     rows.append(Figure("sphere", (x, y), 0.0, spread, spread, height))
+    middle, sides, _ = smallest[0]
+    if float(sides.max()) < CORNER:
+        rows += headings(Figure("corner", (x, y), height=height))
+    around = Figure("box", (x, y), ground.sense * smallest[1], *sides.clamp_min(0.02).tolist())
+    return rows + standing(around)
+
+
+def headings(figure: Figure) -> list[Figure]:
+    """A shape that looks eight ways.
+
+    Args:
+        figure: The shape.
+    """
+    return [replace(figure, yaw=k * math.pi / 4) for k in range(8)]
+
+
+def standing(around: Figure) -> list[Figure]:
+    """People and vehicles of usual sizes that could be what a box surrounds.
+
+    Args:
+        around: The box.
+    """
+    long, short = max(around.length, around.width), min(around.length, around.width)
+    rows: list[Figure] = []
+    if _LEAST_PERSON < long < _PERSON[0] + _SPARE and short < _PERSON[1] + _SPARE:
+        length, width, height = _PERSON
+        rows += headings(replace(around, kind="person", length=length, width=width, height=height))
+    (low, _, _), (high, wide, height) = SIZES["vehicle"]
+    if 0.8 * low < long < high and short < wide:
+        ahead = around.yaw if around.length >= around.width else around.yaw + 0.5 * math.pi
+        rows += [
+            replace(
+                around,
+                kind="vehicle",
+                yaw=ahead + turn,
+                length=max(long, low),
+                width=max(short, 0.8 * wide),
+                height=0.6 * height,
+            )
+            for turn in (0.0, math.pi)
+        ]
     return rows

@@ -12,13 +12,15 @@ from torch.nn.functional import normalize
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.channel import Grid, Sight
 from invertwin.discovery.assembly import Assembly, sampling_of
-from invertwin.discovery.certainty import deviations, kind_probabilities, presence
+from invertwin.discovery.certainty import deviations, kind_probabilities, presence, rivals, widened
+from invertwin.discovery.channels import apart, channels_of_scene
 from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
 from invertwin.discovery.outcome import Picture, Thing, Twin
-from invertwin.discovery.places import dense, movers, points_along
+from invertwin.discovery.places import dense, movers, own_velocities, points_along
 from invertwin.discovery.primitives import upright
 from invertwin.discovery.search import Lattice, Search
 from invertwin.discovery.sharp_image import Response, responses, thinned
+from invertwin.discovery.tracks import tracks
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
@@ -50,7 +52,9 @@ def twin(
     A sharp image shows where echoes come from. Bright places become shapes that stand on the
     ground; all shapes are fitted together, and evidence decides which kinds there are, which
     become one, and which are not there. Of recordings along a dense track of one channel, points
-    are found where echoes agree in phase. Of trains of chirps, what moves is found as well.
+    are found where echoes agree in phase. Of trains of chirps, what moves is found as well, and
+    followed where there are three frames or more with a known time between them. Where several
+    positions show that the phases of the channels are wrong, they are calibrated first.
 
     Args:
         recording: Of radars at known places.
@@ -82,15 +86,15 @@ def twin(
     )
     plane_at = base if height is None else floor + checked_number(height, "height [m]", 0.0)
     reach = _reach(capture, range_max)
-    moving: list[Thing] = []
-    if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
-        farthest = min(range_max or math.inf, recording.max_range)
-        near = _NEAREST * radar.waveform.range_resolution
-        moving = movers(recording, radar.grid(near, farthest))
     if reach is None:
+        moving = _moving(recording, range_max, plane)
         said = "nothing that stands still is above the noise" if moving else _NOTHING
         return Twin(_surest_first(moving), plane, floor, notes=(said,))
     places, step = _places(radar, plane, plane_at, reach, low, high)
+    told = channels_of_scene(capture, radar.grid(*reach), places)
+    if told is not None:
+        recording, capture = told.apply(recording), told.apply(capture)
+    moving = _moving(recording, range_max, plane)
     if dense(capture):
         # Frames add up only where all of them have an echo.
         far = torch.cdist(places, radar.positions.detach())
@@ -100,20 +104,47 @@ def twin(
         return Twin(_surest_first([*found, *moving]), plane, floor, picture)
     grid = radar.grid(*reach)
     still = _standing(capture, radar, grid, plane, floor, places, step, rays, seed)
-    return replace(still, things=_surest_first([*still.things, *moving]))
+    notes = () if told is None else (_CALIBRATED.format(apart(told)),)
+    things = _surest_first([*still.things, *moving])
+    return replace(still, things=things, notes=(*notes, *still.notes), calibration=told)
 
 
 def still_capture(recording: Capture | ChirpCapture) -> Capture:
     """A recording with one signal a frame, in which what moves fades.
+
+    Of a radar that itself moves by a quarter of a wavelength or more in a frame, it is one chirp.
 
     Args:
         recording: Of any kind.
     """
     if isinstance(recording, Capture):
         return recording
+    chirps, radar = recording.chirps, recording.radar()
+    lasts = float(chirps.times(radar.shape[1])[-1].max())
+    way = float(own_velocities(recording).norm(dim=1).max()) * lasts
+    if way > 0.25 * radar.waveform.wavelength:
+        return recording.capture(chirps.count // 2)
     return replace(recording, moving=False).capture()
 
 
+def _moving(
+    recording: Capture | ChirpCapture, range_max: float | None, ground: Ground
+) -> list[Thing]:
+    """What moves in trains of chirps; it is followed where the time between frames is known."""
+    if isinstance(recording, Capture) or recording.chirps.count == 1:
+        return []
+    radar = still_capture(recording).radar()
+    near = _NEAREST * radar.waveform.range_resolution
+    grid = radar.grid(near, min(range_max or math.inf, recording.max_range))
+    if recording.frame_period is not None and recording.frame_count > 2:
+        return tracks(recording, grid, ground)
+    return movers(recording, grid)
+
+
+_CALIBRATED = (
+    "the phases of the channels were {:.0f}° apart (root mean square): they were calibrated on the "
+    "scene itself"
+)
 _NOTHING = "nothing is above the noise"
 _IMAGE_BETTER = (
     "the image explains frames that were held out better than the things do: shapes may be wrong, "
@@ -167,7 +198,8 @@ def _standing(
             notes = (_IMAGE_BETTER,)
     shapes, found = one.fitted(shapes, _STEPS)
     errors, sure = deviations(one, found), presence(one, shapes)
-    kinds = kind_probabilities(one, shapes)
+    among = rivals(one, shapes)
+    kinds = [kind_probabilities(row) for row in among]
     things = [
         Thing(
             f"object_{k}",
@@ -175,7 +207,7 @@ def _standing(
             kinds[k - 1],
             upright(shape, ground, level),
             shape,
-            _own(errors, f"object_{k}."),
+            widened(_own(errors, f"object_{k}."), among[k - 1], ground),
             sure[k - 1],
         )
         for k, shape in enumerate(shapes, 1)

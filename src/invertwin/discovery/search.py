@@ -10,8 +10,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.primitives import Figure
-from invertwin.discovery.proposals import bright, figures, groups
+from invertwin.discovery.clutter import HeavyTailed
+from invertwin.discovery.primitives import Figure, opening, turned
+from invertwin.discovery.proposals import CORNER, bright, figures, groups, headings, standing
 from invertwin.discovery.sharp_image import Response, sharpened, thinned
 from invertwin.inversion.initial import Ground
 
@@ -19,7 +20,11 @@ _MOST = 24  # objects
 _ROUNDS = 3  # of births
 _NEAR = 0.5  # gap between what may be one [m]
 _HOPE = 100.0  # evidence that a fit may gain
+_SLIM = 0.4  # of a side: how wide the slimmer half of a shape is at first
+_WHOLE = 0.25  # side of the smallest shape that may be two [m]
 _SHORT, _LONG = 25, 50  # steps of fits
+_GLINTS = 4  # corner reflectors of a round
+_SEEN = 0.8  # cosine off the way a corner opens, up to which it is bright
 _PATIENCE = 3  # groups in a row that explain nothing
 _DIM = 1e-3  # of all strength: dimmer groups wait for the next round
 
@@ -129,7 +134,7 @@ class Search:
                 break
         if not shapes:
             return []
-        shapes = self.merged(self.kinds(shapes))
+        shapes = self.split(self.merged(self.turns(self.kinds(shapes))))
         shapes, _ = self.fitted.fitted(shapes, _LONG)
         shapes = self.settled(self.heights(shapes))
         return self.alive(shapes)
@@ -157,7 +162,57 @@ class Search:
                 born.append((part, one))
             elif (vain := vain + 1) == _PATIENCE:
                 break  # dimmer groups tell no more
-        return [one for _, one in self.united(shapes, born)]
+        found = [one for _, one in self.united(shapes, born)]
+        return found + self.glints([*shapes, *found])
+
+    def glints(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Corner reflectors that explain what only some directions see.
+
+        An image of places that reflect alike in all directions does not show them.
+
+        Args:
+            shapes: What is known already.
+        """
+        one, lattice = self.fitted, self.lattice
+        power, coarse = thinned(one.power, one.radar, one.model.grid)
+        stride = round(coarse.range_step / one.model.grid.range_step)
+        level = one.loss.level[::stride]
+        rest, _ = thinned(one.predicted(shapes).double(), one.radar, one.model.grid)
+        loss = HeavyTailed(level, one.loss.degrees)
+        nothing = (power - level[:, None, None]).clamp_min(rest)
+        gain = lattice.response.means(loss.rows(rest, power) - loss.rows(nothing, power))
+        at = one.radar.positions.detach()[:, list(self.ground.level)]
+        way = torch.nn.functional.normalize(at[:, None] - lattice.places, dim=2)
+        yaws = [k * math.pi / 8 for k in range(16)]
+        score = torch.stack(
+            [((way @ opening(yaw, self.ground) > _SEEN) * gain).sum(0) for yaw in yaws]
+        )
+        found = list[Figure]()
+        for _ in range(_GLINTS):
+            best, yaw = score.amax(0), score.argmax(0)
+            place = int(best.argmax())
+            options = [
+                Figure(
+                    "corner",
+                    (float(lattice.places[place, 0]), float(lattice.places[place, 1])),
+                    yaws[int(yaw[place])],
+                    height=part * lattice.height,
+                    brightness=brightness,
+                )
+                for part in (0.6, 1.0, 1.5)
+                for brightness in (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+            ]
+            known = [*shapes, *found]
+            new = self.best(known, options)
+            for _ in range(2):
+                # Narrow in place and heading, so that a fit would start beside its minimum.
+                new = self.best(known, nudged(new, lattice.step))
+            if self.evidence([*known, new]) <= self.evidence(known):
+                break
+            found.append(new)
+            near = (lattice.places - lattice.places[place]).norm(dim=1) < _NEAR
+            score[:, near] = 0.0
+        return found
 
     def united(
         self, shapes: Sequence[Figure], born: Sequence[tuple[Tensor, Figure]]
@@ -204,10 +259,7 @@ class Search:
         rows = figures(lattice.places, part, self.ground, step=lattice.step, height=lattice.height)
         found: list[Figure] = []
         for row in rows:
-            # A matte wall of area A seen aslant: cross-section 4 β A cos²θ, half of it on average.
-            seen = 0.5 * math.pi * (row.length + row.width) * 1.5 * lattice.height
-            bright = max(float(part.sum()) / seen, 1e-4)
-            found.append(replace(row, brightness=bright))
+            found.append(replace(row, brightness=max(float(part.sum()) / section(row), 1e-4)))
         return found
 
     def best(self, known: Sequence[Figure], options: Iterable[Figure]) -> Figure:
@@ -248,14 +300,32 @@ class Search:
         Args:
             shapes: After a fit.
         """
-        fitted = {
-            kind: self.settled([as_kind(shape, kind) for shape in shapes])
-            for kind in ("box", "cylinder", "sphere")
-        }
+        return self.likeliest(shapes, other_kinds(self.fitted, shapes))
+
+    def turns(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes, with people and vehicles turned as is likeliest, after a fit of every turn.
+
+        Args:
+            shapes: After a fit.
+        """
+        turns = (0.5 * math.pi, math.pi, 1.5 * math.pi)
+        others = [facing(shapes, turn, self.ground) for turn in turns]
+        return self.likeliest(shapes, [rows for rows in others if rows])
+
+    def likeliest(
+        self, shapes: Sequence[Figure], others: Sequence[Sequence[Figure]]
+    ) -> list[Figure]:
+        """Every shape as it is, or as it is in other lists after a fit, whichever is likelier.
+
+        Args:
+            shapes: After a fit.
+            others: Lists of as many shapes, which start fits.
+        """
+        fitted = [self.settled(rows) for rows in others]
         found = list(shapes)
         for number in range(len(found)):
             rest = [*found[:number], *found[number + 1 :]]
-            options = [found[number], *(rows[number] for rows in fitted.values())]
+            options = [found[number], *(rows[number] for rows in (*others, *fitted))]
             found[number] = max(options, key=lambda one, rest=rest: self.evidence([*rest, one]))
         return found
 
@@ -284,8 +354,33 @@ class Search:
             )
         return found
 
+    def split(self, shapes: Sequence[Figure]) -> list[Figure]:
+        """Shapes, with two boxes in place of one shape where that is likelier.
+
+        Two things that touch are one group of the image, and one shape at first.
+
+        Args:
+            shapes: After a fit.
+        """
+        found, tried = list(shapes), 0
+        while tried < len(found):
+            shape = found[tried]
+            rest = [*found[:tried], *found[tried + 1 :]]
+            tried += 1
+            if max(shape.length, shape.width) < _WHOLE or len(found) == _MOST:
+                continue
+            pairs = halves(shape, self.ground)
+            pair = max(pairs, key=lambda two, rest=rest: self.evidence([*rest, *two]))
+            # Cuts are many enough for the right one to be likelier before any fit.
+            if self.evidence([*rest, *pair]) < self.evidence(found):
+                continue
+            new = self.settled([*rest, *pair])
+            if self.better(new, found):
+                found, tried = new, 0
+        return found
+
     def merged(self, shapes: Sequence[Figure]) -> list[Figure]:
-        """Shapes, with one box in place of two where that is likelier.
+        """Shapes, with one box, person or vehicle in place of two shapes where that is likelier.
 
         Args:
             shapes: After a fit.
@@ -303,7 +398,9 @@ class Search:
             a, b = min(pairs, key=lambda pair: apart(*pair, self.ground))
             tried.add((a, b))
             rest = [shape for shape in found if shape is not a and shape is not b]
-            one = self.best(rest, [around((a, b), turn, self.ground) for turn in _TURNS])
+            boxes = [around((a, b), turn, self.ground) for turn in _TURNS]
+            least = min(boxes, key=lambda one: one.length * one.width)
+            one = self.best(rest, [*boxes, *standing(least)])
             if self.evidence([*rest, one]) < self.evidence(found) - _HOPE:
                 continue
             new = self.settled([*rest, one])
@@ -315,6 +412,88 @@ _PARTS = (0.4, 0.55, 0.75, 1.35, 2.0)  # of a height that are tried
 _TURNS = tuple(k * math.pi / 16 for k in range(8))
 
 
+def section(figure: Figure) -> float:
+    """Radar cross-section of a shape of brightness 1, roughly, as a mean over directions [m²].
+
+    A matte surface of area A seen aslant has 4 A cos²θ, half of it on average.
+
+    Args:
+        figure: The shape.
+    """
+    if figure.kind == "corner":
+        return 0.5 * figure.length**2  # an eighth of its peak
+    if figure.ball:
+        return 0.5 * math.pi * figure.length**2
+    return 0.5 * math.pi * (figure.length + figure.width) * figure.height
+
+
+def other_kinds(one: Assembly, shapes: Sequence[Figure]) -> list[list[Figure]]:
+    """Shapes as other kinds, each time all that could be of that kind, before any fit.
+
+    Args:
+        one: Maps, which tell how a shape with a heading looks best.
+        shapes: As they are.
+    """
+    found = [[as_kind(shape, kind) for shape in shapes] for kind in ("box", "cylinder", "sphere")]
+    for kind in ("person", "vehicle", "corner"):
+        changed = list(shapes)
+        for number, shape in enumerate(shapes):
+            options = [row for row in _headed(shape) if row.kind == kind != shape.kind]
+            if options:
+                rest = [*shapes[:number], *shapes[number + 1 :]]
+                gains = [float(one.gains([*rest, option]).sum()) for option in options]
+                changed[number] = options[gains.index(max(gains))]
+        found.append(changed)
+    return [
+        rows for rows in found if any(new is not old for new, old in zip(rows, shapes, strict=True))
+    ]
+
+
+def facing(shapes: Sequence[Figure], turn: float, ground: Ground) -> list[Figure]:
+    """Shapes, with people and vehicles turned; empty if there are none.
+
+    Args:
+        shapes: As they are.
+        turn: About the vertical [rad].
+        ground: The plane.
+    """
+    fronts = [shape.kind in ("person", "vehicle") for shape in shapes]
+    pairs = zip(shapes, fronts, strict=True)
+    rows = [turned(one, turn, ground) if front else one for one, front in pairs]
+    return rows if any(fronts) else []
+
+
+def _headed(shape: Figure) -> list[Figure]:
+    """What has a heading, and could be in place of a shape; as bright in all."""
+    box = shape if shape.boxed else as_kind(shape, "box")
+    rows = standing(box)
+    if max(shape.length, shape.width) < CORNER:
+        middle = shape.height if shape.ball else 0.5 * shape.height
+        rows += headings(Figure("corner", shape.place, height=middle))
+    strength = shape.brightness * section(shape)
+    found = [replace(row, brightness=strength / section(row)) for row in rows]
+    # What is bright on one side only looked dim as something round.
+    more = [row for row in found if row.kind == "corner"]
+    return found + [replace(r, brightness=r.brightness * by) for r in more for by in (4.0, 16.0)]
+
+
+def nudged(shape: Figure, step: float) -> list[Figure]:
+    """A shape, moved, turned, lifted, or brighter or dimmer by a little.
+
+    Args:
+        shape: As it is.
+        step: Along the ground [m].
+    """
+    x, y = shape.place
+    moves = [(x + a * step, y + b * step) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+    return [
+        *(replace(shape, place=place) for place in moves),
+        *(replace(shape, yaw=shape.yaw + turn) for turn in (-0.2, 0.2)),
+        *(replace(shape, height=shape.height * part) for part in (0.75, 1.3)),
+        *(replace(shape, brightness=shape.brightness * part) for part in (0.6, 1.7)),
+    ]
+
+
 def as_kind(shape: Figure, kind: str) -> Figure:
     """A shape of another kind, of about the same size.
 
@@ -324,6 +503,8 @@ def as_kind(shape: Figure, kind: str) -> Figure:
     """
     if kind == shape.kind:
         return shape
+    if kind == "box" and shape.boxed:
+        return replace(shape, kind="box")
     if kind == "box":
         side = 0.85 * shape.length
         high = shape.height if shape.kind == "cylinder" else 2 * shape.height
@@ -331,9 +512,9 @@ def as_kind(shape: Figure, kind: str) -> Figure:
     mean = 0.5 * (shape.length + shape.width)
     across = mean if not shape.boxed else 1.1 * mean
     high = shape.height
-    if kind == "sphere" and shape.kind != "sphere":
+    if kind == "sphere" and not shape.ball:
         high = 0.5 * shape.height
-    elif kind == "cylinder" and shape.kind == "sphere":
+    elif kind == "cylinder" and shape.ball:
         high = 2 * shape.height
     return replace(shape, kind=kind, length=across, width=across, height=max(high, 0.05))
 
@@ -357,6 +538,43 @@ def around(shapes: Sequence[Figure], yaw: float, ground: Ground) -> Figure:
     return Figure(
         "box", (c * x - s * y, s * x + c * y), yaw, length, width, tall, brightest.brightness
     )
+
+
+def halves(shape: Figure, ground: Ground) -> list[tuple[Figure, Figure]]:
+    """Two boxes in place of one shape: cut across either side at three places, one of them slim.
+
+    Args:
+        shape: Which is to be two.
+        ground: The plane.
+
+    Returns:
+        For each cut both whole, and either one slim, along each edge or the middle of the shape.
+    """
+    box = around((shape,), shape.yaw if shape.boxed else 0.0, ground)
+    c, s = math.cos(ground.sense * box.yaw), math.sin(ground.sense * box.yaw)
+
+    def part(along: int, share: float, away: float, wide: float, off: float) -> Figure:
+        """A part of the box, its sides as shares of the whole's, its middle off by halves of it."""
+        sides, shift = [box.length, box.width], [0.0, 0.0]
+        shift[along], shift[1 - along] = 0.5 * sides[along] * away, 0.5 * sides[1 - along] * off
+        sides[along] *= share
+        sides[1 - along] *= wide
+        x, y = c * shift[0] - s * shift[1], s * shift[0] + c * shift[1]
+        place = box.place[0] + x, box.place[1] + y
+        return replace(box, place=place, length=sides[0], width=sides[1])
+
+    found: list[tuple[Figure, Figure]] = []
+    slim = [(_SLIM, off) for off in (_SLIM - 1, 0.0, 1 - _SLIM)]
+    for along in (0, 1):
+        for share in (1 / 3, 1 / 2, 2 / 3):
+            whole, other = (share, share - 1), (1 - share, share)
+            for first, second in (
+                ((1.0, 0.0), (1.0, 0.0)),
+                *((one, (1.0, 0.0)) for one in slim),
+                *(((1.0, 0.0), one) for one in slim),
+            ):
+                found.append((part(along, *whole, *first), part(along, *other, *second)))
+    return found
 
 
 def apart(first: Figure, second: Figure, ground: Ground) -> float:

@@ -16,6 +16,7 @@ from invertwin.radar import Radar
 from invertwin.radar.spectrum import aperture
 
 _LEAST = 1e-3  # of a response, relative to its peak: less is left out
+_NONE = 1e-30  # of a response: the place is out of sight [1/m²]
 _FINE = 32  # entries of a kernel's table in one bin
 _MOST = 8e7  # entries of the matrix: 8 bytes each
 
@@ -40,6 +41,19 @@ class Response:
         """
         return torch.from_numpy(self.matrix @ strength.numpy()).reshape(self.shape)
 
+    def means(self, values: Float64[Tensor, "frame range u v"]) -> Float64[Tensor, "frame place"]:
+        """The mean of values over the bins of every place, frame by frame.
+
+        Args:
+            values: Of all bins.
+        """
+        bins = int(np.prod(self.shape[1:]))
+        found = []
+        for frame, row in enumerate(values.numpy().reshape(len(values), -1)):
+            part = sparse.csc_matrix(self.matrix[frame * bins : (frame + 1) * bins].T)
+            found.append((part @ row) / np.maximum(part @ np.ones(bins), _NONE))
+        return torch.from_numpy(np.stack(found))
+
 
 def thinned(
     power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
@@ -52,7 +66,7 @@ def thinned(
         grid: Bins of the maps.
     """
     array = aperture(radar)
-    cells = [radar.waveform.range_resolution, *(_cell(p, radar) for p in (array.x, array.y))]
+    cells = [radar.waveform.range_resolution, *(cell_of(p, radar) for p in (array.x, array.y))]
     steps = [
         max(1, round(cell / step)) if count > 1 else 1
         for cell, step, count in zip(
@@ -71,8 +85,13 @@ def thinned(
     )
 
 
-def _cell(places: Float64[Tensor, " place"], radar: Radar) -> float:
-    """Width of a beam of elements in direction cosines."""
+def cell_of(places: Float64[Tensor, " place"], radar: Radar) -> float:
+    """Width of a beam of elements in direction cosines.
+
+    Args:
+        places: Of the elements along one axis [m].
+        radar: Its wavelength counts.
+    """
     if len(places) == 1:
         return 2.0
     extent = float(places.max() - places.min()) * len(places) / (len(places) - 1)

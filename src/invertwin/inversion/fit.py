@@ -135,6 +135,12 @@ class Fit:
                 f"expected parameters to fit and steps >= 1, got {len(free)} and "
                 f"{stage.steps}; give modules such as Pose('object')"
             )
+        few = min(len(observed) for observed in self._observed)
+        if stage.held_out is not None and few < stage.held_out:
+            raise InputError(
+                f"expected at least {stage.held_out} frames in every observation with held_out = "
+                f"{stage.held_out}, got {few}; hold out none, or a larger share"
+            )
         rules = stage.optimizer or settings.optimizer
         rough = [o.model for o in observations if not o.model.smooth]
         if rough and rules.kind == "gauss_newton":
@@ -320,14 +326,27 @@ class Fit:
 
     def _subset(self, k: int, step: int, sensor: Any, observed: Tensor) -> tuple[Any, Tensor]:
         """The frames of one observation that a step compares."""
-        count = self.stage.frames_per_step
-        if count is None or count >= len(observed):
+        fitted = np.array([n for n in range(len(observed)) if n not in self._held(len(observed))])
+        count = min(self.stage.frames_per_step or len(fitted), len(fitted))
+        if count == len(observed):
             return sensor, observed
         rng = np.random.default_rng(
             derived_seed(self._settings.seed, self.number, step, _SUBSETS + k)
         )
-        chosen = np.sort(rng.choice(len(observed), count, replace=False))
+        chosen = np.sort(rng.choice(fitted, count, replace=False))
         return sensor.frames(chosen.tolist()), observed.index_select(0, torch.from_numpy(chosen))
+
+    def _held(self, count: int) -> range:
+        """Numbers of the frames that are held out, of so many."""
+        every = self.stage.held_out
+        return range(0) if every is None else range(every - 1, count, every)
+
+    def _judging(self) -> float:
+        """The loss that tells whether the fit is better than its start."""
+        if self.stage.held_out is None:
+            return float(self.evaluate(self.stage.steps))
+        held = [(self._held(len(b)), a, b) for a, b in self.sharp_maps(0)]
+        return float(self.objective([(a[list(k)], b[list(k)]) for k, a, b in held]))
 
     def _descend(self, callbacks: Sequence[Callback]) -> Status:
         stage = self.stage
@@ -397,13 +416,14 @@ class Fit:
             for name, parameters in ends.items():
                 self.modules.load_state_dict(parameters)
                 try:
-                    losses[name] = float(self.evaluate(self.stage.steps))
+                    losses[name] = self._judging()
                 except InputError:  # out of bounds
                     losses[name] = math.inf
         last = losses.get("last", math.inf)
         if math.isfinite(last) and last <= _WORSE * losses["first"]:
             self.modules.load_state_dict(ends["last"])
             return status
+        # A loss on the way was that of frames that are fitted, which says nothing of the others.
         kept = min(("first", "best"), key=lambda name: losses[name])
         self.modules.load_state_dict(ends[kept])
         self._note(best=(self.progress.step, losses[kept], ends[kept]))

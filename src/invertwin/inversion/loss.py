@@ -17,6 +17,7 @@ _GAIN_STEPS = 8  # at most; three or four do
 _SETTLED = 1e-3  # of the gain: a step this small is the last, and leaves less than 1e-5
 _BLOCK = 2**16  # bins that are worked on at a time: what they need stays in a core's cache
 
+KINDS = ("mse", "likelihood", "heavy_tailed")
 BACKGROUNDS = ("none", "level", "static")
 _Block = tuple[Tensor, Tensor, Tensor]  # of a simulated map, what it holds of power, the measured
 Maps = Sequence[tuple[Tensor, Tensor]]
@@ -33,13 +34,39 @@ def relative_error(simulated: Tensor, measured: Tensor) -> Tensor:
     return (simulated - measured).abs().square().mean() / measured.abs().square().mean()
 
 
+def speckle_divergence(ratio: Tensor, degrees: float = math.inf) -> Tensor:
+    """How much less likely the power of speckle is than if it were its mean.
+
+    Exponential power whose mean is μ times an inverse gamma variable of ν degrees, q times its
+    μ: the negative logarithm of the density is log μ + (ν + 1) log(1 + q / ν) but for a constant.
+    For ν → ∞ it is that of fully developed speckle, log μ + q, under which a few echoes that the
+    model does not hold outweigh all others: they count by q; else they count by its logarithm.
+
+    Args:
+        ratio: q, power over its mean.
+        degrees: ν.
+
+    Returns:
+        The divergence: 0 for q = 1, positive elsewhere.
+
+    Source: Conte and Longo, "Characterisation of radar clutter as a spherically invariant random
+    process", IEE Proceedings F 134, 1987.
+    Differs from the source: the mean over textures is that of ν degrees about a mean that is
+    modelled, not of a fitted K distribution.
+    """
+    if math.isinf(degrees):
+        return ratio - ratio.log() - 1
+    tail = torch.log1p(ratio / degrees) - math.log1p(1 / degrees)
+    return (degrees + 1) * tail - ratio.log()
+
+
 @dataclass(frozen=True)
 class SpectrumLoss:
     """Multiscale difference of power maps.
 
     a, b are the simulated and the measured map; each level pools the bins of the one before in
     pairs, and the loss is the mean over levels. The unknown overall gain g ≥ 0 minimises the loss
-    in closed form (``mse``) or by a short fixed-point iteration (``likelihood``); being a
+    in closed form (``mse``) or by a short fixed-point iteration (the others); being a
     minimiser, it needs no derivative.
 
     Attributes:
@@ -47,32 +74,39 @@ class SpectrumLoss:
             divergence ``mean(q − log q − 1)``, ``q = (b + n) / (g a + n)``, which is the
             likelihood of fully developed speckle (power with an exponential distribution, or
             gamma after averaging). It weighs weak and strong echoes by their information, so that
-            the speckle of a bright wall does not drown a dim object.
+            the speckle of a bright wall does not drown a dim object. ``heavy_tailed``: the same
+            for speckle whose mean is itself uncertain (``speckle_divergence``), so that echoes
+            that the scene does not hold count by the logarithm of q, not by q. It suits measured
+            data.
         levels: Number of resolutions.
         gain: ``fitted``, or ``one`` for calibrated data.
         background: ``mse`` only. What is taken out of both maps first, again in closed form:
             nothing, one common ``level``, or the ``static`` part, the mean over frames of every
             bin (what clutter removal did to the data).
-        floor: ``likelihood`` only. n over the mean of b: noise and sidelobes below this do not
+        floor: Not for ``mse``. n over the mean of b: noise and sidelobes below this do not
             count.
+        degrees: ``heavy_tailed`` only. ν: about how many looks the mean of a bin is known by.
 
     Source: §4.2 of the paper (multiscale MSE).
     Differs from the source: the gain and the background are not parameters of the descent; the
-    likelihood is ours.
+    likelihoods are ours.
 
     Raises:
-        InputError: No levels, an unknown choice, or a background with ``likelihood``.
+        InputError: No levels, an unknown choice, or a background with a likelihood.
     """
 
-    kind: Literal["mse", "likelihood"] = "mse"
+    kind: Literal["mse", "likelihood", "heavy_tailed"] = "mse"
     levels: Count = 3
     gain: Literal["fitted", "one"] = "fitted"
     background: Literal["none", "level", "static"] = "none"
     floor: Positive = 0.01
+    degrees: Positive = 4.0
 
     def __post_init__(self) -> None:
-        if self.kind not in ("mse", "likelihood"):
-            raise InputError(f"expected kind 'mse' or 'likelihood', got {self.kind!r}; choose one")
+        if self.kind not in KINDS:
+            raise InputError(
+                f"expected kind among {', '.join(KINDS)}, got {self.kind!r}; choose one"
+            )
         if self.levels < 1 or self.gain not in ("fitted", "one"):
             raise InputError(
                 f"expected levels >= 1 and gain 'fitted' or 'one', got {self.levels} and "
@@ -83,11 +117,31 @@ class SpectrumLoss:
                 f"expected background among {', '.join(BACKGROUNDS)}, got {self.background!r}; "
                 "choose one"
             )
-        if self.kind == "likelihood" and (self.background != "none" or not self.floor > 0):
+        if self.kind != "mse" and (self.background != "none" or not self.floor > 0):
             raise InputError(
-                f"expected no background and floor > 0 with kind 'likelihood', got "
+                f"expected no background and floor > 0 with kind {self.kind!r}, got "
                 f"{self.background!r} and {self.floor}; the floor stands for a background"
             )
+        if not self.degrees > 0:
+            raise InputError(
+                f"expected degrees > 0, got {self.degrees}; 4 suits echoes that are not all known"
+            )
+
+    @property
+    def _tail(self) -> float:
+        """ν of the speckle."""
+        return self.degrees if self.kind == "heavy_tailed" else math.inf
+
+    def _heeded(self, power: Tensor, inverse: Tensor | float = 1.0) -> Tensor:
+        """Power as it counts in slopes: (ν + 1) / (ν + q) of it, all of it under plain speckle.
+
+        Args:
+            power: Measured.
+            inverse: One over its mean.
+        """
+        if self.kind == "likelihood":
+            return power
+        return (self.degrees + 1) * power / (self.degrees + power * inverse)
 
     def __call__(
         self,
@@ -104,7 +158,7 @@ class SpectrumLoss:
                 f"expected maps of one shape, got {tuple(simulated.shape)} and "
                 f"{tuple(measured.shape)}; use one grid for both"
             )
-        if self.kind == "likelihood":
+        if self.kind != "mse":
             return self._divergence(simulated, measured)
         pairs = self._pyramid(simulated, measured)
         return self._error([(self._cleared(a), self._cleared(b)) for a, b in pairs])
@@ -117,8 +171,8 @@ class SpectrumLoss:
     ) -> Float[Tensor, "p p"]:
         """The Gauss–Newton matrix of the loss: its second derivatives but for those of the map.
 
-        Under ``mse`` it is twice the matrix of squared residuals, under ``likelihood`` the Fisher
-        information of the speckle. A fitted gain is eliminated: what it can explain tells nothing
+        Under ``mse`` it is twice the matrix of squared residuals, else the Fisher information of
+        the speckle. A fitted gain is eliminated: what it can explain tells nothing
         about the parameters.
 
         Args:
@@ -140,7 +194,7 @@ class SpectrumLoss:
                 weight = 2 * gain**2 / b.square().mean().clamp_min(1e-30)
                 weighed = torch.stack([self._cleared(row) for row in rows]).flatten(1)
             else:
-                weight = 1.0
+                weight = 1.0 / (1.0 + 2.0 / self._tail)
                 weighed = (
                     rows * ((a > 0) * gain / (gain * a.clamp_min(0.0) + self.floor))
                 ).flatten(1)
@@ -211,7 +265,7 @@ class SpectrumLoss:
         ]
 
     def _likeliest(self, levels: list[list[_Block]], unit: float = 1.0) -> float:
-        """The gain of the ``likelihood`` over the unit, by a secant on its logarithm."""
+        """The gain of a likelihood over the unit, by a secant on its logarithm."""
         if self.gain == "one":
             return 1.0 / unit
         floor = torch.as_tensor(self.floor).to(levels[0][0][0])
@@ -226,7 +280,7 @@ class SpectrumLoss:
                     for _, a, b in blocks:
                         inverse = torch.add(floor, a, alpha=math.exp(place)).reciprocal_()
                         down += float(a @ inverse) / count
-                        up += float(inverse.square_().mul_(b) @ a) / count
+                        up += float(self._heeded(b, inverse) @ inverse.square_().mul_(a)) / count
                 move = math.log(max(up, _LEAST) / max(down, _LEAST))
                 if step != 0:
                     slope = min(max((before - move) / step, 0.1), 1.0)
@@ -254,7 +308,7 @@ class SpectrumLoss:
             (b.clamp_min(0.0) + self.floor) / (gain * a.clamp_min(0.0) + self.floor)
             for a, b in pairs
         ]
-        return torch.stack([(q - q.log() - 1).mean() for q in ratios]).mean()
+        return torch.stack([speckle_divergence(q, self._tail).mean() for q in ratios]).mean()
 
     @torch.no_grad()
     def _divergence_and_slope(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
@@ -274,11 +328,11 @@ class SpectrumLoss:
             for (a, lit, data), out in zip(blocks, slopes, strict=True):
                 inverse = lit.mul_(gain).add_(self.floor).reciprocal_()
                 ratio = data.mul_(inverse)
-                inverse.addcmul_(inverse, ratio, value=-1).mul_(factor)
+                value += float(speckle_divergence(ratio, self._tail).sum()) / power.numel()
+                inverse.addcmul_(inverse, self._heeded(ratio), value=-1).mul_(factor)
                 # What is below zero counts as zero, and has no derivative; a dark bin has one.
                 least = -torch.finfo(a.dtype).tiny
                 torch.ops.aten.threshold_backward(inverse, a, least, grad_input=out)
-                value += float(ratio.sum() - len(a) - ratio.log_().sum()) / power.numel()
             slope = own if slope is None else _spread(slope, own)
         assert slope is not None
         return slope.new_tensor(value / self.levels), slope

@@ -34,7 +34,8 @@ class Reconstruction:
         parameters: The fitted modules: those of the scene, then those of the sensors.
         history: One row a step: ``step``, ``stage``, ``loss``, ``values`` (parameters by name).
         status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
-            ``diverged`` (not finite, or worse than the start; then the best state is kept).
+            ``diverged`` (not finite, or worse than the start; then the better of the best state
+            and the start is kept).
             Why the fit stopped: whether it is right is the matter of ``verdict``.
         steps: Steps done.
         loss: Final loss; if the fit diverged, that of the best state, without extra widths.

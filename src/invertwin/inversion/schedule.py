@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Annotated
 
-from annotated_types import Gt, Le
+from annotated_types import Ge, Gt, Le
 
 from invertwin.errors import InputError
 from invertwin.inversion.optimizer import Optimizer
@@ -21,6 +21,9 @@ class Schedule:
         steps: Budget.
         annealing: Share of the steps with extra widths.
         frames_per_step: Random frames of every observation in a step; None = all.
+        held_out: Every so manieth frame of every observation is held out: it is not fitted, but
+            judges. A fit that explains these frames worse than its start has diverged, and keeps
+            the start. None = no frame.
         tolerance: Once the widths are zero, the fit stops when the loss has fallen by less than
             this share over 20 steps; 0 = it uses the whole budget.
     """
@@ -29,6 +32,7 @@ class Schedule:
     _: KW_ONLY
     annealing: Annotated[float, Gt(0), Le(1)] = 0.7
     frames_per_step: Count | None = None
+    held_out: Annotated[int, Ge(2)] | None = None
     tolerance: NonNegative = 0.0
 
     @property

@@ -44,6 +44,9 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         if None not in spread:
             sizes = [4 * float(value or 0.0) for value in spread]
             axes.add_patch(Ellipse(at, sizes[0], sizes[1], fill=False, color=tint))
+        if thing.track is not None:
+            path = numbers(thing.track.positions)[:, list(twin.ground.level)]
+            axes.plot(*path.T, color=tint, linewidth=1.0, marker=".", markersize=3)
         if thing.velocity is not None:
             speed = [float(thing.velocity[axis]) for axis in twin.ground.level]
             if math.hypot(*speed) > 0:

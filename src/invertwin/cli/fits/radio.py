@@ -29,7 +29,6 @@ from invertwin.inversion import (
     Checkpoint,
     Observation,
     Reconstruction,
-    SpectrumLoss,
     Stage,
     Unknown,
     reconstruct,
@@ -283,7 +282,7 @@ def _fit(
         heard.scene,
         Observation(stages[-1].models[0], sensor, heard.levels, parameters=own),
         unknowns,
-        loss=_loss(run),
+        loss=build.made(run, "loss"),
         schedule=stages,
         callbacks=[
             *shown,
@@ -291,13 +290,6 @@ def _fit(
         ],
         seed=derived_seed(run.seed, number),
     )
-
-
-def _loss(run: RunFile) -> SpectrumLoss:
-    """How levels are compared: decibels have no gain, and no coarse resolution."""
-    if "loss" in run.model_fields_set:
-        return build.made(run, "loss")
-    return SpectrumLoss(levels=1, gain="one")
 
 
 def _located(run: RunFile) -> bool:

@@ -80,7 +80,7 @@ def tables_of(fitted: Fitted) -> list[Table]:
     if moves:
         tables.append(Table("Moves from the start", ["parameter", "value"], moves))
     if "initial_seconds" in metrics:
-        tables.append(_added(metrics))
+        tables.append(_added(fitted.problem.run, metrics))
     return tables
 
 
@@ -99,9 +99,8 @@ def _result(run: RunFile, metrics: dict[str, Any]) -> Table:
     rows.extend(map(list, quantities("", metrics, skip=skip).rows))
     made_of = {key: name for key, name in _MATERIAL.items() if key in metrics}
     rows += [[f"{name}, share off the truth", metrics[key]] for key, name in made_of.items()]
-    others = tuple(f"_{mode}" for mode in run.variants)
     for key in metrics:
-        if is_shape_key(key) and not key.endswith(others):
+        if _own_shape(run, key):
             rows.append([shape_label(key), metrics[key]])
             found = key.removeprefix("start_")
             if found not in metrics:
@@ -140,9 +139,14 @@ def _places(fitted: Fitted) -> Table:
     return Table("Parameters", ["parameter", "start", "result", "truth"], cells)
 
 
-def _added(metrics: dict[str, Any]) -> Table:
+def _own_shape(run: RunFile, key: str) -> bool:
+    """Whether a number measures the shape that the run's own way to fit has found."""
+    return is_shape_key(key) and not key.endswith(tuple(f"_{mode}" for mode in run.variants))
+
+
+def _added(run: RunFile, metrics: dict[str, Any]) -> Table:
     """What the fit has made better: the conventional guess beside the twin."""
-    shapes = [(shape_label(key), f"start_{key}", key) for key in metrics if is_shape_key(key)]
+    shapes = [(shape_label(key), f"start_{key}", key) for key in metrics if _own_shape(run, key)]
     rows = [
         [label, metrics[before], metrics[after]]
         for label, before, after in (*_CONVENTIONAL, *shapes)

@@ -185,6 +185,15 @@ class _RunFile(Section):
         "[[vary]]: what is drawn anew for every sample of [dataset]", []
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _levels_have_no_gain(cls, data: Any) -> Any:
+        """Received levels [dB] are compared as they are, at one resolution, unless said else."""
+        read = data.get("data") if isinstance(data, dict) and "loss" not in data else None
+        if isinstance(read, dict) and read.get("kind") in ("received", "received_file"):
+            return data | {"loss": {"levels": 1, "gain": "one"}}
+        return data
+
     @model_validator(mode="after")
     def _names_exist(self) -> "_RunFile":
         if self.scene_file is None:

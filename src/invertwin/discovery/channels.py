@@ -1,0 +1,145 @@
+"""Calibration of the channels on a scene that nobody knows, by its own image."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+from invertwin.capture import Capture, ChannelCalibration
+from invertwin.channel import Grid
+from invertwin.discovery.clutter import background
+from invertwin.discovery.sharp_image import responses, sharpened, thinned
+from invertwin.radar import Radar, range_profile
+from invertwin.radar.radar import sampled
+
+_ROUNDS = 2  # an image, then the channels that it tells
+_SWEEPS = 100  # over the channels, at most
+_DEGREES = 4.0  # of the heavy-tailed speckle
+_WORTH = 10.0  # degrees of phase, root mean square: less is left as it is
+_FRAMES = 8  # at least: one place cannot tell a wrong phase from another direction
+
+
+def channels_of_scene(
+    capture: Capture, grid: Grid, places: Float64[Tensor, "place 3"]
+) -> ChannelCalibration | None:
+    """The gains of the channels under which a recording fits its own image best.
+
+    The first image is made of ranges alone, which the phases of channels do not touch: many
+    positions of the radar tell where echoes come from. It predicts the covariance of the channels
+    in every range bin, which tells their gains by likelihood; the next image uses directions, too.
+
+    Args:
+        capture: Of several positions.
+        grid: Bins.
+        places: Of the image [m].
+
+    Returns:
+        None where the channels agree, or where too few positions tell a wrong phase from another
+        direction.
+    """
+    radar = capture.radar()
+    if len(radar.virtual_positions) == 1 or radar.frame_count < _FRAMES:
+        return None
+    flat = replace(grid, u_start=0.0, u_step=1.0, u_count=1, v_start=0.0, v_step=1.0, v_count=1)
+    shape = tuple(capture.beat.shape[1:3])
+    found = ChannelCalibration(torch.ones(shape, dtype=torch.complex128))
+    for number in range(_ROUNDS):
+        now = found.apply(capture)
+        bins = flat if number == 0 else grid
+        power = now.spectrum(bins).detach().double()
+        power, coarse = thinned(power, radar, bins)
+        level = background(power)[:, None, None].expand_as(power)
+        image = sharpened(responses(radar, coarse, places), power, level)
+        found = _likeliest(capture, flat, places, image)
+        if number == 0 and apart(found) < _WORTH:
+            return None
+    return found
+
+
+def apart(calibration: ChannelCalibration) -> float:
+    """How far the phases of channels are apart, root mean square [°].
+
+    Args:
+        calibration: Of the channels.
+    """
+    return math.degrees(float(calibration.gains.angle().square().mean().sqrt()))
+
+
+def _likeliest(
+    capture: Capture, flat: Grid, places: Float64[Tensor, "place 3"], image: Tensor
+) -> ChannelCalibration:
+    """Gains of the channels, of a known image.
+
+    With h = 1/g and D = diag(x), a range bin of channels x has the covariance R that the image
+    predicts, once D h replaces x. Minus the logarithm of its likelihood, summed over bins, is
+    hᴴ Q h − 2 N Σ log|h|, Q = Σ Dᴴ R⁻¹ D; one channel after the other minimises it in closed form.
+    Bins that the image does not explain count less, as heavy-tailed speckle does.
+
+    Args:
+        capture: Signals.
+        flat: Bins of range.
+        places: Of the image [m].
+        image: Radar cross-section of every place [m²].
+    """
+    radar = capture.radar()
+    profile = range_profile(capture.beat.to(torch.complex128), radar, flat)
+    power = profile.abs().square().mean((1, 2))
+    power, coarse = thinned(power[:, :, None, None], radar, flat)
+    stride = round(coarse.range_step / flat.range_step)
+    cells = profile[..., ::stride].flatten(1, 2).movedim(1, -1)  # frame, range, channel
+    level = background(power)
+    predicted = responses(radar, coarse, places).matrix
+    count, ranges = cells.shape[-1], cells.shape[1]
+    eye = torch.eye(count, dtype=torch.complex128)
+    total, draws = torch.zeros(count, count, dtype=torch.complex128), 0.0
+    for frame, waves in enumerate(_waves(radar, places)):
+        model = level[:, None, None] * eye
+        for k in range(ranges):
+            row = predicted[frame * ranges + k]
+            near = torch.from_numpy(row.indices.astype(np.int64))
+            seen = waves[near]
+            power = image[near] * torch.from_numpy(row.data)
+            model[k] += (seen * power[:, None]).T @ seen.conj()
+        inverse = torch.linalg.inv(model)
+        x = cells[frame]
+        misfit = torch.einsum("ri,rij,rj->r", x.conj(), inverse, x).real / count
+        weight = (_DEGREES + 1) / (_DEGREES + misfit)
+        total += torch.einsum("r,ri,rij,rj->ij", weight.to(x), x.conj(), inverse, x)
+        draws += float(weight.sum())
+    return ChannelCalibration((1 / _minimum(total, draws)).reshape(capture.beat.shape[1:3]))
+
+
+def _waves(radar: Radar, places: Float64[Tensor, "place 3"]) -> list[Complex128[Tensor, "p c"]]:
+    """What the channels of every frame get from echoes at places."""
+    found = []
+    for place, axes in zip(radar.positions.detach(), radar.link().rotations.detach(), strict=True):
+        seen = torch.nn.functional.normalize(places - place, dim=1) @ axes
+        path = seen[:, :2] @ radar.virtual_positions[:, :2].T
+        phase = -2 * math.pi / sampled(radar).wavelength * path
+        found.append(torch.polar(torch.ones_like(phase), phase))
+    return found
+
+
+def _minimum(matrix: Complex128[Tensor, "c c"], draws: float) -> Complex128[Tensor, " c"]:
+    """The h that minimises hᴴ Q h − 2 N Σ log|h|.
+
+    Args:
+        matrix: Q, Hermitian.
+        draws: N.
+    """
+    vectors = torch.linalg.eigh(matrix).eigenvectors
+    h = vectors[:, 0] / vectors[:, 0].abs().clamp_min(1e-3)
+    for _ in range(_SWEEPS):
+        before = h.clone()
+        for c in range(len(h)):
+            own = float(matrix[c, c].real)
+            rest = (matrix[c] * h).sum() - matrix[c, c] * h[c]
+            size = float(rest.abs())
+            length = (size + math.sqrt(size**2 + 4 * own * draws)) / (2 * own)
+            h[c] = -length * rest / max(size, 1e-300)
+        if float((h - before).abs().max()) < 1e-6 * float(h.abs().max()):
+            break
+    return h

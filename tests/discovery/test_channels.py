@@ -1,0 +1,76 @@
+"""Calibration of the channels on a scene that nobody knows."""
+
+import math
+from functools import cache
+
+import pytest
+import torch
+
+import invertwin as iw
+from invertwin.capture import ChannelCalibration
+from invertwin.discovery.channels import apart, channels_of_scene
+from invertwin.scene import RoughDielectric, box, linear_array, look_at, rigid
+
+CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
+PLACES = 12
+
+
+@cache
+def recording() -> iw.Capture:
+    """Two boxes from places on a circle of 3 m, with noise."""
+    half = CHIRP.wavelength / 2
+    angle = 2 * math.pi * torch.arange(PLACES, dtype=torch.float64) / PLACES
+    places = 3 * torch.stack([angle.cos(), 0 * angle, angle.sin()], dim=1)
+    tx, rx = linear_array(2, 4 * half), linear_array(4, half)
+    radar = iw.Radar(tx, rx, CHIRP, places, look_at(places, [0, 0, 0]))
+    paint = RoughDielectric(permittivity=4.0)
+    scene = iw.Scene(
+        {
+            "one": iw.Object(box(0.4), paint, rigid(translation=[0.7, 0.0, 0.3])),
+            "two": iw.Object(box([0.2, 0.4, 0.6]), paint, rigid(translation=[-0.6, 0.0, -0.5])),
+        }
+    )
+    sampling = iw.Sampling(depth=1, points_per_m2=1e3)
+    with torch.no_grad():
+        beat = iw.simulate(
+            scene, radar, radar.grid(0.5, 5.0), sampling=sampling, seed=1, snr_db=15.0
+        ).beat
+    return iw.Capture.from_beat(beat, radar)
+
+
+def gains(seed: int) -> torch.Tensor:
+    """Any phases, and amplitudes within 6 dB."""
+    generator = torch.Generator().manual_seed(seed)
+    phase, level = torch.rand(2, 2, 4, generator=generator, dtype=torch.float64)
+    return torch.polar(10 ** (0.3 * (level - 0.5)), 2 * math.pi * phase)
+
+
+def found(capture: iw.Capture) -> ChannelCalibration | None:
+    radar = capture.radar()
+    ends = torch.arange(-1.5, 1.5, 0.06, dtype=torch.float64)
+    flat = torch.cartesian_prod(ends, ends)
+    places = torch.stack([flat[:, 0], torch.zeros(len(flat)), flat[:, 1]], dim=1).double()
+    return channels_of_scene(capture, radar.grid(0.5, 5.0), places)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_any_phases_and_levels_are_found(seed):
+    wrong = gains(seed)
+    spoilt = ChannelCalibration(1 / wrong).apply(recording())
+    told = found(spoilt)
+    assert told is not None
+    left = told.gains / wrong
+    left = left / left[0, 0]
+    assert float(left.angle().abs().max()) < math.radians(6)
+    assert float(20 * left.abs().log10().abs().max()) < 1.5
+    assert apart(told) > 45
+
+
+def test_channels_that_agree_are_left_alone():
+    assert found(recording()) is None
+
+
+def test_few_positions_tell_nothing():
+    few = recording().frames(range(4))
+    spoilt = ChannelCalibration(1 / gains(0)).apply(few)
+    assert found(spoilt) is None

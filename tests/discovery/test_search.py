@@ -1,0 +1,127 @@
+"""Which shapes there are: halves of a shape, other kinds, and the moves that change them."""
+
+import math
+
+import pytest
+import torch
+from scipy import sparse
+
+import invertwin as iw
+from discovery.test_recordings import CHAIN, around, thing
+from invertwin.discovery.assembly import Assembly, sampling_of
+from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
+from invertwin.discovery.primitives import Figure
+from invertwin.discovery.proposals import standing
+from invertwin.discovery.search import (
+    Lattice,
+    Search,
+    facing,
+    halves,
+    other_kinds,
+    outline,
+    section,
+)
+from invertwin.discovery.sharp_image import Response
+from invertwin.inversion.initial import Ground
+from invertwin.models import SurrogateMap
+from invertwin.scene import box, cylinder, person, standing_height
+
+BOX = Figure("box", (0.3, -0.4), 0.3, 0.8, 0.2, 1.1, 0.05)
+
+
+def search_of(scene: iw.Scene, count: int = 12) -> Search:
+    """A search of a simulated scene; it has no image."""
+    radar = around(count)
+    grid = radar.grid(0.5, 3.0)
+    beat = iw.simulate(scene, radar, grid, seed=3, sampling=CHAIN, snr_db=10.0).beat
+    power = iw.Capture.from_beat(beat, radar).spectrum(grid).float()
+    one = Assembly(
+        SurrogateMap(grid, sampling=sampling_of(count, 1500)),
+        radar,
+        power,
+        HeavyTailed(background(power)),
+        shared_bins(radar, grid),
+        Ground(),
+        0.0,
+        0,
+    )
+    nowhere = torch.zeros(1, 2, dtype=torch.float64)
+    empty = Response(sparse.csr_matrix((power.numel(), 1)), tuple(power.shape))
+    held = list(range(3, count, 4))
+    fitted = one.frames([frame for frame in range(count) if frame not in held])
+    return Search(fitted, one.frames(held), Lattice(nowhere, 0.04, empty, 0.6))
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_halves_fill_the_whole(up):
+    ground = Ground(up)
+    pairs = halves(BOX, ground)
+    assert len(pairs) == 42
+    middle = torch.tensor(BOX.place, dtype=torch.float64)
+    whole = outline(BOX, ground)
+    for number, pair in enumerate(pairs):
+        area = sum(one.length * one.width for one in pair) / (0.8 * 0.2)
+        parts = torch.cat([outline(one, ground) for one in pair])
+        # No part reaches beyond the whole.
+        assert float((parts - middle).norm(dim=1).max()) < 0.5 * math.hypot(0.8, 0.2) + 1e-9
+        if number % 7:
+            assert area < 0.9
+        else:
+            assert area == pytest.approx(1.0)
+            assert float(torch.cdist(whole, parts).amin(1).max()) < 1e-9
+    post = Figure("cylinder", (0.0, 0.0), 0.0, 0.4, 0.4, 1.0)
+    assert {one.kind for pair in halves(post, ground) for one in pair} == {"box"}
+
+
+def test_only_what_is_as_large_as_a_person_or_a_vehicle_may_be_one():
+    def kinds(length: float, width: float) -> set[str]:
+        return {one.kind for one in standing(Figure("box", (0.0, 0.0), 0.0, length, width, 1.0))}
+
+    assert kinds(0.5, 0.3) == {"person"}
+    assert kinds(1.8, 0.1) == set()
+    assert kinds(4.0, 1.7) == {"vehicle"}
+    assert kinds(0.05, 0.05) == set()
+
+
+def test_a_section_grows_with_the_surface():
+    assert section(Figure("box", (0.0, 0.0), 0.0, 1.0, 1.0, 2.0)) == pytest.approx(2 * math.pi)
+    ball = Figure("sphere", (0.0, 0.0), 0.0, 0.5, 0.5, 1.0)
+    assert section(ball) == pytest.approx(math.pi / 8)
+
+
+@pytest.mark.slow
+def test_one_shape_about_two_things_is_split():
+    scene = iw.Scene(
+        {
+            "wall": thing(box((0.7, 0.9, 0.1)), (-0.25, 0.1), 0.45),
+            "post": thing(cylinder(0.2, 0.9), (0.3, 0.1), 0.45),
+        }
+    )
+    search = search_of(scene)
+    whole = search.settled([Figure("box", (-0.05, 0.1), 0.0, 1.1, 0.4, 0.9, 0.1)])
+    found = search.alive(search.kinds(search.split(whole)))
+    assert len(found) == 2
+    assert search.evidence(found) > search.evidence(whole)
+    away = torch.cdist(
+        torch.tensor([[-0.25, 0.1], [0.3, 0.1]], dtype=torch.float64),
+        torch.tensor([one.place for one in found], dtype=torch.float64),
+    )
+    assert float(away.amin(1).max()) < 0.1
+    # One thing stays one.
+    alone = search_of(iw.Scene({"wall": thing(box((0.7, 0.9, 0.1)), (-0.25, 0.1), 0.45)}))
+    assert len(alone.split(alone.settled([Figure("box", (-0.25, 0.1), 0.0, 0.7, 0.1, 0.9)]))) == 1
+
+
+@pytest.mark.slow
+def test_a_person_is_no_box():
+    body = person(height=1.65, spacing=0.05)
+    scene = iw.Scene({"person": thing(body.mesh({}), (0.1, -0.2), standing_height(body), 0.6)})
+    search = search_of(scene)
+    start = Figure("box", (0.12, -0.18), 0.7, 0.5, 0.25, 1.2, 0.1)
+    before = search.settled([start])
+    (found,) = search.turns(search.kinds(before))
+    assert found.kind == "person"
+    assert math.dist(found.place, (0.1, -0.2)) < 0.06
+    lists = other_kinds(search.fitted, before)
+    assert {rows[0].kind for rows in lists} == {"cylinder", "sphere", "person"}
+    assert facing(before, math.pi, Ground()) == []
