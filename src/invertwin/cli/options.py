@@ -104,6 +104,9 @@ class Fits(Resumable):
         ),
     ] = None
     engine: EngineOption = "processes"
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the fits in a browser while they go on.")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)
