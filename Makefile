@@ -18,16 +18,18 @@ MINUTES ?= 30
 LOWEST := .venv-lowest
 WHEEL := .venv-wheel
 
-.PHONY: help demo test test-fast test-gpu fuzz lowest wheel check format bench clean
+.PHONY: help demo test test-fast test-gpu test-browser fuzz lowest wheel docs check format bench clean
 
 help:
 	@echo 'make demo       find a hidden letter from its radar echoes (under 5 minutes)'
 	@echo 'make test       all tests but those that need a GPU'
 	@echo 'make test-fast  the quick ones'
 	@echo 'make test-gpu   those that need a GPU'
+	@echo 'make test-browser  viewer and report in Chromium; screenshots in out/browser'
 	@echo 'make fuzz       read damaged files of every format for MINUTES=30'
 	@echo 'make lowest     the quick tests with the lowest versions that we allow'
 	@echo 'make wheel      build, check, and run the demo from the wheel in an empty folder'
+	@echo 'make docs       the site in out/docs/html: runs all tutorials, checks all links'
 	@echo 'make check      format, lint, types, import arrows'
 	@echo 'make format     let ruff format and sort'
 	@echo 'make bench      speed and memory, ours and peers'"'"
@@ -44,6 +46,9 @@ test-fast: .venv/.dev .venv/.llvm
 
 test-gpu: .venv/.dev .venv/.llvm
 	$(BIN)/python -m pytest -m gpu
+
+test-browser: .venv/.dev .venv/.llvm .venv/.browser
+	$(BIN)/python -m pytest -m browser tests/browser
 
 fuzz: .venv/.dev
 	PYTHONPATH=tests $(BIN)/python -m fuzz.long --minutes $(MINUTES)
@@ -70,6 +75,14 @@ wheel: .venv/.release .venv/.llvm
 	@set -e; folder=$$(mktemp -d); root=$$PWD; cd $$folder; \
 	    $$root/$(WHEEL)/bin/invertwin doctor; $$root/$(WHEEL)/bin/invertwin demo; \
 	    rm -r $$folder
+
+# From a clean slate: a tutorial that no longer runs must show. Nothing is fetched.
+docs: .venv/.docs .venv/.llvm
+	@rm -rf out/docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html -d out/docs/doctrees docs out/docs/html
+	$(BIN)/python docs/check_site.py out/docs/html
+	$(BIN)/python docs/public_names.py docs/api/*.md
+	@echo 'the site: out/docs/html/index.html'
 
 check: .venv/.dev
 	$(BIN)/ruff format --check .
@@ -123,9 +136,23 @@ $(BIN)/python:
 	@$(PIP) install --constraint constraints.txt --editable '.[release]'
 	@touch $@
 
+.venv/.docs: .venv/.run
+	@echo 'set-up: what builds the site'
+	@$(PIP) install --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
 .venv/.bench: .venv/.run
 	@echo 'set-up: peers for the benchmarks'
 	@$(PIP) install --constraint constraints.txt --editable '.[bench]'
+	@touch $@
+
+# Debian's Chromium, where we may install it; else the one that Playwright fetches.
+.venv/.browser: .venv/.run
+	@echo 'set-up: the viewer, and Chromium for its tests'
+	@$(PIP) install --constraint constraints.txt --editable '.[browser]'
+	@command -v chromium >/dev/null || \
+	    { $(MAY_APT) && $(APT) update && $(APT) install -y --no-install-recommends chromium; } || \
+	    $(BIN)/playwright install chromium
 	@touch $@
 
 # libllvm19 is what we test with; a system that no longer has it offers a newer one. Dr.Jit also

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import json
 import os
 import pickle
@@ -18,14 +19,16 @@ from invertwin.cli.run_file import load_run, validate
 from invertwin.cli.schema import RunFile
 from invertwin.registry.kinds import PLUGINS
 from invertwin_studies.recordings import rail_sar
+from public_names import ROOMS, cells, documented, examples, menu, used, uses
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES[1:] if "```python" in page.read_text()]
 NEEDS_DATA = ["measured_data.md"]
+REFERENCE = sorted((REPOSITORY / "docs" / "api").glob("*.md"))
+TUTORIALS = sorted((REPOSITORY / "docs" / "tutorials").glob("*.py"))
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 
-SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"`(invertwin(?:_studies)?(?:\.\w+)+)`")
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 RUN_FILE = re.compile(r"\b(?:experiments|examples|benchmarks|tests)/[\w/*.]*\w")
@@ -52,19 +55,15 @@ def run(arguments, folder):
         capture_output=True,
         text=True,
     )
-    assert ended.returncode == 0, ended.stderr[-3000:]
+    assert ended.returncode == 0, (ended.stdout + ended.stderr)[-3000:]
     return ended.stdout
-
-
-def snippets(page):
-    return [match.group(1) for match in SNIPPET.finditer(page.read_text())]
 
 
 @pytest.fixture(scope="module")
 def readme(tmp_path_factory):
     """What the README's two snippets print, run in one session."""
     folder = tmp_path_factory.mktemp("readme")
-    return run(["-c", "\n".join(snippets(REPOSITORY / "README.md"))], folder)
+    return run(["-c", "\n".join(cells(REPOSITORY / "README.md"))], folder)
 
 
 @pytest.mark.slow
@@ -78,7 +77,7 @@ def test_readme_simulates_and_finds_the_letter(readme):
 def test_readme_snippets_are_short():
     counts = [
         sum(bool(line.strip()) for line in snippet.splitlines())
-        for snippet in snippets(REPOSITORY / "README.md")
+        for snippet in cells(REPOSITORY / "README.md")
     ]
     assert len(counts) == 2
     assert max(counts) <= 15
@@ -89,8 +88,68 @@ def test_readme_snippets_are_short():
     "page", [p for p in WITH_PYTHON if p.name not in NEEDS_DATA], ids=lambda page: page.name
 )
 def test_snippets_of_a_page_run(page, tmp_path):
-    run(["-c", "\n".join(snippets(page))], tmp_path)
+    run(["-c", "\n".join(cells(page))], tmp_path)
     assert not list(tmp_path.iterdir()), "a snippet leaves a file behind"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_tutorials_hold(page, tmp_path):
+    """Every tutorial checks a value itself."""
+    assert "\nassert " in page.read_text()
+    run(["-c", "\n".join(cells(page))], tmp_path)
+    assert not list(tmp_path.iterdir()), "a tutorial leaves a file behind"
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_tutorials_have_a_picture_and_use_public_names(page):
+    text = page.read_text()
+    assert "iw.plotting." in text or "Figure(" in text
+    assert text.startswith("# %% [markdown]\n# # ")
+    check_public(text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", REFERENCE, ids=lambda page: page.stem)
+def test_examples_of_the_reference_hold(page, tmp_path):
+    """Every output is as the page says."""
+    run([str(REPOSITORY / "docs" / "public_names.py"), str(page)], tmp_path)
+    assert not list(tmp_path.iterdir()), "an example leaves a file behind"
+
+
+def test_reference_has_a_page_for_every_room():
+    shown = {
+        page.stem: re.findall(r"^```{names} (\S+)$", page.read_text(), re.M) for page in REFERENCE
+    }
+    assert shown.pop("index") == []
+    assert shown == {"invertwin": ["invertwin"], **{room: [f"invertwin.{room}"] for room in ROOMS}}
+    assert set(importlib.import_module("invertwin").__all__) - {"__version__"} <= {
+        *ROOMS,
+        *documented()["invertwin"],
+    }
+
+
+def test_every_page_of_the_reference_has_examples_of_its_room():
+    for room in ROOMS:
+        page = REPOSITORY / "docs" / "api" / f"{room}.md"
+        shown = used("\n".join(example.source for example in examples(page)))
+        assert shown & set(documented()[f"invertwin.{room}"]), f"{page.name} uses none of its names"
+
+
+def test_every_name_of_the_package_has_an_example():
+    page = REPOSITORY / "docs" / "api" / "invertwin.md"
+    shown = used("\n".join(example.source for example in examples(page)))
+    with_a_page = {"dataset"}  # it writes a folder: docs/datasets.md
+    assert set(documented()["invertwin"]) - shown == with_a_page
+    assert with_a_page <= set(uses())
+
+
+def test_every_public_name_says_what_it_is():
+    for room, names in documented().items():
+        for name in names:
+            thing = getattr(importlib.import_module(room), name)
+            named = inspect.isclass(thing) or inspect.isroutine(thing)
+            assert not named or thing.__doc__, f"{room}.{name} has no docstring"
 
 
 def test_recipe_of_the_rail_data_makes_the_file_that_is_read(data_folder, tmp_path):
@@ -99,7 +158,7 @@ def test_recipe_of_the_rail_data_makes_the_file_that_is_read(data_folder, tmp_pa
         arrays = {name: file[name] for name in file.files if name != "meta"}
     recorded = arrays | {"range_bins": arrays["range_bins"][None]}  # as the original has it
     (tmp_path / "master_data.pkl").write_bytes(pickle.dumps(recorded))
-    (recipe,) = snippets(REPOSITORY / "docs" / "measured_data.md")
+    (recipe,) = cells(REPOSITORY / "docs" / "measured_data.md")
     run(["-c", recipe], tmp_path)
     with np.load(tmp_path / made) as file:
         for name, values in arrays.items():
@@ -131,8 +190,9 @@ def test_run_file_on_the_page_finds_the_ball(tmp_path):
 
 def test_page_on_run_files_names_every_section():
     page = (REPOSITORY / "docs" / "run_files.md").read_text()
-    cells = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
-    named = {re.sub(r"\W*(\w+).*", r"\1", name) for c in cells for name in re.findall("`.+?`", c)}
+    table = page.split("## Which command needs what")[1].split("\n## ")[0]
+    heads = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    named = {re.sub(r"\W*(\w+).*", r"\1", name) for c in heads for name in re.findall("`.+?`", c)}
     assert named == set(RunFile.model_fields)
 
 
@@ -147,29 +207,19 @@ def test_examples_run(script, tmp_path):
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.name)
 def test_examples_are_short_and_use_public_names(script):
     assert len(script.read_text().splitlines()) <= 60
+    check_public(script.read_text())
+
+
+def check_public(text):
+    """Refuse what is not on a menu."""
     public = {
         "invertwin",
-        *(f"invertwin.{room}" for room in importlib.import_module("invertwin").__all__),
+        *(f"invertwin.{room}" for room in [*importlib.import_module("invertwin").__all__, *ROOMS]),
     }
-    for node in ast.walk(ast.parse(script.read_text())):
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("invertwin"):
             assert node.module in public
             assert {alias.name for alias in node.names} <= menu(node.module)
-
-
-def menu(room: str) -> set[str]:
-    """What a room shows: what its `__init__` imports under its own name, and what it defines."""
-    shown: set[str] = set()
-    source = Path(importlib.import_module(room).__file__ or "").read_text()
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.ImportFrom):
-            shown |= {alias.name for alias in node.names if alias.asname == alias.name}
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            shown.add(node.name)
-        elif isinstance(node, ast.AnnAssign | ast.Assign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            shown |= {target.id for target in targets if isinstance(target, ast.Name)}
-    return {name for name in shown if not name.startswith("_")}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

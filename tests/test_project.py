@@ -65,3 +65,40 @@ def test_every_bundled_file_is_in_the_notice(repository):
     bundled = {f.name for f in found if f.suffix != ".py"} - {"py.typed"}
     notice = (repository / "NOTICE").read_text()
     assert {name for name in bundled if name not in notice} == set()
+
+
+# What conda-forge calls a package that PyPI calls otherwise.
+CONDA = {"torch": "pytorch", "libigl": "igl", "matplotlib": "matplotlib-base"}
+
+
+def test_the_recipe_has_the_version_and_requirements_of_the_project(project, repository):
+    recipe = (repository / "conda" / "recipe.yaml").read_text()
+    assert f'version: "{invertwin.__version__}"' in recipe
+    (run,) = re.findall(r"^  run:\n((?:    - .+\n)+)", recipe, re.M)
+    listed = {line.removeprefix("    - ").replace(" ", "") for line in run.splitlines()}
+    expected = {f"python{project['requires-python']}"}
+    for requirement in project["dependencies"]:
+        name = requirement.split(">")[0]
+        expected.add(CONDA.get(name, name) + requirement.removeprefix(name))
+    assert listed == expected
+    assert f"license: {project['license']}\n" in recipe
+    assert f'summary: "{project["description"]}"' in recipe
+    (script,) = re.findall(r"- (invertwin = .+)", recipe)
+    assert script.split(" = ") == ["invertwin", project["scripts"]["invertwin"]]
+
+
+def test_the_citation_has_the_version(repository):
+    assert f"\nversion: {invertwin.__version__}\n" in (repository / "CITATION.cff").read_text()
+
+
+def test_the_changelog_begins_with_what_is_not_released_or_this_version(repository):
+    first, *others = re.findall(r"^## (.+)$", (repository / "CHANGELOG.md").read_text(), re.M)
+    assert first == "Unreleased" or first.startswith(invertwin.__version__)
+    assert any(head.startswith(invertwin.__version__) for head in [first, *others])
+
+
+def test_the_sdist_has_what_its_tests_read(repository):
+    build = tomllib.loads((repository / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
+    held = set(build["targets"]["sdist"]["include"])
+    assert {"src", "tests", "docs", "examples", "experiments", "conda", "benchmarks"} <= held
+    assert {"CITATION.cff", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"} <= held

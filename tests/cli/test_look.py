@@ -284,6 +284,9 @@ def test_one_chirp_has_points_of_several_reflectors(recording, monkeypatch):
     Capture.from_beat((beat + 0.1 * noise)[:, 0], RADAR).save("one.nc")
     assert call(monkeypatch, "look", "one.nc", "-o", "seen") == 0
     head, *lines = (recording / "seen" / "points.csv").read_text().splitlines()
+    for suffix in ("ply", "pcd"):
+        count = f" {len(lines)}\n".encode()
+        assert count in (recording / "seen" / f"points.{suffix}").read_bytes()
     rows = [dict(zip(head.split(","), map(float, line.split(",")), strict=True)) for line in lines]
     assert len(rows) == 3
     for row, (distance, u, amplitude) in zip(rows, parts, strict=True):

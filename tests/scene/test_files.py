@@ -87,6 +87,32 @@ def test_open_and_degenerate_meshes_are_read(tmp_path):
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 3], [1, 0, 2], [0, 0, 1]]
 
 
+def test_glb_keeps_names_and_materials(tmp_path):
+    paint = RoughDielectric(3.0)
+    scene = Scene(
+        {
+            "plate": Object(plate(1.0, 1.0), PerfectConductor()),
+            "ball": Object(sphere(0.1, 1), paint),
+            "wall": Object(plate(2.0, 1.0), paint),
+        }
+    )
+    save_mesh(tmp_path / "scene.glb", scene)
+    read = trimesh.load_scene(tmp_path / "scene.glb")
+    assert set(read.graph.nodes_geometry) == {"plate", "ball", "wall"}
+    shown = {name: mesh.visual.material for name, mesh in read.geometry.items()}
+    assert {name: look.name for name, look in shown.items()} == {
+        "plate": "PerfectConductor",
+        "ball": "RoughDielectric",
+        "wall": "RoughDielectric",
+    }
+    assert shown["plate"].metallicFactor == 1.0
+    assert shown["ball"].metallicFactor == 0.0
+    assert shown["wall"].doubleSided
+    assert len(load_mesh(tmp_path / "scene.glb").faces) == sum(
+        len(item.mesh.faces) for item in scene.objects.values()
+    )
+
+
 def test_scene_is_saved_in_the_world(tmp_path):
     pose = rigid(
         rotation_from_vector(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)),

@@ -11,6 +11,10 @@ from invertwin.capture.chirps import ChirpData as ChirpData
 from invertwin.capture.chirps import ChirpSettings as ChirpSettings
 from invertwin.capture.chirps import adc_counts as adc_counts
 from invertwin.capture.chirps import settings_of as settings_of
+from invertwin.capture.cubes import from_openradar as from_openradar
+from invertwin.capture.cubes import from_radarsimpy as from_radarsimpy
+from invertwin.capture.cubes import to_openradar as to_openradar
+from invertwin.capture.cubes import to_radarsimpy as to_radarsimpy
 from invertwin.capture.faults import Fault as Fault
 from invertwin.capture.faults import faults_of as faults_of
 from invertwin.capture.faults import shown_ranges as shown_ranges

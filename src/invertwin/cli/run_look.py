@@ -34,6 +34,7 @@ from invertwin.radar import (
     points_csv,
     points_of,
     range_profile,
+    save_points,
     sharp_map,
     snapshots_of,
     velocity_span,
@@ -98,6 +99,8 @@ def run_look(look: Look, folder: RunFolder) -> list[Table]:
     if points is not None:
         metrics["points"] = len(points)
         folder.write_text("points.csv", points_csv(points))
+        for suffix in ("ply", "pcd"):
+            save_points(folder.file(f"points.{suffix}"), points)
     title = look.recording.name
     return finish(
         folder,

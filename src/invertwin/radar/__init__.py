@@ -42,6 +42,7 @@ from invertwin.radar.parameters import ClockOffset as ClockOffset
 from invertwin.radar.parameters import RadarPath as RadarPath
 from invertwin.radar.parameters import RadarPose as RadarPose
 from invertwin.radar.parameters import RangeBias as RangeBias
+from invertwin.radar.point_files import save_points as save_points
 from invertwin.radar.point_spread import airy as airy
 from invertwin.radar.point_spread import dirichlet as dirichlet
 from invertwin.radar.point_spread import normalized_gaussian as normalized_gaussian

@@ -13,12 +13,18 @@ import trimesh
 from torch import Tensor
 from trimesh import transformations
 from trimesh.exchange.gltf import export_glb
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.folders import replacing
 from invertwin.scene import shapes
 from invertwin.scene.checks import checked_tensor
-from invertwin.scene.material.materials import RoughDielectric
+from invertwin.scene.material.materials import (
+    PerfectConductor,
+    RoughConductor,
+    RoughDielectric,
+)
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.radio_materials import radio_bsdf, stated_material
@@ -126,7 +132,8 @@ def _loaded(
 def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
     """Write a mesh, or all objects of a scene, as PLY in float64 or as GLB in float32.
 
-    A GLB file keeps the objects apart, by name.
+    A GLB file keeps the objects apart, by name, and their materials: by the name of their class,
+    metallic or not. Scenes of Blender and other programs have both after an import.
 
     The file appears complete or not at all: a failure leaves an existing one as it was.
 
@@ -144,13 +151,19 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
             f"expected a file name ending in .ply or .glb, got {file.name}; rename the output"
         )
     parts = (
-        {"mesh": (shape.vertices, shape.faces)}
+        {"mesh": (shape.vertices, shape.faces, None)}
         if isinstance(shape, Mesh)
-        else {name: (item.vertices, item.mesh.faces) for name, item in shape.objects.items()}
+        else {
+            name: (item.vertices, item.mesh.faces, item.material)
+            for name, item in shape.objects.items()
+        }
     )
+    looks = {id(material): _look(material) for *_, material in parts.values()}
     written = trimesh.Scene()
-    for name, (vertices, faces) in parts.items():
+    for name, (vertices, faces, material) in parts.items():
         mesh = trimesh.Trimesh(vertices.detach().cpu().numpy(), faces.cpu().numpy(), process=False)
+        if material is not None:
+            mesh.visual = TextureVisuals(material=looks[id(material)])
         written.add_geometry(mesh, geom_name=name, node_name=name)
     with replacing(file) as part:
         glb = file.suffix.lower() == ".glb"
@@ -284,6 +297,18 @@ def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     renumbered[used] = rank[group.ravel()]
     merged = vertices[used][first[order]]
     return Mesh(torch.from_numpy(merged), torch.from_numpy(renumbered[faces]))
+
+
+def _look(material: Material | None) -> PBRMaterial:
+    """What a viewer shows of a material: its name, and whether it is a metal."""
+    metal = isinstance(material, PerfectConductor | RoughConductor)
+    return PBRMaterial(
+        name=type(material).__name__,
+        baseColorFactor=(190, 190, 195, 255) if metal else (205, 200, 190, 255),
+        metallicFactor=float(metal),
+        roughnessFactor=0.3 if metal else 0.9,
+        doubleSided=True,  # surfaces reflect on both sides
+    )
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:

@@ -1,0 +1,76 @@
+# %% [markdown]
+# # Planning positions
+#
+# Before anything is recorded, the simulation tells how sure a fit will be, and which further position of the radar
+# would help most.
+
+# %%
+# %matplotlib inline
+from matplotlib.figure import Figure
+
+import invertwin as iw
+from invertwin.inversion import fit_at, planned
+from invertwin.scene import RoughDielectric, Translation, box, linear_array, rigid
+
+# %% [markdown]
+# ## What is planned
+# A box, of which x and z are unknown. The radar has two positions so far, close to each other. Four more are possible.
+
+# %%
+paint = RoughDielectric(permittivity=4.0)
+truth = iw.Scene(
+    {"box": iw.Object(box((0.3, 0.3, 0.3)), paint, rigid(translation=[0.1, 0.0, 2.5]))}
+)
+here = [[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]
+possible = [[0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [-0.8, 0.0, 0.0], [0.0, 0.0, 1.0]]
+chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
+radar = iw.Radar(
+    linear_array(2, 4 * chirp.wavelength),
+    linear_array(8, chirp.wavelength / 2),
+    chirp,
+    positions=here + possible,
+)
+grid = radar.grid(range_min=1.0, range_max=3.6, u_max=0.6)
+
+# %% [markdown]
+# ## Error bars before the recording
+# One simulated recording tells gain and noise. The fit stands at the truth, and `planned` computes how far speckle and
+# noise would move it. The last four frames are candidates: each is tried by itself.
+
+# %%
+few = iw.Sampling(depth=1, points_per_m2=2e3)
+recorded = iw.simulate(truth, radar, grid, seed=1, sampling=few, snr_db=20.0)
+model = iw.SurrogateMap(grid, sampling=iw.Sampling(depth=1, samples=40_000, boundary_samples=8_000))
+seen = iw.Observation(model, radar, iw.Capture.from_beat(recorded.beat, radar))
+likely = iw.SpectrumLoss(kind="likelihood")
+at_truth = fit_at(truth, [seen], Translation("box", axes="xz"), loss=likely, seed=1)
+now, added = planned(at_truth, candidates=len(possible))
+print("two positions:", {name: f"{100 * value:.1f} cm" for name, value in now.deviations.items()})
+for one in added:
+    print(f"with {possible[one.frame - len(here)]}: deviations times {one.share:.2f}")
+
+# %% [markdown]
+# Which position helps most is hard to guess: here it is not the farthest one. So it pays to compute it.
+
+# %%
+figure = Figure(figsize=(5, 3.4), layout="constrained")
+axes = figure.subplots()
+axes.plot(*zip(*[(x, z) for x, _, z in here], strict=True), "k^", label="there already")
+places = [possible[one.frame - len(here)] for one in added]
+dots = axes.scatter(
+    [x for x, _, _ in places], [z for _, _, z in places], c=[one.share for one in added], s=80
+)
+axes.plot(0.1, 2.5, "s", markersize=14, color="0.6", label="box")
+axes.set(xlabel="x [m]", ylabel="z [m]", aspect="equal")
+axes.legend(fontsize=8)
+figure.colorbar(dots, label="deviations, times")
+figure
+
+# %%
+assert all(one.share < 1.0 for one in added)
+assert added[0].share < 0.85
+assert all(one.bars.deviations["box.x"] < 1.02 * now.deviations["box.x"] for one in added)
+
+# %% [markdown]
+# `invertwin plan run.toml` does this from a run file, and with `fits` compares the plan with fits of as many simulated
+# recordings ([run files](../run_files.md#how-sure-and-from-where)).

@@ -1,0 +1,48 @@
+"""The check of the built site finds what leads nowhere and what is fetched from elsewhere."""
+
+import pytest
+
+pytest.importorskip("bs4", reason="pip install -e '.[docs]'")
+
+from check_site import problems
+
+PAGE = '<html><head>{head}</head><body><h1 id="top">Title</h1>{body}</body></html>'
+
+
+def site(folder, head="", body=""):
+    (folder / "other.html").write_text(PAGE.format(head="", body='<p id="there">text</p>'))
+    (folder / "index.html").write_text(PAGE.format(head=head, body=body))
+    return problems(folder)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '<a href="other.html#there">a</a> <a href="#top">b</a> <a href="other.html">c</a>',
+        '<a href="https://example.org/page#part">a link that a person may follow</a>',
+        '<a href="mailto:somebody@example.org">mail</a>',
+    ],
+)
+def test_links_that_lead_somewhere_are_fine(tmp_path, body):
+    assert site(tmp_path, body=body) == []
+
+
+@pytest.mark.parametrize(
+    ("head", "body", "problem"),
+    [
+        ("", '<a href="missing.html">a</a>', "index.html: no such file: missing.html"),
+        ("", '<a href="other.html#gone">a</a>', "index.html: no such anchor: other.html#gone"),
+        ("", '<a href="#gone">a</a>', "index.html: no such anchor: #gone"),
+        ("", '<img src="gone.png">', "index.html: no such file: gone.png"),
+        ('<script src="https://cdn.example/a.js"></script>', "", "fetches https://cdn.example"),
+        ('<link rel="stylesheet" href="//fonts.example/a.css">', "", "fetches //fonts.example"),
+    ],
+)
+def test_what_leads_nowhere_or_is_fetched_is_told(tmp_path, head, body, problem):
+    (found,) = site(tmp_path, head, body)
+    assert problem in found
+
+
+def test_styles_that_fetch_are_told(tmp_path):
+    (tmp_path / "style.css").write_text("@import url('https://fonts.example/a.css');")
+    assert site(tmp_path) == ["style.css: fetches from elsewhere"]
