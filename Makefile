@@ -18,13 +18,14 @@ MINUTES ?= 30
 LOWEST := .venv-lowest
 WHEEL := .venv-wheel
 
-.PHONY: help demo test test-fast test-gpu fuzz lowest wheel docs check format bench clean
+.PHONY: help demo test test-fast test-gpu test-browser fuzz lowest wheel docs check format bench clean
 
 help:
 	@echo 'make demo       find a hidden letter from its radar echoes (under 5 minutes)'
 	@echo 'make test       all tests but those that need a GPU'
 	@echo 'make test-fast  the quick ones'
 	@echo 'make test-gpu   those that need a GPU'
+	@echo 'make test-browser  viewer and report in Chromium; screenshots in out/browser'
 	@echo 'make fuzz       read damaged files of every format for MINUTES=30'
 	@echo 'make lowest     the quick tests with the lowest versions that we allow'
 	@echo 'make wheel      build, check, and run the demo from the wheel in an empty folder'
@@ -45,6 +46,9 @@ test-fast: .venv/.dev .venv/.llvm
 
 test-gpu: .venv/.dev .venv/.llvm
 	$(BIN)/python -m pytest -m gpu
+
+test-browser: .venv/.dev .venv/.llvm .venv/.browser
+	$(BIN)/python -m pytest -m browser tests/browser
 
 fuzz: .venv/.dev
 	PYTHONPATH=tests $(BIN)/python -m fuzz.long --minutes $(MINUTES)
@@ -140,6 +144,15 @@ $(BIN)/python:
 .venv/.bench: .venv/.run
 	@echo 'set-up: peers for the benchmarks'
 	@$(PIP) install --constraint constraints.txt --editable '.[bench]'
+	@touch $@
+
+# Debian's Chromium, where we may install it; else the one that Playwright fetches.
+.venv/.browser: .venv/.run
+	@echo 'set-up: the viewer, and Chromium for its tests'
+	@$(PIP) install --constraint constraints.txt --editable '.[browser]'
+	@command -v chromium >/dev/null || \
+	    { $(MAY_APT) && $(APT) update && $(APT) install -y --no-install-recommends chromium; } || \
+	    $(BIN)/playwright install chromium
 	@touch $@
 
 # libllvm19 is what we test with; a system that no longer has it offers a newer one. Dr.Jit also

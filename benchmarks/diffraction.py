@@ -371,7 +371,9 @@ def slope_jump(*, corrected: bool = True) -> float:
     before = _unit(found.points[:, 0] - tx)
     sent = (found.transfer @ emitted(before)[..., None])[..., 0]
     if corrected and found.slopes is not None:
-        sent = sent + (found.slopes[0] @ vector[..., None])[..., 0]
+        # A turn about the edge turns the ray by as many radians, times sinβ.
+        lean = cross(edge_axis(wedges), before).norm(dim=1)[:, None]
+        sent = sent + (found.slopes[0] @ (lean * vector)[..., None])[..., 0]
     power = (total + sent * phase).abs().square().sum(1)
     (gradient,) = torch.autograd.grad(power.sum(), azimuth)
     return float((gradient[1] - gradient[0]).abs() / gradient.abs().mean())

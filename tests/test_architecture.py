@@ -19,6 +19,7 @@ FOUNDATION = {
         "untrusted",
         "apart",
         "progress",
+        "outward",
     ),
 }
 SCENE = FOUNDATION | {"scene"}
@@ -45,6 +46,7 @@ ALLOWED = {
     "untrusted": {"errors"},
     "apart": {"errors"},
     "progress": set(),
+    "outward": set(),
     "threads": set(),
     "engines": {"errors", "threads"},
     "doctor": FOUNDATION,
@@ -62,11 +64,12 @@ ALLOWED = {
     "discovery": DISCOVERY,
     "runs": FOUNDATION | {"runs"},
     "plotting": DISCOVERY | {"plotting"},
+    "viewer": DISCOVERY | {"plotting", "viewer"},
     "registry": FOUNDATION | {"registry"},
     "cli": DISCOVERY
     | SIGNATURES
     | DATASETS
-    | {"doctor", "threads", "engines", "runs", "plotting", "registry", "cli", "__init__"},
+    | {"doctor", "threads", "engines", "runs", "plotting", "viewer", "registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
     "__init__": DISCOVERY | SIGNATURES | {"doctor", "threads"},
 }

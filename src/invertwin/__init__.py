@@ -5,8 +5,8 @@ and antennas; ``channel`` traces them into paths; ``radar`` makes beat signals a
 or their smooth mean, the surrogate; ``links`` makes responses of paths between antennas;
 ``inversion`` compares spectra with a capture and moves θ; ``discovery`` finds what there is.
 ``simulation.py`` is the way from scene to spectrum on one page. Beside it, ``capture`` holds
-measured data, ``datasets`` simulated ones with labels, ``plotting`` draws figures, ``registry``
-says what run files may name and ``cli`` has the commands.
+measured data, ``datasets`` simulated ones with labels, ``plotting`` draws figures, ``viewer``
+shows scenes in a browser, ``registry`` says what run files may name and ``cli`` has the commands.
 
 The names below are the public menu. Each is loaded when it is first used, so ``import invertwin``
 is quick, and ``invertwin doctor`` runs where no ray tracer can.
@@ -29,6 +29,7 @@ _ROOMS = (
     "plotting",
     "radar",
     "scene",
+    "viewer",
 )
 
 # Name → module.

@@ -53,3 +53,15 @@ def told(parts: Collection[_T], name: str) -> Generator[_T]:
             listener.hear(name, done, len(parts), left)
     finally:
         listener.busy = False
+
+
+def time_left(seconds: float) -> str:
+    """A time as people say it.
+
+    Args:
+        seconds: The time [s].
+    """
+    for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

@@ -35,7 +35,7 @@ CHECKPOINT = "checkpoint.pt"
 # What commands write, beside run files and the pictures that are named after them.
 RESULTS = (
     *("metrics.json", "report.html", "checkpoint*.pt", "twin.*", "raw", "capture.nc", "chirps.*"),
-    *("manifest.json", "shard-*.tar"),
+    *("manifest.json", "shard-*.tar", "view.npz"),
     *("channels.json", "points.*", "prior.npz", "train.log", "turntable.gif", UNFINISHED),
     *("scene.png", "spectra*.png", "doppler.png", "loss*.png", "convergence.png", "landscape.png"),
     *("look.png", "recording.png", "twin_*.png", "residuals*.png"),

@@ -102,7 +102,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert names == {
         *(".invertwin.json", "metrics.json", "run.toml", "report.html", "twin.ply"),
         *("checkpoint.pt", "scene.png", "spectra.png", "loss.png", "landscape.png"),
-        "residuals.png",
+        *("residuals.png", "view.npz"),
     }
     metrics = read_metrics(out)
     assert metrics["status"] in ("budget", "converged")
@@ -207,7 +207,7 @@ def test_ended_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypa
 def test_interruption_says_how_to_go_on(run_file, monkeypatch, capsys):
     from invertwin.cli import run_reconstruct
 
-    def interrupted(run, folder, console, workers):
+    def interrupted(run, folder, console, workers, view):
         folder.write_text("checkpoint.pt", "state")
         raise KeyboardInterrupt
 
@@ -225,7 +225,7 @@ def test_demo_reconstructs_the_run_file_that_comes_along(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     seen = []
 
-    def noted(run, folder, console, workers):
+    def noted(run, folder, console, workers, view):
         seen.append((run, folder.path))
         return [], "found"
 
@@ -242,7 +242,7 @@ def test_demo_replaces_its_own_results_but_no_others(tmp_path, monkeypatch, caps
 
     monkeypatch.chdir(tmp_path)
 
-    def noted(run, folder, console, workers):
+    def noted(run, folder, console, workers, view):
         folder.write_json("metrics.json", {"seed": run.seed})
         return [], "found"
 
@@ -286,11 +286,11 @@ def test_backend_option_is_in_force(monkeypatch, run_file):
 def test_a_resumed_run_is_complete_and_only_then_complete_already(run_file, monkeypatch, capsys):
     from invertwin.cli import run_reconstruct
 
-    def interrupted(run, folder, console, workers):
+    def interrupted(run, folder, console, workers, view):
         folder.write_text("checkpoint.pt", "state")
         raise KeyboardInterrupt
 
-    def finished(run, folder, console, workers):
+    def finished(run, folder, console, workers, view):
         folder.write_text("metrics.json", "{}")
         return [], "found"
 

@@ -10,8 +10,8 @@ from invertwin.cli import build, run_check, run_gradcheck, run_simulate
 from invertwin.cli import estimate as estimates
 from invertwin.cli.fits import problem
 from invertwin.cli.run_file import load_run, validate
-from invertwin.cli.running import time_left
 from invertwin.errors import PhysicsWarning
+from invertwin.progress import time_left
 from invertwin.scene import Mesh, shapes
 from invertwin.scene.files import save_mesh
 

@@ -70,7 +70,8 @@ rays = 1500
 @pytest.mark.slow
 def test_what_is_found_can_be_fitted_on(tmp_path: Path, monkeypatch, capsys):
     (tmp_path / "box.toml").write_text(RUN)
-    given = ["twin", str(tmp_path / "box.toml"), "-o", str(tmp_path / "found")]
+    # What the command line says wins over the run file, which says 1500.
+    given = ["twin", str(tmp_path / "box.toml"), "--rays", "1200", "-o", str(tmp_path / "found")]
     assert call(monkeypatch, *given) == 0, capsys.readouterr().err
     folder = tmp_path / "found"
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -85,13 +86,21 @@ def test_what_is_found_can_be_fitted_on(tmp_path: Path, monkeypatch, capsys):
     assert {"twin.glb", "report.html", "ground.png", "maps.png", "capture.nc"} <= {
         file.name for file in folder.iterdir()
     }
-    command = "twin capture.nc --low -1.0 -1.0 --high 1.0 1.0 --level 0.0 --up y --rays 1500"
-    assert command in (folder / "report.html").read_text()
+    command = "twin capture.nc --low -1.0 -1.0 --high 1.0 1.0 --up y --level 0.0 --rays 1200"
+    assert f"{command} --seed 2" in (folder / "report.html").read_text()
     run = load_run(folder / "twin.toml")
     assert run.scene["object_1"].position == pytest.approx(thing["position_m"])
     # The capture that it wrote gives the same things again.
-    options = ["--low", "-1", "-1", "--high", "1", "1", "--level", "0", "--rays", "1500"]
-    again = ["twin", str(folder / "capture.nc"), *options, "-o", str(tmp_path / "again")]
+    options = ["--low", "-1", "-1", "--high", "1", "1", "--level", "0", "--rays", "1200"]
+    again = [
+        "twin",
+        str(folder / "capture.nc"),
+        *options,
+        "--seed",
+        "2",
+        "-o",
+        str(tmp_path / "again"),
+    ]
     assert call(monkeypatch, *again) == 0, capsys.readouterr().err
     (other,) = json.loads((tmp_path / "again" / "metrics.json").read_text())["things"]
     assert other["position_m"] == pytest.approx(thing["position_m"], abs=1e-3)

@@ -1,13 +1,14 @@
 """Which shapes there are: halves of a shape, other kinds, and the moves that change them."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from scipy import sparse
 
 import invertwin as iw
-from discovery.test_recordings import CHAIN, around, thing
+from discovery.test_recordings import CHAIN, HEIGHT, around, thing
 from invertwin.discovery.assembly import Assembly, sampling_of
 from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
 from invertwin.discovery.primitives import Figure
@@ -24,23 +25,26 @@ from invertwin.discovery.search import (
 from invertwin.discovery.sharp_image import Response
 from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
-from invertwin.scene import box, cylinder, person, standing_height
+from invertwin.scene import Mesh, box, cylinder, person, standing_height
+from invertwin_studies.vehicles import car_mesh, sample_car
 
 BOX = Figure("box", (0.3, -0.4), 0.3, 0.8, 0.2, 1.1, 0.05)
 
 
-def search_of(scene: iw.Scene, count: int = 12) -> Search:
+def search_of(scene: iw.Scene, radar: iw.Radar | None = None, density: float = 500.0) -> Search:
     """A search of a simulated scene; it has no image."""
-    radar = around(count)
-    grid = radar.grid(0.5, 3.0)
-    beat = iw.simulate(scene, radar, grid, seed=3, sampling=CHAIN, snr_db=10.0).beat
-    power = iw.Capture.from_beat(beat, radar).spectrum(grid).float()
+    board: iw.Radar = around(12) if radar is None else radar
+    count, farthest = board.frame_count, 1.7 * float(board.positions[0].norm())
+    grid = board.grid(0.5, farthest)
+    sampling = replace(CHAIN, points_per_m2=density)
+    beat = iw.simulate(scene, board, grid, seed=3, sampling=sampling, snr_db=10.0).beat
+    power = iw.Capture.from_beat(beat, board).spectrum(grid).float()
     one = Assembly(
         SurrogateMap(grid, sampling=sampling_of(count, 1500)),
-        radar,
+        board,
         power,
         HeavyTailed(background(power)),
-        shared_bins(radar, grid),
+        shared_bins(board, grid),
         Ground(),
         0.0,
         0,
@@ -125,3 +129,28 @@ def test_a_person_is_no_box():
     lists = other_kinds(search.fitted, before)
     assert {rows[0].kind for rows in lists} == {"cylinder", "sphere", "person"}
     assert facing(before, math.pi, Ground()) == []
+
+
+@pytest.mark.slow
+def test_a_car_is_a_vehicle():
+    """Its form is that of another generator of cars, and unknown to the search."""
+    mesh = car_mesh(sample_car(1), 0.1)
+    # From z up to y up, about its middle.
+    upright = torch.stack([mesh.vertices[:, 0], mesh.vertices[:, 2], -mesh.vertices[:, 1]], 1)
+    low, high = upright.amin(0), upright.amax(0)
+    long, tall, wide = (high - low).tolist()
+    shape = Mesh(upright - 0.5 * (low + high), mesh.faces)
+    scene = iw.Scene({"car": thing(shape, (0.3, -0.5), 0.5 * tall, 0.6)})
+    near = around(12)
+    chirp = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=50e-6, samples=128)
+    up = torch.tensor([0.0, HEIGHT, 0.0], dtype=torch.float64)
+    places = (near.positions - up) * 4 + up
+    radar = iw.Radar(near.transmitters, near.receivers, chirp, places, near.rotations)
+    search = search_of(scene, radar, 50.0)
+    start = Figure("box", (0.2, -0.4), 0.6, 3.8, 1.7, 1.5, 0.1)
+    (found,) = search.turns(search.kinds(search.settled([start])))
+    assert found.kind == "vehicle"
+    assert math.dist(found.place, (0.3, -0.5)) < 0.15
+    assert found.length == pytest.approx(long, abs=0.3)
+    assert found.width == pytest.approx(wide, abs=0.2)
+    assert abs(math.remainder(found.yaw - 0.6, 2 * math.pi)) < math.radians(4)

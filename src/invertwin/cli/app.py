@@ -195,6 +195,29 @@ def twin(options: Find) -> None:
 
 
 @app.command()
+def view(
+    target: Annotated[
+        Path,
+        typer.Argument(help="Run folder, run file or capture (.nc).", show_default=False),
+    ],
+    host: Annotated[str, typer.Option(help="Others than this machine need a token.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The first that is tried.")] = 8080,
+    token: Annotated[
+        str | None, typer.Option(help="16 letters or digits that the address must hold.")
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Write an HTML page that needs no server, and end.", show_default=False),
+    ] = None,
+    backend: BackendOption = None,
+) -> None:
+    """Show a run, a scene or a capture in the browser, in three dimensions."""
+    from invertwin.cli.run_view import run_view
+
+    run_view(target, console, host=host, port=port, token=token, record=record)
+
+
+@app.command()
 @with_options(Resumable)
 def gradcheck(options: Resumable, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
@@ -300,8 +323,9 @@ def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
 
         fits = isinstance(options, Fits)
         workers = Workers.asked(options.engine, options.workers) if fits else None
+        view = isinstance(options, Fits) and options.view
         with about_file(file):
-            tables, outcome = run_reconstruct(runs[file.stem], folder, console, workers)
+            tables, outcome = run_reconstruct(runs[file.stem], folder, console, workers, view=view)
         print_tables(tables)
         console.print(outcome, markup=False, soft_wrap=True)
 

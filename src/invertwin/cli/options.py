@@ -104,6 +104,9 @@ class Fits(Resumable):
         ),
     ] = None
     engine: EngineOption = "processes"
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the fits in a browser while they go on.")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +185,9 @@ class Find(Recorded):
     range_max: Annotated[
         float | None, typer.Option(help="m; default: the last range with echoes.")
     ] = None
-    up: Annotated[Literal["y", "z"], typer.Option(help="The world axis that points up.")] = "y"
+    up: Annotated[
+        Literal["y", "z"] | None, typer.Option(help="The world axis that points up; default: y.")
+    ] = None
     level: Annotated[
         float | None, typer.Option(help="Height of the ground, m; default: 0.6 below the radars.")
     ] = None
@@ -192,8 +197,12 @@ class Find(Recorded):
             help="Above the ground, where echoes are looked for, m; default: the radars'."
         ),
     ] = None
-    rays: Annotated[int, typer.Option(min=100, help="Of every frame in fits.")] = 2000
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of rays.")] = 0
+    rays: Annotated[
+        int | None, typer.Option(min=100, help="Of every frame in fits; default: 2000.")
+    ] = None
+    seed: Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Of rays; default: 0.")] = (
+        None
+    )
     backend: BackendOption = None
 
 

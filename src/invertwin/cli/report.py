@@ -37,11 +37,24 @@ class Picture:
     note: str = ""
 
 
+@dataclass(frozen=True)
+class View:
+    """A display in three dimensions; a report holds one at most.
+
+    Attributes:
+        html: Of `viewer.view_html`.
+    """
+
+    html: str
+    title: str = "In three dimensions"
+    note: str = "Drag to turn, wheel to come nearer, shift and drag to move."
+
+
 def report_html(
     title: str,
     status: str,
     note: str,
-    parts: Sequence[Table | Picture],
+    parts: Sequence[Table | Picture | View],
     again: str,
     files: Mapping[str, str],
 ) -> str:
@@ -51,11 +64,13 @@ def report_html(
         title: Heading.
         status: What came out, in a sentence.
         note: What the run file says about the run; blank lines part paragraphs.
-        parts: Tables and pictures in reading order.
+        parts: Tables, pictures and a view in reading order.
         again: The command that does it again, in the run's own folder.
         files: Run files as used, by their path in the folder.
     """
     from jinja2 import Environment
+
+    from invertwin.viewer import policy
 
     pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     pages.filters |= {"shown": shown, "base64": _base64}
@@ -68,6 +83,7 @@ def report_html(
         version=__version__,
         command=f"invertwin {again} -o again" + (f" --backend {backend}" if backend else ""),
         files=files,
+        policy=policy(),
     )
 
 
@@ -76,7 +92,7 @@ def finish(
     metrics: Mapping[str, Any],
     title: str,
     status: str,
-    parts: Sequence[Table | Picture],
+    parts: Sequence[Table | Picture | View],
     *,
     again: str,
     note: str = "",

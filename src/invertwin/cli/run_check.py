@@ -14,11 +14,11 @@ from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Table, texts
 from invertwin.cli.run_file import about, need
 from invertwin.cli.run_simulate import chirp_train, exact
-from invertwin.cli.running import time_left
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
 from invertwin.memory import free_memory, gigabytes
 from invertwin.models import SurrogateMap
+from invertwin.progress import time_left
 from invertwin.scene import Scene, Translation
 
 _FRAMES = 4  # of the radar, or aspects, in the probe

@@ -5,12 +5,20 @@ import shutil
 import time
 import tomllib
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from invertwin.cli.fits.displays import (
+    VIEW,
+    display_of_fit,
+    display_of_problem,
+    steps_file,
+    steps_in,
+)
 from invertwin.cli.fits.fitting import calibrated, fit
 from invertwin.cli.fits.initial import guessed
 from invertwin.cli.fits.mover import run_mover
@@ -38,21 +46,28 @@ from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
 from invertwin.cli.fits.spreading import QUIET, Workers, fit_elsewhere, refused
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
 from invertwin.cli.landscape import landscape
-from invertwin.cli.report import Table, finish, picture
+from invertwin.cli.report import Table, View, finish, picture
 from invertwin.cli.run_file import stated, validate
 from invertwin.cli.run_placement import run_placement
 from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.shape_tables import Mover
+from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.inversion.certainty import certainty, coverage
 from invertwin.runs import CHECKPOINT, RunFolder
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry.density import without_clouds
+from invertwin.viewer import Viewer, view_html
 
 
 def run_reconstruct(
-    run: RunFile, folder: RunFolder, console: Console, workers: Workers | None = None
+    run: RunFile,
+    folder: RunFolder,
+    console: Console,
+    workers: Workers | None = None,
+    *,
+    view: bool = False,
 ) -> tuple[list[Table], str]:
     """Fit from every start, write the folder; return the tables to print and the outcome.
 
@@ -63,10 +78,18 @@ def run_reconstruct(
         folder: For the results.
         console: Shows progress.
         workers: Who fits; None = this process, one start after another.
+        view: Show the fits in a browser while they go on.
 
     Raises:
-        InputError: A wrong run file, or workers where there is one fit.
+        InputError: A wrong run file, workers where there is one fit, or a view of fits that have
+            none.
     """
+    elsewhere = workers is not None or run.map is not None or run.placement is not None
+    if view and (elsewhere or isinstance(next(iter(run.parameters), None), Mover)):
+        raise InputError(
+            "expected --view with fits of a scene to radar maps in this process, got others; "
+            "leave --view or --workers out"
+        )
     if run.map is not None:
         return run_radio(run, folder, console, workers)
     mover = isinstance(next(iter(run.parameters), None), Mover)
@@ -89,15 +112,20 @@ def run_reconstruct(
         fit_elsewhere(_fit_one, run, folder, console, workers, fits)
     rows: dict[str, list[dict[str, Any]]] = {}
     outcomes: dict[int, Callable[[], Reconstruction]] = {}
-    for mode in modes:
-        rows[mode] = []
-        for i, start in enumerate(starts):
-            checkpoint = CHECKPOINT if single else None
-            own = recorded_for(whole, i, console)
-            row, outcome = fit(own, start, i, mode, folder, console, checkpoint)
-            rows[mode].append(row)
-            if mode == modes[0]:
-                outcomes[i] = outcome
+    live = Viewer(display_of_problem(problem, starts[0])) if view else None
+    with live or nullcontext():
+        if live is not None:
+            console.print(f"open {live.address}", markup=False, soft_wrap=True)
+        show = live and live.add_step
+        for mode in modes:
+            rows[mode] = []
+            for i, start in enumerate(starts):
+                checkpoint = CHECKPOINT if single else None
+                own = recorded_for(whole, i, console)
+                row, outcome = fit(own, start, i, mode, folder, console, checkpoint, show)
+                rows[mode].append(row)
+                if mode == modes[0]:
+                    outcomes[i] = outcome
     best = min(rows[modes[0]], key=lambda row: (row["status"] == "diverged", _finite(row["loss"])))
     start, found = starts[best["start"]], outcomes[best["start"]]()
     problem = varied(recorded_for(whole, best["start"], console), FULL)
@@ -139,7 +167,10 @@ def run_reconstruct(
     metrics["wall_seconds"] = time.perf_counter() - begin
     fitted = Fitted(problem, metrics, rows, start, twin, maps, found.verdict.residuals)
     result, *tables = tables_of(fitted)
-    parts = [result, *pictures_of(fitted, folder), *tables]
+    steps = steps_in(folder.file(steps_file(best["checkpoint"])))
+    display = display_of_fit(problem, start, twin, maps, metrics, steps)
+    display.save(folder.file(VIEW))
+    parts = [result, View(view_html(display)), *pictures_of(fitted, folder), *tables]
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:
         save_mesh(folder.file("twin.glb"), twin)

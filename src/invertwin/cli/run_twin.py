@@ -25,6 +25,8 @@ from invertwin.runs import RunFolder
 from invertwin.scene import RoughDielectric, Scene, joined, save_mesh
 
 _SURE = 0.5  # confidence of things that are counted
+# Of the command line; they win over those of a run file.
+_OPTIONS = ("low", "high", "range_max", "level", "height", "up", "rays", "seed")
 
 
 def run_twin(find: Find, folder: RunFolder) -> list[Table]:
@@ -34,22 +36,17 @@ def run_twin(find: Find, folder: RunFolder) -> list[Table]:
         InputError: A recording or options that do not fit each other; nothing has been written.
     """
     begin = time.perf_counter()
-    options: dict[str, Any] = {
-        "low": find.low,
-        "high": find.high,
-        "range_max": find.range_max,
-        "level": find.level,
-        "height": find.height,
-    }
-    options = {name: value for name, value in options.items() if value is not None}
-    truth, up, rays = None, find.up, find.rays
+    stated = {name: getattr(find, name) for name in _OPTIONS}
+    options = {name: value for name, value in stated.items() if value is not None}
+    truth = None
     if is_run_file(find.recording):
         recording, truth, table = _of_run_file(find)
-        up, rays = table.pop("up", up), table.pop("rays", rays)
         options = table | options
     else:
         _, recording = read_recording(find)
-    found = twin(recording, ground=Ground(up), rays=rays, seed=find.seed, **options)
+    ground = Ground(options.get("up", "y"))
+    rest = {name: value for name, value in options.items() if name != "up"}
+    found = twin(recording, ground=ground, **rest)
     sure = [thing for thing in found.things if thing.confidence > _SURE]
     metrics: dict[str, Any] = {
         "task": "twin",
@@ -84,7 +81,7 @@ def run_twin(find: Find, folder: RunFolder) -> list[Table]:
     still.save(folder.file("capture.nc"))
     # Movers are in the chirps alone, which a capture does not keep.
     name = title if isinstance(recording, ChirpCapture) else "capture.nc"
-    again = " ".join(["twin", name, *_stated(options | {"up": up, "rays": rays})])
+    again = " ".join(["twin", name, *_stated(options)])
     return finish(folder, metrics, title, f"{said}.", parts, again=again)
 
 
@@ -104,6 +101,7 @@ def _of_run_file(
     with about_file(find.recording):
         run = load_run(find.recording)
         given = {} if run.twin is None else run.twin.model_dump(exclude_none=True)
+        given["seed"] = run.seed
         data = need(run, "data", "a twin")
         if not isinstance(data, SimulatedData):
             return data.build(), None, given

@@ -19,7 +19,7 @@ from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.run_file import about_file, load_run, need, to_toml
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
-from invertwin.progress import listening
+from invertwin.progress import listening, time_left
 from invertwin.runs import RunFolder, open_run
 
 _LOG_SECONDS = 10.0  # between lines of progress in a log
@@ -159,14 +159,6 @@ def progress(shown: Console) -> Iterator[None]:
 
         with listening(hear):
             yield
-
-
-def time_left(seconds: float) -> str:
-    """A time as people say it."""
-    for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"
 
 
 def now_and_then(shown: Console = console, last: float = -math.inf) -> Callable[[str], None]:

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.primitives import Figure
+from invertwin.discovery.primitives import Figure, upright
 from invertwin.discovery.search import facing, other_kinds
 from invertwin.inversion import Reconstruction
-from invertwin.inversion.initial import Ground
 from invertwin.inversion.uncertainty import coordinates, map_derivatives
 
 
@@ -137,18 +136,26 @@ def kind_probabilities(among: Sequence[Rival]) -> dict[str, float]:
     return found
 
 
-def widened(own: Mapping[str, float], among: Sequence[Rival], ground: Ground) -> dict[str, float]:
-    """Standard deviations of a shape's place, with what it would be if it were a rival.
+def widened(one: Assembly, own: Mapping[str, float], among: Sequence[Rival]) -> dict[str, float]:
+    """Standard deviations of a shape's place, with what its derivatives do not tell.
+
+    They do not tell where it would be if it were a rival; nor, of what may hang at any height near
+    the radar's, how its range grows with the square of its way up or down.
 
     Args:
+        one: Maps.
         own: Its deviations if it is what it is called.
         among: What it may be, itself first.
-        ground: The plane.
     """
-    found, place = dict(own), among[0].figure.place
-    for number, axis in enumerate(ground.level):
-        away = sum(r.weight * (r.figure.place[number] - place[number]) ** 2 for r in among)
-        found["xyz"[axis]] = math.hypot(own["xyz"[axis]], math.sqrt(away))
+    found, figure = dict(own), among[0].figure
+    middle = upright(figure, one.ground, one.level)
+    farther = 0.0
+    if figure.ball:
+        distance = float((one.radar.positions.detach() - middle).norm(dim=1).mean())
+        farther = own["height"] ** 2 / (2 * distance)
+    for number, axis in enumerate(one.ground.level):
+        away = sum(r.weight * (r.figure.place[number] - figure.place[number]) ** 2 for r in among)
+        found["xyz"[axis]] = math.hypot(own["xyz"[axis]], math.sqrt(away), farther)
     return found
 
 

@@ -207,7 +207,7 @@ def _standing(
             kinds[k - 1],
             upright(shape, ground, level),
             shape,
-            widened(_own(errors, f"object_{k}."), among[k - 1], ground),
+            widened(one, _own(errors, f"object_{k}."), among[k - 1]),
             sure[k - 1],
         )
         for k, shape in enumerate(shapes, 1)

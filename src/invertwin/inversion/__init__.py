@@ -52,3 +52,4 @@ from invertwin.inversion.starts import posed as posed
 from invertwin.inversion.tangents import Bump as Bump
 from invertwin.inversion.uncertainty import Uncertainty as Uncertainty
 from invertwin.inversion.verdict import Verdict as Verdict
+from invertwin.inversion.watching import watched as watched

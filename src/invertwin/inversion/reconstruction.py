@@ -19,6 +19,7 @@ from invertwin.inversion.schedule import Schedule, Stage, checked_stages
 from invertwin.inversion.uncertainty import Evidence, Uncertainty
 from invertwin.inversion.verdict import Verdict, verdict
 from invertwin.models import ForwardModel
+from invertwin.outward import shown_by
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene
 
@@ -49,6 +50,10 @@ class Reconstruction:
     steps: int
     loss: float
     end: End = field(repr=False)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return shown_by("reconstruction_html", self)
 
     @cached_property
     def uncertainty(self) -> Uncertainty:

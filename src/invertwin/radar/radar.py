@@ -17,6 +17,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MOST, Among
 from invertwin.memory import require_at_most
+from invertwin.outward import shown_by
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.scene.antenna import AntennaArray
 from invertwin.scene.checks import ArrayLike, check_fields, check_shape, checked_tensor
@@ -97,6 +98,10 @@ class Radar:
             "receivers",
         )
         self._warn_about_spacing()
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return shown_by("radar_html", self)
 
     @property
     def frame_count(self) -> int:

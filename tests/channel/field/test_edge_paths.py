@@ -1,13 +1,14 @@
 """Paths over edges: where they turn, their derivatives, reciprocity, and edges in pieces."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
 
 from invertwin.channel.field.diffraction import conductor
-from invertwin.channel.field.edge_paths import Edge, over_edges
+from invertwin.channel.field.edge_paths import Edge, over_edges, two_turning_points
 from invertwin.channel.field.wedges import Wedges, joined_wedges
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 
@@ -95,24 +96,40 @@ def test_paths_back_are_the_same():
         assert (sent.transfer - returned.transfer.mT).abs().max() < 1e-12 * scale, name
 
 
-def test_second_edge_takes_over_where_the_first_one_hides():
+@pytest.mark.parametrize(
+    ("off", "endless", "most"),
+    # Endless edges, the transmitter's wave grazing or not, and edges with ends.
+    [(-2.0, True, 0.005), (-0.2, True, 0.005), (-2.0, False, 0.03)],
+)
+def test_second_edge_takes_over_where_the_first_one_hides(off, endless, most):
     """Behind the plane of the side the wave of the first edge ends; both together do not jump."""
-    edges = grazing()
+    tx = number([[3.0, off, 0.4]])
+    edges = [replace(edge, endless=endless) for edge in grazing()]
 
     def field(height):
         rx = number([[-9.0, height, 0.9]])
-        sent = over_edges(edges, TX, rx, K)
+        sent = over_edges(edges, tx, rx, K)
         total = sent.transfer * torch.exp(-1j * K * sent.length)
         if height > 0:
-            once = over_edges([Edge(FIRST)], TX, rx, K)
+            once = over_edges([Edge(FIRST, endless=endless)], tx, rx, K)
             total = total + once.transfer * torch.exp(-1j * K * once.length)
         return total[0], sent.transfer[0]
 
     above, alone_above = field(1e-7)
     below, alone_below = field(-1e-7)
-    assert (alone_above - alone_below).abs().max() > 10 * (above - below).abs().max()
-    # Both transition regions meet where the wave comes in steeply; here they are apart.
-    assert (above - below).norm() < 0.03 * below.norm()
+    assert (alone_above - alone_below).norm() > 10 * (above - below).norm()
+    assert (above - below).norm() < most * below.norm()
+
+
+def test_path_over_edges_that_meet_is_found():
+    """Both edges begin in the corner; the path touches them beside it."""
+    corner, along, down = (number(p) for p in ([0.0, 0, 0], [4.0, 0, 0], [0, -4.0, 0]))
+    edges = [wedge(corner.tolist(), end.tolist(), [1.0, -1.0, 0.0]) for end in (along, down)]
+    tx, rx = number([[9.0, 4.0, 0.8]]), number([[-3.0, -2.0, -1.0]])
+    points, stationary = two_turning_points(edges[0], edges[1], tx, rx)
+    assert bool(stationary)
+    assert points[0, 0, 0] > 0.5
+    assert points[0, 1, 1] < -0.2
 
 
 def test_edge_in_pieces_is_the_whole_edge():

@@ -3,10 +3,11 @@
 import math
 
 import mpmath
+import numpy as np
 import pytest
 import torch
 
-from invertwin.channel.field.transition import end_transition, transition
+from invertwin.channel.field.transition import corner_transition, end_transition, transition
 
 RADII = (0.01, 1.0, 3.9, 4.1, 20.0)
 ANGLES = (0.02, 0.78, 1.2)
@@ -57,6 +58,24 @@ def test_part_beyond_an_end_to_rounding():
             assert abs(end_transition(number(s), number(t)).item() / beyond(s, t) - 1) < 1e-13
             rest = end_transition(number(-s), number(-t)).item()
             assert abs(rest + whole(s) - beyond(s, t)) < 1e-14 * abs(whole(s)) + 1e-15
+
+
+@pytest.mark.parametrize(("s", "t", "w"), [(0.3, 0.5, 0.6), (1.2, 0.1, -0.9), (4.0, 2.0, 0.3)])
+def test_corner_to_rounding(s, t, w):
+    # Both ways are turned to where the integrand decays.
+    turn = complex(math.sqrt(0.5), -math.sqrt(0.5))
+    node, weight = np.polynomial.legendre.leggauss(200)
+    x, part = 7.5 * (node + 1), 7.5 * weight
+    form = x[:, None] ** 2 + x**2 - 2 * w * x[:, None] * x
+    wave = np.exp(-2j * turn * (s * x[:, None] + t * x) - form)
+    truth = -4 * turn**2 * (part @ wave @ part)
+    found = corner_transition(number([s]), number([t]), number([w]))
+    assert abs(found.item() - truth) < 1e-9 * abs(truth)
+
+
+def test_corner_without_coupling_is_a_product():
+    s, t = number([-0.7, 2.0]), number([0.4, -0.1])
+    torch.testing.assert_close(corner_transition(s, t, 0 * s), transition(s) * transition(t))
 
 
 def test_rectangle_is_a_product_of_fresnel_integrals():

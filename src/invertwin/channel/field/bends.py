@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.field.edge_paths import Edge, over_edges, turning_points
+from invertwin.channel.field.edge_paths import turning_points, two_turning_points
 from invertwin.channel.field.edged import EdgedScene, exterior
 from invertwin.channel.field.images import clear_ways, images, reaching
 from invertwin.channel.field.sequences import (
@@ -324,23 +324,17 @@ def _twice(around: EdgedScene, tx: Tensor, rx: Tensor) -> Iterator[Bends]:
         legs = Legs(none, none.bool())
         source, target = some[link].unbind(1)
         found = Bends(source, target, pairs[pair], legs, legs, between[pair])
-        angles = along_faces(around, found)
         row = [around.plain.rows(column) for column in found.edge.T]
-        edges = [
-            Edge(row[0], azimuth=angles[:, 0]),
-            Edge(row[1], azimuth_in=angles[:, 1]),
-        ]
-        sent = over_edges(edges, tx[source], rx[target], 1.0)
-        good = sent.stationary
+        points, good = two_turning_points(row[0], row[1], tx[source], rx[target])
         # Where no face lies between two edges, each must see the other's point.
         for first, second in ((0, 1), (1, 0)):
-            outside = exterior(around.plain.rows(found.edge[:, first]), sent.points[:, second])
+            outside = exterior(around.plain.rows(found.edge[:, first]), points[:, second])
             good &= outside | (found.between[:, 0] >= 0)
         stops = [tx[source]]
         for number in (0, 1):
-            edge, points = found.edge[:, number], sent.points[:, number]
-            good &= around.free(edge, points)
-            stops.append(around.beside(edge, points))
+            edge, place = found.edge[:, number], points[:, number]
+            good &= around.free(edge, place)
+            stops.append(around.beside(edge, place))
         stops.append(rx[target])
         for start, end in pairwise(stops):
             rows = torch.nonzero(good)[:, 0]

@@ -17,14 +17,19 @@ The straight wave's terms of a sheet count by 1 − T.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.transition import edge_transition, edge_transition_slope
+from invertwin.channel.field.transition import (
+    corner_transition,
+    edge_transition,
+    edge_transition_slope,
+    transition,
+)
 from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
 from invertwin.channel.field.wedges import Wedges, edge_axis
 from invertwin.scene.material.fresnel import FieldCoefficients
@@ -130,52 +135,149 @@ def diffraction_dyads(
     return (there + back.mT) / 2
 
 
+def double_dyad(
+    first: Turn, second: Turn, coupling: Float64[Tensor, " row"], wave_number: float
+) -> Complex128[Tensor, "row 3 3"]:
+    """Of two edges one after the other, in m: more than the product of both dyads.
+
+    Where the second edge is in a transition region of the first, its field is no single wave. Each
+    pair of cotangents then has one transition function. Of what is alike on both sides of the way
+    between the edges it takes the values, of the rest the slopes.
+
+    Args:
+        first, second: the waves.
+        coupling: w of ``corner_transition``; > 0 where growing azimuths of departure from the
+            first edge and of incidence on the second are on the same side.
+        wave_number: k [1/m].
+    """
+    total = torch.zeros((), dtype=torch.complex128)
+    behind = _dyads(second)
+    for one, before in zip(_couplings(first, wave_number), _dyads(first), strict=True):
+        for other, after in zip(_couplings(second, wave_number), behind, strict=True):
+            w = coupling * (one.side_out * other.side_in)
+            same, opposite = (corner_transition(one.s, other.s, way) for way in (w, -w))
+            strength = one.value * other.value * (same + opposite)
+            strength = strength + one.slope * other.slope * (same - opposite)
+            total = total + (strength / 2)[:, None, None] * (after @ before)
+    return total
+
+
+class _Coupling(NamedTuple):
+    """A cotangent that meets one of another edge.
+
+    Attributes:
+        value, slope: strength of 1/s, and by the root that of −1/s² in the derivative.
+        s: of ``transition``.
+        side_in, side_out: 1 where s falls with the azimuth of incidence or of departure.
+    """
+
+    value: Complex128[Tensor, " row"]
+    slope: Complex128[Tensor, " row"]
+    s: Float64[Tensor, " row"]
+    side_in: float
+    side_out: float
+
+
+def _couplings(turn: Turn, wave_number: float) -> list[_Coupling]:
+    opening, root = turn.wedges.opening, torch.sqrt(2 * wave_number * turn.parameter)
+    scale = -_scale(turn, wave_number) * root
+    found = []
+    for other, sign in _signs(turn):
+        half = _past(turn, other, sign)
+        near = half.abs() < _SERIES
+        safe = torch.where(near, torch.full_like(half, _SERIES), half)
+        sine = torch.sin(safe)
+        square = torch.where(near, opening, sine**2 / (opening * torch.sin(safe / opening) ** 2))
+        s = root * torch.sin(half)
+        seen = scale * (edge_transition(s, turn.ends) / transition(s))
+        found.append(
+            _Coupling(seen * _quotient(half, opening), seen * square, s, sign * other, sign)
+        )
+    return found
+
+
 def _one_way(turn: Turn, wave_number: float, orders: Sequence[Order]) -> Tensor:
     weights = _terms(turn, wave_number, orders)[..., None, None]
+    straight, _, *mirrors = _one_way_dyads(turn)
+    total = (weights[0] + weights[1]) * straight
+    for weight, mirror in zip(weights[2:], mirrors, strict=True):
+        total = total + weight * mirror
+    return total
+
+
+def _dyads(turn: Turn) -> list[Complex128[Tensor, "row 3 3"]]:
+    """What the terms multiply, the same on the way back."""
+    there = _one_way_dyads(turn)
+    if turn.faces is conductor or turn.absorbs:
+        return there
+    back = _one_way_dyads(turn.reversed())
+    return [(one + other.mT) / 2 for one, other in zip(there, back, strict=True)]
+
+
+def _one_way_dyads(turn: Turn) -> list[Complex128[Tensor, "row 3 3"]]:
     if turn.absorbs:
         along = edge_axis(turn.wedges)
         bases = _basis(along, turn.towards), _basis(along, turn.direction)
-        same = torch.eye(3, dtype=torch.complex128)
-        return (weights[0] + weights[1]) * _turned(*bases, same)
-    straight, last, first = _carried(turn)
-    return (weights[0] + weights[1]) * straight + weights[2] * last + weights[3] * first
+        return [_turned(*bases, torch.eye(3, dtype=torch.complex128))] * 2
+    straight, *mirrors = _carried(turn)
+    return [straight, straight, *mirrors]
+
+
+def _signs(turn: Turn) -> tuple[tuple[float, float], ...]:
+    return _SIGNS[:2] if turn.absorbs else _SIGNS
+
+
+def _scale(turn: Turn, wave_number: float) -> Tensor:
+    return -_TURN / (2 * turn.wedges.opening * math.sqrt(2 * math.pi * wave_number) * turn.sine)
 
 
 def _terms(
     turn: Turn, wave_number: float, orders: Sequence[Order]
 ) -> Complex128[Tensor, "term order row"]:
     """The four scalar coefficients, or their derivatives."""
-    scale = -_TURN / (2 * turn.wedges.opening * math.sqrt(2 * math.pi * wave_number) * turn.sine)
+    scale = _scale(turn, wave_number)
     root = torch.sqrt(2 * wave_number * turn.parameter)
     found = []
-    for other, sign in _SIGNS[:2] if turn.absorbs else _SIGNS:
-        beta = turn.azimuth + other * turn.azimuth_in
-        value, slope = _cotangent(turn, beta, sign, root, list(orders) != ["value"])
+    for other, sign in _signs(turn):
+        value, slope = _cotangent(turn, other, sign, root, list(orders) != ["value"])
         each: dict[Order, Tensor] = {"value": value, "in": other * slope, "out": slope}
         found.append(torch.stack([scale * each[order] for order in orders]))
     return torch.stack(found)
 
 
+def _past(turn: Turn, other: float, sign: float) -> Tensor:
+    """Half the angle δ past a boundary of β = φ ± φ′."""
+    beta, full = turn.azimuth + other * turn.azimuth_in, 2 * math.pi * turn.wedges.opening
+    turns = torch.round((beta + sign * math.pi) / full).detach()
+    return (sign * (full * turns - beta) - math.pi) / 2
+
+
+def _quotient(half: Tensor, opening: Tensor) -> Tensor:
+    """sin(δ/2)/tan(δ/2n)."""
+    near = half.abs() < _SERIES
+    safe = torch.where(near, torch.full_like(half, _SERIES), half)
+    bend = opening * (1 / 6 + 1 / (3 * opening**2))
+    return torch.where(near, opening - bend * half**2, torch.sin(safe) / torch.tan(safe / opening))
+
+
 def _cotangent(
-    turn: Turn, beta: Tensor, sign: float, root: Tensor, sloped: bool
+    turn: Turn, other: float, sign: float, root: Tensor, sloped: bool
 ) -> tuple[Tensor, Tensor]:
     """cot((π ± β)/2n) F(kLa) in one, and its derivative by β where it is asked for.
 
     With δ the angle past the boundary, it is −[sin(δ/2)/tan(δ/2n)] √(2kL) g(√(2kL) sin(δ/2)).
     """
-    opening = turn.wedges.opening
-    turns = torch.round((beta + sign * math.pi) / (2 * math.pi * opening)).detach()
-    half = (sign * (2 * math.pi * opening * turns - beta) - math.pi) / 2
-    near = half.abs() < _SERIES
-    safe = torch.where(near, torch.full_like(half, _SERIES), half)
-    bend = opening * (1 / 6 + 1 / (3 * opening**2))
-    sine, tangent = torch.sin(safe), torch.tan(safe / opening)
-    quotient = torch.where(near, opening - bend * half**2, sine / tangent)
+    opening, half = turn.wedges.opening, _past(turn, other, sign)
+    quotient = _quotient(half, opening)
     s = root * torch.sin(half)
     sent = edge_transition(s, turn.ends)
     value = -quotient * root * sent
     if not sloped:
         return value, value
+    near = half.abs() < _SERIES
+    safe = torch.where(near, torch.full_like(half, _SERIES), half)
+    sine, tangent = torch.sin(safe), torch.tan(safe / opening)
+    bend = opening * (1 / 6 + 1 / (3 * opening**2))
     past = torch.cos(safe) / tangent - sine / (opening * torch.sin(safe / opening) ** 2)
     past = torch.where(near, -2 * bend * half, past)
     by_s = edge_transition_slope(s, turn.ends, sent)

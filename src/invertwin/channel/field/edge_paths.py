@@ -6,8 +6,8 @@ second derivatives H of its length by the places on the edges: over N edges
 parameter of an edge is that by which its field's step at a boundary is the whole field of the path
 that leaves this edge out: ``L = s s′ sin²β/(s + s′)`` of one edge or of parallel ones.
 
-Source: derivations §9; Tiberio, Manara, Pelosi and Kouyoumjian, "High-frequency electromagnetic
-scattering of plane waves from double wedges", IEEE TAP 37, 1989 (slopes between edges of a face).
+Source: derivations §9; Capolino, Albani, Maci and Tiberio, "Double diffraction at a pair of
+coplanar skew edges", IEEE TAP 45, 1997.
 """
 
 from collections.abc import Sequence
@@ -16,19 +16,22 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from invertwin.channel.field.diffraction import (
     Faces,
     Order,
     Turn,
     conductor,
-    diffraction_dyad,
     diffraction_dyads,
+    double_dyad,
 )
 from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
 
 _STEPS = 40  # of the search for the shortest path over two edges
+_LIFTS = (0.1, 0.01, 0.0)  # of the antennas' distance, one after the other
+_BENT = 1e-6  # rad of phase, up to which a path over an end is as long as to second order
 _LEAST = 1e-9  # of a path's length: edges that touch there have no path between them
 
 
@@ -63,8 +66,8 @@ class EdgePaths:
             length [1/m]; world coordinates, receive × transmit.
         stationary: False where no such path exists: edges meet in the point where it would turn.
         slopes: as ``transfer``, of ∂E/∂ψ at the transmitter, and for ∂E/∂ψ of what the receiver
-            would send; where they were asked for. ψ [rad] is the angle at the antenna by which its
-            ray turns about the edge, along ``−edge_axis × direction``, its field with it.
+            would send; where they were asked for. ψ [rad] is the angle by which the ray at the
+            antenna turns about ``−edge_axis``, its field with it.
     """
 
     points: Float64[Tensor, "row edge 3"]
@@ -85,7 +88,7 @@ def over_edges(
     """The diffracted field of one edge, or of two one after the other.
 
     Where two edges bound a face along which the path runs (``Edge.azimuth`` is then that of the
-    face), the second meets half the field of the first, and its slope.
+    face), the second meets half the field of the first.
 
     Args:
         edges: one or two, in the order in which the wave meets them.
@@ -97,15 +100,17 @@ def over_edges(
     """
     route = _route(edges, tx, rx)
     turns = route.turns(wave_number)
-    orders: tuple[Order, ...] = ("value", "in", "out") if slopes else ("value",)
-    transfer, *turned = diffraction_dyads(turns[0], wave_number, orders)
+    turned: list[Tensor] = []
     if len(edges) == 2:
-        transfer = _second(route, turns, wave_number, transfer)
+        transfer = _second(route, turns, wave_number)
+    else:
+        orders: tuple[Order, ...] = ("value", "in", "out") if slopes else ("value",)
+        transfer, *turned = diffraction_dyads(turns[0], wave_number, orders)
     spread = 1 / (route.legs.prod(1) * route.spread)
     amplitude = torch.stack([turn.sine for turn in turns]).prod(0) * spread
     found = None
     if slopes:
-        scale = (spread / (1j * wave_number))[:, None] / route.legs
+        scale = (spread / (1j * wave_number * turns[0].sine))[:, None] / route.legs
         found = torch.stack(turned) * scale.T[..., None, None]
     return EdgePaths(
         route.points,
@@ -129,6 +134,19 @@ def turning_points(
     points = wedges.start + _between(wedges.start, axis, tx, rx)[:, None] * axis
     before, after = (points - tx).norm(dim=1), (rx - points).norm(dim=1)
     return points, torch.minimum(before, after) > _LEAST * (before + after)
+
+
+def two_turning_points(
+    first: Wedges, second: Wedges, tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
+) -> tuple[Float64[Tensor, "row 2 3"], Bool[Tensor, " row"]]:
+    """As ``turning_points``, of paths over two edges.
+
+    Args:
+        first, second: one row each.
+        tx, rx: the antennas [m].
+    """
+    route = _route([Edge(first), Edge(second)], tx, rx)
+    return route.points, route.stationary
 
 
 @dataclass(frozen=True)
@@ -202,7 +220,7 @@ class _Route:
     def ends(self, number: int, wave_number: float) -> Float64[Tensor, "row 2"]:
         """√phase by which paths over the ends of an edge are longer, < 0 past the end.
 
-        Over one edge that is exact. Of two, the other's point follows, to second order.
+        Of two edges, the other's point follows.
         """
         wedges = self.edges[number].wedges
         offset = self.offsets[:, number]
@@ -218,7 +236,23 @@ class _Route:
             return past * (wave_number * excess).sqrt()
         other = self.hessian[:, 1 - number, 1 - number]
         stiff = self.spread**2 / other.clamp_min(1e-300)
-        return past * (0.5 * wave_number * stiff).sqrt()[:, None]
+        bent = 0.5 * stiff[:, None] * past**2
+        excess = self._over_ends(number) - self.legs.sum(1, keepdim=True)
+        near = wave_number * bent.detach() < _BENT
+        ratio = torch.where(near, 1.0, excess / torch.where(near, 1.0, bent))
+        return past * (0.5 * wave_number * stiff[:, None] * ratio.clamp_min(0.0)).sqrt()
+
+    def _over_ends(self, number: int) -> Float64[Tensor, "row 2"]:
+        """Lengths of the paths over the ends of one edge of two, shortest over the other edge."""
+        wedges, other = self.edges[number].wedges, self.edges[1 - number].wedges
+        near, far = self.vertices[:, 3 * number], self.vertices[:, 3 - 3 * number]
+        axis = _unit(other.end - other.start)
+        found = []
+        for end in (wedges.start, wedges.end):
+            asides = [cross(point - other.start, axis).norm(dim=1) for point in (end, far)]
+            folded = torch.hypot(asides[0] + asides[1], dot(far - end, axis))
+            found.append((end - near).norm(dim=1) + folded)
+        return torch.stack(found, 1)
 
 
 _OUTWARDS = torch.tensor([-1.0, 1.0], dtype=torch.float64)
@@ -262,7 +296,10 @@ def _route(edges: Sequence[Edge], tx: Tensor, rx: Tensor) -> _Route:
 def _between(start: Tensor, axis: Tensor, first: Tensor, last: Tensor) -> Tensor:
     """Where the shortest path between two points touches a line, from its start."""
     along = [dot(point - start, axis) for point in (first, last)]
-    aside = [cross(point - start, axis).norm(dim=-1) for point in (first, last)]
+    aside = [
+        (point - start - way[:, None] * axis).norm(dim=-1)
+        for point, way in zip((first, last), along, strict=True)
+    ]
     share = aside[0] / (aside[0] + aside[1]).clamp_min(1e-300)
     return along[0] + (along[1] - along[0]) * share
 
@@ -314,8 +351,26 @@ def _shortest(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
     """Places on two edges of the shortest path: Newton's steps where they shorten it.
 
     The length is convex; elsewhere each place is moved to the shortest way between its neighbours.
+    That would stick where the edges' lines cross. So the second edge and the receiver are lifted
+    into a fourth dimension first, and then let down.
     """
     offsets = torch.zeros(starts.shape[:2], dtype=starts.dtype)
+    size = (rx - tx).norm(dim=1)
+    none = torch.zeros_like(size)[:, None]
+    for lift in _LIFTS:
+        up = lift * size[:, None]
+        offsets = _settled(
+            offsets,
+            torch.cat([starts, torch.stack([none, up], 1)], 2),
+            torch.nn.functional.pad(axes, (0, 1)),
+            torch.cat([tx, none], 1),
+            torch.cat([rx, up], 1),
+        )
+    return offsets
+
+
+def _settled(offsets: Tensor, starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
+    """``_shortest`` from given places on."""
 
     def length(at: Tensor) -> Tensor:
         points = _vertices(starts, axes, at, tx, rx)
@@ -337,23 +392,19 @@ def _shortest(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
     return offsets
 
 
-def _second(route: _Route, turns: Sequence[Turn], wave_number: float, first: Tensor) -> Tensor:
-    """Both dyads one after the other; along a face with half the field, and its slope.
+def _second(route: _Route, turns: Sequence[Turn], wave_number: float) -> Tensor:
+    """The dyad of both edges; of those of a face with half the field, which is twice the incident.
 
-    Two edges closer than half a wavelength are one thing, which the product of dyads is not: it
-    grows without bound into the corner where they meet. There it is taken off, by x³/(1 + x³).
+    Two edges closer than half a wavelength are one thing, which two one after the other are not:
+    that grows without bound into the corner where they meet. There it is taken off, by x³/(1 + x³).
     """
-    legs = route.legs
-    total = diffraction_dyad(turns[1], wave_number) @ first
+    way, legs = turns[0].towards, route.legs
+    first, second = turns
+    one, other = (normalize(cross(edge_axis(turn.wedges), way), dim=1) for turn in turns)
+    share = legs[:, 0] * legs[:, 2] / ((legs[:, 0] + legs[:, 1]) * (legs[:, 1] + legs[:, 2]))
+    total = double_dyad(first, second, -dot(one, other) * share.sqrt(), wave_number)
     before, after = route.edges[0].azimuth, route.edges[1].azimuth_in
     if before is not None and after is not None:
-        along = (~before.isnan())[:, None, None]
-        ways = [torch.where(angle > 1.0, -1.0, 1.0) for angle in (before, after)]
-        # ∂/∂ν off the face is ±∂/(s sinβ ∂φ) of the first edge.
-        scale = ways[0] * ways[1] / (1j * wave_number * legs[:, 1] * turns[0].sine * turns[1].sine)
-        slope = diffraction_dyad(turns[1], wave_number, "in") @ diffraction_dyad(
-            turns[0], wave_number, "out"
-        )
-        total = torch.where(along, (total + scale[:, None, None] * slope) / 2, total)
+        total = torch.where(before.isnan()[:, None, None], total, total / 2)
     apart = (wave_number * legs[:, 1] / torch.pi) ** 3
     return total * (apart / (1 + apart))[:, None, None]

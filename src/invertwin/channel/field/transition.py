@@ -104,6 +104,32 @@ def edge_transition_slope(
     return slope
 
 
+def corner_transition(
+    s: Float64[Tensor, "*#row"], t: Float64[Tensor, "*#row"], coupling: Float64[Tensor, "*#row"]
+) -> Complex128[Tensor, "*row"]:
+    """What two edges one after the other send: −4 ∫∫ exp(−j(2sx + 2ty + x² + y² − 2wxy)) dx dy.
+
+    Both integrals go from 0 to ∞, for s and t ≥ 0; for others, the function is −1 times that of
+    −s, t and −w. Without coupling it is g(s) g(t); far away it is 1/st.
+
+    Args:
+        s, t: as in ``transition``, of the path over both edges at either of them.
+        coupling: w, of −1 to 1: how much the way through one opening moves that through the other.
+
+    Source: Capolino, Albani, Maci and Tiberio, "Double diffraction at a pair of coplanar skew
+    edges", IEEE TAP 45, 1997, T(s, t, w)/st.
+    """
+    sides = torch.where(s < 0, -1.0, 1.0), torch.where(t < 0, -1.0, 1.0)
+    s, t, side = s.abs(), t.abs(), sides[0] * sides[1]
+    w = side * coupling
+    root = torch.sqrt((1 - w) * (1 + w))
+    parts = [
+        _wave(own * own) * end_transition((other + w * own) / root, own)
+        for own, other in ((s, t), (t, s))
+    ]
+    return (2j * _ROOT * _TURN.conjugate() * side / root) * (parts[0] + parts[1])
+
+
 def _in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
     """A function of numbers of one shape, some rows at a time."""
     pieces = zip(*(values.reshape(-1).split(_ROWS_AT_ONCE) for values in given), strict=True)

@@ -1,24 +1,23 @@
 """The fits themselves: calibration, one fit per start, progress, interruptions."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli import build
+from invertwin.cli.fits.displays import KeptSteps, steps_file
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
+    fitted_objects,
     known_of,
     models_of,
     observations_of,
@@ -31,7 +30,6 @@ from invertwin.cli.fits.problem import (
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
 from invertwin.cli.fits.spreading import part_name
-from invertwin.cli.running import time_left
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import (
@@ -44,13 +42,15 @@ from invertwin.inversion import (
     Watch,
     reconstruct,
     search,
+    watched,
 )
-from invertwin.inversion.callbacks import interrupted_between_steps, stage_file
+from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.certainty import certainty
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runs import RunFolder
 from invertwin.scene import Object, Scene
 from invertwin.seeds import derived_seed
+from invertwin.viewer import Step
 
 
 def calibrated(
@@ -71,7 +71,7 @@ def calibrated(
         bias, clock = RangeBias(), ClockOffset(sight.capture.positions)
         own = replace(problem, run=run.varied(table))
         schedule, (model,) = settings_of(own.run).build(), models_of(own)
-        with watched(console, "calibration", schedule.steps) as shown:
+        with watched("calibration", schedule.steps, console) as shown:
             found = reconstruct(
                 Scene({table.object: target}),
                 Observation(model, sight.radar, sight.capture, parameters=[bias, clock]),
@@ -100,6 +100,7 @@ def fit(
     folder: RunFolder,
     console: Console,
     checkpoint: str | None,
+    show: Callable[[Step], None] | None = None,
 ) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
     """One fit, or what an interrupted run has kept of it.
 
@@ -111,6 +112,7 @@ def fit(
         folder: Keeps results and checkpoints.
         console: Shows progress.
         checkpoint: Name of the checkpoint; None = one among the parts.
+        show: Is told of steps as they come.
 
     Returns:
         The row of the fit, and a function that gives its outcome.
@@ -119,14 +121,14 @@ def fit(
     checkpoint = checkpoint or f"{part}.pt"
     own = varied(problem, mode)
     stages = schedule_of(own)
-    again = partial(_staged, own, stages, start, index, folder, checkpoint)
+    again = partial(_staged, own, stages, start, index, folder, checkpoint, show)
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
         return row, lambda: again()[0]
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    with watched(console, name, sum(stage.steps for stage in stages)) as shown:
+    with watched(name, sum(stage.steps for stage in stages), console) as shown:
         found, found_ends = again(shown)
     row = {
         "start": index,
@@ -154,6 +156,7 @@ def _staged(
     index: int,
     folder: RunFolder,
     checkpoint: str,
+    show: Callable[[Step], None] | None,
     shown: Sequence[Report] = (),
 ) -> tuple[Reconstruction, dict[str, Any]]:
     """A fit, or a search about its start; and what the row says of the search."""
@@ -164,7 +167,14 @@ def _staged(
         for k in range(len(stages) - 1):
             folder.file(str(stage_file(Path(file), k)))
         watching = [] if watch is None else [Watch(watch, every)]
-        return [*watching, *shown, _checkpoint(problem, folder, file)]
+        kept = KeptSteps(
+            folder.file(steps_file(file)),
+            [name for name in dict.fromkeys(fitted_objects(run)) if name in start.names],
+            sum(stage.steps for stage in stages),
+            settings_of(run).checkpoint_every,
+            show if shown else None,
+        )
+        return [*watching, *shown, _checkpoint(problem, folder, file), kept]
 
     given = start, observations_of(problem), unknowns_of(run)
     how: dict[str, Any] = {key: build.made(run, key) for key in ("loss", "optimizer")}
@@ -191,33 +201,3 @@ def _values(modules: nn.ModuleList) -> dict[str, Any]:
         found: dict[str, torch.Tensor] = getattr(module, "values", dict)()
         rows |= {name: value.tolist() for name, value in found.items() if value.numel() <= 16}
     return rows
-
-
-@contextmanager
-def watched(console: Console, name: str, steps: int) -> Iterator[list[Report]]:
-    """Progress with the loss and the first parameters: a bar, or lines where no terminal is.
-
-    Ctrl-C waits for the end of the step.
-    """
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    words, lines = TextColumn("{task.description}"), not console.is_terminal
-    bar = Progress(*columns, words, console=console, disable=lines)
-    task = bar.add_task("", total=steps)
-    begin = time.monotonic()
-    with bar, interrupted_between_steps() as heed:
-
-        def show(row: dict[str, Any]) -> None:
-            values = " ".join(
-                np.array2string(np.atleast_1d(value), precision=3, suppress_small=True)
-                for value in list(row["values"].values())[:2]
-                if np.size(value) <= 3
-            )
-            text, done = f"loss {row['loss']:.4f} {values}", row["step"] + 1
-            bar.update(task, completed=done, description=text)
-            if lines and done * 10 // steps > row["step"] * 10 // steps:
-                left = time_left((time.monotonic() - begin) / done * (steps - done))
-                line = f"{name}: step {done} of {steps}, {left} left, {text}"
-                console.print(line, markup=False, soft_wrap=True)
-            heed()
-
-        yield [Report(show)]

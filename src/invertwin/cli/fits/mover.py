@@ -15,7 +15,6 @@ from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
 from invertwin.cli import build
 from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.fits.fitting import watched
 from invertwin.cli.motion_tables import at_start
 from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
@@ -33,6 +32,7 @@ from invertwin.inversion import (
     Schedule,
     reconstruct,
     strongest_mover,
+    watched,
 )
 from invertwin.models import MotionMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
@@ -154,7 +154,7 @@ def _fitted(
     with about(f"scene.{table.object}"):
         body = MovingBody(table.object, scene, radar, echo, table.free)
     near = model.around(echo.range, echo.rate, table.cells, radar)
-    with watched(console, name, settings.steps) as callbacks:
+    with watched(name, settings.steps, console) as callbacks:
         found = reconstruct(
             scene,
             Observation(near, radar, recording),

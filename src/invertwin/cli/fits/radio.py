@@ -16,7 +16,6 @@ from invertwin import plotting
 from invertwin.channel import trace_paths
 from invertwin.cli import build
 from invertwin.cli.fits.certainty import certainty_table
-from invertwin.cli.fits.fitting import watched
 from invertwin.cli.fits.problem import FULL, settings_of, stages_of, varied_run
 from invertwin.cli.fits.spreading import QUIET, Workers, fit_elsewhere, part_name
 from invertwin.cli.radio_tables import ReceivedData, ReceivedFile
@@ -33,6 +32,7 @@ from invertwin.inversion import (
     Stage,
     Unknown,
     reconstruct,
+    watched,
 )
 from invertwin.inversion.certainty import certainty
 from invertwin.inversion.rivals import REJECTED, score
@@ -235,7 +235,7 @@ def _fitted(
         return kept, again
     begin = time.perf_counter()
     name = f"start {number + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    with watched(console, name, sum(stage.steps for stage in stages)) as shown:
+    with watched(name, sum(stage.steps for stage in stages), console) as shown:
         found = again(shown)
     place = found.sensors[0].positions[0].detach()
     row: dict[str, Any] = {

@@ -1,0 +1,242 @@
+"""What a viewer shows, as plain arrays: layers, the steps of a fit, and maps of its data."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from invertwin.channel import Grid
+from invertwin.untrusted import read_arrays, reading
+
+_FORMAT = 1
+_DO = "repeat the run with --overwrite"
+_MOST_VALUES = 2_000_000  # of maps that are kept
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A surface in the world.
+
+    Attributes:
+        vertices: Places [m], float32 [v, 3].
+        faces: Corners of the triangles, int32 [t, 3].
+    """
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One thing that can be shown and hidden.
+
+    Attributes:
+        name: Group and name, such as "twin/letter"; groups are switched together.
+        kind: A surface, pairs of points that are joined, or points.
+        points: Places [m], float32 [n, 3].
+        faces: Of a surface, int32 [t, 3]; else empty.
+        color: Red, green and blue, 0 to 255.
+        opacity: 1 hides what is behind.
+        shown: Whether it is seen at first.
+    """
+
+    name: str
+    kind: Literal["surface", "lines", "points"]
+    points: NDArray[np.float32]
+    faces: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
+    color: tuple[int, int, int] = (185, 190, 199)
+    opacity: float = 1.0
+    shown: bool = True
+
+    @property
+    def group(self) -> str:
+        """What it is switched with."""
+        return self.name.split("/")[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Where a fit stood.
+
+    Attributes:
+        number: Steps done.
+        label: Such as "step 12, loss 0.31".
+        bodies: What moves, by the name of its object.
+    """
+
+    number: int
+    label: str
+    bodies: Mapping[str, Body]
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """Power over range and direction, of some frames of a radar.
+
+    Attributes:
+        frames: Numbers of the frames.
+        ranges: Range of each row [m].
+        across: Direction cosine u of each column.
+        power: By what is shown, float32 [frame, range, u]: the strongest over v.
+    """
+
+    frames: list[int]
+    ranges: list[float]
+    across: list[float]
+    power: Mapping[str, NDArray[np.float32]]
+
+    @classmethod
+    def of(cls, spectra: Mapping[str, Tensor], grid: Grid) -> "Maps":
+        """Maps of spectra [frame, range, u, v]; of many frames, evenly chosen ones.
+
+        Args:
+            spectra: By what is shown, all of one shape.
+            grid: Their bins.
+        """
+        frames, ranges, across, _ = next(iter(spectra.values())).shape
+        count = max(1, min(frames, _MOST_VALUES // (len(spectra) * ranges * across)))
+        chosen = np.unique(np.linspace(0, frames - 1, count).astype(int)).tolist()
+        return cls(
+            chosen,
+            grid.ranges.tolist(),
+            grid.u.tolist(),
+            {
+                name: np.asarray(power.detach()[chosen].amax(3).cpu(), np.float32)
+                for name, power in spectra.items()
+            },
+        )
+
+    def at(self, frame: int) -> dict[str, NDArray[np.float32]]:
+        """The maps of a frame; none, where they were not kept.
+
+        Args:
+            frame: Its number.
+        """
+        if frame not in self.frames:
+            return {}
+        number = self.frames.index(frame)
+        return {name: power[number] for name, power in self.power.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Display:
+    """Everything that a viewer shows.
+
+    Attributes:
+        title: Of the window.
+        layers: In the order in which they are listed.
+        steps: Of a fit, in order; they move the layers "twin/<object>".
+        maps: Of the first radar, where there are data.
+        up: The direction that points up.
+        ahead: The direction in which the radar looks.
+    """
+
+    title: str
+    layers: Sequence[Layer]
+    steps: Sequence[Step] = ()
+    maps: Maps | None = None
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    ahead: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    @property
+    def box(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Lowest and highest corner of the surfaces; of everything, where there are none."""
+        bodies = [x for x in self.layers if x.kind == "surface" and len(x.points)]
+        points = [x.points for x in bodies or self.layers if len(x.points)]
+        every = np.concatenate(points) if points else np.zeros((1, 3), np.float32)
+        return every.min(0), every.max(0)
+
+    @property
+    def groups(self) -> dict[str, bool]:
+        """Groups of layers in order, and whether they are seen at first."""
+        found: dict[str, bool] = {}
+        for layer in self.layers:
+            found.setdefault(layer.group, layer.shown)
+        return found
+
+    def at_step(self, step: Step) -> "Display":
+        """The display with the bodies of a step in place of the twin's.
+
+        Args:
+            step: One of the steps.
+        """
+        bodies = {f"twin/{name}": body for name, body in step.bodies.items()}
+        layers = [
+            replace(x, points=bodies[x.name].vertices, faces=bodies[x.name].faces)
+            if x.name in bodies
+            else x
+            for x in self.layers
+        ]
+        return replace(self, layers=layers)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything into one .npz file.
+
+        Args:
+            path: The file.
+        """
+        arrays: dict[int, NDArray[Any]] = {}  # by identity: faces of steps are mostly the same
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, np.ndarray):
+                arrays[id(value)] = value
+                return {"array": f"a{list(arrays).index(id(value))}"}
+            if isinstance(value, Mapping):
+                return {name: plain(item) for name, item in value.items()}
+            if isinstance(value, list | tuple):
+                return [plain(item) for item in value]
+            return plain(vars(value)) if hasattr(value, "__dataclass_fields__") else value
+
+        header = np.array(json.dumps(plain(self) | {"format": _FORMAT}))
+        named = {f"a{number}": array for number, array in enumerate(arrays.values())}
+        with Path(path).open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, header=header, **named)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Display":
+        """Read what `save` wrote.
+
+        Args:
+            path: The file.
+
+        Raises:
+            InputError: A damaged file, or one of another version.
+        """
+        with reading(path, "what a fit leaves to be viewed", _DO):
+            arrays = read_arrays(path, _DO)
+
+            def whole(value: Any) -> Any:
+                if isinstance(value, dict):
+                    if set(value) == {"array"}:
+                        return arrays[value["array"]]
+                    return {name: whole(item) for name, item in value.items()}
+                return [whole(item) for item in value] if isinstance(value, list) else value
+
+            read = whole(json.loads(str(arrays["header"])))
+            if read.pop("format") != _FORMAT:
+                raise ValueError("of another version")
+            maps = read.pop("maps")
+            steps = [
+                Step(**step | {"bodies": {n: Body(**body) for n, body in step["bodies"].items()}})
+                for step in read.pop("steps")
+            ]
+            layers = [
+                Layer(**layer | {"color": tuple(layer["color"])}) for layer in read.pop("layers")
+            ]
+            read |= {key: tuple(read[key]) for key in ("up", "ahead")}
+            for body in (*layers, *(body for step in steps for body in step.bodies.values())):
+                _check(body)
+            return cls(**read, layers=layers, steps=steps, maps=maps and Maps(**maps))
+
+
+def _check(body: Layer | Body) -> None:
+    """Refuse what would crash the graphics of a browser."""
+    points = body.points if isinstance(body, Layer) else body.vertices
+    inside = not body.faces.size or 0 <= body.faces.min() <= body.faces.max() < len(points)
+    if points.ndim != 2 or points.shape[1] != 3 or body.faces.shape[1:] != (3,) or not inside:
+        raise ValueError("triangles without corners")

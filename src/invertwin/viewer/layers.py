@@ -1,0 +1,195 @@
+"""From scenes, radars and error bars to layers of a display."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from invertwin.capture import Capture
+from invertwin.channel import Grid
+from invertwin.radar import Radar
+from invertwin.scene import Object, Scene
+from invertwin.scene.geometry.density import without_clouds
+from invertwin.viewer.display import Body, Display, Layer
+
+_GREY, _RADAR = (185, 190, 199), (110, 120, 140)
+_COLORS = {"truth": (192, 20, 60), "start": (224, 128, 60)}
+_TWIN = (76, 120, 168)
+_MOST_BEAMS = 24  # positions whose beams are drawn
+_RINGS = 32  # corners of an ellipsoid's circles
+_LEVEL = 7.815  # squared radius of the ellipsoid that holds 95 % of a normal law in space
+
+
+def floats(values: Any) -> NDArray[np.float32]:
+    """Numbers as the graphics card takes them.
+
+    Args:
+        values: A tensor or an array.
+    """
+    return np.ascontiguousarray(torch.as_tensor(values).detach().cpu().numpy(), np.float32)
+
+
+def body_of(item: Object) -> Body:
+    """The surface of an object in the world.
+
+    Args:
+        item: The object.
+    """
+    faces = np.ascontiguousarray(item.mesh.faces.cpu().numpy(), np.int32)
+    return Body(floats(item.vertices), faces)
+
+
+def scene_layers(
+    scene: Scene, group: str = "twin", *, fitted: Collection[str] = (), only: bool = False
+) -> list[Layer]:
+    """The surfaces of a scene.
+
+    Args:
+        scene: What is shown.
+        group: Of the layers, such as "twin".
+        fitted: Names of objects that are coloured.
+        only: Leave the others out.
+    """
+    layers = []
+    for name, item in without_clouds(scene).objects.items():
+        if only and name not in fitted:
+            continue
+        body = body_of(item)
+        color = _COLORS.get(group, _TWIN if name in fitted else _GREY)
+        opacity = 0.35 if group in _COLORS else 1.0
+        shown = group != "start"
+        layers.append(
+            Layer(f"{group}/{name}", "surface", body.vertices, body.faces, color, opacity, shown)
+        )
+    return layers
+
+
+def radar_layers(radar: Radar, grid: Grid | None, length: float, name: str = "") -> list[Layer]:
+    """Positions of a radar, and the pyramid that its map covers from some of them.
+
+    Args:
+        radar: The radar.
+        grid: Bins of the map; None = half of all directions.
+        length: Of the beams [m].
+        name: Of the radar, where there are several.
+    """
+    places, axes = radar.positions.detach(), radar.link().rotations.detach()
+    chosen = np.unique(np.linspace(0, len(places) - 1, _MOST_BEAMS).astype(int))
+    half = [_edge(grid and grid.u, 0.5), _edge(grid and grid.v, 0.5)]
+    u = torch.tensor([-1.0, 1.0, 1.0, -1.0]).double() * half[0]
+    v = torch.tensor([-1.0, -1.0, 1.0, 1.0]).double() * half[1]
+    w = (1 - u.square() - v.square()).clamp_min(0.0).sqrt()
+    corners = torch.stack([u, v, w], dim=1) * length
+    lines = []
+    for k in chosen:
+        ends = places[k] + corners @ axes[k].T
+        sides = torch.stack([places[k].expand(4, 3), ends], dim=1)
+        lines += [sides.reshape(-1, 3), torch.stack([ends, ends.roll(-1, 0)], 1).reshape(-1, 3)]
+    of = f"/{name}" if name else ""
+    beams = floats(torch.cat(lines))
+    return [
+        Layer(f"radar{of}", "points", floats(places), color=_RADAR),
+        Layer(f"beams{of}", "lines", beams, color=(150, 150, 160), shown=False),
+    ]
+
+
+def _edge(cosines: torch.Tensor | None, default: float) -> float:
+    """The largest direction cosine that is covered, short of the side."""
+    if cosines is None or len(cosines) < 2:
+        return default
+    return min(float(cosines.abs().max()), math.sqrt(0.45))
+
+
+def capture_layers(capture: Capture) -> list[Layer]:
+    """Surveyed targets of a capture, and the track of its radar.
+
+    Args:
+        capture: The capture.
+    """
+    layers = []
+    if capture.survey is not None:
+        points = floats(capture.survey)
+        layers.append(Layer("surveyed targets", "points", points, color=_COLORS["truth"]))
+    if capture.track is not None:
+        places = floats(capture.track.positions)
+        pairs = np.stack([places[:-1], places[1:]], axis=1).reshape(-1, 3)
+        layers.append(Layer("track", "lines", pairs, color=_RADAR))
+    return layers
+
+
+def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[Layer]:
+    """Where the middles of fitted objects are with 95 %, as three circles each.
+
+    A coordinate without an error bar has none here either: the ellipsoid is flat along it.
+
+    Args:
+        scene: The twin.
+        metrics: ``standard_deviations`` by coordinate and their ``correlations``.
+    """
+    deviations: Mapping[str, float] = metrics.get("standard_deviations", {})
+    names, layers = list(deviations), []
+    correlations = torch.as_tensor(metrics.get("correlations", [])).double().numpy()
+    for name in scene.names:
+        own = [(axis, f"{name}.{c}") for axis, c in enumerate("xyz") if f"{name}.{c}" in names]
+        if not own:
+            continue
+        covariance = np.zeros((3, 3))
+        for i, first in own:
+            for j, second in own:
+                scale = deviations[first] * deviations[second]
+                covariance[i, j] = scale * correlations[names.index(first), names.index(second)]
+        sizes, axes = np.linalg.eigh(covariance)
+        radii = axes * np.sqrt(_LEVEL * sizes.clip(0))
+        turn = np.linspace(0, 2 * math.pi, _RINGS + 1)
+        circle = np.stack([np.cos(turn), np.sin(turn)])
+        rings = [(radii[:, [i, j]] @ circle).T for i, j in ((0, 1), (1, 2), (0, 2))]
+        pairs = [np.stack([ring[:-1], ring[1:]], axis=1).reshape(-1, 3) for ring in rings]
+        points = floats(np.concatenate(pairs)) + floats(scene[name].center)
+        layers.append(Layer(f"95 % ellipsoid/{name}", "lines", points, color=(230, 160, 0)))
+    return layers
+
+
+def display_of(
+    scene: Scene | None,
+    radars: Mapping[str, tuple[Radar, Grid | None]],
+    title: str,
+    *,
+    truth: Scene | None = None,
+    fitted: Sequence[str] = (),
+) -> Display:
+    """A display of a scene and of what looks at it.
+
+    Args:
+        scene: What there is; None = nothing known.
+        radars: With the bins of their maps, by name.
+        title: Of the window.
+        truth: The scene as it really is, of which what is fitted is shown.
+        fitted: Names of objects that are coloured.
+    """
+    layers = [] if scene is None else scene_layers(scene, fitted=fitted)
+    if truth is not None:
+        layers += scene_layers(truth, "truth", fitted=fitted, only=True)
+    places = [floats(radar.positions) for radar, _ in radars.values()]
+    length = 1.0
+    if layers and places:
+        middle = np.concatenate([x.points for x in layers]).mean(0)
+        length = float(np.linalg.norm(np.concatenate(places).mean(0) - middle))
+    up, ahead = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    for name, (radar, grid) in radars.items():
+        layers += radar_layers(radar, grid, length, name)
+    for radar, _ in list(radars.values())[:1]:
+        axes = radar.link().rotations.detach().mean(0)
+        up, ahead = _unit(axes[:, 1], up), _unit(axes[:, 2], ahead)
+    return Display(title, layers, up=up, ahead=ahead)
+
+
+def _unit(vector: torch.Tensor, default: tuple[float, float, float]) -> tuple[float, float, float]:
+    """The direction of a mean axis; the default, where the axes cancel."""
+    length = float(vector.norm())
+    if length < 0.1:
+        return default
+    x, y, z = (vector / length).tolist()
+    return x, y, z

@@ -1,0 +1,147 @@
+"""What joins a scene and its map: the map of a moved scene, and the points that feed a bin."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invertwin.channel import Grid, Paths, Sampling, torch_threads, trace_power
+from invertwin.errors import InputError
+from invertwin.models import SurrogateMap
+from invertwin.radar import Radar
+from invertwin.scene import Mesh, Scene, compose
+from invertwin.scene.geometry.density import without_clouds
+from invertwin.viewer.display import Body
+
+_SAMPLES = 20_000  # rays of a map: quick, and smooth enough for the eye
+_PATHS = 4_000  # rays of which single paths are shown
+_EDGES = 600  # samples of silhouettes that are shown
+_SEED = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What one position sees.
+
+    Attributes:
+        place: Of the radar [m].
+        points: Where the paths meet surfaces first and last [m].
+        power: Of each path, received over transmitted.
+        bins: Range and u of each path, in bins.
+        edges: Points of silhouettes, where what is seen jumps [m].
+    """
+
+    place: Float[Tensor, "3"]
+    points: Float[Tensor, "path 2 3"]
+    power: Float[Tensor, " path"]
+    bins: Float[Tensor, "path 2"]
+    edges: Float[Tensor, "edge 3"]
+
+    def feeding(self, range_bin: float, u_bin: float) -> Float[Tensor, "point 3"]:
+        """Points whose echoes fall into a bin, or into its neighbours.
+
+        Args:
+            range_bin: Number of the range.
+            u_bin: Number of the direction.
+        """
+        away = (self.bins - torch.tensor([range_bin, u_bin])).abs()
+        return self.points[(away <= 1.0).all(dim=1)][:, 1]
+
+
+class Link:
+    """The forward model of one radar, for maps that follow what a person moves.
+
+    Args:
+        scene: With its materials, where nothing has been moved.
+        radar: All positions.
+        grid: Bins of the map.
+        depth: Most bounces.
+    """
+
+    def __init__(self, scene: Scene, radar: Radar, grid: Grid, depth: int = 1) -> None:
+        self.scene = self._begun = without_clouds(scene)
+        self.radar, self.grid = radar, grid
+        self._model = SurrogateMap(
+            grid, sampling=Sampling(depth=depth, samples=_SAMPLES, boundary=False)
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what can be moved."""
+        return self.scene.names
+
+    def take(self, bodies: Mapping[str, Body]) -> None:
+        """Put other surfaces in place of those of some objects.
+
+        Args:
+            bodies: By the name of the object.
+
+        Raises:
+            InputError: Other triangles than a material with values for each can have.
+        """
+        scene = self._begun
+        for name, body in bodies.items():
+            mesh = Mesh(
+                torch.tensor(body.vertices, dtype=torch.float64),
+                torch.tensor(body.faces, dtype=torch.int64),
+            )
+            scene = scene.replace(name, mesh=mesh, pose=None)
+        self.scene = scene
+
+    def moved(self, name: str, motion: Float[Tensor, "4 4"]) -> Scene:
+        """The scene with one object moved rigidly.
+
+        Args:
+            name: Of the object.
+            motion: World to world.
+        """
+        return self.scene.replace(name, pose=compose(self.scene[name].transform, motion))
+
+    def map(self, scene: Scene, frame: int) -> Float[Tensor, "range u"]:
+        """The power that one position would show, the strongest over v.
+
+        Args:
+            scene: What is seen.
+            frame: Number of the position.
+        """
+        with torch.no_grad(), torch_threads(1):  # small work, which more threads slow
+            return self._model.predict(scene, self.radar.frames([frame]), _SEED)[0].amax(2)
+
+    def seen(self, scene: Scene, frame: int) -> Seen:
+        """Single paths of one bounce, and points of silhouettes.
+
+        Args:
+            scene: What is seen.
+            frame: Number of the position.
+        """
+        link = self.radar.frames([frame]).link()
+        sampling = Sampling(
+            depth=1, samples=_PATHS, boundary_samples=_EDGES, contacts=False, boundary=True
+        )
+        with torch.no_grad(), torch_threads(1):  # small work, which more threads slow
+            try:
+                paths = trace_power(scene, link, sampling=sampling, seed=_SEED)
+            except InputError:  # silhouettes of sheets have no explicit paths
+                sampling = replace(sampling, boundary=False)
+                paths = trace_power(scene, link, sampling=sampling, seed=_SEED)
+        return self._sorted(paths, frame)
+
+    def _sorted(self, paths: Paths, frame: int) -> Seen:
+        place = self.radar.positions[frame].detach()
+        rotation, grid = self.radar.link().rotations[frame].detach(), self.grid
+        edges = paths.last[paths.boundary]
+        paths = paths.chosen(~paths.boundary)
+        toward = torch.nn.functional.normalize(paths.last - place, dim=1) @ rotation
+        origin = float(self.radar.origins[frame])
+        bins = torch.stack(
+            [
+                (paths.range - origin - grid.range_start) / grid.range_step,
+                (toward[:, 0] - grid.u_start) / grid.u_step
+                if grid.u_count > 1
+                else torch.zeros(len(paths), dtype=torch.float64),
+            ],
+            dim=1,
+        )
+        return Seen(place, torch.stack([paths.first, paths.last], 1), paths.power, bins, edges)

@@ -1,0 +1,156 @@
+"""What notebooks show of values: a picture and a table; and the way from a scene to its viewer."""
+
+import base64
+import html
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+
+from invertwin import plotting
+from invertwin.capture import Capture, shown_ranges
+from invertwin.channel import Grid
+from invertwin.inversion import Reconstruction
+from invertwin.radar import Radar, SampledWaveform
+from invertwin.scene import Scene
+from invertwin.scene.geometry.density import without_clouds
+from invertwin.viewer.display import Display
+from invertwin.viewer.layers import display_of
+from invertwin.viewer.link import Link
+from invertwin.viewer.server import Viewer
+
+
+def show_scene(
+    scene: Scene, *, radar: Radar | None = None, grid: Grid | None = None, **options: Any
+) -> Viewer:
+    """A viewer of a scene; with a radar and its grid, one whose map follows what is moved.
+
+    Args:
+        scene: What is shown.
+        radar: What looks at it.
+        grid: Bins of its map.
+        options: As of `Viewer`.
+
+    Raises:
+        InputError: No `viser`, or a host without a token.
+    """
+    display: Display = display_of(scene, {} if radar is None else {"": (radar, grid)}, "scene")
+    link = None if radar is None or grid is None else Link(scene, radar, grid)
+    viewer = Viewer(display, link, **options)
+    print(f"open {viewer.address}")
+    return viewer
+
+
+def scene_html(scene: Scene) -> str:
+    """Three views of a scene, and its objects.
+
+    Args:
+        scene: The scene.
+    """
+    surfaces = without_clouds(scene)
+    rows = [
+        (
+            name,
+            len(item.mesh.faces),
+            type(item.material).__name__,
+            " × ".join(f"{x:.3g}" for x in _extent(surfaces[name].vertices)),
+            ", ".join(f"{x:.3g}" for x in item.center.detach().tolist()),
+        )
+        for name, item in scene.objects.items()
+    ]
+    heads = ("object", "triangles", "material", "size [m]", "middle [m]")
+    return _shown(plotting.scene(surfaces), "three views of the scene", heads, rows)
+
+
+def radar_html(radar: Radar) -> str:
+    """The virtual array of a radar, and what it resolves.
+
+    Args:
+        radar: The radar.
+    """
+    places = 1e3 * radar.virtual_positions.detach()
+    figure = Figure(figsize=(4, 2.5), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(places[:, 0].numpy(), places[:, 1].numpy(), ".")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", title="virtual array")
+    return _shown(figure, "places of the virtual elements", ("quantity", "value"), _of_radar(radar))
+
+
+def capture_html(capture: Capture) -> str:
+    """The first frame of a capture, and what recorded it.
+
+    Args:
+        capture: The capture.
+    """
+    radar = capture.radar()
+    if "beat" in capture.dataset:
+        grid = radar.grid(*shown_ranges(capture, None, None))
+        figure = plotting.spectrum({"first frame": capture.frames([0]).spectrum(grid)}, grid)
+    else:
+        figure = Figure(figsize=(5, 2.5), layout="constrained")
+        axes = figure.subplots()
+        level = 20 * torch.log10(capture.range_profile[0].abs().clamp_min(1e-30))
+        axes.plot(capture.ranges.numpy(), level.numpy())
+        axes.set(xlabel="range [m]", ylabel="power [dB]", title="first frame")
+    return _shown(figure, "map of the first frame", ("quantity", "value"), _of_radar(radar))
+
+
+def reconstruction_html(found: Reconstruction) -> str:
+    """The loss of a fit over its steps, and what was found.
+
+    The verdict and the error bars are shown once they have been asked for: they take time.
+
+    Args:
+        found: The fit.
+    """
+    rows: list[tuple[Any, ...]] = [
+        ("why it stopped", found.status),
+        ("steps", found.steps),
+        ("loss", f"{found.loss:.4g}"),
+    ]
+    known = vars(found)
+    bars = known["uncertainty"].interval() if "uncertainty" in known else {}
+    if "verdict" in known:
+        rows.append(("verdict", known["verdict"].word))
+    for name, value in found.history[-1]["values"].items():
+        numbers = torch.as_tensor(value).reshape(-1)
+        if len(numbers) <= 16:
+            rows.append((name, ", ".join(f"{x:.4g}" for x in numbers.tolist())))
+    rows += [(f"{name}, within (95 %)", f"± {width:.2g}") for name, width in bars.items()]
+    figure = plotting.convergence({"loss": [[step["loss"] for step in found.history]]})
+    return _shown(figure, "loss over the steps", ("quantity", "value"), rows)
+
+
+def _of_radar(radar: Radar) -> list[tuple[str, Any]]:
+    waveform = radar.waveform
+    rows: list[tuple[str, Any]] = [
+        ("positions", radar.frame_count),
+        ("transmitters × receivers", " × ".join(map(str, radar.shape[1:]))),
+        ("waveform", type(waveform).__name__),
+        ("middle of the band [GHz]", f"{waveform.center_frequency / 1e9:.4g}"),
+        ("range cell [m]", f"{waveform.range_resolution:.4g}"),
+        ("cells in u and v", " × ".join(f"{x:.3g}" for x in radar.beamwidth)),
+    ]
+    if isinstance(waveform, SampledWaveform):
+        rows.append(("unambiguous range [m]", f"{waveform.max_range:.4g}"))
+    return rows
+
+
+def _extent(vertices: torch.Tensor) -> list[float]:
+    return (vertices.amax(0) - vertices.amin(0)).detach().tolist()
+
+
+def _shown(figure: Figure, alt: str, heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A picture above a table; texts of users are escaped."""
+    png = base64.b64encode(plotting.png_bytes(figure)).decode()
+    cells = [[html.escape(str(cell)) for cell in row] for row in (heads, *rows)]
+    top, *others = (
+        "".join(f"<{kind}>{cell}</{kind}>" for cell in row)
+        for kind, row in zip(("th", *("td",) * len(cells)), cells, strict=False)
+    )
+    body = "".join(f"<tr>{row}</tr>" for row in others)
+    return (
+        f'<img alt="{alt}" src="data:image/png;base64,{png}" style="max-width: 100%">'
+        f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+    )

@@ -1,0 +1,142 @@
+"""Maps as pictures that stand beside the scene: measured, simulated, and what is left."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from invertwin.viewer.display import Display
+
+MEASURED, SIMULATED, RESIDUAL = "measured", "simulated", "residual"
+_DARKEST = -40.0  # dB below the peak
+_LARGEST = 15.0  # dB of a residual
+_PIXELS = 200  # along the shorter side of a picture, at least
+
+
+class Panels:
+    """Pictures in a row above the scene, each bin of which can be clicked.
+
+    Args:
+        server: Of viser.
+        display: Tells where the scene is.
+        shown: Names of the pictures.
+        shape: Numbers of ranges and of directions.
+
+    Attributes:
+        right: The direction in which u grows.
+        offset: From the middle of the scene to that of the pictures.
+    """
+
+    def __init__(
+        self, server: Any, display: Display, shown: Sequence[str], shape: tuple[int, int]
+    ) -> None:
+        low, high = display.box
+        up, ahead = np.array(display.up), np.array(display.ahead)
+        self.right, self.offset = np.cross(up, ahead), np.zeros(3)
+        self._nodes: dict[str, Any] = {}
+        self._places: dict[str, Any] = {}
+        if not shown:
+            return
+        self._shape = shape
+        self._size = 0.5 * (float(np.linalg.norm(high - low)) or 1.0)
+        self._axes = self.right, up
+        self.offset = up * (float((high - low) @ np.abs(up)) / 2 + 0.65 * self._size)
+        self._known: dict[str, tuple[Any, Any]] = {}
+        # The picture's right, which is that of u, its foot, and what is behind it.
+        turn = _quaternion(np.stack([self.right, -up, -ahead], axis=1))
+        for number, name in enumerate(shown):
+            # The first one stands on the left of who looks along the radar.
+            across = 1.1 * self._size * ((len(shown) - 1) / 2 - number)
+            place = (low + high) / 2 + self.offset + across * self.right
+            self._places[name] = place
+            self._nodes[name] = server.scene.add_image(
+                f"/maps/{name}",
+                np.zeros((8, 8, 3), np.uint8),
+                self._size,
+                self._size,
+                format="png",
+                cast_shadow=False,
+                receive_shadow=False,
+                wxyz=turn,
+                position=place,
+            )
+            server.scene.add_label(
+                f"/maps/{name}/label", name, position=(0.0, -0.55 * self._size, 0.0)
+            )
+
+    def on_click(self, choose: Callable[[tuple[int, int]], None]) -> None:
+        """Say which bin was clicked.
+
+        Args:
+            choose: Takes the numbers of its range and its u.
+        """
+        for name, node in self._nodes.items():
+            node.on_click(self._clicked(name, choose))
+
+    def _clicked(
+        self, name: str, choose: Callable[[tuple[int, int]], None]
+    ) -> Callable[[Any], None]:
+        def clicked(event: Any) -> None:
+            origin, toward = np.array(event.ray_origin), np.array(event.ray_direction)
+            right, up = self._axes
+            normal = np.cross(right, up)
+            distance = (self._places[name] - origin) @ normal / (toward @ normal)
+            away = origin + distance * toward - self._places[name]
+            shares = 0.5 + away @ np.stack([up, right], axis=1) / self._size
+            found = np.floor(shares * self._shape).astype(int).clip(0, np.array(self._shape) - 1)
+            choose((int(found[0]), int(found[1])))
+
+        return clicked
+
+    def show(self, maps: Mapping[str, NDArray[np.float32]], chosen: tuple[int, int] | None) -> None:
+        """Draw maps, each below its own peak; the residual where both are known.
+
+        Args:
+            maps: Power [range, u], by the name of the picture.
+            chosen: A bin that is framed.
+        """
+        from matplotlib import colormaps
+
+        levels = {name: _decibels(power) for name, power in maps.items()}
+        pictures = {
+            name: colormaps["viridis"](1 - level / _DARKEST) for name, level in levels.items()
+        }
+        if MEASURED in levels and SIMULATED in levels:
+            apart = levels[MEASURED] - levels[SIMULATED]
+            pictures[RESIDUAL] = colormaps["RdBu_r"](0.5 + apart / (2 * _LARGEST))
+        for name, colors in pictures.items():
+            if name in self._nodes and not (name in maps and self._has(name, maps[name], chosen)):
+                self._nodes[name].image = _drawn(np.uint8(255 * colors[..., :3]), chosen)
+
+    def _has(self, name: str, power: NDArray[np.float32], chosen: Any) -> bool:
+        """Whether a picture shows that already; from now on it does."""
+        before, frame = self._known.get(name, (None, None))
+        self._known[name] = power, chosen
+        return before is not None and frame == chosen and bool((before == power).all())
+
+
+def _decibels(power: NDArray[np.float32]) -> NDArray[Any]:
+    peak = float(power.max()) or 1.0
+    return (10 * np.log10(np.maximum(power / peak, 1e-30))).clip(_DARKEST, 0.0)
+
+
+def _drawn(colors: Any, chosen: tuple[int, int] | None) -> NDArray[np.uint8]:
+    """A picture with the farthest range on top, each bin some pixels large."""
+    times = [max(1, -(-_PIXELS // count)) for count in colors.shape[:2]]
+    large = colors.repeat(times[0], axis=0).repeat(times[1], axis=1)
+    if chosen is not None:
+        rows, columns = (
+            np.arange(k * size - 2, (k + 1) * size + 2).clip(0, end - 1)
+            for k, size, end in zip(chosen, times, large.shape, strict=False)
+        )
+        large[rows[:, None], columns[[0, 1, -2, -1]]] = (255, 60, 60)
+        large[rows[[0, 1, -2, -1]][:, None], columns] = (255, 60, 60)
+    return np.ascontiguousarray(large[::-1])
+
+
+def _quaternion(axes: NDArray[np.float64]) -> tuple[float, ...]:
+    """The rotation whose columns these are, w first."""
+    from scipy.spatial.transform import Rotation
+
+    return tuple(Rotation.from_matrix(axes).as_quat()[[3, 0, 1, 2]].tolist())

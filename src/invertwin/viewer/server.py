@@ -1,0 +1,393 @@
+"""A display in the browser that answers: `viser` draws, one thread of ours traces rays."""
+
+import importlib
+import io
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from invertwin.errors import InputError
+from invertwin.scene import rigid, rotation_from_quaternion
+from invertwin.viewer.display import Display, Layer, Step
+from invertwin.viewer.guard import LOOPBACK, Guard, guarding
+from invertwin.viewer.layers import floats
+from invertwin.viewer.link import Link, Seen
+from invertwin.viewer.panels import MEASURED, RESIDUAL, SIMULATED, Panels
+
+_NOBODY = "nothing"
+_SHOWN_PATHS = 300  # rays that are drawn
+_TIMES = 10  # updates over which their rate is taken
+_PAUSE = 1.0  # seconds: later updates do not follow each other
+_STILL = 0.4  # seconds after which nothing moves
+# Layers of the present position, and their colours.
+_PATHS, _SEEN, _EDGES, _FED = "sampled paths", "what is seen", "boundary paths", "chosen bin"
+_OWN = {_PATHS: (120, 170, 220), _SEEN: (30, 140, 90), _EDGES: (200, 40, 160), _FED: (255, 220, 0)}
+
+
+@dataclass
+class _Wish:
+    """What the person has chosen last."""
+
+    step: int
+    frame: int = 0
+    moved: str = _NOBODY
+    turn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    place: tuple[float, ...] = (0.0, 0.0, 0.0)
+    bin: tuple[int, int] | None = None
+
+
+class Viewer:
+    """A display that a browser shows, until it is closed.
+
+    It listens on this machine alone. Elsewhere it needs a token, which is part of its address.
+
+    Args:
+        display: What is shown.
+        link: Lets people move objects, and shows maps and paths; None = it only shows.
+        host: Where it listens.
+        port: The first one that is tried.
+        token: See ``Guard``.
+
+    Attributes:
+        address: What to open in a browser.
+        rate: Maps a second, over the last ones that followed each other.
+
+    Raises:
+        InputError: No `viser`, or a host without a token.
+    """
+
+    def __init__(
+        self,
+        display: Display,
+        link: Link | None = None,
+        *,
+        host: str = LOOPBACK,
+        port: int = 8080,
+        token: str | None = None,
+    ) -> None:
+        guard = Guard(host, token)
+        self._server = _started(guard, host, port)
+        query = "" if token is None else f"/?token={token}"
+        named = f"[{host}]" if ":" in host else host
+        self.address = f"http://{named}:{self._server.get_port()}{query}"
+        self._link, self._steps = link, list(display.steps)
+        self._display = display
+        self._lock, self._due, self._closed = threading.Lock(), threading.Event(), False
+        self._wish = _Wish(step=len(self._steps) - 1)
+        self._taken: int | None = None  # the step whose bodies the link has
+        self._times: deque[float] = deque(maxlen=_TIMES)
+        self._seen: Seen | None = None
+        self._nodes: dict[str, Any] = {}
+        self._visible = display.groups | {name: name != _PATHS for name in _OWN if link}
+        self._arrange()
+        self._worker = threading.Thread(target=self._work, daemon=True)
+        self._worker.start()
+        self._due.set()
+
+    @property
+    def rate(self) -> float:
+        """Maps a second, over the last ones that followed each other."""
+        times = list(self._times)
+        return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
+
+    def add_step(self, step: Step) -> None:
+        """Show a further step of a fit that goes on; who looks at the last one follows.
+
+        Args:
+            step: The step.
+        """
+        with self._lock:
+            follows = self._wish.step == len(self._steps) - 1
+            self._steps.append(step)
+        self._step.max = max(1, len(self._steps) - 1)
+        self._step.visible = len(self._steps) > 1
+        if follows:
+            self._step.value = len(self._steps) - 1
+            self._choose(step=len(self._steps) - 1)
+
+    def wait(self) -> None:
+        """Return when the viewer is closed; Ctrl-C closes it."""
+        try:
+            while not self._closed:
+                time.sleep(0.2)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Stop listening."""
+        if not self._closed:
+            self._closed = True
+            self._due.set()
+            self._worker.join()
+            with redirect_stdout(io.StringIO()):
+                self._server.stop()
+
+    def __enter__(self) -> "Viewer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _choose(self, **changes: Any) -> None:
+        """Note what the person wants; the worker takes the latest."""
+        with self._lock:
+            self._wish = replace(self._wish, **changes)
+        self._due.set()
+
+    def _arrange(self) -> None:
+        """Put everything into the window."""
+        display, gui, scene = self._display, self._server.gui, self._server.scene
+        scene.set_up_direction(display.up)
+        # Shadows and mirrored surroundings tell nothing here, and halve the rate without a GPU.
+        scene.configure_default_lights(cast_shadow=False)
+        scene.configure_environment_map(hdri=None)
+        scene.add_light_ambient("/light", intensity=1.2)
+        gui.set_panel_label("invertwin")
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        # Texts of fields are shown as they are; markdown would run what names hold.
+        gui.add_text("shown", display.title, disabled=True)
+        count = len(self._steps)
+        self._step = gui.add_slider(
+            "step", 0, max(1, count - 1), 1, max(0, count - 1), visible=count > 1
+        )
+        self._step.on_update(lambda _: self._choose(step=int(self._step.value)))
+        self._where = gui.add_text("fit", "", disabled=True, visible=count > 1)
+        low, high = display.box
+        self._size = float(np.linalg.norm(high - low)) or 1.0
+        link, maps = self._link, display.maps
+        self._arrange_link()
+        with gui.add_folder("layers"):
+            for group, shown in self._visible.items():
+                box = gui.add_checkbox(group, shown)
+                box.on_update(self._switch(group))
+        self._said = gui.add_text("note", "", disabled=True, visible=False)
+        for layer in display.layers:
+            self._put(layer)
+        shown = [MEASURED] if maps is not None else []
+        if link is not None:
+            shown += [SIMULATED, RESIDUAL] if shown else [SIMULATED]
+        shape = (len(maps.ranges), len(maps.across)) if maps else (0, 0)
+        self._panels = Panels(self._server, display, shown, link.grid.shape[:2] if link else shape)
+        self._panels.on_click(lambda found: self._choose(bin=found))
+        camera = self._server.initial_camera
+        middle = (low + high) / 2
+        up, ahead = np.array(display.up), np.array(display.ahead)
+        # The window's own panel covers its right, where u falls.
+        camera.look_at = middle + 0.6 * self._panels.offset - 0.3 * self._size * self._panels.right
+        camera.position = camera.look_at + self._size * (
+            0.15 * up - 1.6 * ahead + 0.25 * self._panels.right
+        )
+        camera.up = up
+
+    def _arrange_link(self) -> None:
+        gui, link, maps = self._server.gui, self._link, self._display.maps
+        if link is None and maps is None:
+            return
+        frames = link.radar.frame_count if link else maps.frames[-1] + 1 if maps else 1
+        self._frame = gui.add_slider("position", 0, max(1, frames - 1), 1, 0, visible=frames > 1)
+        self._frame.on_update(lambda _: self._choose(frame=int(self._frame.value)))
+        self._bin = gui.add_text("bin", "click a map", disabled=True)
+        if link is None:
+            return
+        self._mover = gui.add_dropdown("move", (_NOBODY, *link.names), initial_value=_NOBODY)
+        self._mover.on_update(lambda _: self._grab(str(self._mover.value)))
+        self._rate = gui.add_text("maps a second", "", disabled=True)
+        self._gizmo = self._server.scene.add_transform_controls(
+            "/gizmo", scale=0.4 * self._size, depth_test=False, visible=False
+        )
+        self._gizmo.on_update(lambda _: self._move())
+
+    def _switch(self, group: str) -> Callable[[Any], None]:
+        def switch(event: Any) -> None:
+            self._visible[group] = bool(event.target.value)
+            for name, node in list(self._nodes.items()):
+                if name.split("/")[0] == group:
+                    node.visible = self._visible[group]
+
+        return switch
+
+    def _grab(self, name: str) -> None:
+        """Let the person move an object, from where the step has it."""
+        assert self._link is not None
+        self._release()
+        if name != _NOBODY:
+            center = tuple(self._link.scene[name].center.detach().tolist())
+            self._gizmo.position, self._gizmo.wxyz = center, (1.0, 0.0, 0.0, 0.0)
+            self._center = np.array(center)
+            self._choose(moved=name, turn=(1.0, 0.0, 0.0, 0.0), place=center)
+        self._gizmo.visible = name != _NOBODY
+
+    def _release(self) -> None:
+        """Put what was moved back."""
+        node = self._nodes.get(f"twin/{self._wish.moved}")
+        if node is not None:
+            node.wxyz, node.position = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        self._choose(moved=_NOBODY)
+
+    def _move(self) -> None:
+        """Follow the gizmo: the surface at once, the map when it is traced."""
+        wish = self._wish
+        if wish.moved == _NOBODY:
+            return
+        turn = tuple(float(x) for x in self._gizmo.wxyz)
+        place = tuple(float(x) for x in self._gizmo.position)
+        node = self._nodes.get(f"twin/{wish.moved}")
+        if node is not None:
+            motion = self._motion(turn, place).numpy()
+            with self._server.atomic():
+                node.wxyz, node.position = turn, motion[:3, 3]
+        self._choose(turn=turn, place=place)
+
+    def _motion(self, turn: tuple[float, ...], place: tuple[float, ...]) -> torch.Tensor:
+        rotation = rotation_from_quaternion(torch.tensor(turn, dtype=torch.float64))
+        center = torch.as_tensor(self._center, dtype=torch.float64)
+        return rigid(rotation, torch.tensor(place, dtype=torch.float64) - rotation @ center)
+
+    def _put(self, layer: Layer, size: float = 1.0) -> None:
+        """Draw a layer, in place of the one of its name."""
+        scene, visible = self._server.scene, self._visible[layer.group]
+        # Slashes would part a name into nodes of a tree, which are hidden together.
+        node = "/" + "/".join(part.replace("/", "∕") for part in layer.name.split("/", 1))
+        how: dict[str, Any] = {"visible": visible}
+        if layer.kind == "surface":
+            made = scene.add_mesh_simple(
+                node,
+                layer.points,
+                layer.faces,
+                color=layer.color,
+                opacity=None if layer.opacity == 1 else layer.opacity,
+                flat_shading=True,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+                **how,
+            )
+        elif layer.kind == "lines":
+            pairs = layer.points.reshape(-1, 2, 3)
+            thick = {"thickness": 1.5, "thickness_units": "screen"}
+            made = scene.add_line_segments(node, pairs, colors=layer.color, **thick, **how)
+        else:
+            made = scene.add_point_cloud(
+                node,
+                layer.points,
+                colors=layer.color,
+                point_size=0.006 * size * self._size,
+                point_shape="circle",
+                precision="float32",
+                **how,
+            )
+        self._nodes[layer.name] = made
+
+    def _work(self) -> None:
+        """Trace what the person wants, the latest alone; single paths when nothing moves."""
+        while True:
+            self._due.wait()
+            self._due.clear()
+            if self._closed:
+                return
+            with self._lock:
+                wish = self._wish
+            try:
+                self._show_step(wish)
+                if self._link is not None or self._display.maps is not None:
+                    self._follow(wish)
+                self._said.visible = False
+            except InputError as error:
+                self._said.value, self._said.visible = str(error), True
+
+    def _show_step(self, wish: _Wish) -> None:
+        if not self._steps or wish.step == self._taken:
+            return
+        if wish.moved != _NOBODY:
+            self._mover.value = _NOBODY  # what was moved stands where the step has it
+        self._taken, step = wish.step, self._steps[wish.step]
+        for layer in self._display.at_step(step).layers:
+            if layer.name.removeprefix("twin/") in step.bodies:
+                node = self._nodes[layer.name]
+                if node.faces.shape == layer.faces.shape and (node.faces == layer.faces).all():
+                    node.vertices = layer.points
+                else:
+                    self._put(layer)
+        self._where.visible, self._where.value = True, step.label
+        if self._link is not None:
+            self._link.take(step.bodies)
+
+    def _follow(self, wish: _Wish) -> None:
+        """Show the maps of a position, and its paths once nothing moves."""
+        link, known = self._link, self._display.maps
+        maps = known.at(wish.frame) if known else {}
+        if link is None:
+            scene = None
+        elif wish.moved == _NOBODY:
+            scene = link.scene
+        else:
+            scene = link.moved(wish.moved, self._motion(wish.turn, wish.place))
+        if link is not None and scene is not None:
+            maps |= {SIMULATED: floats(link.map(scene, wish.frame))}
+        self._panels.show(maps, wish.bin)
+        if wish.bin is not None:
+            self._bin.value = self._told(*wish.bin)
+        if link is None or scene is None:
+            return
+        now = time.perf_counter()
+        if self._times and now - self._times[-1] > _PAUSE:
+            self._times.clear()
+        self._times.append(now)
+        if len(self._times) == _TIMES:
+            self._rate.value = f"{self.rate:.0f}"
+        if not self._due.wait(_STILL):
+            self._show_paths(link.seen(scene, wish.frame), wish.bin)
+
+    def _told(self, row: int, column: int) -> str:
+        """A bin in words."""
+        if self._link is not None:
+            grid = self._link.grid
+            away, across = float(grid.ranges[row]), float(grid.u[column])
+        else:
+            assert self._display.maps is not None
+            away, across = self._display.maps.ranges[row], self._display.maps.across[column]
+        return f"range {away:.2f} m, u {across:.3f}"
+
+    def _show_paths(self, seen: Seen, chosen: tuple[int, int] | None) -> None:
+        points = floats(seen.points)
+        some = points[:: max(1, len(points) // _SHOWN_PATHS)]
+        place = np.broadcast_to(floats(seen.place), some[:, 0].shape)
+        corners = np.stack([place, some[:, 0], some[:, 0], some[:, 1]], axis=1)
+        fed = floats(seen.feeding(*chosen)) if chosen else np.zeros((0, 3), np.float32)
+        found: dict[str, tuple[str, NDArray[np.float32], float]] = {
+            _PATHS: ("lines", corners.reshape(-1, 3), 1.0),
+            _SEEN: ("points", points[:, 1], 0.4),
+            _EDGES: ("points", floats(seen.edges), 0.7),
+            _FED: ("points", fed, 1.5),
+        }
+        with self._server.atomic():
+            for name, (kind, places, size) in found.items():
+                self._put(Layer(name, kind, places, color=_OWN[name]), size)  # type: ignore[arg-type]
+
+
+def _started(guard: Guard, host: str, port: int) -> Any:
+    """The server of viser, behind a guard."""
+    try:
+        viser: Any = importlib.import_module("viser")
+    except ImportError:
+        raise InputError(
+            "expected the package viser for the viewer, got none; type: "
+            'pip install "invertwin[view]"'
+        ) from None
+
+    class Server(viser.ViserServer):
+        """One that never opens a tunnel to a server of others, which any browser might ask for."""
+
+        def request_share_url(self, verbose: bool = True) -> None:
+            return None
+
+    with guarding(guard), redirect_stdout(io.StringIO()):
+        return Server(host=host, port=port, verbose=False)

@@ -1,0 +1,201 @@
+"""The viewer in a real browser: it loads, follows, answers clicks, and is alone with its server."""
+
+import json
+import math
+import os
+import time
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+import torch
+
+from invertwin.radar import FMCW, Radar
+from invertwin.scene import Object, RoughDielectric, Scene, planar_array, plate, rigid, sphere
+from invertwin.viewer import Body, Link, Maps, Step, Viewer, body_of, display_of
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+LOADED = 3.0  # s
+RATE = 5.0  # maps a second, with 20 000 triangles
+
+
+def note(pictures: Path, **figures: float) -> None:
+    """Keep measured figures."""
+    file = pictures / "figures.json"
+    known = json.loads(file.read_text()) if file.exists() else {}
+    file.write_text(json.dumps(known | figures, indent=2) + "\n")
+
+
+@pytest.fixture(scope="module")
+def viewer(chromium: Any):
+    array = planar_array((16, 4), (1.9e-3, 1.9e-3))
+    waveform = FMCW(77e9, 2e9, 50e-6, 128)
+    places = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0]], dtype=torch.float64)
+    radar = Radar(planar_array((1, 1), (1.9e-3, 1.9e-3)), array, waveform, places)
+    grid = radar.grid(1.0, 4.5, 0.5, 0.5)
+    material = RoughDielectric(4.0)
+    ball = Object(sphere(0.3, 5), material, rigid(translation=[0.0, 0.0, 2.0]))
+    wall = Object(plate(3.0, 2.4), material, rigid(translation=[0.0, 0.0, 3.3]))
+    scene = Scene({"ball": ball, "wall": wall})
+    assert len(ball.mesh.faces) >= 20_000
+    link = Link(scene, radar, grid)
+    truth = scene.replace("ball", pose=rigid(translation=[0.1, 0.0, 2.1]))
+    measured = torch.stack([link.map(truth, k)[..., None] for k in range(2)])
+    begun, away = body_of(ball), np.array([0.1, 0.0, 0.0], np.float32)
+    steps = [
+        Step(
+            k,
+            f"step {k}",
+            {"ball": Body(begun.vertices - k * away, begun.faces)},
+        )
+        for k in range(6)
+    ]
+    display = display_of(scene, {"": (radar, grid)}, "<script>alert(1)</script>", fitted=["ball"])
+    display = type(display)(
+        display.title, display.layers, steps, Maps.of({"measured": measured}, grid)
+    )
+    with Viewer(display, link, port=0) as found:
+        yield found
+
+
+def opened(watched: Any, viewer: Viewer) -> float:
+    """Seconds until the page is drawn and its panel answers."""
+    begin = time.monotonic()
+    watched.page.goto(viewer.address)
+    watched.page.wait_for_selector("canvas")
+    watched.page.get_by_role("slider").first.wait_for()
+    return time.monotonic() - begin
+
+
+def seen_at(viewer: Viewer, place: Any) -> tuple[float, float]:
+    """Where a point of the world is on the screen [pixels]."""
+    camera = next(iter(viewer._server.get_clients().values())).camera
+    ahead = camera.look_at - camera.position
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, camera.up_direction)
+    right /= np.linalg.norm(right)
+    away = np.asarray(place) - camera.position
+    scale = 320 / np.tan(camera.fov / 2) / (away @ ahead)
+    return 512 + scale * (away @ right), 320 - scale * (away @ np.cross(right, ahead))
+
+
+def test_it_loads_and_reaches_nobody_else(watched, viewer, pictures):
+    seconds = min(opened(watched, viewer) for _ in range(3))  # others use the machine too
+    watched.page.wait_for_timeout(2000)
+    watched.page.screenshot(path=str(pictures / "viewer.png"))
+    assert watched.errors == []
+    hosts = {
+        urlsplit(url).hostname for url in watched.requests if url.split(":")[0] in "http ws wss"
+    }
+    assert hosts == {"127.0.0.1"}
+    note(pictures, viewer_load_seconds=seconds)
+    assert seconds <= LOADED
+
+
+def test_the_map_follows_what_a_person_drags(watched, viewer, pictures):
+    opened(watched, viewer)
+    page = watched.page
+    page.wait_for_timeout(2000)
+    page.get_by_role("combobox").click()
+    page.get_by_role("option", name="ball").click()
+    page.wait_for_timeout(1000)
+    center = viewer._center
+    begun = np.array(viewer._gizmo.position)
+    x, y = seen_at(viewer, center + np.array([0.3 * viewer._size, 0.0, 0.0]))
+    page.mouse.move(x, y)
+    page.wait_for_timeout(300)
+    page.mouse.down()
+    watched.received.clear()
+    begin = time.monotonic()
+    k = 1
+    while time.monotonic() - begin < 4.0:
+        k = -k
+        page.mouse.move(x + 40 * k, y, steps=20)
+    seconds = time.monotonic() - begin
+    page.mouse.up()
+    page.screenshot(path=str(pictures / "dragged.png"))
+    rate = maps_in(watched.received) / seconds
+    moved = np.linalg.norm(np.array(viewer._gizmo.position) - begun)
+    page.get_by_role("combobox").click()
+    page.get_by_role("option", name="nothing").click()
+    note(pictures, updates_per_second=rate, triangles=20_480)
+    assert moved > 0.01
+    assert watched.errors == []
+    assert rate >= RATE
+
+
+def maps_in(frames: list[bytes]) -> int:
+    """How many pictures of the simulated map have come."""
+    import msgspec  # pyright: ignore[reportMissingImports]
+    import zstandard  # pyright: ignore[reportMissingImports]
+
+    found = 0
+    for frame in frames:
+        size = int.from_bytes(frame[8:16], "little")
+        text = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size])
+        for message in msgspec.msgpack.decode(text)["messages"]:
+            if message.get("name") == "/maps/simulated" and "_data" in str(message.get("updates")):
+                found += 1
+    return found
+
+
+def test_the_slider_moves_the_mesh(watched, viewer, pictures, blue):
+    opened(watched, viewer)
+    page = watched.page
+    page.wait_for_timeout(2500)
+    hidden = page.get_by_role("checkbox")  # what is seen would cover the mesh
+    hidden.nth(list(viewer._visible).index("what is seen")).click()
+    columns = []
+    for number, key in ((5, "End"), (0, "Home")):
+        page.get_by_role("slider").first.press(key)
+        page.wait_for_timeout(2500)
+        page.screenshot(path=str(pictures / f"step_{number}.png"))
+        whole = {"x": 0, "y": 0, "width": 680, "height": 640}  # left of the window's panel
+        columns.append(blue(page.screenshot(clip=whole)))
+    away = [seen_at(viewer, [-0.1 * k, 0.0, 2.0])[0] for k in (5, 0)]
+    assert columns[0] - columns[1] == pytest.approx(away[0] - away[1], rel=0.25)
+    assert watched.errors == []
+
+
+def test_a_click_on_a_map_lights_the_points_that_feed_it(watched, viewer, pictures):
+    opened(watched, viewer)
+    page = watched.page
+    page.wait_for_timeout(1000)
+    page.get_by_role("slider").first.press("End")
+    page.wait_for_timeout(2500)
+    grid = viewer._link.grid
+    # The last step has the ball at x = -0.5 m.
+    row = round((math.hypot(0.5, 2.0) - 0.3 - grid.range_start) / grid.range_step)
+    column = round((-0.5 / math.hypot(0.5, 2.0) - grid.u_start) / grid.u_step)
+    panels = viewer._panels
+    right, up = panels._axes
+    shares = (np.array([column, row]) + 0.5) / [grid.u_count, grid.range_count] - 0.5
+    place = panels._places["simulated"] + panels._size * (shares[0] * right + shares[1] * up)
+    page.mouse.click(*seen_at(viewer, place))
+    page.wait_for_timeout(2500)
+    page.screenshot(path=str(pictures / "clicked.png"))
+    assert viewer._wish.bin == (row, column)
+    fed = viewer._nodes["chosen bin"].points
+    ranges = np.linalg.norm(fed, axis=1)
+    assert len(fed) > 3
+    assert np.abs(ranges - float(grid.ranges[row])).max() <= 1.01 * grid.range_step
+    assert watched.errors == []
+
+
+def test_no_port_is_open_beyond_loopback(viewer):
+    own = {os.readlink(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd") if _there(n)}
+    rows = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path(f"/proc/self/net/{name}").read_text().splitlines()[1:]
+    ]
+    listening = [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own]
+    assert listening
+    assert all(place.startswith("0100007F:") for place in listening)
+
+
+def _there(number: str) -> bool:
+    return os.path.islink(f"/proc/self/fd/{number}")

@@ -1,0 +1,120 @@
+"""`invertwin view` and `reconstruct --view`: what there is to see of runs, run files, captures."""
+
+import html
+import importlib.util
+import re
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli.small import RUN, call, read_metrics
+from invertwin.cli.fits.displays import VIEW, steps_in
+from invertwin.cli.run_file import load_run
+from invertwin.cli.run_view import shown_of
+from invertwin.viewer import Display, Viewer, policy
+
+EVIL = "<script>alert(1)</script>"
+NEEDS_VISER = pytest.mark.skipif(
+    importlib.util.find_spec("viser") is None, reason='needs: pip install "invertwin[view]"'
+)
+
+
+def test_a_run_file_shows_the_truth_and_can_be_moved(run_file):
+    display, link = shown_of(run_file)
+    run = load_run(run_file)
+    layers = {layer.name: layer for layer in display.layers}
+    name = next(iter(run.truth))
+    center = (layers[f"twin/{name}"].points.min(0) + layers[f"twin/{name}"].points.max(0)) / 2
+    assert center == pytest.approx(run.truth[name].position, abs=1e-5)
+    assert link is not None
+    assert link.names == tuple(run.scene)
+
+
+def test_a_fit_leaves_its_steps_and_a_report_in_which_no_name_acts(run_file, monkeypatch, capsys):
+    text = RUN.replace('object = "plate"', f'object = "{EVIL}"')
+    run_file.write_text(re.sub(r"\[(scene|truth)\.plate]", rf'[\1."{EVIL}"]', text))
+    assert call(monkeypatch, "reconstruct", run_file) == 0
+    folder = Path("out/small")
+    metrics = read_metrics(folder)
+    display, link = shown_of(folder)
+    assert [step.number for step in display.steps] == list(range(metrics["steps"] + 1))
+    assert display.steps[0].label == "start"
+    assert f"{metrics['loss']:.4g}" in display.steps[-1].label
+    begun, ended = (display.steps[k].bodies[EVIL].vertices for k in (0, -1))
+    assert (ended - begun).std(0) == pytest.approx(0, abs=1e-5)  # it was moved, not turned
+    assert np.linalg.norm(ended - begun, axis=1).mean() > 1e-3
+    layers = {layer.name: layer for layer in display.layers}
+    assert layers[f"twin/{EVIL}"].points == pytest.approx(ended, abs=1e-6)
+    assert {"truth", "start", "radar", "95 % ellipsoid"} <= set(display.groups)
+    assert display.maps is not None
+    assert set(display.maps.power) == {"measured", "simulated"}
+    assert link is not None
+    assert link.scene[EVIL].vertices.numpy() == pytest.approx(ended, abs=1e-6)
+    report = (folder / "report.html").read_text()
+    assert "<script>alert" not in report
+    assert 'id="view-data"' in report
+    assert policy() in html.unescape(report)
+    assert call(monkeypatch, "view", folder, "--record", "page.html") == 0
+    assert "<script>alert" not in Path("page.html").read_text()
+
+
+def test_a_capture_shows_its_maps(run_file, monkeypatch):
+    assert call(monkeypatch, "simulate", run_file) == 0
+    display, link = shown_of(Path("out/small/capture.nc"))
+    assert link is None
+    assert display.maps is not None
+    assert len(display.maps.frames) == len(display.layers[0].points)
+    assert shown_of(Path("out/small"))[0].maps is not None
+
+
+@pytest.mark.parametrize("target", ["none.toml", "empty", "picture.png"])
+def test_what_cannot_be_shown_is_one_line(target, run_file, monkeypatch, capsys):
+    Path("empty").mkdir()
+    assert call(monkeypatch, "view", target) == 2
+    error = capsys.readouterr().err
+    assert "expected a run" in error
+    assert error.count("\n") == 1
+
+
+def test_a_host_of_others_without_a_token_is_refused(run_file, monkeypatch, capsys):
+    assert call(monkeypatch, "view", run_file, "--host", "0.0.0.0") == 2
+    assert "expected a token" in capsys.readouterr().err
+
+
+def test_a_damaged_view_is_refused(run_file, monkeypatch, capsys):
+    folder = Path("out/small")
+    folder.mkdir(parents=True)
+    (folder / "run.toml").write_text(RUN)
+    (folder / VIEW).write_bytes(b"damaged")
+    assert call(monkeypatch, "view", folder) == 2
+    assert "repeat the run with --overwrite" in capsys.readouterr().err
+
+
+@NEEDS_VISER
+def test_a_fit_is_seen_while_it_goes_on(run_file, monkeypatch, capsys):
+    seen = []
+    plain = Viewer.add_step
+
+    def noted(self: Viewer, step) -> None:
+        plain(self, step)
+        port = self._server.get_port()
+        with socket.create_connection(("127.0.0.1", port), timeout=5):
+            seen.append(step.number)
+
+    monkeypatch.setattr(Viewer, "add_step", noted)
+    assert call(monkeypatch, "reconstruct", run_file, "--view") == 0
+    assert "open http://127.0.0.1:" in capsys.readouterr().out
+    assert seen == list(range(read_metrics(Path("out/small"))["steps"] + 1))
+
+
+def test_workers_cannot_be_viewed(run_file, monkeypatch, capsys):
+    assert call(monkeypatch, "reconstruct", run_file, "--view", "--workers", "2") == 2
+    assert "expected --view with fits" in capsys.readouterr().err
+
+
+def test_no_file_has_no_steps(tmp_path):
+    assert steps_in(tmp_path / "none.npz") == []
+    Display("", []).save(tmp_path / "empty.npz")
+    assert steps_in(tmp_path / "empty.npz") == []

@@ -1,0 +1,136 @@
+"""Displays as arrays: layers of scenes, radars and error bars; files."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from invertwin.channel import Grid
+from invertwin.errors import InputError
+from invertwin.radar import FMCW, Radar
+from invertwin.scene import Object, RoughDielectric, Scene, box, planar_array, plate, rigid
+from invertwin.viewer import Body, Display, Link, Maps, Step, body_of, display_of, ellipsoid_layers
+
+GRID = Grid(1.0, 0.05, 60, -0.5, 0.05, 21)
+
+
+def scene() -> Scene:
+    material = RoughDielectric(4.0)
+    cube = Object(box((0.4, 0.4, 0.4)), material, rigid(translation=[0.3, 0.0, 2.0]))
+    wall = Object(plate(2.0, 2.0), material, rigid(translation=[0.0, 0.0, 3.0]))
+    return Scene({"a/cube": cube, "wall": wall})
+
+
+def radar() -> Radar:
+    array = planar_array((16, 1), (1.9e-3, 1.9e-3))
+    places = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], dtype=torch.float64)
+    one = planar_array((1, 1), (1.9e-3, 1.9e-3))
+    return Radar(one, array, FMCW(77e9, 1.5e9, 5e-5, 128), places)
+
+
+def display() -> Display:
+    made = display_of(scene(), {"": (radar(), GRID)}, "title", truth=scene(), fitted=["a/cube"])
+    body = body_of(scene()["a/cube"])
+    steps = [
+        Step(k, f"step {k}", {"a/cube": Body(body.vertices + np.float32(k), body.faces)})
+        for k in range(3)
+    ]
+    power = torch.rand(2, 60, 21, 1, generator=torch.Generator().manual_seed(1))
+    return replace(made, steps=steps, maps=Maps.of({"measured": power}, GRID))
+
+
+def test_layers_are_where_things_are():
+    found = {layer.name: layer for layer in display().layers}
+    assert list(found) == ["twin/a/cube", "twin/wall", "truth/a/cube", "radar", "beams"]
+    assert found["twin/a/cube"].points.min(0) == pytest.approx([0.1, -0.2, 1.8], abs=1e-6)
+    assert found["radar"].points.tolist() == [[0, 0, 0], [0.5, 0, 0]]
+    # A beam is as wide as the map, and as long as the scene is far.
+    end = found["beams"].points[1]
+    assert abs(end[0]) / np.linalg.norm(end) == pytest.approx(0.5, rel=0.01)
+    assert display().groups == {"twin": True, "truth": True, "radar": True, "beams": False}
+
+
+def test_a_step_moves_its_layer_alone():
+    made = display()
+    before = {layer.name: layer.points for layer in made.layers}
+    after = {layer.name: layer.points for layer in made.at_step(made.steps[2]).layers}
+    moved = [name for name in before if not np.array_equal(before[name], after[name])]
+    assert moved == ["twin/a/cube"]
+    assert after["twin/a/cube"] - before["twin/a/cube"] == pytest.approx(2.0, abs=1e-6)
+
+
+def test_a_file_holds_everything_and_triangles_once(tmp_path):
+    made = display()
+    made.save(tmp_path / "view.npz")
+    read = Display.load(tmp_path / "view.npz")
+    assert [vars(x).keys() for x in read.layers] == [vars(x).keys() for x in made.layers]
+    for one, other in zip(read.layers, made.layers, strict=True):
+        assert np.array_equal(one.points, other.points)
+        assert (one.name, one.color, one.shown) == (other.name, other.color, other.shown)
+    assert [step.label for step in read.steps] == ["step 0", "step 1", "step 2"]
+    one, other = (x.steps[1].bodies["a/cube"].vertices for x in (read, made))
+    assert np.array_equal(one, other)
+    assert read.maps is not None
+    assert made.maps is not None
+    assert np.array_equal(read.maps.at(1)["measured"], made.maps.at(1)["measured"])
+    assert (read.title, read.up, read.ahead) == (made.title, made.up, made.ahead)
+    names = np.load(tmp_path / "view.npz").files
+    assert len(names) < 1 + 2 * len(made.layers) + 2 * len(made.steps)
+
+
+def test_damaged_files_are_refused(tmp_path):
+    (tmp_path / "view.npz").write_bytes(b"no archive")
+    with pytest.raises(InputError, match="npz"):
+        Display.load(tmp_path / "view.npz")
+    made = display()
+    bad = replace(made.layers[0], faces=np.array([[0, 1, 999]], np.int32))
+    replace(made, layers=[bad]).save(tmp_path / "view.npz")
+    with pytest.raises(InputError, match="triangles without corners"):
+        Display.load(tmp_path / "view.npz")
+
+
+def test_many_frames_are_thinned_out_evenly():
+    power = torch.zeros(300, 200, 101, 1)
+    maps = Maps.of({"measured": power}, Grid(0.0, 0.1, 200, -1.0, 0.02, 101))
+    assert maps.frames[0] == 0
+    assert maps.frames[-1] == 299
+    assert len(maps.frames) == 2_000_000 // (200 * 101)
+    assert maps.at(1) == {} or 1 in maps.frames
+
+
+def test_ellipsoids_hold_95_percent():
+    names = ["wall.x", "wall.y", "wall.z"]
+    deviations = dict(zip(names, (0.1, 0.02, 0.05), strict=True))
+    correlations = [[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    metrics = {"standard_deviations": deviations, "correlations": correlations}
+    (layer,) = ellipsoid_layers(scene(), metrics)
+    scale = torch.tensor([*deviations.values()]).double()
+    covariance = torch.tensor(correlations).double() * scale * scale[:, None]
+    away = torch.tensor(layer.points).double() - scene()["wall"].center
+    # Every point of the circles is at the same distance by the covariance: 95 % of χ² with three.
+    squares = torch.einsum("ni,ij,nj->n", away, covariance.inverse(), away)
+    assert squares == pytest.approx(7.815, rel=1e-3)
+    drawn = torch.randn(20000, 3, generator=torch.Generator().manual_seed(1)).square().sum(1)
+    assert float((drawn < 7.815).double().mean()) == pytest.approx(0.95, abs=0.005)
+    assert ellipsoid_layers(scene(), {}) == []
+
+
+def test_a_link_says_what_feeds_a_bin_and_follows():
+    link = Link(scene(), radar(), GRID)
+    before = link.map(link.scene, 0)
+    moved = link.moved("a/cube", rigid(translation=torch.tensor([0.0, 0.0, 0.25]).double()))
+    after = link.map(moved, 0)
+    near = 1.0 + 0.05 * int(before.amax(1)[:28].argmax())
+    assert near == pytest.approx(1.8, abs=0.06)
+    assert 1.0 + 0.05 * int(after.amax(1)[:32].argmax()) == pytest.approx(2.05, abs=0.06)
+    seen = link.seen(link.scene, 0)
+    row, column = 17, round((0.1 / math.hypot(0.1, 1.8) + 0.5) / 0.05)
+    fed = seen.feeding(row, column)
+    assert len(fed) > 5
+    assert float((fed.norm(dim=1) - GRID.ranges[row]).abs().max()) <= 0.051
+    assert len(seen.edges) > 50
+    body = body_of(moved["a/cube"])
+    link.take({"a/cube": body})
+    assert link.map(link.scene, 0) == pytest.approx(after, rel=0.05, abs=float(after.max()) * 0.05)
