@@ -19,7 +19,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 # Rooms that have a page of the reference beside the package itself.
 ROOMS = (
     *("scene", "channel", "radar", "links", "camera", "simulation", "signatures", "capture"),
-    *("datasets", "models", "inversion", "discovery", "plotting"),
+    *("datasets", "models", "inversion", "discovery", "plotting", "viewer"),
 )
 CELL = re.compile(r"^# %%(.*)\n", re.MULTILINE)
 FENCE = re.compile(r"^```(python|pycon)\n(.*?)^```", re.MULTILINE | re.DOTALL)

@@ -58,7 +58,6 @@ class Viewer:
 
     Attributes:
         address: What to open in a browser.
-        rate: Maps a second, over the last ones that followed each other.
 
     Raises:
         InputError: No `viser`, or a host without a token.
