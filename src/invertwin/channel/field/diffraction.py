@@ -150,16 +150,18 @@ def double_dyad(
             first edge and of incidence on the second are on the same side.
         wave_number: k [1/m].
     """
-    total = torch.zeros((), dtype=torch.complex128)
-    behind = _dyads(second)
-    for one, before in zip(_couplings(first, wave_number), _dyads(first), strict=True):
-        for other, after in zip(_couplings(second, wave_number), behind, strict=True):
-            w = coupling * (one.side_out * other.side_in)
-            same, opposite = (corner_transition(one.s, other.s, way) for way in (w, -w))
-            strength = one.value * other.value * (same + opposite)
-            strength = strength + one.slope * other.slope * (same - opposite)
-            total = total + (strength / 2)[:, None, None] * (after @ before)
-    return total
+    before, after = _couplings(first, wave_number), _couplings(second, wave_number)
+    # All pairs at once: [term of the first, of the second, row].
+    sides = torch.tensor([[a.side_out * b.side_in for b in after] for a in before]).double()
+    w = sides[..., None] * coupling
+    s, t = (torch.stack([each.s for each in some]) for some in (before, after))
+    same, opposite = corner_transition(s[:, None], t, torch.stack([w, -w]))
+    strength = torch.stack([a.value for a in before])[:, None] * (same + opposite)
+    strength = strength * torch.stack([b.value for b in after])
+    uneven = torch.stack([a.slope for a in before])[:, None] * (same - opposite)
+    strength = (strength + uneven * torch.stack([b.slope for b in after])) / 2
+    dyads = [torch.stack(torch.broadcast_tensors(*_dyads(turn))) for turn in (first, second)]
+    return torch.einsum("abr,brij,arjk->rik", strength, dyads[1], dyads[0])
 
 
 class _Coupling(NamedTuple):

@@ -121,6 +121,7 @@ def corner_transition(
     """
     sides = torch.where(s < 0, -1.0, 1.0), torch.where(t < 0, -1.0, 1.0)
     s, t, side = s.abs(), t.abs(), sides[0] * sides[1]
+    s, t, _ = torch.broadcast_tensors(s, t, coupling)
     w = side * coupling
     root = torch.sqrt((1 - w) * (1 + w))
     parts = [
