@@ -1,6 +1,7 @@
 """What is free, and what is refused before any of it is taken."""
 
 import math
+import sys
 
 import pytest
 
@@ -39,3 +40,15 @@ def test_counts_beyond_a_stated_number_are_refused():
     for count in (6, math.inf, math.nan, 10**400):
         with pytest.raises(InputError, match="at most 5 bins"):
             memory.require_at_most(count, 5, "bins", "lower it")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not say")
+def test_the_most_that_was_held_never_falls():
+    before = memory.peak_memory()
+    assert before is not None
+    block = bytearray(int(before))
+    after = memory.peak_memory()
+    del block
+    assert after is not None
+    assert after > 1.5 * before
+    assert memory.peak_memory() == after

@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
@@ -15,6 +16,17 @@ _GROUPS = Path("/sys/fs/cgroup")
 def free_memory() -> float:
     """Bytes that this process may still take, of the machine, of its group, of its limit."""
     return max(0.0, min((_of_machine(), *_of_groups(), *_of_process())))
+
+
+def peak_memory() -> float | None:
+    """Most bytes that this process has held at a time; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    # Kilobytes, but on macOS.
+    unit = 1 if sys.platform == "darwin" else 1024
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
 
 
 def require_memory(needed: float, what: str, do: str, at: str = "") -> None:

@@ -111,6 +111,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert metrics["landscape"]["local_minima"]["exact"] >= 3
     assert metrics["start_loss_sharp"] > 0
     assert 0 < metrics["fit_seconds"] <= metrics["wall_seconds"]
+    assert 0.1 < metrics["peak_memory_gb"] < 8
     assert load_run(out / "run.toml").seed == 5
     report = (out / "report.html").read_text()
     assert report.count("data:image/png;base64,") == 5

@@ -55,6 +55,7 @@ from invertwin.cli.shape_tables import Mover
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.inversion.certainty import certainty, coverage
+from invertwin.memory import peak_memory
 from invertwin.runs import CHECKPOINT, RunFolder
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry.density import without_clouds
@@ -165,6 +166,8 @@ def run_reconstruct(
         metrics["landscape"] = minima
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
+    if (held := peak_memory()) is not None:
+        metrics["peak_memory_gb"] = held / 1e9
     fitted = Fitted(problem, metrics, rows, start, twin, maps, found.verdict.residuals)
     result, *tables = tables_of(fitted)
     steps = steps_in(folder.file(steps_file(best["checkpoint"])))
