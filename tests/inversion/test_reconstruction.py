@@ -45,6 +45,19 @@ def moved(fit: Reconstruction) -> torch.Tensor:
     return fit.parameters.state_dict()["0.translation"]
 
 
+def traced(monkeypatch) -> list[list[float]]:
+    """Where the radar stands, along x, in every map that is predicted from now on."""
+    seen: list[list[float]] = []
+    true = models.surrogate_spectrum
+
+    def spy(scene, radar, *rest, **options):
+        seen.append(radar.positions[:, 0].tolist())
+        return true(scene, radar, *rest, **options)
+
+    monkeypatch.setattr(models, "surrogate_spectrum", spy)
+    return seen
+
+
 class InterruptError(Exception):
     """Stands for whatever ends a run."""
 
@@ -332,14 +345,7 @@ def test_few_steps_are_a_spent_budget(case):
 
 def test_subsets_of_frames(case, monkeypatch):
     """Every step takes another few frames; over the steps all have their turn."""
-    seen = []
-    true = models.surrogate_spectrum
-
-    def spy(scene, radar, *rest, **options):
-        seen.append(radar.positions[:, 0].tolist())
-        return true(scene, radar, *rest, **options)
-
-    monkeypatch.setattr(models, "surrogate_spectrum", spy)
+    seen = traced(monkeypatch)
     fit(
         case.scene,
         case.radar,
@@ -354,13 +360,6 @@ def test_subsets_of_frames(case, monkeypatch):
 
 def test_frames_that_are_held_out_are_not_fitted_but_judge(case, monkeypatch):
     """What fitted frames show has moved, what the held out one shows has not: the start wins."""
-    seen = []
-    true = models.surrogate_spectrum
-
-    def spy(scene, radar, *rest, **options):
-        seen.append(radar.positions[:, 0].tolist())
-        return true(scene, radar, *rest, **options)
-
     with torch.no_grad():
         still = simulate(case.scene, case.radar, case.grid, sampling=EXACT, seed=7).beat
     mixed = case.capture.beat.clone()
@@ -368,7 +367,7 @@ def test_frames_that_are_held_out_are_not_fitted_but_judge(case, monkeypatch):
     capture = Capture.from_beat(mixed, case.radar)
     settings = case.settings(steps=60)
     free = fit(case.scene, case.radar, capture, case.parameters(), **settings)
-    monkeypatch.setattr(models, "surrogate_spectrum", spy)
+    seen = traced(monkeypatch)
     judged = fit(case.scene, case.radar, capture, case.parameters(), held_out=4, **settings)
     assert free.status != "diverged"
     assert float(moved(free).norm()) > 0.02
