@@ -780,7 +780,9 @@ class RadioMap(ForwardModel):
             return {}
         if rough is not None:
             rough = replace(rough, boundary=False)
-        reception = replace(self.reception, edges=0, rough=rough)
+        # In cells without diffraction, powers add.
+        bandwidth = self.reception.bandwidth if fixed is None else None
+        reception = replace(self.reception, edges=0, bandwidth=bandwidth, rough=rough)
         return {"boundary": replace(self, places=fixed or self.places, reception=reception)}
 
 

@@ -310,5 +310,46 @@ def test_what_is_no_map_is_refused():
     with pytest.raises(InputError, match="points"):
         CellSampling(points=0)
     cells = MapPlane.horizontal([0.0, 0.0], [1.0, 1.0], 1.0, 0.5)
-    with pytest.raises(InputError, match="bandwidth None and edges 0"):
-        cells.received(FAR, Transmitters(TX), Reception(FREQUENCY, 1e8, edges=1), 0)
+    with pytest.raises(InputError, match="with bandwidth None, or with edges, got bandwidth"):
+        cells.received(FAR, Transmitters(TX), Reception(FREQUENCY, 1e8), 0)
+
+
+def walled(shift: Tensor) -> Scene:
+    """A wall before the cells, moved sideways."""
+    place = float64([0.0, 0.0, 1.0]) + shift * float64([0.0, 1.0, 0.0])
+    return Scene({"wall": upright(1.0, 6.0, place)})
+
+
+def test_cells_in_a_shadow_hold_what_the_edges_of_it_diffract():
+    """The mean over a finer lattice of points, one by one; behind the wall nothing else arrives."""
+    cells = MapPlane.horizontal([0.8, -0.2], [1.6, 0.6], 0.6, 0.4, CellSampling(points=100))
+    round_edges = replace(DIRECT, bandwidth=1e8, edges=1)
+    still = walled(torch.zeros(()).double())
+    found = cells.received(still, Transmitters(TX), round_edges, 3)
+    line = float64([(k + 0.5) / 14 * 0.4 for k in range(14)])
+    for i in range(2):
+        for j in range(2):
+            x, y = torch.meshgrid(0.8 + 0.4 * i + line, -0.2 + 0.4 * j + line, indexing="ij")
+            flat = torch.stack([x.flatten(), y.flatten(), torch.full((196,), 0.6).double()], 1)
+            points = Points(flat).received(still, Transmitters(TX), round_edges, 3)
+            assert float(found.gain[0, i, j]) == pytest.approx(float(points.gain.mean()), rel=0.03)
+    dark = cells.received(still, Transmitters(TX), DIRECT, 3).gain
+    assert float(dark.min()) == 0.0
+    assert float(found.gain.min()) > 1e-4 * SCALE / 9
+    assert float(found.delay_spread.max()) < 5e-9
+
+
+def test_a_shadow_with_diffraction_sweeps_over_cells_as_differences_do():
+    cells = MapPlane.horizontal([0.8, -0.6], [2.0, 0.9], 0.6, 0.3, CellSampling(points=9))
+    gain = gains(cells, walled, replace(DIRECT, bandwidth=1e8, edges=1))
+    step = 1e-4
+    with torch.no_grad():
+        ends = [gain(torch.tensor(side * step).double()) for side in (1.0, -1.0)]
+    truth = (ends[0] - ends[1]) / (2 * step)
+    assert error(slope(gain), truth) < 0.01
+    model = RadioMap(cells, replace(DIRECT, bandwidth=1e8, edges=1), "gain")
+    fixed = model.ablations()["boundary"]
+    assert isinstance(fixed, RadioMap)
+    assert fixed.reception.bandwidth is None
+    still = slope(lambda shift: fixed.predict(walled(shift), Transmitters(TX), 1)[0])
+    assert error(still, truth) > 0.5

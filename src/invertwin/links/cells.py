@@ -4,6 +4,9 @@ A cell holds the mean power of a receiver that may stand anywhere in it. Powers 
 they do in the mean over places some wavelengths apart. The mean is that over points spread over the
 cell. Derivatives hold boundary paths, so that the edges of shadows and of mirrored beams, which
 sweep over the cells, count (derivations §11).
+
+Where edges diffract, fields add. They have no jump at shadows, so the mean over points has its
+derivative without boundary paths.
 """
 
 import math
@@ -119,16 +122,22 @@ class Cells(Places):
         that of the straight line to the same point.
 
         Raises:
-            InputError: A reception whose fields add, or with edges.
+            InputError: A reception whose fields add and jump at shadows, since no edge diffracts.
         """
-        if reception.bandwidth is not None or reception.edges:
+        if reception.bandwidth is not None and not reception.edges:
             raise InputError(
-                "expected a reception with bandwidth None and edges 0 for cells, got bandwidth "
-                f"{reception.bandwidth} and edges {reception.edges}; cells are means of powers: "
-                "use Points for fields and diffraction"
+                "expected a reception for cells with bandwidth None, or with edges, got bandwidth "
+                f"{reception.bandwidth} and edges 0; such fields jump at shadows: give edges=1, "
+                "or leave out the bandwidth"
             )
         numbers = np.random.default_rng(np.random.SeedSequence([seed, 1]))
         points = self.drawn(numbers)
+        if reception.edges:
+            gain, moments = reception.added(scene, sensor, points.flatten(0, 1), seed)
+            shape = (len(gain), *self.shape)
+            mean = moments.unflatten(1, points.shape[:2]).mean(2)
+            gain = gain.unflatten(1, points.shape[:2]).mean(2)
+            return Received(gain.reshape(shape), spread_of(mean).reshape(shape))
 
         def measure(paths: RayPaths, tx: Tensor, rx: Tensor) -> Tensor:
             return reception.moments(paths, tx, rx, sensor.terminals)

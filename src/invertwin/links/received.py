@@ -127,6 +127,20 @@ class Reception:
             places: Of the receivers [m].
             seed: Of the rays that find paths.
         """
+        gain, moments = self.added(scene, sensor, places, seed)
+        return Received(gain, spread_of(moments))
+
+    def added(
+        self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int
+    ) -> tuple[Float64[Tensor, "tx place"], Float64[Tensor, "tx place 3"]]:
+        """Gains at points, as paths add up, and sums of ``moments``. Arguments as in ``at``.
+
+        Args:
+            scene: What is in the way.
+            sensor: What sends.
+            places: Of the receivers [m].
+            seed: Of the rays that find paths.
+        """
 
         def found(some: Tensor) -> tuple[Tensor, Tensor]:
             paths = self.paths(scene, sensor, some, seed)
@@ -135,7 +149,7 @@ class Reception:
 
         gain, moments = in_batches(found, places)
         more = self.scattered(scene, sensor, places, seed)
-        return Received(gain + more[..., 0], spread_of(moments + more))
+        return gain + more[..., 0], moments + more
 
     def moments(
         self,

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from invertwin.cli.fits.problem import Problem, fitted_objects
@@ -94,7 +95,7 @@ class KeptSteps(Callback):
         found = {}
         for name in self._names:
             body = body_of(scene[name])
-            if name in before and (body.faces == before[name].faces).all():
+            if name in before and np.array_equal(body.faces, before[name].faces):
                 body = Body(body.vertices, before[name].faces)  # kept once
             found[name] = body
         return found
