@@ -117,17 +117,17 @@ class _Updated(Learner):
 class ByGradient(_Updated):
     """Backwards through the whole drive, the radar included.
 
-    A third of the updates take few worlds, from which most is learnt for the steps they cost; the
-    rest takes more, which ends better.
+    The first updates take few worlds, from which most is learnt for the steps they cost; the rest
+    takes more, which ends better.
 
     What a robot's state passes on to the step before is at most 1 long, since derivatives through
     many steps of a robot that bounces off a box grow without bound.
     """
 
-    few = 4
+    few, first = 4, 150  # worlds of so many first updates
 
     def gradient(self, seed: int) -> int:
-        count = self.few if 3 * self.number < self.updates else self.worlds
+        count = self.few if self.number < self.first else self.worlds
         worlds = driving.random_worlds(count, derived_seed(seed, 0))
         shown = driving.smooth_radar(worlds)
         found = driving.drive(

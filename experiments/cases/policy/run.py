@@ -51,7 +51,7 @@ class Plan:
     """
 
     seeds: int = 3
-    updates: int = 450
+    updates: int = 900
     budget: int = 200_000
     watched: int = 100
     unseen: int = 200
