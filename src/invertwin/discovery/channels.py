@@ -19,7 +19,7 @@ _ROUNDS = 2  # an image, then the channels that it tells
 _SWEEPS = 100  # over the channels, at most
 _DEGREES = 4.0  # of the heavy-tailed speckle
 _WORTH = 10.0  # degrees of phase, root mean square: less is left as it is
-_FRAMES = 8  # at least: one place cannot tell a wrong phase from another direction
+_APART = 8  # positions at least that are a range cell apart: they tell directions by ranges
 
 
 def channels_of_scene(
@@ -41,7 +41,8 @@ def channels_of_scene(
         direction.
     """
     radar = capture.radar()
-    if len(radar.virtual_positions) == 1 or radar.frame_count < _FRAMES:
+    cells = (radar.positions.detach() / radar.waveform.range_resolution).round().unique(dim=0)
+    if len(radar.virtual_positions) == 1 or len(cells) < _APART:
         return None
     flat = replace(grid, u_start=0.0, u_step=1.0, u_count=1, v_start=0.0, v_step=1.0, v_count=1)
     shape = tuple(capture.beat.shape[1:3])
@@ -54,18 +55,34 @@ def channels_of_scene(
         level = background(power)[:, None, None].expand_as(power)
         image = sharpened(responses(radar, coarse, places), power, level)
         found = _likeliest(capture, flat, places, image)
-        if number == 0 and apart(found) < _WORTH:
+        if number == 0 and apart(found, radar) < _WORTH:
             return None
     return found
 
 
-def apart(calibration: ChannelCalibration) -> float:
-    """How far the phases of channels are apart, root mean square [°].
+def apart(calibration: ChannelCalibration, radar: Radar) -> float:
+    """How far the phases of channels are apart, root mean square [°], but for a ramp.
+
+    A ramp along the array is a turn of the radar, and may come of an image that is a little off.
 
     Args:
         calibration: Of the channels.
+        radar: Its array and wavelength.
     """
-    return math.degrees(float(calibration.gains.angle().square().mean().sqrt()))
+    places = radar.virtual_positions[:, :2] / sampled(radar).wavelength
+    extent = places.amax(0) - places.amin(0)
+    steps = [
+        torch.arange(-1.0, 1.0, 1 / (16 * float(e)) if e > 0 else 2.0).double() for e in extent
+    ]
+    turns = (
+        places @ torch.cartesian_prod(*[axis if len(axis) > 1 else 0 * axis for axis in steps]).T
+    )
+    left = calibration.gains.flatten()[:, None] * torch.polar(
+        torch.ones_like(turns), 2 * math.pi * turns
+    )
+    best = left[:, int(left.sum(0).abs().argmax())]
+    best = best * best.sum().conj()
+    return math.degrees(float(best.angle().square().mean().sqrt()))
 
 
 def _likeliest(

@@ -104,7 +104,7 @@ def twin(
         return Twin(_surest_first([*found, *moving]), plane, floor, picture)
     grid = radar.grid(*reach)
     still = _standing(capture, radar, grid, plane, floor, places, step, rays, seed)
-    notes = () if told is None else (_CALIBRATED.format(apart(told)),)
+    notes = () if told is None else (_CALIBRATED.format(apart(told, radar)),)
     things = _surest_first([*still.things, *moving])
     return replace(still, things=things, notes=(*notes, *still.notes), calibration=told)
 
@@ -142,8 +142,8 @@ def _moving(
 
 
 _CALIBRATED = (
-    "the phases of the channels were {:.0f}° apart (root mean square): they were calibrated on the "
-    "scene itself"
+    "the phases of the channels were {:.0f}° apart (root mean square, but for a ramp): they were "
+    "calibrated on the scene itself"
 )
 _NOTHING = "nothing is above the noise"
 _IMAGE_BETTER = (
