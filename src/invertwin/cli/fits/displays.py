@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from invertwin.cli.fits.problem import Problem, fitted_objects
+from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
@@ -71,7 +73,9 @@ class KeptSteps(Callback):
         self._steps = [step for step in self._steps if step.number < number]
         if number % self._apart == 0:
             label = f"step {number}, loss {row['loss']:.4g}"
-            self._keep(Step(number, label, self._bodies(fit.twin())))
+            # Parameters that the scene refuses have no picture; the fit ends as diverged.
+            with suppress(InputError):
+                self._keep(Step(number, label, self._bodies(fit.twin())))
         if fit.progress.step % self._every == 0:
             self._write()
 
