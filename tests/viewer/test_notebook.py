@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import signal
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ import torch
 from invertwin import Observation, Schedule, SurrogateMap, reconstruct, simulate
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
-from invertwin.inversion import Checkpoint, watched
+from invertwin.inversion import Checkpoint, Report, watched
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, Translation, box, planar_array, rigid
 
@@ -75,9 +76,16 @@ def test_a_capture_and_a_fit_show_themselves(tmp_path):
     assert found.verdict.word in cells(found._repr_html_())
 
 
-def test_a_fit_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, capsys):
-    import signal
+@pytest.fixture
+def interruptible():
+    """Ctrl-C as in a fresh process; workers of tests before may ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
+
+@pytest.mark.usefixtures("interruptible")
+def test_a_fit_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, capsys):
     (tmp_path / "a").mkdir()
     whole = fit(tmp_path / "a")[1]
     (tmp_path / "b").mkdir()
@@ -92,8 +100,6 @@ def test_a_fit_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, capsys):
             self.count += 1
             if self.count == 3:
                 signal.raise_signal(signal.SIGINT)
-
-    from invertwin.inversion import Report
 
     with pytest.raises(KeyboardInterrupt), watched("fit", 6) as shown:
         fit(tmp_path / "b", [Report(Stop()), *shown])
