@@ -23,7 +23,9 @@ def problems(site: Path) -> list[str]:
         for file in sorted(site.rglob("*.html"))
         if "_static" not in file.parts  # parts of the theme, not pages
     }
-    anchors = {file: {tag["id"] for tag in page.find_all(id=True)} for file, page in pages.items()}
+    anchors = {
+        file: {str(tag["id"]) for tag in page.find_all(id=True)} for file, page in pages.items()
+    }
     found = []
     for file, page in pages.items():
         name = file.relative_to(site)
