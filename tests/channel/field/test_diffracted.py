@@ -135,11 +135,12 @@ def test_solids_and_order():
     rx = torch.tensor([[-9.0, 1.4, 0.2]], dtype=torch.float64)
     with tracing():
         # Face to face no single edge is seen from both sides.
-        (second,) = sent_by(cube, tx, rx, 2)
+        second, *corners = sent_by(cube, tx, rx, 2)
+        assert {part.corner for part in corners} <= {"first", "last"}
         assert second.edge.shape[1] == 2
         assert len(second.rx) >= 4
         inside = torch.zeros(1, 3, dtype=torch.float64)
-        assert not sent_by(cube, inside, rx, 2)
+        assert not sent_by(cube, inside, rx, 3)
     # Over the two edges of a side: front to back.
     over = second.points[:, :, 0]
     straight = (over[:, 0] - 2.5).abs() + (over[:, 1] + 2.5).abs() < 1e-9

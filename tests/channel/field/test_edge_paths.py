@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from invertwin.channel.field.diffraction import conductor
-from invertwin.channel.field.edge_paths import Edge, over_edges, two_turning_points
+from invertwin.channel.field.edge_paths import Edge, over_edges, several_turning_points
 from invertwin.channel.field.wedges import Wedges, joined_wedges
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 
@@ -35,6 +35,7 @@ def wedge(start, end, into, opening=1.5):
 FIRST = wedge([0.0, 0.0, 3.0], [0.0, 0.0, -2.0], [-1.0, 0.0, 0.0])
 SECOND = wedge([-4.0, 0.0, -2.0], [-4.0, 0.0, 3.0], [1.0, 0.0, 0.0])
 LEANS = wedge([-4.0, 1.0, -2.0], [-4.4, 1.3, 3.0], [0.0, -1.0, 0.0], 2.0)
+SKEW = wedge([-5.0, -1.0, -1.0], [-6.0, 0.5, 2.0], [1.0, 1.0, 0.0])
 TX, RX = number([[3.0, -2.0, 0.4]]), number([[-7.0, -3.0, 1.1]])
 
 
@@ -83,6 +84,10 @@ def test_paths_back_are_the_same():
     cases = {
         "one": ([Edge(FIRST, lossy)], [Edge(FIRST, lossy)]),
         "free": ([Edge(FIRST), Edge(LEANS)], [Edge(LEANS), Edge(FIRST)]),
+        "three": (
+            [Edge(FIRST, lossy), Edge(LEANS), Edge(SKEW)],
+            [Edge(SKEW), Edge(LEANS), Edge(FIRST, lossy)],
+        ),
         "lossy": ([Edge(FIRST, lossy), Edge(LEANS)], [Edge(LEANS), Edge(FIRST, lossy)]),
         "face": (
             edges,
@@ -121,12 +126,36 @@ def test_second_edge_takes_over_where_the_first_one_hides(off, endless, most):
     assert (above - below).norm() < most * below.norm()
 
 
+def test_third_edge_takes_over_where_the_second_one_hides():
+    """Behind the plane of the next side; with a wave that grazes the first side or does not."""
+    third = wedge([-4.0, -4.0, -2.0], [-4.0, -4.0, 3.0], [0.0, 1.0, 0.0])
+    zero, last = number([0.0]), number([1.5 * math.pi])
+    for off in (-2.0, -0.2):
+        tx = number([[3.0, off, 0.4]])
+        first, second = (replace(edge, endless=True) for edge in grazing())
+        edges = [first, replace(second, azimuth=last), Edge(third, azimuth_in=zero, endless=True)]
+        fields = []
+        for aside in (-1e-7, 1e-7):
+            rx = number([[-4.0 + aside, -9.0, 0.9]])
+            sent, twice = (over_edges(some, tx, rx, K) for some in (edges, [first, second]))
+            fields.append([s.transfer * torch.exp(-1j * K * s.length) for s in (sent, twice)])
+        (before, lost), (after, _) = fields
+        assert (after - before - lost).norm() < 0.005 * lost.norm()
+        back = [
+            Edge(third, azimuth=zero, endless=True),
+            Edge(SECOND, azimuth_in=last, azimuth=zero, endless=True),
+            Edge(FIRST, azimuth_in=zero, endless=True),
+        ]
+        returned = over_edges(back, rx, tx, K).transfer.mT
+        assert (sent.transfer - returned).abs().max() < 1e-12 * returned.abs().max()
+
+
 def test_path_over_edges_that_meet_is_found():
     """Both edges begin in the corner; the path touches them beside it."""
     corner, along, down = (number(p) for p in ([0.0, 0, 0], [4.0, 0, 0], [0, -4.0, 0]))
     edges = [wedge(corner.tolist(), end.tolist(), [1.0, -1.0, 0.0]) for end in (along, down)]
     tx, rx = number([[9.0, 4.0, 0.8]]), number([[-3.0, -2.0, -1.0]])
-    points, stationary = two_turning_points(edges[0], edges[1], tx, rx)
+    points, stationary = several_turning_points(edges, tx, rx)
     assert bool(stationary)
     assert points[0, 0, 0] > 0.5
     assert points[0, 1, 1] < -0.2
@@ -179,9 +208,11 @@ def test_derivatives():
         once = over_edges([Edge(at, lossy)], tx, rx, K)
         twice = over_edges([Edge(at), Edge(LEANS)], tx, rx, K)
         along = over_edges([Edge(at, azimuth=edges[0].azimuth), edges[1]], tx, rx, K)
+        thrice = over_edges([Edge(at), Edge(LEANS), Edge(SKEW)], tx, rx, K)
         sloped = over_edges([Edge(at)], tx, rx, K, slopes=True).slopes
         assert sloped is not None
-        sent = torch.stack([once.transfer, twice.transfer, along.transfer, *sloped])
+        fields = (once.transfer, twice.transfer, along.transfer, thrice.transfer, *sloped)
+        sent = torch.stack(fields)
         return torch.view_as_real(sent.sum((1, 2, 3)))
 
     values = tuple(value.clone().requires_grad_() for value in (TX, RX, FIRST.end))

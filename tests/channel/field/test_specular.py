@@ -10,7 +10,7 @@ import scipy.special
 import torch
 from torch import Tensor
 
-from invertwin.channel import RayPaths, trace_paths
+from invertwin.channel import KINDS, RayPaths, trace_paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import (
@@ -535,16 +535,28 @@ def test_the_size_of_a_plate_has_a_derivative_with_diffraction():
         return torch.view_as_real(response(found)).flatten()
 
     zero = torch.zeros((), dtype=torch.float64)
-    for edges in (1, 2):
+    for edges in (1, 2, 3):
         found: Any = torch.autograd.functional.jacobian(lambda t, n=edges: value(t, n), zero)
         truth = (value(zero + 1e-5, edges) - value(zero - 1e-5, edges)) / 2e-5
         assert float((found - truth).norm() / truth.norm()) < 1e-4
     assert not (value(zero + 1e-3, 0) - value(zero, 0)).any()
 
 
-def test_three_edges_are_too_many():
-    with pytest.raises(InputError, match="at most 2 edges"):
-        trace(GROUND, *HEIGHTS, edges=3)
+def test_paths_over_three_edges_reach_the_side_of_a_box_away_from_the_transmitter():
+    """Round three edges of a tall box, and back the same way."""
+    scene = Scene({"tower": Object(box((2.0, 40.0, 2.0)), METAL)})
+    ends = [4.0, 0.2, 0.5], [1.9, -0.3, -6.0]
+    deep = [trace(scene, *ends, edges=edges, depth=1) for edges in (2, 3)]
+    three = (deep[1].kinds == KINDS.index("diffraction")).sum(1) == 3
+    assert int(three.sum()) >= 4
+    assert len(deep[0]) == int((~three).sum())
+    back = trace(scene, *reversed(ends), edges=3, depth=1)
+    torch.testing.assert_close(response(deep[1]), response(back).mT, rtol=1e-9, atol=1e-16)
+
+
+def test_four_edges_are_too_many():
+    with pytest.raises(InputError, match="at most 3 edges"):
+        trace(GROUND, *HEIGHTS, edges=4)
 
 
 def test_padded_links_may_be_empty():

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.channel.field.transition import corner_transition, end_transition, transition
+from invertwin.channel.field.transition import (
+    chain_transition,
+    corner_transition,
+    end_transition,
+    transition,
+)
 
 RADII = (0.01, 1.0, 3.9, 4.1, 20.0)
 ANGLES = (0.02, 0.78, 1.2)
@@ -78,6 +83,36 @@ def test_corner_without_coupling_is_a_product():
     torch.testing.assert_close(corner_transition(s, t, 0 * s), transition(s) * transition(t))
 
 
+def chained(r, s, t, v, w):
+    """Of one term each."""
+    return chain_transition(r[None], [s[None], t[None]], [v, w]).sum((0, 1))[0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("r", "s", "t", "v", "w"), [(0.3, 0.2, 0.5, 0.4, -0.6), (0.1, 1.0, 0.5, 0.5, 0.6)]
+)
+def test_chain_of_three_to_rounding(r, s, t, v, w):
+    turn = complex(math.sqrt(0.5), -math.sqrt(0.5))
+    node, weight = np.polynomial.legendre.leggauss(60)
+    x, part = 4.5 * (node + 1), 4.5 * weight * turn
+    form = x**2 + 2j * turn * r * x
+    inner = [
+        np.exp(2 * c * x[:, None] * x - x**2 - 2j * turn * z * x) @ part
+        for z, c in ((s, v), (t, w))
+    ]
+    truth = -8j * (part @ (np.exp(-form) * inner[0] * inner[1]))
+    found = chained(*(number([value]) for value in (r, s, t, v, w)))
+    assert abs(found.item() - truth) < 1e-11 * abs(truth)
+
+
+def test_chain_of_a_pair_and_a_lone_edge_is_a_product():
+    r, s, t = (number(values) for values in ([0.1, 9.0, 0.7], [30.0, 2.0, 0.0], [4.0, 0.1, 12.0]))
+    w, none = number([0.9, -0.7, 0.3]), number([0.0, 0.0, 0.0])
+    truth = corner_transition(r, s, w) * transition(t)
+    for found in (chained(r, s, t, w, none), chained(s, r, t, w, none), chained(r, t, s, none, w)):
+        assert ((found - truth).abs() / truth.abs()).max() < 1e-5
+
+
 def test_rectangle_is_a_product_of_fresnel_integrals():
     """The straight wave and what the four edges send add up to the integral over the rectangle."""
 
@@ -98,11 +133,19 @@ def test_rectangle_is_a_product_of_fresnel_integrals():
 
 
 def test_derivatives():
+    torch.manual_seed(1)
     s = number([0.3, -1.0, 2.0, 5.0, -7.0]).requires_grad_()
     t = number([0.2, 1.0, -3.0, -0.1, 4.0]).requires_grad_()
     assert torch.autograd.gradcheck(transition, s, check_forward_ad=True)
     assert torch.autograd.gradgradcheck(transition, s)
     assert torch.autograd.gradcheck(end_transition, (s, t), check_forward_ad=True)
+    three = tuple(torch.rand(3, 2).double().requires_grad_() for _ in range(3))
+    w = tuple(number(values).requires_grad_() for values in ([0.3, -0.5], [0.6, 0.2]))
+
+    def chain(r, s, t, v, w):
+        return chain_transition(r, [s, t], [v, w])
+
+    assert torch.autograd.gradcheck(chain, (*three, *w), check_forward_ad=True)
     # One value for several ends.
     assert torch.autograd.gradcheck(end_transition, (s, t[:1]))
 

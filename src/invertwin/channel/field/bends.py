@@ -14,15 +14,17 @@ would jump.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.field.edge_paths import turning_points, two_turning_points
+from invertwin.channel.field.corners import face_share
+from invertwin.channel.field.edge_paths import several_turning_points, turning_points
 from invertwin.channel.field.edged import EdgedScene, exterior
 from invertwin.channel.field.images import clear_ways, images, reaching
 from invertwin.channel.field.sequences import (
@@ -33,7 +35,9 @@ from invertwin.channel.field.sequences import (
 from invertwin.channel.field.waves import dot
 from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION
 
+Corner = Literal["first", "last"] | None
 _ROWS_AT_ONCE = 1 << 16
+_SHARES = (0.5, 0.1, 0.9)  # of edges: where they may see each other
 _ONE_PLANE = 1e-6  # of the scene's size, or rad
 
 
@@ -67,8 +71,10 @@ class Bends:
         tx, rx: numbers of the antennas.
         edge: numbers of the edges, from the transmitter on.
         before, after: surfaces on the way to the first edge and from the last.
-        between: of two edges, which of their faces lies between them (−1: none).
+        between: of legs from edge to edge, which of either edge's faces they run along (−1: none).
         absorbs: leave out what the edge's faces mirror and let through: one surface too many.
+        corner: whether the first or the last edge is met in a corner, where its neighbour ends.
+        end: which end of that neighbour it is.
     """
 
     tx: Int64[Tensor, " row"]
@@ -76,8 +82,10 @@ class Bends:
     edge: Int64[Tensor, "row order"]
     before: Legs
     after: Legs
-    between: Int64[Tensor, "row order"]
+    between: Int64[Tensor, "row leg 2"]
     absorbs: bool = False
+    corner: Corner = None
+    end: Int64[Tensor, " row"] | None = None
 
     def rows(self, index: Tensor) -> "Bends":
         """Some rows."""
@@ -89,6 +97,8 @@ class Bends:
             self.after.rows(index),
             self.between[index],
             self.absorbs,
+            self.corner,
+            None if self.end is None else self.end[index],
         )
 
 
@@ -102,13 +112,13 @@ def find_bends(
     rays: int | None,
     seed: int,
 ) -> Iterator[Bends]:
-    """Paths over one edge with up to ``depth`` surfaces, and over two edges alone.
+    """Paths over one edge with up to ``depth`` surfaces, and over more edges alone.
 
     Args:
         around: the scene.
         powers: what triangles do to rays.
         tx, rx: antennas [m].
-        order: most edges of a path, 1 or 2.
+        order: most edges of a path, 1 to 3.
         depth: most surfaces of a path over one edge.
         rays: shot from all edges together, for candidates; None = every sequence.
         seed: of these rays.
@@ -121,7 +131,7 @@ def find_bends(
         for before in range(surfaces + 1):
             yield from _once(around, sides[0][before], sides[1][surfaces - before], depth)
     if order > 1:
-        yield from _twice(around, tx, rx)
+        yield from _several(around, tx, rx, order)
 
 
 def _tables(
@@ -282,7 +292,7 @@ def _once(around: EdgedScene, one: _Reach, other: _Reach, depth: int) -> Iterato
                 some.edge[:, None],
                 Legs(faces[0], (some.steps.flip(1) & 1).bool()),
                 Legs(faces[1].flip(1), (rest.steps & 1).bool()),
-                torch.full((len(some.edge), 1), -1),
+                torch.full((len(some.edge), 0, 2), -1),
                 absorbs=surfaces == depth > 0,
             )
             yield found.rows(torch.nonzero(good)[:, 0])
@@ -302,11 +312,10 @@ def _pairs(one: _Reach, other: _Reach, count: int) -> Iterator[tuple[Tensor, Ten
             yield first, begin[one.edge[first]] + within
 
 
-def _twice(around: EdgedScene, tx: Tensor, rx: Tensor) -> Iterator[Bends]:
-    """Paths over two edges, on free legs."""
-    pairs, between = _edge_pairs(around)
-    if not len(pairs):
-        return
+def _several(around: EdgedScene, tx: Tensor, rx: Tensor, order: int) -> Iterator[Bends]:
+    """Paths over two edges and up to ``order``, on free legs."""
+    chains, between = _edge_pairs(around)
+    pairs, beside = chains, between
     alone = torch.arange(len(around.plain.start))[:, None]
     sees = []
     for places in (tx, rx):
@@ -314,47 +323,161 @@ def _twice(around: EdgedScene, tx: Tensor, rx: Tensor) -> Iterator[Bends]:
         table = torch.zeros(len(places), len(alone), dtype=torch.bool)
         table[found.antenna, found.edge] = True
         sees.append(table)
+    yield from _along(around, tx, rx, sees, chains, between)
+    if order < 3 or not len(chains):
+        return
+    open_ways = _see_each_other(around, pairs, beside)
+    pairs, beside = pairs[open_ways], beside[open_ways]
+    seen = torch.nonzero(sees[0].any(0)[pairs[:, 0]])[:, 0]
+    if not len(seen):
+        return
+    # In pieces: there are as many chains as pairs, times the edges that may follow an edge.
+    step = max(1, _ROWS_AT_ONCE * len(alone) // max(1, len(pairs)))
+    for some in seen.split(step):
+        chains, between = _longer(pairs[some], beside[some], pairs, beside)
+        yield from _along(around, tx, rx, sees, chains, between)
+
+
+def _see_each_other(around: EdgedScene, pairs: Tensor, between: Tensor) -> Bool[Tensor, " pair"]:
+    """Pairs with a face between them, and those of which some of nine ways across are free."""
+    found = between[:, 0, 0] >= 0
+    wedges, none = around.plain, torch.zeros(len(pairs), 0, dtype=torch.int64)
+    for share, other in product(_SHARES, _SHARES):
+        rows = torch.nonzero(~found)[:, 0]
+        if not len(rows):
+            break
+        places = []
+        for edge, at in zip(pairs[rows].T, (share, other), strict=True):
+            point = wedges.start[edge] + at * (wedges.end[edge] - wedges.start[edge])
+            places.append(around.beside(edge, point))
+        found[rows] = clear_ways(around.walls, none[rows], places[0], places[1])[0]
+    return found
+
+
+def _longer(
+    chains: Tensor, between: Tensor, pairs: Tensor, beside: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Chains of edges with one edge more."""
+    order = pairs[:, 0].argsort(stable=True)
+    number = torch.bincount(pairs[:, 0], minlength=int(pairs.max()) + 1)
+    begin = number.cumsum(0) - number
+    some = number[chains[:, -1]]
+    row = torch.arange(len(chains)).repeat_interleave(some)
+    within = torch.arange(len(row)) - (some.cumsum(0) - some).repeat_interleave(some)
+    pair = order[begin[chains[row, -1]] + within]
+    found = torch.cat([chains[row], pairs[pair, 1:]], 1)
+    return found, torch.cat([between[row], beside[pair]], 1)
+
+
+def _along(
+    around: EdgedScene,
+    tx: Tensor,
+    rx: Tensor,
+    sees: list[Tensor],
+    chains: Tensor,
+    between: Tensor,
+) -> Iterator[Bends]:
+    """Paths over given chains of edges, of which antennas see the first and the last."""
+    # Chains that some antenna sees from either side.
+    kept = sees[0].any(0)[chains[:, 0]] & sees[1].any(0)[chains[:, -1]]
+    chains, between = chains[kept], between[kept]
+    if not len(chains):
+        return
     links = torch.cartesian_prod(torch.arange(len(tx)), torch.arange(len(rx)))
-    for some in links.split(max(1, _ROWS_AT_ONCE // len(pairs))):
-        both = sees[0][some[:, 0]][:, pairs[:, 0]] & sees[1][some[:, 1]][:, pairs[:, 1]]
-        link, pair = torch.nonzero(both).T
+    for some in links.split(max(1, _ROWS_AT_ONCE // len(chains))):
+        both = sees[0][some[:, 0]][:, chains[:, 0]] & sees[1][some[:, 1]][:, chains[:, -1]]
+        link, chain = torch.nonzero(both).T
         if not len(link):
             continue
         none = torch.zeros(len(link), 0, dtype=torch.int64)
         legs = Legs(none, none.bool())
         source, target = some[link].unbind(1)
-        found = Bends(source, target, pairs[pair], legs, legs, between[pair])
-        row = [around.plain.rows(column) for column in found.edge.T]
-        points, good = two_turning_points(row[0], row[1], tx[source], rx[target])
+        found = Bends(source, target, chains[chain], legs, legs, between[chain])
+        rows = [around.plain.rows(column) for column in found.edge.T]
+        points, good = several_turning_points(rows, tx[source], rx[target])
         # Where no face lies between two edges, each must see the other's point.
-        for first, second in ((0, 1), (1, 0)):
-            outside = exterior(around.plain.rows(found.edge[:, first]), points[:, second])
-            good &= outside | (found.between[:, 0] >= 0)
+        for leg in range(chains.shape[1] - 1):
+            for first, second in ((leg, leg + 1), (leg + 1, leg)):
+                outside = exterior(rows[first], points[:, second])
+                good &= outside | (found.between[:, leg, 0] >= 0)
         stops = [tx[source]]
-        for number in (0, 1):
+        for number in range(chains.shape[1]):
             edge, place = found.edge[:, number], points[:, number]
             good &= around.free(edge, place)
             stops.append(around.beside(edge, place))
         stops.append(rx[target])
         for start, end in pairwise(stops):
-            rows = torch.nonzero(good)[:, 0]
-            good[rows], _ = clear_ways(around.walls, none[rows], start[rows], end[rows])
+            at = torch.nonzero(good)[:, 0]
+            good[at], _ = clear_ways(around.walls, none[at], start[at], end[at])
         if bool(good.any()):
             yield found.rows(torch.nonzero(good)[:, 0])
+        yield from _round_corners(around, tx, rx, found)
 
 
-def along_faces(around: EdgedScene, bends: Bends) -> Float64[Tensor, "row order"]:
-    """Azimuths of paths over two edges that run along a face between these, NaN of the others.
+def _round_corners(around: EdgedScene, tx: Tensor, rx: Tensor, found: Bends) -> Iterator[Bends]:
+    """Of chains of edges, those whose first or last is met where its neighbour ends."""
+    wedges = around.plain
+    ends = torch.stack([wedges.start, wedges.end], 1)
+    sides: tuple[tuple[Corner, int, int, Tensor], ...] = (
+        ("first", 0, 1, tx[found.tx]),
+        ("last", -1, -2, rx[found.rx]),
+    )
+    for corner, own, other, place in sides:
+        edge, beside = found.edge[:, own], found.edge[:, other]
+        apart = (ends[edge][:, :, None] - ends[beside][:, None]).norm(dim=3)
+        least, end = apart.amin(1).min(1)
+        at = ends[beside, end]
+        faces = found.between[:, own]
+        faces = faces.flip(1) if corner == "first" else faces
+        good = (least < _ONE_PLANE * around.walls.size) & (faces[:, 0] >= 0)
+        rows = torch.nonzero(good)[:, 0]
+        sends, last = (wedges.rows(column[rows]) for column in (beside, edge))
+        rows = rows[face_share(sends, last, faces[rows], (place - at)[rows]) > 0]
+        if not len(rows):
+            continue
+        some = replace(found.rows(rows), corner=corner, end=end[rows])
+        numbers = range(found.edge.shape[1])
+        main = numbers[1:] if corner == "first" else numbers[:-1]
+        source, target = tx[some.tx], rx[some.rx]
+        between = [wedges.rows(some.edge[:, n]) for n in main]
+        if len(main) == 1:
+            points, good = turning_points(between[0], source, target)
+            points = points[:, None]
+        else:
+            points, good = several_turning_points(between, source, target)
+        both = [points, at[rows, None]] if corner == "last" else [at[rows, None], points]
+        points = torch.cat(both, 1)
+        stops = [source]
+        for number in numbers:
+            edge = some.edge[:, number]
+            good &= around.free(edge, points[:, number])
+            stops.append(around.beside(edge, points[:, number]))
+        stops.append(target)
+        none = some.before.faces
+        for start, stop in pairwise(stops):
+            left = torch.nonzero(good)[:, 0]
+            good[left], _ = clear_ways(around.walls, none[left], start[left], stop[left])
+        if bool(good.any()):
+            yield some.rows(torch.nonzero(good)[:, 0])
+
+
+def along_faces(around: EdgedScene, bends: Bends) -> Float64[Tensor, "row leg 2"]:
+    """Azimuths of departure and of incidence of legs between edges along a face, NaN of the others.
 
     Args:
         around: the scene.
         bends: the paths.
     """
-    opening = around.plain.opening[bends.edge]
+    opening = torch.stack([around.plain.opening[n] for n in _legs_of(bends.edge)], 2)
     return torch.where(bends.between < 0, torch.nan, bends.between * opening * torch.pi)
 
 
-def _edge_pairs(around: EdgedScene) -> tuple[Int64[Tensor, "pair 2"], Int64[Tensor, "pair 2"]]:
+def _legs_of(edge: Tensor) -> tuple[Tensor, Tensor]:
+    """Edges before and after each leg between edges."""
+    return edge[:, :-1], edge[:, 1:]
+
+
+def _edge_pairs(around: EdgedScene) -> tuple[Int64[Tensor, "pair 2"], Int64[Tensor, "pair 1 2"]]:
     """Edges that may follow one another, and which of their faces lies between them (−1: none).
 
     Two edges with a face between them have one path along each side that both have in common.
@@ -382,4 +505,4 @@ def _edge_pairs(around: EdgedScene) -> tuple[Int64[Tensor, "pair 2"], Int64[Tens
         free &= outside[0] | outside[1]
     rows.append(torch.stack([first[free], second[free]], 1))
     faces.append(torch.full((int(free.sum()), 2), -1))
-    return torch.cat(rows), torch.cat(faces)
+    return torch.cat(rows), torch.cat(faces)[:, None]

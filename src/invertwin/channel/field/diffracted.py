@@ -7,15 +7,16 @@ images of the antennas, and the field, turned at every surface before and after.
 Source: derivations §9 and §10.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.bends import Bends, Legs, along_faces
-from invertwin.channel.field.edge_paths import over_edges
+from invertwin.channel.field.bends import Bends, Corner, Legs, along_faces
+from invertwin.channel.field.corners import round_corner
+from invertwin.channel.field.edge_paths import Edge, EdgePaths, over_edges
 from invertwin.channel.field.edged import EdgedScene, on_edge
 from invertwin.channel.field.images import corners_of, images
 from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
@@ -39,8 +40,9 @@ class DiffractedPaths:
         transfer: E at the receiver of E at 1 m from the transmitter, without the phase of
             ``length`` [1/m]; world coordinates, receive × transmit.
         slopes: as ``transfer``, of derivatives of the transmitter's and of the receiver's field by
-            angles [rad] about ``axes``; zero of paths over two edges.
+            angles [rad] about ``axes``; zero of paths over more edges.
         axes: unit vectors about which these angles turn, of transmitter and receiver.
+        corner: whether the first or the last edge is met in a corner, where its neighbour ends.
     """
 
     tx: Int64[Tensor, " row"]
@@ -54,6 +56,7 @@ class DiffractedPaths:
     transfer: Complex128[Tensor, "row 3 3"]
     slopes: Complex128[Tensor, "row 2 3 3"]
     axes: Float64[Tensor, "row 2 3"]
+    corner: Corner = None
 
 
 def diffracted_paths(
@@ -74,13 +77,12 @@ def diffracted_paths(
     source, target = tx[bends.tx], rx[bends.rx]
     legs = [_Mirrors(around, bends.before, source), _Mirrors(around, _back(bends.after), target)]
     angles = along_faces(around, bends)
-    alone = bends.edge.shape[1] == 1
-    known = [(None, None)] if alone else [(None, angles[:, 0]), (angles[:, 1], None)]
+    arrive, leave = ([None, *angles[..., 1].T], [*angles[..., 0].T, None])
     edges = [
         around.edge(row, pair, absorbs=bends.absorbs)
-        for row, pair in zip(bends.edge.T, known, strict=True)
+        for row, pair in zip(bends.edge.T, zip(arrive, leave, strict=True), strict=True)
     ]
-    sent = over_edges(edges, legs[0].image, legs[1].image, wave_number, slopes=alone)
+    sent = _sent(bends, edges, legs[0].image, legs[1].image, wave_number)
     places = [on_edge(edge.wedges, sent.points[:, n]) for n, edge in enumerate(edges)]
     stops = torch.stack([legs[0].image, *places, legs[1].image], 1)
     pieces = stops[:, 1:] - stops[:, :-1]
@@ -114,7 +116,19 @@ def diffracted_paths(
         leaving @ (sent.transfer * turn) @ arriving,
         slopes.transpose(0, 1),
         torch.stack(axes, 1),
+        bends.corner,
     )
+
+
+def _sent(bends: Bends, edges: list[Edge], tx: Tensor, rx: Tensor, k: float) -> EdgePaths:
+    if bends.end is None:
+        return over_edges(edges, tx, rx, k, slopes=len(edges) == 1)
+    if bends.corner == "last":
+        return round_corner(edges, bends.end, bends.between[:, -1], tx, rx, k)
+    # Reciprocity: the way back ends in the corner.
+    back = [replace(e, azimuth_in=e.azimuth, azimuth=e.azimuth_in) for e in reversed(edges)]
+    found = round_corner(back, bends.end, bends.between[:, 0].flip(1), rx, tx, k)
+    return replace(found, points=found.points.flip(1), transfer=found.transfer.mT)
 
 
 def _back(legs: Legs) -> Legs:

@@ -14,6 +14,7 @@ dyads in the basis of the mirrored direction; D is the mean of both ways, so tha
 The straight wave's terms of a sheet count by 1 − T.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.transition import (
+    chain_transition,
     corner_transition,
     edge_transition,
     edge_transition_slope,
@@ -36,6 +38,7 @@ from invertwin.scene.material.fresnel import FieldCoefficients
 
 _TURN = complex(math.sqrt(0.5), -math.sqrt(0.5))  # exp(−jπ/4)
 _FLAT = 1e-6  # of an opening: both faces are those of one sheet
+_UNCOUPLED = 1e-9  # couplings that count as none
 _SERIES = 1e-4  # rad from a boundary, within which a quotient is its series
 _SIGNS = ((-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0), (1.0, -1.0))
 """By term: φ − φ′ or φ + φ′, and the sign of π beside it. The third is the face n, the last 0."""
@@ -152,35 +155,88 @@ def double_dyad(
     """
     before, after = _couplings(first, wave_number), _couplings(second, wave_number)
     # All pairs at once: [term of the first, of the second, row].
-    sides = torch.tensor([[a.side_out * b.side_in for b in after] for a in before]).double()
-    w = sides[..., None] * coupling
-    s, t = (torch.stack([each.s for each in some]) for some in (before, after))
-    same, opposite = corner_transition(s[:, None], t, torch.stack([w, -w]))
-    strength = torch.stack([a.value for a in before])[:, None] * (same + opposite)
-    strength = strength * torch.stack([b.value for b in after])
-    uneven = torch.stack([a.slope for a in before])[:, None] * (same - opposite)
-    strength = (strength + uneven * torch.stack([b.slope for b in after])) / 2
-    dyads = [torch.stack(torch.broadcast_tensors(*_dyads(turn))) for turn in (first, second)]
-    return torch.einsum("abr,brij,arjk->rik", strength, dyads[1], dyads[0])
+    w = before.sides[1][:, None, None] * after.sides[0][:, None] * coupling
+    same, opposite = corner_transition(before.s[:, None], after.s, torch.stack([w, -w]))
+    strength = before.value[:, None] * (same + opposite) * after.value
+    strength = (strength + before.slope[:, None] * (same - opposite) * after.slope) / 2
+    return torch.einsum("abr,brij,arjk->rik", strength, _dyads(second), _dyads(first))
 
 
-class _Coupling(NamedTuple):
-    """A cotangent that meets one of another edge.
+def triple_dyad(
+    turns: Sequence[Turn], couplings: Float64[Tensor, "row 3 3"], wave_number: float
+) -> Complex128[Tensor, "row 3 3"]:
+    """Of three edges one after the other, in √m³: as ``double_dyad``, of triples of cotangents.
+
+    One of the edges is coupled to both others; the least of the three couplings is left out. There
+    is none between parallel edges with another between them, nor between edges at right angles. A
+    cotangent of the edge in the middle that is uneven to both sides counts by its curvature.
+
+    Args:
+        turns: the waves.
+        couplings: w between edges, as in ``double_dyad``.
+        wave_number: k [1/m].
+    """
+    found = [_couplings(turn, wave_number) for turn in turns]
+    dyads = [_dyads(turn) for turn in turns]
+    least = torch.stack([couplings[:, a, b].abs() for a, b in ((1, 2), (0, 2), (0, 1))])
+    # Of edges that are all alike, either way takes the same one.
+    reach = torch.stack([turn.parameter for turn in turns])
+    least = torch.where(least > _UNCOUPLED, least, -reach).argmin(0)
+    total = torch.zeros(len(couplings), 3, 3, dtype=torch.complex128)
+    # The middle of the chain is the edge that takes no part in the least coupling.
+    for center, (first, second, third) in enumerate(("cab", "acb", "abc")):
+        rows = torch.nonzero(least == center)[:, 0]
+        if not len(rows):
+            continue
+        others = [edge for edge in range(3) if edge != center]
+        middle, *outer = (found[edge].rows(rows) for edge in (center, *others))
+        parts = chain_transition(
+            middle.s.abs(),
+            [edge.s.abs() for edge in outer],
+            [couplings[rows, center, other] for other in others],
+        )
+        strength = torch.zeros(parts.shape[2:], dtype=torch.complex128)
+        for odd in itertools.product((0, 1), (0, 1)):
+            weights = [middle.strength(sum(odd))]
+            for other, edge, uneven in zip(others, outer, odd, strict=True):
+                weights.append(edge.strength(uneven))
+                if uneven:
+                    weights[0] = weights[0] * middle.sides[int(other > center), :, None]
+                    weights[-1] = weights[-1] * edge.sides[int(other < center), :, None]
+            strength = strength + parts[odd] * torch.einsum("cr,ar,br->cabr", *weights)
+        some = [dyad[:, rows] for dyad in dyads]
+        chain = f"cabr,{third}rij,{second}rjk,{first}rkl->ril"
+        total = total.index_add(0, rows, torch.einsum(chain, strength, *reversed(some)))
+    return total
+
+
+class _Couplings(NamedTuple):
+    """Cotangents that meet those of other edges.
 
     Attributes:
-        value, slope: strength of 1/s, and by the root that of −1/s² in the derivative.
+        value, slope, curve: strengths of 1/s, and by the root of −1/s² and 2/s³ in derivatives.
         s: of ``transition``.
-        side_in, side_out: 1 where s falls with the azimuth of incidence or of departure.
+        sides: 1 where s falls with the azimuth of incidence or of departure.
     """
 
-    value: Complex128[Tensor, " row"]
-    slope: Complex128[Tensor, " row"]
-    s: Float64[Tensor, " row"]
-    side_in: float
-    side_out: float
+    value: Complex128[Tensor, "term row"]
+    slope: Complex128[Tensor, "term row"]
+    curve: Complex128[Tensor, "term row"]
+    s: Float64[Tensor, "term row"]
+    sides: Float64[Tensor, "2 term"]
+
+    def rows(self, index: Tensor) -> "_Couplings":
+        """Some rows."""
+        value, slope, curve, s = (column[:, index] for column in self[:4])
+        return _Couplings(value, slope, curve, s, self.sides)
+
+    def strength(self, order: int) -> Tensor:
+        """Of a derivative, for |s|: of −s, a function of both has the other sign, and −w."""
+        strength = (self.value, self.slope, self.curve)[order]
+        return strength if order % 2 else torch.where(self.s < 0, -strength, strength)
 
 
-def _couplings(turn: Turn, wave_number: float) -> list[_Coupling]:
+def _couplings(turn: Turn, wave_number: float) -> _Couplings:
     opening, root = turn.wedges.opening, torch.sqrt(2 * wave_number * turn.parameter)
     scale = -_scale(turn, wave_number) * root
     found = []
@@ -188,14 +244,15 @@ def _couplings(turn: Turn, wave_number: float) -> list[_Coupling]:
         half = _past(turn, other, sign)
         near = half.abs() < _SERIES
         safe = torch.where(near, torch.full_like(half, _SERIES), half)
-        sine = torch.sin(safe)
-        square = torch.where(near, opening, sine**2 / (opening * torch.sin(safe / opening) ** 2))
+        ratio = torch.where(near, opening, torch.sin(safe) / torch.sin(safe / opening))
+        bent = torch.cos(half / opening)
         s = root * torch.sin(half)
         seen = scale * (edge_transition(s, turn.ends) / transition(s))
-        found.append(
-            _Coupling(seen * _quotient(half, opening), seen * square, s, sign * other, sign)
-        )
-    return found
+        curve = seen * ratio**3 * bent / opening**2
+        found.append((seen * _quotient(half, opening), seen * ratio**2 / opening, curve, s))
+    value, slope, curve, s = (torch.stack(column) for column in zip(*found, strict=True))
+    sides = torch.tensor([[sign * other, sign] for other, sign in _signs(turn)]).double().T
+    return _Couplings(value, slope, curve, s, sides)
 
 
 def _one_way(turn: Turn, wave_number: float, orders: Sequence[Order]) -> Tensor:
@@ -207,13 +264,13 @@ def _one_way(turn: Turn, wave_number: float, orders: Sequence[Order]) -> Tensor:
     return total
 
 
-def _dyads(turn: Turn) -> list[Complex128[Tensor, "row 3 3"]]:
+def _dyads(turn: Turn) -> Complex128[Tensor, "term row 3 3"]:
     """What the terms multiply, the same on the way back."""
-    there = _one_way_dyads(turn)
+    there = torch.stack(torch.broadcast_tensors(*_one_way_dyads(turn)))
     if turn.faces is conductor or turn.absorbs:
         return there
-    back = _one_way_dyads(turn.reversed())
-    return [(one + other.mT) / 2 for one, other in zip(there, back, strict=True)]
+    back = torch.stack(torch.broadcast_tensors(*_one_way_dyads(turn.reversed())))
+    return (there + back.mT) / 2
 
 
 def _one_way_dyads(turn: Turn) -> list[Complex128[Tensor, "row 3 3"]]:

@@ -1,10 +1,15 @@
-"""Fields of point antennas by way of one edge or two: where paths turn, how long, how strong.
+"""Fields of point antennas by way of up to three edges: where paths turn, how long, how strong.
 
 A path over edges is as short as paths that touch these edges can be. Its amplitude spreads with the
 second derivatives H of its length by the places on the edges: over N edges
 ``A = Π sinβ_i / (Π s_j √det H)``, of the unit of 1/length that a free path has. The distance
 parameter of an edge is that by which its field's step at a boundary is the whole field of the path
-that leaves this edge out: ``L = s s′ sin²β/(s + s′)`` of one edge or of parallel ones.
+that leaves this edge out: ``L = s s′ sin²β/(s + s′)`` of one edge.
+
+Waves spread across a path as a chain of springs: with S_i the length up to edge i and T that of
+all, openings at the edges have the covariances ``Σ_ij = cosγ_ij S_i (T − S_j)/T``, γ between the
+edges as seen along the way. With P = Σ⁻¹, ``L_i = sin²β_i/P_ii`` and the coupling of two edges
+is ``w_ij = ±P_ij/√(P_ii P_jj)``.
 
 Source: derivations §9; Capolino, Albani, Maci and Tiberio, "Double diffraction at a pair of
 coplanar skew edges", IEEE TAP 45, 1997.
@@ -12,11 +17,11 @@ coplanar skew edges", IEEE TAP 45, 1997.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from invertwin.channel.field.diffraction import (
     Faces,
@@ -25,12 +30,14 @@ from invertwin.channel.field.diffraction import (
     conductor,
     diffraction_dyads,
     double_dyad,
+    triple_dyad,
 )
 from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
 
 _STEPS = 40  # of the search for the shortest path over two edges
 _LIFTS = (0.1, 0.01, 0.0)  # of the antennas' distance, one after the other
+_ROUGH, _FINE = 1e-3, 1e-13  # of the antennas' distance: by how much places may still move
 _BENT = 1e-6  # rad of phase, up to which a path over an end is as long as to second order
 _LEAST = 1e-9  # of a path's length: edges that touch there have no path between them
 
@@ -85,40 +92,48 @@ def over_edges(
     *,
     slopes: bool = False,
 ) -> EdgePaths:
-    """The diffracted field of one edge, or of two one after the other.
+    """The diffracted field of one edge, or of two or three one after the other.
 
     Where two edges bound a face along which the path runs (``Edge.azimuth`` is then that of the
-    face), the second meets half the field of the first.
+    face), the next meets half the field of the one before.
 
     Args:
-        edges: one or two, in the order in which the wave meets them.
+        edges: one to three, in the order in which the wave meets them.
         tx, rx: the antennas, or their images [m].
         wave_number: k [1/m].
         slopes: whether those are asked for; of one edge only.
 
     Source: derivations §9; slopes are (1/jk sinβ) ∂D/∂φ′ ∂E/∂n′.
     """
-    route = _route(edges, tx, rx)
+    route = find_route(edges, tx, rx)
     turns = route.turns(wave_number)
-    turned: list[Tensor] = []
-    if len(edges) == 2:
-        transfer = _second(route, turns, wave_number)
-    else:
-        orders: tuple[Order, ...] = ("value", "in", "out") if slopes else ("value",)
-        transfer, *turned = diffraction_dyads(turns[0], wave_number, orders)
-    spread = 1 / (route.legs.prod(1) * route.spread)
-    amplitude = torch.stack([turn.sine for turn in turns]).prod(0) * spread
+    orders: tuple[Order, ...] = ("value", "in", "out") if slopes else ("value",)
+    transfer, *turned = transfers(route, turns, wave_number, orders)
     found = None
     if slopes:
-        scale = (spread / (1j * wave_number * turns[0].sine))[:, None] / route.legs
+        scale = 1 / (1j * wave_number * turns[0].sine[:, None] ** 2 * route.legs)
         found = torch.stack(turned) * scale.T[..., None, None]
-    return EdgePaths(
-        route.points,
-        route.legs.sum(1),
-        transfer * amplitude[:, None, None],
-        route.stationary,
-        found,
-    )
+    return EdgePaths(route.points, route.legs.sum(1), transfer, route.stationary, found)
+
+
+def transfers(
+    route: "Route", turns: Sequence[Turn], wave_number: float, orders: Sequence[Order] = ("value",)
+) -> list[Complex128[Tensor, "row 3 3"]]:
+    """E at the receiver, as in ``EdgePaths``, and its derivatives by azimuths at a single edge.
+
+    Args:
+        route: the paths.
+        turns: the waves at its edges.
+        wave_number: k [1/m].
+        orders: derivatives that are asked for; of several edges, the field alone.
+    """
+    if len(turns) > 1:
+        found = [_several(route, turns, wave_number)]
+    else:
+        found = list(diffraction_dyads(turns[0], wave_number, orders))
+    sines = torch.stack([turn.sine for turn in turns]).prod(0)
+    amplitude = sines / (route.legs.prod(1) * route.spread)
+    return [dyad * amplitude[:, None, None] for dyad in found]
 
 
 def turning_points(
@@ -136,21 +151,21 @@ def turning_points(
     return points, torch.minimum(before, after) > _LEAST * (before + after)
 
 
-def two_turning_points(
-    first: Wedges, second: Wedges, tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
-) -> tuple[Float64[Tensor, "row 2 3"], Bool[Tensor, " row"]]:
-    """As ``turning_points``, of paths over two edges.
+def several_turning_points(
+    wedges: Sequence[Wedges], tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
+) -> tuple[Float64[Tensor, "row edge 3"], Bool[Tensor, " row"]]:
+    """As ``turning_points``, of paths over several edges.
 
     Args:
-        first, second: one row each.
+        wedges: in the order of the path; one row each.
         tx, rx: the antennas [m].
     """
-    route = _route([Edge(first), Edge(second)], tx, rx)
+    route = find_route([Edge(each) for each in wedges], tx, rx)
     return route.points, route.stationary
 
 
 @dataclass(frozen=True)
-class _Route:
+class Route:
     """The shortest path over edges.
 
     Attributes:
@@ -168,7 +183,7 @@ class _Route:
     stationary: Tensor
 
     @property
-    def points(self) -> Tensor:
+    def points(self) -> Float64[Tensor, "row edge 3"]:
         """Where it turns."""
         return self.vertices[:, 1:-1]
 
@@ -180,14 +195,42 @@ class _Route:
     @property
     def spread(self) -> Tensor:
         """√det H."""
-        if len(self.edges) == 1:
-            return self.hessian[:, 0, 0].sqrt()
         return _determinant(self.hessian).clamp_min(1e-300).sqrt()
 
+    @property
+    def covariance(self) -> Float64[Tensor, "row edge edge"]:
+        """Σ of the openings at the edges, each where its azimuth of departure grows [m]."""
+        legs = self.legs
+        total, reached = legs.sum(1), legs.cumsum(1)
+        ways = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
+        count = len(self.edges)
+        found = [[total] * count for _ in range(count)]
+        axes = [edge_axis(edge.wedges) for edge in self.edges]
+        # Across every edge, before and after it.
+        into, out = (
+            [_unit(cross(axis, ways[:, n + after])) for n, axis in enumerate(axes)]
+            for after in (0, 1)
+        )
+        for a in range(count):
+            side = out[a]
+            for b in range(a, count):
+                alike = torch.ones_like(total) if a == b else dot(side, into[b])
+                found[a][b] = found[b][a] = alike * reached[:, a] * (1 - reached[:, b] / total)
+                if a < b:
+                    # Over this edge the way turns about it.
+                    along = [cross(ways[:, b + n], each[b]) for n, each in enumerate((into, out))]
+                    side = dot(side, along[0])[:, None] * along[1] + alike[:, None] * out[b]
+        return torch.stack([torch.stack(row, 1) for row in found], 1)
+
     def turns(self, wave_number: float) -> list[Turn]:
-        """The waves at every edge."""
+        """The waves at every edge.
+
+        Args:
+            wave_number: k [1/m].
+        """
         found, legs = [], self.legs
         way = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
+        parameters = self._parameters()
         for number, edge in enumerate(self.edges):
             direction, towards = way[:, number], way[:, number + 1]
             turn = Turn(
@@ -196,7 +239,7 @@ class _Route:
                 towards,
                 _azimuth(edge.wedges, -direction, edge.azimuth_in),
                 _azimuth(edge.wedges, towards, edge.azimuth),
-                self._parameter(number, legs, way),
+                parameters[:, number] * cross(edge_axis(edge.wedges), direction).square().sum(1),
                 edge.faces,
                 None if edge.endless else self.ends(number, wave_number),
                 edge.absorbs,
@@ -204,23 +247,37 @@ class _Route:
             found.append(turn)
         return found
 
-    def _parameter(self, number: int, legs: Tensor, way: Tensor) -> Tensor:
-        """L of an edge: (s s′/(s + s′))² det H over that of the path without it."""
-        before, after = legs[:, number], legs[:, number + 1]
-        share = before * after / (before + after)
-        stiff = self.spread**2
-        if len(self.edges) == 2:
-            other = 1 - number
-            outer = legs[:, 2] if other else legs[:, 0]
-            axis = edge_axis(self.edges[other].wedges)
-            square = cross(axis, way[:, 2 * other]).square().sum(1)
-            stiff = stiff / (square * (1 / outer + 1 / (before + after)))
-        return share**2 * stiff
+    def _parameters(self) -> Float64[Tensor, "row edge"]:
+        """L/sin²β of the edges: 1/P_ii."""
+        minors, whole = _minors(self.covariance)
+        own = torch.diagonal(minors, dim1=1, dim2=2)
+        return whole.clamp_min(0)[:, None] / own.clamp_min(1e-300)
+
+    @property
+    def couplings(self) -> Float64[Tensor, "row edge edge"]:
+        """w_ij, > 0 where azimuths of departure from i and of incidence on j grow to one side."""
+        minors, _ = _minors(self.covariance)
+        root = torch.diagonal(minors, dim1=1, dim2=2).clamp_min(1e-300).sqrt()
+        return minors / (root[:, :, None] * root[:, None])
 
     def ends(self, number: int, wave_number: float) -> Float64[Tensor, "row 2"]:
         """√phase by which paths over the ends of an edge are longer, < 0 past the end.
 
-        Of two edges, the other's point follows.
+        The other edges' points follow.
+
+        Args:
+            number: of the edge on the path.
+            wave_number: k [1/m].
+        """
+        past, root = self.beyond(number, wave_number)
+        return past * root
+
+    def beyond(self, number: int, wave_number: float) -> tuple[Tensor, Tensor]:
+        """How far the ends of an edge lie outwards of its point [m], and √phase over that [1/m].
+
+        Args:
+            number: of the edge on the path.
+            wave_number: k [1/m].
         """
         wedges = self.edges[number].wedges
         offset = self.offsets[:, number]
@@ -233,26 +290,55 @@ class _Route:
                 along = dot(point - antenna, axis)
                 aside = cross(point - antenna, axis).norm(dim=1)
                 excess = excess + _excess(aside[:, None], along[:, None], past)
-            return past * (wave_number * excess).sqrt()
-        other = self.hessian[:, 1 - number, 1 - number]
+            return past, (wave_number * excess).sqrt()
+        rest = [other for other in range(len(self.edges)) if other != number]
+        other = _determinant(self.hessian[:, rest][:, :, rest])
         stiff = self.spread**2 / other.clamp_min(1e-300)
         bent = 0.5 * stiff[:, None] * past**2
         excess = self._over_ends(number) - self.legs.sum(1, keepdim=True)
         near = wave_number * bent.detach() < _BENT
         ratio = torch.where(near, 1.0, excess / torch.where(near, 1.0, bent))
-        return past * (0.5 * wave_number * stiff[:, None] * ratio.clamp_min(0.0)).sqrt()
+        return past, (0.5 * wave_number * stiff[:, None] * ratio.clamp_min(0.0)).sqrt()
 
     def _over_ends(self, number: int) -> Float64[Tensor, "row 2"]:
-        """Lengths of the paths over the ends of one edge of two, shortest over the other edge."""
-        wedges, other = self.edges[number].wedges, self.edges[1 - number].wedges
-        near, far = self.vertices[:, 3 * number], self.vertices[:, 3 - 3 * number]
-        axis = _unit(other.end - other.start)
+        """Lengths of the paths over the ends of one edge, shortest over the others."""
+        wedges = self.edges[number].wedges
+        before = [edge.wedges for edge in self.edges[:number]]
+        after = [edge.wedges for edge in self.edges[number + 1 :]]
         found = []
         for end in (wedges.start, wedges.end):
-            asides = [cross(point - other.start, axis).norm(dim=1) for point in (end, far)]
-            folded = torch.hypot(asides[0] + asides[1], dot(far - end, axis))
-            found.append((end - near).norm(dim=1) + folded)
+            there = _shortest_length(before, self.vertices[:, 0], end)
+            found.append(there + _shortest_length(after, end, self.vertices[:, -1]))
         return torch.stack(found, 1)
+
+
+def _shortest_length(wedges: Sequence[Wedges], first: Tensor, last: Tensor) -> Tensor:
+    """Of ways over edges without ends, differentiable once."""
+    if not wedges:
+        return (last - first).norm(dim=1)
+    axes = [_unit(each.end - each.start) for each in wedges]
+    if len(wedges) == 1:
+        asides = [cross(point - wedges[0].start, axes[0]).norm(dim=1) for point in (first, last)]
+        return torch.hypot(asides[0] + asides[1], dot(last - first, axes[0]))
+    starts, axis = torch.stack([each.start for each in wedges], 1), torch.stack(axes, 1)
+    offsets = _shortest(starts.detach(), axis.detach(), first.detach(), last.detach())
+    stops = _vertices(starts, axis, offsets, first, last)
+    found = (stops[:, 1:] - stops[:, :-1]).norm(dim=2).sum(1)
+    # Where lines cross, the shortest way may go over their crossing, in which it is not smooth.
+    apart, both = starts[:, 1] - starts[:, 0], dot(axes[0], axes[1])
+    square = (1 - both**2).clamp_min(_LEAST)
+    near = (
+        starts[:, 0] + (dot(apart, axes[0] - both[:, None] * axes[1]) / square)[:, None] * axes[0]
+    )
+    crossing = cross(near - starts[:, 1], axes[1]).detach().norm(dim=1) < _LEAST * found.detach()
+    over = (near - first).norm(dim=1) + (last - near).norm(dim=1)
+    found = torch.where(crossing & (over.detach() < found.detach()), over, found)
+    # A point on the line next to it needs no way there.
+    for side, place in ((0, first), (1, last)):
+        aside = cross(place - wedges[side].start, axes[side]).detach().norm(dim=1)
+        rest = _shortest_length([wedges[1 - side]], first, last)
+        found = torch.where(aside < _LEAST * found.detach(), rest, found)
+    return found
 
 
 _OUTWARDS = torch.tensor([-1.0, 1.0], dtype=torch.float64)
@@ -274,8 +360,15 @@ def _azimuth(wedges: Wedges, direction: Tensor, known: Tensor | None) -> Tensor:
     return found if known is None else torch.where(known.isnan(), found, known)
 
 
-def _route(edges: Sequence[Edge], tx: Tensor, rx: Tensor) -> _Route:
-    """Where paths turn: in closed form on one edge, by Newton's steps on two."""
+def find_route(
+    edges: Sequence[Edge], tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
+) -> Route:
+    """Where paths turn: in closed form on one edge, by Newton's steps on more.
+
+    Args:
+        edges: in the order of the path.
+        tx, rx: the antennas, or their images [m].
+    """
     starts = torch.stack([edge.wedges.start for edge in edges], 1)
     axes = torch.stack([_unit(edge.wedges.end - edge.wedges.start) for edge in edges], 1)
     if len(edges) == 1:
@@ -290,7 +383,7 @@ def _route(edges: Sequence[Edge], tx: Tensor, rx: Tensor) -> _Route:
     legs = (vertices[:, 1:] - vertices[:, :-1]).detach().norm(dim=2)
     slope = _slopes(vertices.detach(), axes.detach())
     stationary = (legs > _LEAST * legs.sum(1, keepdim=True)).all(1) & (slope.abs() < 1e-6).all(1)
-    return _Route(edges, offsets, vertices, _second_derivatives(vertices, axes), stationary)
+    return Route(edges, offsets, vertices, _second_derivatives(vertices, axes), stationary)
 
 
 def _between(start: Tensor, axis: Tensor, first: Tensor, last: Tensor) -> Tensor:
@@ -326,85 +419,120 @@ def _second_derivatives(vertices: Tensor, axes: Tensor) -> Tensor:
         first, second, u = axes[:, a], axes[:, b], way[:, leg]
         return (dot(first, second) - dot(first, u) * dot(second, u)) / legs[:, leg]
 
-    own = [entry(a, a, a) + entry(a, a, a + 1) for a in range(axes.shape[1])]
-    if len(own) == 1:
-        return own[0][:, None, None]
-    both = -entry(0, 1, 1)
-    return torch.stack([own[0], both, both, own[1]], 1).unflatten(1, (2, 2))
+    count = axes.shape[1]
+    none = torch.zeros_like(legs[:, 0])
+    found = [[none] * count for _ in range(count)]
+    for a in range(count):
+        found[a][a] = entry(a, a, a) + entry(a, a, a + 1)
+        if a:
+            found[a][a - 1] = found[a - 1][a] = -entry(a - 1, a, a)
+    return torch.stack([torch.stack(row, 1) for row in found], 1)
 
 
 def _determinant(matrix: Tensor) -> Tensor:
-    return matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] ** 2
+    """Of tridiagonal symmetric ones."""
+    before, last = torch.ones_like(matrix[:, 0, 0]), matrix[:, 0, 0]
+    for n in range(1, matrix.shape[1]):
+        step = matrix[:, n, n] * last - matrix[:, n - 1, n] ** 2 * before
+        before, last = last, step
+    return last
+
+
+def _minors(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """The signed minors of symmetric matrices of up to three rows, and the determinants."""
+    count = matrix.shape[1]
+    if count == 1:
+        return torch.ones_like(matrix), matrix[:, 0, 0]
+    if count == 2:
+        own, both = matrix.diagonal(dim1=1, dim2=2).flip(1), -matrix[:, 0, 1]
+        found = torch.stack([own[:, 0], both, both, own[:, 1]], 1).unflatten(1, (2, 2))
+    else:
+        found = cross(matrix.roll(-1, 1), matrix.roll(-2, 1))
+    return found, dot(matrix[:, 0], found[:, 0])
 
 
 def _solved(matrix: Tensor, right: Tensor) -> Tensor:
-    """H⁻¹ times a vector, 2 × 2."""
-    first, second = right.unbind(1)
-    flipped = [
-        matrix[:, 1, 1] * first - matrix[:, 0, 1] * second,
-        matrix[:, 0, 0] * second - matrix[:, 0, 1] * first,
-    ]
-    return torch.stack(flipped, 1) / _determinant(matrix).clamp_min(1e-300)[:, None]
+    """H⁻¹ times a vector, of tridiagonal H ≥ 0."""
+    count = matrix.shape[1]
+    pivots, sides = [matrix[:, 0, 0].clamp_min(1e-300)], [right[:, 0]]
+    for n in range(1, count):
+        share = matrix[:, n - 1, n] / pivots[-1]
+        pivots.append((matrix[:, n, n] - share * matrix[:, n - 1, n]).clamp_min(1e-300))
+        sides.append(right[:, n] - share * sides[-1])
+    found = [sides[-1] / pivots[-1]]
+    for n in reversed(range(count - 1)):
+        found.insert(0, (sides[n] - matrix[:, n, n + 1] * found[0]) / pivots[n])
+    return torch.stack(found, 1)
 
 
 def _shortest(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
-    """Places on two edges of the shortest path: Newton's steps where they shorten it.
+    """Places on edges of the shortest path: Newton's steps where they shorten it.
 
     The length is convex; elsewhere each place is moved to the shortest way between its neighbours.
-    That would stick where the edges' lines cross. So the second edge and the receiver are lifted
-    into a fourth dimension first, and then let down.
+    That would stick where the edges' lines cross. So each edge and the receiver are lifted into a
+    fourth dimension first, above the edge before, and then let down.
     """
     offsets = torch.zeros(starts.shape[:2], dtype=starts.dtype)
     size = (rx - tx).norm(dim=1)
     none = torch.zeros_like(size)[:, None]
     for lift in _LIFTS:
-        up = lift * size[:, None]
+        ups = lift * size[:, None] * torch.arange(starts.shape[1])
         offsets = _settled(
             offsets,
-            torch.cat([starts, torch.stack([none, up], 1)], 2),
+            torch.cat([starts, ups[..., None]], 2),
             torch.nn.functional.pad(axes, (0, 1)),
             torch.cat([tx, none], 1),
-            torch.cat([rx, up], 1),
+            torch.cat([rx, ups[:, -1:]], 1),
+            _ROUGH if lift else _FINE,
         )
     return offsets
 
 
-def _settled(offsets: Tensor, starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
-    """``_shortest`` from given places on."""
+def _settled(
+    offsets: Tensor, starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor, least: float
+) -> Tensor:
+    """``_shortest`` from given places on, until these move by a share of the antennas' distance."""
 
     def length(at: Tensor) -> Tensor:
         points = _vertices(starts, axes, at, tx, rx)
         return (points[:, 1:] - points[:, :-1]).norm(dim=2).sum(1)
 
+    found, rows = offsets, torch.arange(len(offsets))
     for _ in range(_STEPS):
-        points = _vertices(starts, axes, offsets, tx, rx)
-        first = _between(starts[:, 0], axes[:, 0], tx, points[:, 2])
-        place = starts[:, 0] + first[:, None] * axes[:, 0]
-        second = _between(starts[:, 1], axes[:, 1], place, rx)
-        turned = torch.stack([first, second], 1)
+        points, place, moved = _vertices(starts, axes, offsets, tx, rx), tx, []
+        for n in range(starts.shape[1]):
+            moved.append(_between(starts[:, n], axes[:, n], place, points[:, n + 2]))
+            place = starts[:, n] + moved[-1][:, None] * axes[:, n]
+        turned = torch.stack(moved, 1)
         points = _vertices(starts, axes, turned, tx, rx)
-        step = _solved(_second_derivatives(points, axes), _slopes(points, axes))
-        newton = turned - step
+        newton = turned - _solved(_second_derivatives(points, axes), _slopes(points, axes))
         better = (length(newton) < length(turned))[:, None]
         offsets, before = torch.where(better, newton, turned), offsets
-        if bool((offsets - before).abs().max() < 1e-12 * (1 + offsets.abs().max())):
+        found = found.index_copy(0, rows, offsets)
+        # Only those that still move go on.
+        on = (offsets - before).abs().amax(1) >= least * (rx - tx).norm(dim=1)
+        if not bool(on.any()):
             break
-    return offsets
+        rows, offsets, starts, axes = rows[on], offsets[on], starts[on], axes[on]
+        tx, rx = tx[on], rx[on]
+    return found
 
 
-def _second(route: _Route, turns: Sequence[Turn], wave_number: float) -> Tensor:
-    """The dyad of both edges; of those of a face with half the field, which is twice the incident.
+def _several(route: Route, turns: Sequence[Turn], wave_number: float) -> Tensor:
+    """The dyad of all edges; of those of a face with half the field, which is twice the incident.
 
     Two edges closer than half a wavelength are one thing, which two one after the other are not:
     that grows without bound into the corner where they meet. There it is taken off, by x³/(1 + x³).
     """
-    way, legs = turns[0].towards, route.legs
-    first, second = turns
-    one, other = (normalize(cross(edge_axis(turn.wedges), way), dim=1) for turn in turns)
-    share = legs[:, 0] * legs[:, 2] / ((legs[:, 0] + legs[:, 1]) * (legs[:, 1] + legs[:, 2]))
-    total = double_dyad(first, second, -dot(one, other) * share.sqrt(), wave_number)
-    before, after = route.edges[0].azimuth, route.edges[1].azimuth_in
-    if before is not None and after is not None:
-        total = torch.where(before.isnan()[:, None, None], total, total / 2)
-    apart = (wave_number * legs[:, 1] / torch.pi) ** 3
-    return total * (apart / (1 + apart))[:, None, None]
+    couplings = route.couplings
+    if len(turns) == 2:
+        total = double_dyad(turns[0], turns[1], couplings[:, 0, 1], wave_number)
+    else:
+        total = triple_dyad(turns, couplings, wave_number)
+    share = torch.ones_like(couplings[:, 0, 0])
+    for number, (one, other) in enumerate(pairwise(route.edges), start=1):
+        if one.azimuth is not None and other.azimuth_in is not None:
+            share = torch.where(one.azimuth.isnan(), share, share / 2)
+        apart = (wave_number * route.legs[:, number] / torch.pi) ** 3
+        share = share * apart / (1 + apart)
+    return total * share[:, None, None]

@@ -51,7 +51,7 @@ from invertwin.scene.checks import (
 )
 from invertwin.scene.scene import Scene
 
-_DEEPEST, _MOST_EDGES = 6, 2
+_DEEPEST, _MOST_EDGES = 6, 3
 _ROWS_AT_ONCE = 1 << 15
 _BENT_AT_ONCE = 1 << 13  # paths round edges, which hold more
 _UP = (0.0, 0.0, 1.0)
@@ -116,7 +116,7 @@ def trace_paths(
         rx: Receivers, [3] or [rx, 3] [m].
         frequency: Of the coefficients [Hz].
         depth: Most surfaces that a path meets, 0 to 6; a sheet that it passes counts as one.
-        edges: Most edges that a path goes round, 0 to 2. Paths round one edge also meet up to
+        edges: Most edges that a path goes round, 0 to 3. Paths round one edge also meet up to
             ``depth`` surfaces; round two, none.
         rays: Shot from each antenna of the side with fewer, and from all edges together; None tries
             every sequence.

@@ -9,7 +9,7 @@ Source: derivations §9; Weideman, "Computation of the complex error function", 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,11 @@ from torch import Tensor
 
 _TERMS = 40  # of Weideman's sum: 1e-14
 _POINTS = 24  # of either quadrature: 1e-14
+_CHAINED = 48  # of that over a third edge
 _NEAR = 16.0  # s² + t² from which on the far quadrature serves
 _TURN = complex(math.sqrt(0.5), math.sqrt(0.5))  # exp(jπ/4)
 _ROOT = math.sqrt(math.pi)
+_DEEP = 6.0  # exp(−36) of the largest value, where an integral ends
 _ROWS_AT_ONCE = 1 << 13  # such pieces stay in the processor's cache: ten times as fast
 
 
@@ -35,8 +37,16 @@ def _weideman(terms: int) -> tuple[float, list[float]]:
     return scale, found[terms:0:-1].tolist()
 
 
+def _graded(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights from 0 to 1, closer together near 0: Gauss's of the cube root."""
+    node, weight = np.polynomial.legendre.leggauss(count)
+    root = (node + 1) / 2
+    return root**3, 1.5 * weight * root**2
+
+
 _SCALE, _COEFFICIENTS = _weideman(_TERMS)
 _LEGENDRE = tuple(zip(*np.polynomial.legendre.leggauss(_POINTS), strict=True))
+_GRADED = tuple(values.tolist() for values in _graded(_CHAINED))
 _LAGUERRE = tuple(zip(*np.polynomial.laguerre.laggauss(_POINTS), strict=True))
 
 
@@ -131,6 +141,38 @@ def corner_transition(
     return (2j * _ROOT * _TURN.conjugate() * side / root) * (parts[0] + parts[1])
 
 
+def chain_transition(
+    middle: Float64[Tensor, "term row"],
+    outer: Sequence[Float64[Tensor, "term row"]],
+    coupling: Sequence[Float64[Tensor, " row"]],
+) -> Complex128[Tensor, "parity parity term term term row"]:
+    """What three edges send, of which one is coupled to both others: parts by parity in couplings.
+
+    The whole is −8j ∫∫∫ exp(−j(x² + y² + z² + 2rx + 2sy + 2tz − 2vxy − 2wxz)) from 0 to ∞, with
+    y and z of the outer edges. For every x, the integrals over y and z are functions of their own,
+    and that over x goes down from the real axis. Parts even (0) and odd (1) in v and w add up to
+    the whole; terms are in the order of the arguments. Without coupling it is g(r) g(s) g(t). Of
+    arguments up to 30 it is exact to 3e-5 of it, of arguments up to 3 to 1e-10.
+
+    Args:
+        middle: r ≥ 0, as in ``transition``.
+        outer: s and t ≥ 0.
+        coupling: v and w, v² + w² < 1.
+    """
+    left = (1 - coupling[0] ** 2 - coupling[1] ** 2).clamp_min(1e-9)
+    node, weight = (torch.tensor(values, dtype=torch.float64) for values in _GRADED)
+    reach = _DEEP / left.detach().sqrt()
+    x, step = reach[:, None] * node, reach[:, None] * weight
+    sides = []
+    for values, w in zip(outer, coupling, strict=True):
+        up, down = (_Shifted.apply(values[..., None], sign * w[:, None], x) for sign in (1, -1))
+        sides.append(torch.stack([up + down, up - down]) / 2)
+    falls = left[:, None] * x**2 + math.sqrt(2) * middle[..., None] * x
+    turns = -math.sqrt(2) * middle[..., None] * x
+    kernel = torch.polar(2 * step * (-falls).exp(), turns) * _TURN
+    return torch.einsum("crx,parx,qbrx->pqcabr", kernel, sides[0], sides[1])
+
+
 def _in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
     """A function of numbers of one shape, some rows at a time."""
     pieces = zip(*(values.reshape(-1).split(_ROWS_AT_ONCE) for values in given), strict=True)
@@ -146,6 +188,50 @@ def _scaled_erfc(x: Tensor) -> Tensor:
     for coefficient in _COEFFICIENTS[1:]:
         total = total * ratio + coefficient
     return (2 * total / below + 1 / _ROOT) / below
+
+
+class _Shifted(torch.autograd.Function):
+    """exp(−w²x²) g(s − exp(−jπ/4) w x), where g is that of s ≥ 0 for all complex numbers."""
+
+    @staticmethod
+    def forward(s: Tensor, w: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]
+        s, shift = torch.broadcast_tensors(s, w * x)
+        return _in_pieces(_shifted, s, shift)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:  # type: ignore[override]
+        ctx.save_for_backward(*inputs, output)
+        ctx.save_for_forward(*inputs, output)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
+        s, w, x, found = ctx.saved_tensors
+        by_s, by_w = ((grad.conj() * slope).real for slope in _shifted_slopes(s, w, x, found))
+        return by_s.sum_to_size(s.shape), by_w.sum_to_size(w.shape), None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent_s: Any, tangent_w: Any, _: Any) -> Tensor:  # type: ignore[override]
+        s, w, x, found = ctx.saved_tensors
+        by_s, by_w = _shifted_slopes(s, w, x, found)
+        return by_s * (torch.zeros_like(s) if tangent_s is None else tangent_s) + by_w * (
+            torch.zeros_like(w) if tangent_w is None else tangent_w
+        )
+
+
+def _shifted(s: Tensor, shift: Tensor) -> Tensor:
+    """One-dimensional; beyond s = √2 shift by way of the function of −s."""
+    way = s - _TURN.conjugate() * shift
+    over = shift * math.sqrt(2) > s
+    size = _scaled_erfc(torch.where(over, -way, way)) * torch.exp(-shift * shift)
+    turn = s * s - math.sqrt(2) * shift * s
+    straight = torch.exp(torch.complex(-math.sqrt(2) * shift * s * over, turn))
+    return _ROOT * _TURN * torch.where(over, 2 * straight - size, size)
+
+
+def _shifted_slopes(s: Tensor, w: Tensor, x: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
+    way = s - _TURN.conjugate() * w * x
+    by_s = 2j * way * found - 2j * torch.exp(-((w * x) ** 2))
+    return by_s, -_TURN.conjugate() * x * by_s - 2 * w * x * x * found
 
 
 def _wave(phase: Tensor) -> Tensor:
