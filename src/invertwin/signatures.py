@@ -35,7 +35,7 @@ class Signature:
     Attributes:
         parts: S [m] of each part of the field: ``order 1``, ``order 2`` … are physical optics after
             as many bounces, ``edges 1`` fringe currents, ``edges 2`` … waves that several edges of
-            a plate diffract.
+            a plate diffract, ``rest`` what these leave out of the solved field of small bodies.
         frequencies: [Hz].
         directions: unit vectors from the target to the transmitter.
         receivers: unit vectors to the receiver.
@@ -133,8 +133,8 @@ def rcs(
     """Compute the radar cross-section of smooth conductors and dielectrics, far away.
 
     Scenes of at most 24 triangles are exact physical optics of every bounce, and differentiable
-    with respect to the scene; others are shot with ray tubes. Monostatic and bistatic results are
-    reciprocal.
+    with respect to the scene; others are shot with ray tubes. Of small closed conductors that have
+    more triangles, currents are solved instead. Monostatic and bistatic results are reciprocal.
 
     Args:
         scene: the target about the world's origin.
@@ -145,7 +145,8 @@ def rcs(
             or a Jones vector (V, H). V and H are the unit vectors of θ and φ about ``up``.
         depth: most bounces.
         edges: most diffractions of a wave by sharp edges of conductors: 0 is physical optics alone,
-            1 adds fringe currents, 2 the waves between the edges of a flat plate.
+            1 adds fringe currents, 2 the waves between the edges of a flat plate. From 1 on small
+            closed conductors are solved.
         tubes_per_wavelength: at the highest frequency, for scenes of many triangles.
         up: vertical axis.
         boundary: False leaves out of derivatives what moving edges of beams and shadows change:

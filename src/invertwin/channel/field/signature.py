@@ -20,6 +20,7 @@ from torch.nn.functional import normalize
 from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
+from invertwin.channel.field.solved import SolvedBodies
 from invertwin.channel.field.tubes import tubes
 from invertwin.channel.field.waves import (
     Skins,
@@ -44,6 +45,7 @@ from invertwin.channel.rays.scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
+from invertwin.progress import told
 from invertwin.scene.scene import Scene
 
 _SAGITTA = 1 / 50  # wavelengths that a facet may be off the curved surface
@@ -88,6 +90,11 @@ class _Body:
         smooth = (first.coherent == 1) & (first.rms_height == 0)
         return bool((first.conducting & smooth).all())
 
+    @property
+    def solvable(self) -> bool:
+        """Whether all is closed bodies of metal, which have too many facets for beams."""
+        return len(self.facets.normal) > FEW and self.plain and bool(self.facets.solid.all())
+
     def clear(self, points: Tensor, directions: Tensor) -> Tensor:
         """Whether nothing lies between points and the far end of directions."""
         return visible(self.occluders, points, points + 3 * self.facets.size * directions)
@@ -108,7 +115,8 @@ def trace_signature(
     """Scattering amplitudes S of every part of the field, about the world's origin; σ = 4π|S|².
 
     Rows are the receiving, columns the transmitting polarisation, V and H of ``polarisations``. The
-    parts are ``order 1``, ``order 2`` and so on, and ``edges 1``, ``edges 2``.
+    parts are ``order 1``, ``order 2`` and so on, ``edges 1``, ``edges 2``, and of small closed
+    conductors ``rest``, which is what these leave out of the solved field.
 
     Args:
         scene: conductors and smooth dielectrics.
@@ -116,7 +124,8 @@ def trace_signature(
         receivers: the same; None = the transmitter receives.
         frequencies: [Hz].
         depth: most bounces.
-        edges: most diffractions of a wave by sharp edges of conductors; 0 leaves them out.
+        edges: most diffractions of a wave by sharp edges of conductors; 0 leaves them out, and the
+            rest.
         tubes_per_wavelength: at the highest frequency, where the scene has many triangles.
         up: V lies in a plane with this unit vector.
         boundary: False leaves out of derivatives what moving edges of beams change.
@@ -133,13 +142,18 @@ def trace_signature(
                 "ray tubes jump at edges; detach the scene, or fit with power paths"
             )
         spacing = None if count <= FEW else body.wavelength / tubes_per_wavelength
-        _warn(scene, body, tubes_per_wavelength, spacing)
+        solves = edges > 0 and body.solvable
+        _warn(scene, body, tubes_per_wavelength, spacing, solves)
         ways = [(transmitters, transmitters if receivers is None else receivers)]
         if receivers is not None:
             ways.append((receivers, transmitters))
         found = [_View(body, *way).parts(depth, edges, spacing, boundary) for way in ways]
         # The mean of both ways between two antennas, or between polarisations of one.
-        return {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
+        parts = {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
+        if solves:
+            rest = _rest(body, ways, torch.stack([*parts.values()]).sum(0))
+            parts |= {} if rest is None else {"rest": rest}
+        return parts
 
 
 @dataclass(frozen=True)
@@ -280,6 +294,20 @@ class _View:
         return torch.stack(total)
 
 
+def _rest(body: _Body, ways: Sequence[tuple[Tensor, Tensor]], known: Tensor) -> Tensor | None:
+    """What bounces and edges leave out of the fields of small bodies; of larger ones zero."""
+    bodies = SolvedBodies(body.facets.corners.detach(), body.up)
+    rest: dict[int, Tensor] = {}
+    downwards = sorted(range(len(known)), key=lambda f: -body.wave_numbers[f])
+    for f in told(downwards, "frequencies"):
+        found = bodies.scattered(body.wave_numbers[f], ways)
+        if found is not None:
+            rest[f] = (found[0] + found[-1].mT) / 2 - known[f]
+    if not rest:
+        return None
+    return torch.stack([rest.get(f, torch.zeros_like(known[f])) for f in range(len(known))])
+
+
 def _segments(wedges: Wedges, longest: float) -> Wedges:
     """Edges in equal pieces no longer than a length."""
     side = wedges.end - wedges.start
@@ -330,7 +358,7 @@ def _skins(scene: Scene, topology: Topology, frequency: float) -> Skins:
     return Skins(*map(torch.cat, columns))
 
 
-def _warn(scene: Scene, body: _Body, density: float, spacing: float | None) -> None:
+def _warn(scene: Scene, body: _Body, density: float, spacing: float | None, solves: bool) -> None:
     """Say where the physics ends."""
     found: list[str] = []
     if spacing is not None and density < 1:
@@ -350,7 +378,7 @@ def _warn(scene: Scene, body: _Body, density: float, spacing: float | None) -> N
         own = faces == number
         points = body.facets.corners.detach()[own].reshape(-1, 3)
         size = float((points.amax(0) - points.amin(0)).norm())
-        if size < body.wavelength:
+        if size < body.wavelength and not solves:
             found.append(
                 f"{name} is {size / body.wavelength:.2g} wavelengths large: physical optics is for "
                 "objects of several"
