@@ -9,6 +9,8 @@ import invertwin as iw
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.discovery import Twin, still_capture, twin
 from invertwin.discovery.places import dense
+from invertwin.discovery.primitives import Figure
+from invertwin.discovery.search import Search
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground
 from invertwin.radar import Chirps, add_noise
@@ -87,6 +89,25 @@ def test_what_stands_in_a_room_is_found(room: Twin):
     assert sides == pytest.approx([0.3, 0.5], abs=0.05)
     long_way = figure.yaw if figure.length > figure.width else figure.yaw + math.pi / 2
     assert abs(math.remainder(long_way - 0.5, math.pi)) < math.radians(4)
+
+
+def test_what_is_likelier_something_else_becomes_that(monkeypatch):
+    """The search ends with a box where a post stands."""
+    monkeypatch.setattr(
+        Search, "run", lambda _: [Figure("box", (0.1, 0.2), 0.3, 0.3, 0.25, 1.0, 0.05)]
+    )
+    radar = around(8)
+    scene = iw.Scene({"post": thing(cylinder(0.2, 1.0), (0.1, 0.2), 0.5)})
+    grid = radar.grid(0.5, 3.5)
+    beat = iw.simulate(scene, radar, grid, seed=3, sampling=CHAIN, snr_db=10.0).beat
+    (one,) = twin(
+        Capture.from_beat(beat, radar), low=(-0.6, -0.6), high=(0.6, 0.6), level=0.0
+    ).things
+    assert one.figure is not None
+    assert (one.kind, one.figure.kind) == ("cylinder", "cylinder")
+    assert one.probabilities["cylinder"] > 0.5
+    assert one.figure.length == pytest.approx(0.4, abs=0.04)
+    assert {"x", "z", "length", "height", "brightness"} == set(one.deviations)
 
 
 @pytest.mark.slow
@@ -204,6 +225,16 @@ def test_the_strongest_mover_of_the_board_is_found(data_folder):
     assert float(strongest.position.norm()) == pytest.approx(2.93, abs=0.05)
     assert strongest.confidence > 0.9
     assert float(strongest.velocity.norm()) > 0.2
+
+
+def test_what_rests_keeps_its_signal_and_what_moves_fades():
+    radar, chirps = around(1), Chirps(32, 100e-6)
+    turns = 2.5 * torch.arange(32, dtype=torch.float64) / 32  # two and a half bins of range rate
+    mover = torch.exp(2j * torch.pi * turns)[:, None, None, None]
+    for signal, least, most in ((torch.ones_like(mover), 1 - 1e-12, 1 + 1e-12), (mover, 0, 6e-4)):
+        beat = signal.expand(1, 32, 2, 4, 128).contiguous()
+        power = still_capture(ChirpCapture(beat, radar, chirps)).beat.abs().square()
+        assert least <= float(power.min()) <= float(power.max()) <= most
 
 
 def test_a_region_that_nothing_sees_is_refused():

@@ -170,7 +170,7 @@ def _described(found: Twin, folder: RunFolder) -> dict[str, Any]:
         sides[found.ground.level[1]] = figure.width
         sides[axis] = figure.height
         shape: dict[str, Any] = {"shape": "sphere", "radius": 0.5 * figure.length}
-        if figure.kind in ("person", "vehicle", "corner"):
+        if figure.kind in ("person", "vehicle", "corner", "prism"):
             item = found.scene.objects[thing.name]
             mesh = replace(item.mesh, vertices=item.vertices - thing.position)
             save_mesh(folder.file(f"{thing.name}.ply"), mesh)

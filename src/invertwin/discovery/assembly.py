@@ -8,9 +8,11 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.channel import Sampling
+from invertwin.channel import Grid, Sampling
 from invertwin.discovery.clutter import HeavyTailed
 from invertwin.discovery.primitives import Figure, Primitive
+from invertwin.discovery.prisms import Outline, unknown
+from invertwin.discovery.sharp_image import thinned
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
 from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
@@ -18,6 +20,21 @@ from invertwin.radar import Radar
 from invertwin.scene import Scene
 
 _RATE = 0.01  # of the optimiser, see the scales of ``Primitive``
+
+
+@dataclass(frozen=True, eq=False)
+class Coarse:
+    """Maps of nearly independent bins.
+
+    Attributes:
+        power: The maps.
+        grid: Their bins.
+        loss: How unlikely they are.
+    """
+
+    power: Float64[Tensor, "frame some_range some_u some_v"]
+    grid: Grid
+    loss: HeavyTailed
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +61,33 @@ class Assembly:
     level: float
     seed: int
 
-    def primitives(self, figures: Sequence[Figure]) -> dict[str, Primitive]:
+    def unknowns(self, figures: Sequence[Figure]) -> dict[str, Primitive | Outline]:
         """Shapes as unknowns, by name.
 
         Args:
             figures: The shapes.
         """
         return {
-            f"object_{number}": Primitive(f"object_{number}", figure, self.ground, self.level)
+            f"object_{number}": unknown(f"object_{number}", figure, self.ground, self.level)
             for number, figure in enumerate(figures, 1)
         }
+
+    @cached_property
+    def coarse(self) -> "Coarse":
+        """The maps with one bin for each cell of range and direction."""
+        power, grid = thinned(self.power, self.radar, self.model.grid)
+        stride = round(grid.range_step / self.model.grid.range_step)
+        return Coarse(power, grid, replace(self.loss, level=self.loss.level[::stride]))
+
+    def coarse_predicted(
+        self, figures: Sequence[Figure]
+    ) -> Float64[Tensor, "frame some_range some_u some_v"]:
+        """``predicted`` in the bins of ``coarse``.
+
+        Args:
+            figures: The shapes.
+        """
+        return thinned(self.predicted(figures).double(), self.radar, self.model.grid)[0]
 
     def scene(self, figures: Sequence[Figure]) -> Scene:
         """Shapes as a scene.
@@ -61,7 +95,7 @@ class Assembly:
         Args:
             figures: The shapes.
         """
-        return Scene({name: one.item for name, one in self.primitives(figures).items()})
+        return Scene({name: one.item for name, one in self.unknowns(figures).items()})
 
     @torch.no_grad()
     def predicted(self, figures: Sequence[Figure]) -> Float[Tensor, "frame range u v"]:
@@ -120,17 +154,17 @@ class Assembly:
             figures: At the start.
             steps: Of the fit.
         """
-        primitives = self.primitives(figures)
+        unknowns = self.unknowns(figures)
         found = reconstruct(
             self.scene(figures),
             Observation(self.model, self.radar, self.power),
-            primitives,
+            unknowns,
             loss=self.loss,
             optimizer=Optimizer("adam", rate=_RATE),
             schedule=Schedule(steps, annealing=0.5),
             seed=self.seed,
         )
-        return [primitive.figure for primitive in primitives.values()], found
+        return [one.figure for one in unknowns.values()], found
 
 
 def sampling_of(frames: int, rays: int) -> Sampling:

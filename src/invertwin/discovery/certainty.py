@@ -10,7 +10,7 @@ from torch import Tensor
 from invertwin.discovery.assembly import Assembly
 from invertwin.discovery.primitives import Figure, upright
 from invertwin.discovery.search import facing, other_kinds
-from invertwin.inversion import Reconstruction
+from invertwin.inversion import Reconstruction, speckle_weight
 from invertwin.inversion.uncertainty import coordinates, map_derivatives
 
 
@@ -32,7 +32,7 @@ def deviations(one: Assembly, found: Reconstruction) -> dict[str, float]:
     level = one.loss.level.to(mean)[:, None, None]
     mean = (mean.detach().clamp_min(0.0) + level).double()
     ratio, nu = power.double() / mean, one.loss.degrees
-    score = 1 - ratio * (nu + 1) / (nu + ratio)
+    score = 1 - ratio * speckle_weight(ratio, nu)
     first, second = (
         map_derivatives(fit, rows, number)[0].detach().double() / mean for number in (0, 1)
     )

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from invertwin.capture import Capture, ChannelCalibration
 from invertwin.channel import Grid
-from invertwin.discovery.clutter import background
+from invertwin.discovery.clutter import DEGREES, background
 from invertwin.discovery.sharp_image import responses, sharpened, thinned
+from invertwin.inversion import speckle_weight
 from invertwin.radar import Radar, range_profile
 from invertwin.radar.radar import sampled
 
 _ROUNDS = 2  # an image, then the channels that it tells
 _SWEEPS = 100  # over the channels, at most
-_DEGREES = 4.0  # of the heavy-tailed speckle
 _WORTH = 10.0  # degrees of phase, root mean square: less is left as it is
 _APART = 8  # positions at least that are a range cell apart: they tell directions by ranges
 
@@ -123,7 +123,7 @@ def _likeliest(
         inverse = torch.linalg.inv(model)
         x = cells[frame]
         misfit = torch.einsum("ri,rij,rj->r", x.conj(), inverse, x).real / count
-        weight = (_DEGREES + 1) / (_DEGREES + misfit)
+        weight = speckle_weight(misfit, DEGREES)
         total += torch.einsum("r,ri,rij,rj->ij", weight.to(x), x.conj(), inverse, x)
         draws += float(weight.sum())
     return ChannelCalibration((1 / _minimum(total, draws)).reshape(capture.beat.shape[1:3]))

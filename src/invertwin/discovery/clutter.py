@@ -14,6 +14,8 @@ from invertwin.radar.radar import sampled
 from invertwin.radar.spectrum import aperture
 from invertwin.radar.waveform import unit_window
 
+DEGREES = 4.0
+"""Of the heavy-tailed speckle."""
 _LEAST = 1e-30  # of power, to keep logarithms finite
 _QUIET = 0.25  # quantile of a range bin that is taken for background
 
@@ -116,7 +118,7 @@ class HeavyTailed:
     """
 
     level: Float64[Tensor, " range"]
-    degrees: float = 4.0
+    degrees: float = DEGREES
 
     def __call__(
         self,

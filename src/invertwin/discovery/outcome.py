@@ -9,7 +9,8 @@ from torch import Tensor
 
 from invertwin.capture import ChannelCalibration
 from invertwin.channel import Grid
-from invertwin.discovery.primitives import Figure, Primitive
+from invertwin.discovery.primitives import Figure
+from invertwin.discovery.prisms import unknown
 from invertwin.inversion.initial import Ground
 from invertwin.scene import Object, Scene
 
@@ -46,7 +47,7 @@ class Thing:
 
     Attributes:
         name: In the twin's scene.
-        kind: The likeliest, among ``discovery.KINDS``.
+        kind: That of its figure, among ``discovery.KINDS``.
         probabilities: Of every kind that was tried.
         position: Its middle [m].
         figure: All numbers of its shape; None = only a place is known.
@@ -139,8 +140,7 @@ class Twin:
         objects: dict[str, Object] = {}
         for thing in self.things:
             if thing.figure is not None:
-                one = Primitive(thing.name, thing.figure, self.ground, self.level)
-                item = one.item
+                item = unknown(thing.name, thing.figure, self.ground, self.level).item
                 mesh = type(item.mesh)(item.mesh.vertices.detach(), item.mesh.faces)
                 objects[thing.name] = Object(mesh, thing.figure.material)
         return Scene(objects) if objects else None

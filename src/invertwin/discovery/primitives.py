@@ -26,7 +26,7 @@ from invertwin.scene.geometry.gait import hanging
 from invertwin.scene.parameters import Coordinate
 from invertwin.scene.shapes import box, cylinder, sphere
 
-Kind = Literal["wall", "box", "cylinder", "sphere", "point", "person", "vehicle", "corner"]
+Kind = Literal["wall", "box", "cylinder", "sphere", "point", "person", "vehicle", "corner", "prism"]
 KINDS: tuple[str, ...] = get_args(Kind)
 THIN = 0.06
 """A box that is thinner than this, and three times as long, is a wall [m]."""
@@ -75,12 +75,13 @@ class Figure:
     Attributes:
         kind: Its shape. A wall is a thin box, a point a small sphere. A person stands with hanging
             arms. A vehicle is a car of usual proportions. A corner is a bright plate that reflects
-            on one side: the way a corner reflector opens.
+            on one side: the way a corner reflector opens. A prism has vertical sides and any
+            outline, see ``Prism``.
         place: Along the two axes of the ground [m].
         yaw: About the vertical, of all but round shapes [rad]. If it is 0, a vehicle looks along
             x; a person and a corner look along −z where y is up, and along y where z is up.
         length: Along its first axis; the diameter of round shapes [m].
-        width: Along its second axis, of shapes with a yaw [m].
+        width: Along its second axis, of shapes with a yaw and of prisms [m].
         height: Of the shape, which stands on the ground; a sphere's and a corner's is that of its
             middle [m].
         brightness: See ``Matte``.
@@ -131,10 +132,70 @@ class Figure:
         return self.kind
 
 
-class Primitive(nn.Module):
-    """One shape on the ground as an unknown: place, turn, size and brightness.
+class Unknown(nn.Module):
+    """What all unknown things on the ground share.
 
     It brings its object with it: the scene needs none of that name.
+
+    Args:
+        name: Of the object.
+        ground: The plane, and which way is up.
+        level: Height of the ground [m].
+        place: To start with [m].
+        brightness: To start with, see ``Matte``.
+
+    Attributes:
+        place: Parameter [2], metres.
+        strength: Parameter, a tenth of the logarithm of the brightness.
+    """
+
+    # Scaled so that steps of one length suit all parameters.
+    TURN, SIZE, STRENGTH = 2.0, 3.0, 10.0
+
+    def __init__(
+        self, name: str, ground: Ground, level: float, place: tuple[float, float], brightness: float
+    ) -> None:
+        super().__init__()
+        self.object, self.ground, self.level = name, ground, level
+        self.place = nn.Parameter(torch.tensor(place, dtype=torch.float64))
+        strength = math.log(brightness) / self.STRENGTH
+        self.strength = nn.Parameter(torch.tensor(strength, dtype=torch.float64))
+
+    @property
+    def brightness(self) -> Float64[Tensor, ""]:
+        """See ``Matte``."""
+        return (self.STRENGTH * self.strength).exp()
+
+    def mesh(self) -> Mesh:
+        """The surface in the world, differentiable by all parameters."""
+        raise NotImplementedError
+
+    @property
+    def item(self) -> Object:
+        """The object, differentiable by all parameters."""
+        return Object(self.mesh(), Matte(self.brightness))
+
+    def forward(self, scene: Scene) -> Scene:
+        """The scene with the object in it, in place of one of the same name."""
+        return Scene({**scene.objects, self.object: self.item})
+
+    def places(self) -> list[Coordinate]:
+        """The two of its place."""
+        along = torch.eye(2, dtype=torch.float64)
+        return [
+            Coordinate(f"{self.object}.{'xyz'[axis]}", "m", {"place": row}, 0.1)
+            for axis, row in zip(self.ground.level, along, strict=True)
+        ]
+
+    def bright(self) -> Coordinate:
+        """That of its brightness."""
+        value = float(self.brightness.detach())
+        slope = torch.tensor(1 / (self.STRENGTH * value), dtype=torch.float64)
+        return Coordinate(f"{self.object}.brightness", "", {"strength": slope}, value)
+
+
+class Primitive(Unknown):
+    """One shape on the ground as an unknown: place, turn, size and brightness.
 
     Args:
         name: Of the object.
@@ -143,45 +204,31 @@ class Primitive(nn.Module):
         level: Height of the ground [m].
 
     Attributes:
-        place: Parameter [2], metres.
         turn: Parameter, half the yaw.
         size: Parameter, thirds of the logarithms of length, width and height; a sphere's last is
             its height in m.
-        strength: Parameter, a tenth of the logarithm of the brightness.
     """
 
-    # Scaled so that steps of one length suit all parameters.
-    _TURN, _SIZE, _STRENGTH = 2.0, 3.0, 10.0
-
     def __init__(self, name: str, start: Figure, ground: Ground, level: float = 0.0) -> None:
-        super().__init__()
+        super().__init__(name, ground, level, start.place, start.brightness)
         self.kind: Kind = start.kind
-        self.object, self.ground, self.level = name, ground, level
         self.round = start.ball
         self.low, self.high = SIZES.get(start.kind, (_LEAST, _MOST))
         given = (start.length, start.width, start.height)
         sizes = [
             min(max(v, low), high) for v, low, high in zip(given, self.low, self.high, strict=True)
         ]
-        logs = torch.tensor(sizes, dtype=torch.float64).log() / self._SIZE
+        logs = torch.tensor(sizes, dtype=torch.float64).log() / self.SIZE
         if self.round:
             logs[2] = start.height
-        self.place = nn.Parameter(torch.tensor(start.place, dtype=torch.float64))
-        self.turn = nn.Parameter(torch.tensor(start.yaw / self._TURN, dtype=torch.float64))
+        self.turn = nn.Parameter(torch.tensor(start.yaw / self.TURN, dtype=torch.float64))
         self.size = nn.Parameter(logs)
-        strength = math.log(start.brightness) / self._STRENGTH
-        self.strength = nn.Parameter(torch.tensor(strength, dtype=torch.float64))
 
     @property
     def sides(self) -> Float64[Tensor, "3"]:
         """Length, width and height within bounds [m]; the last is none of a sphere's."""
         low, high = (torch.tensor(v, dtype=torch.float64).log() for v in (self.low, self.high))
-        return (self._SIZE * self.size).clamp(low, high).exp()
-
-    @property
-    def brightness(self) -> Float64[Tensor, ""]:
-        """See ``Matte``."""
-        return (self._STRENGTH * self.strength).exp()
+        return (self.SIZE * self.size).clamp(low, high).exp()
 
     @property
     def figure(self) -> Figure:
@@ -192,7 +239,7 @@ class Primitive(nn.Module):
             height = float(self.size.detach()[2])
         if self.kind not in _BOXED:
             width = length
-        yaw = self._TURN * float(self.turn.detach())
+        yaw = self.TURN * float(self.turn.detach())
         return Figure(
             self.kind, (x, y), yaw, length, width, height, float(self.brightness.detach())
         )
@@ -213,7 +260,7 @@ class Primitive(nn.Module):
             middle[up] = self.level + self.size[2]
         middle[first], middle[second] = self.place.unbind()
         local = unit.vertices * torch.stack(sides)
-        yaw = self._TURN * self.turn
+        yaw = self.TURN * self.turn
         c, s = yaw.cos(), yaw.sin()
         # The turn of ``Ground.turn``: about y it takes z towards x, about z it takes x towards y.
         sign = self.ground.sense
@@ -225,14 +272,10 @@ class Primitive(nn.Module):
     @property
     def item(self) -> Object:
         """The object, differentiable by all parameters."""
-        mesh, brightness = self.mesh(), self.brightness
         if self.kind == "corner":
-            return Object(mesh, Matte(brightness * _front(self.ground.up), _NARROW))
-        return Object(mesh, Matte(brightness))
-
-    def forward(self, scene: Scene) -> Scene:
-        """The scene with the object in it, in place of one of the same name."""
-        return Scene({**scene.objects, self.object: self.item})
+            lit = self.brightness * _front(self.ground.up)
+            return Object(self.mesh(), Matte(lit, _NARROW))
+        return super().item
 
     def values(self) -> dict[str, Tensor]:
         """What is fitted by name, in SI units."""
@@ -248,15 +291,10 @@ class Primitive(nn.Module):
     def coordinates(self) -> list[Coordinate]:
         """Place, turn, size and brightness, as far as the shape has them."""
         zero, found = torch.zeros_like(self.size), self.figure
-        place = torch.eye(2, dtype=torch.float64)
-        axes = "xyz"
-        rows = [
-            Coordinate(f"{self.object}.{axes[axis]}", "m", {"place": along}, 0.1)
-            for axis, along in zip(self.ground.level, place, strict=True)
-        ]
+        rows = self.places()
         sizes = {"length": (0, found.length), "height": (2, found.height)}
         if found.turned:
-            along = torch.tensor(1 / self._TURN, dtype=torch.float64)
+            along = torch.tensor(1 / self.TURN, dtype=torch.float64)
             rows.append(Coordinate(f"{self.object}.yaw", "rad", {"turn": along}, 0.2))
         if found.boxed:
             sizes["width"] = (1, found.width)
@@ -264,14 +302,9 @@ class Primitive(nn.Module):
             del sizes["length"]
         for name, (entry, value) in sizes.items():
             along = zero.clone()
-            along[entry] = 1.0 if self.round and entry == 2 else 1 / (self._SIZE * value)
+            along[entry] = 1.0 if self.round and entry == 2 else 1 / (self.SIZE * value)
             rows.append(Coordinate(f"{self.object}.{name}", "m", {"size": along}, 0.1))
-        share = 1 / (self._STRENGTH * found.brightness)
-        slope = torch.tensor(share, dtype=torch.float64)
-        rows.append(
-            Coordinate(f"{self.object}.brightness", "", {"strength": slope}, found.brightness)
-        )
-        return rows
+        return [*rows, self.bright()]
 
 
 def upright(figure: Figure, ground: Ground, level: float) -> Float64[Tensor, "3"]:

@@ -15,11 +15,12 @@ from invertwin.discovery.assembly import Assembly, sampling_of
 from invertwin.discovery.certainty import deviations, kind_probabilities, presence, rivals, widened
 from invertwin.discovery.channels import apart, channels_of_scene
 from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
+from invertwin.discovery.forms import outlined
 from invertwin.discovery.outcome import Picture, Thing, Twin
 from invertwin.discovery.places import dense, movers, own_velocities, points_along
 from invertwin.discovery.primitives import upright
 from invertwin.discovery.search import Lattice, Search
-from invertwin.discovery.sharp_image import Response, responses, thinned
+from invertwin.discovery.sharp_image import Response, responses
 from invertwin.discovery.tracks import tracks
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground
@@ -112,7 +113,8 @@ def twin(
 def still_capture(recording: Capture | ChirpCapture) -> Capture:
     """A recording with one signal a frame, in which what moves fades.
 
-    Of a radar that itself moves by a quarter of a wavelength or more in a frame, it is one chirp.
+    It is the mean over the chirps, by Hann's window. Of a radar that itself moves by a quarter of a
+    wavelength or more in a frame, it is one chirp.
 
     Args:
         recording: Of any kind.
@@ -124,7 +126,11 @@ def still_capture(recording: Capture | ChirpCapture) -> Capture:
     way = float(own_velocities(recording).norm(dim=1).max()) * lasts
     if way > 0.25 * radar.waveform.wavelength:
         return recording.capture(chirps.count // 2)
-    return replace(recording, moving=False).capture()
+    # Of what moves by 2.5 bins of range rate a plain mean passes 1.7 % of the power, this 0.05 %.
+    window = torch.hann_window(chirps.count + 2, periodic=False, dtype=recording.beat.real.dtype)
+    window = window[1:-1]
+    weights = (window / window.mean())[:, None, None, None]
+    return replace(recording, beat=recording.beat * weights, moving=False).capture()
 
 
 def _moving(
@@ -133,7 +139,7 @@ def _moving(
     """What moves in trains of chirps; it is followed where the time between frames is known."""
     if isinstance(recording, Capture) or recording.chirps.count == 1:
         return []
-    radar = still_capture(recording).radar()
+    radar = recording.radar()
     near = _NEAREST * radar.waveform.range_resolution
     grid = radar.grid(near, min(range_max or math.inf, recording.max_range))
     if recording.frame_period is not None and recording.frame_count > 2:
@@ -178,11 +184,12 @@ def _standing(
     )
     held = list(range(_HOLD - 1, frames, _HOLD)) if frames >= 2 * _HOLD else []
     fitted = one.frames([k for k in range(frames) if k not in held]) if held else one
-    _, coarse = thinned(fitted.power, fitted.radar, grid)
+    coarse = fitted.coarse.grid
     flat = places[:, list(ground.level)]
     height = float(places[:, ground.vertical].mean()) - level
     lattice = Lattice(flat, step, responses(fitted.radar, coarse, places), max(height, 0.1))
-    search = Search(fitted, one.frames(held) if held else None, lattice)
+    aside = one.frames(held) if held else None
+    search = Search(fitted, aside, lattice)
     picture = search.first_image
     shapes = search.run()
     level_map = one.loss.level[:, None, None].to(power)
@@ -191,20 +198,23 @@ def _standing(
         nothing = level_map.expand_as(power)
         return Twin((), ground, level, seen, nothing, power, grid, (_NOTHING,))
     notes: tuple[str, ...] = ()
-    if held:
-        aside = one.frames(held)
+    if aside is not None:
+        shapes = outlined(fitted, aside, shapes)
         seen_there = responses(aside.radar, coarse, places)
         if _explained(aside, seen_there, picture) > float(aside.gains(shapes).sum()):
             notes = (_IMAGE_BETTER,)
     shapes, found = one.fitted(shapes, _STEPS)
-    errors, sure = deviations(one, found), presence(one, shapes)
     among = rivals(one, shapes)
-    kinds = [kind_probabilities(row) for row in among]
+    likelier = [max(row, key=lambda rival: rival.weight).figure for row in among]
+    if any(new is not old for new, old in zip(likelier, shapes, strict=True)):
+        shapes, found = one.fitted(likelier, _STEPS)
+        among = rivals(one, shapes)
+    errors, sure = deviations(one, found), presence(one, shapes)
     things = [
         Thing(
             f"object_{k}",
-            max(kinds[k - 1], key=lambda kind, row=kinds[k - 1]: row[kind]),
-            kinds[k - 1],
+            shape.named,
+            kind_probabilities(among[k - 1]),
             upright(shape, ground, level),
             shape,
             widened(one, _own(errors, f"object_{k}."), among[k - 1]),
@@ -233,9 +243,7 @@ def _explained(one: Assembly, response: Response, strength: Tensor) -> float:
         response: Of the image's places, to thinned maps.
         strength: The image.
     """
-    power, coarse = thinned(one.power, one.radar, one.model.grid)
-    stride = round(coarse.range_step / one.model.grid.range_step)
-    loss = HeavyTailed(one.loss.level[::stride], one.loss.degrees)
+    power, coarse, loss = one.coarse.power, one.coarse.grid, one.coarse.loss
     rows = loss.rows(torch.zeros_like(power), power) - loss.rows(response.maps(strength), power)
     return float(rows.sum()) / shared_bins(one.radar, coarse)
 

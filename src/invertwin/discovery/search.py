@@ -10,10 +10,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.clutter import HeavyTailed
 from invertwin.discovery.primitives import Figure, opening, turned
+from invertwin.discovery.prisms import Prism, contour
 from invertwin.discovery.proposals import CORNER, bright, figures, groups, headings, standing
-from invertwin.discovery.sharp_image import Response, sharpened, thinned
+from invertwin.discovery.sharp_image import Response, sharpened
 from invertwin.inversion.initial import Ground
 
 _MOST = 24  # objects
@@ -114,10 +114,9 @@ class Search:
             shapes: What is known already.
         """
         one = self.fitted
-        level = one.loss.level[:, None, None]
-        rest, _ = thinned(one.predicted(shapes).double() + level, one.radar, one.model.grid)
-        power, _ = thinned(one.power, one.radar, one.model.grid)
-        return sharpened(self.lattice.response, power, rest, degrees=one.loss.degrees)
+        coarse = one.coarse
+        rest = one.coarse_predicted(shapes) + coarse.loss.level[:, None, None]
+        return sharpened(self.lattice.response, coarse.power, rest, degrees=coarse.loss.degrees)
 
     def run(self) -> list[Figure]:
         """The shapes."""
@@ -174,12 +173,9 @@ class Search:
             shapes: What is known already.
         """
         one, lattice = self.fitted, self.lattice
-        power, coarse = thinned(one.power, one.radar, one.model.grid)
-        stride = round(coarse.range_step / one.model.grid.range_step)
-        level = one.loss.level[::stride]
-        rest, _ = thinned(one.predicted(shapes).double(), one.radar, one.model.grid)
-        loss = HeavyTailed(level, one.loss.degrees)
-        nothing = (power - level[:, None, None]).clamp_min(rest)
+        power, loss = one.coarse.power, one.coarse.loss
+        rest = one.coarse_predicted(shapes)
+        nothing = (power - loss.level[:, None, None]).clamp_min(rest)
         gain = lattice.response.means(loss.rows(rest, power) - loss.rows(nothing, power))
         at = one.radar.positions.detach()[:, list(self.ground.level)]
         way = torch.nn.functional.normalize(at[:, None] - lattice.places, dim=2)
@@ -465,6 +461,8 @@ def facing(shapes: Sequence[Figure], turn: float, ground: Ground) -> list[Figure
 
 def _headed(shape: Figure) -> list[Figure]:
     """What has a heading, and could be in place of a shape; as bright in all."""
+    if shape.kind == "prism":
+        return []
     box = shape if shape.boxed else as_kind(shape, "box")
     rows = standing(box)
     if max(shape.length, shape.width) < CORNER:
@@ -501,7 +499,7 @@ def as_kind(shape: Figure, kind: str) -> Figure:
         shape: As it is.
         kind: Which it is to be.
     """
-    if kind == shape.kind:
+    if shape.kind in (kind, "prism"):
         return shape
     if kind == "box" and shape.boxed:
         return replace(shape, kind="box")
@@ -593,13 +591,15 @@ def apart(first: Figure, second: Figure, ground: Ground) -> float:
 
 
 def outline(shape: Figure, ground: Ground, count: int = 16) -> Float64[Tensor, "corner 2"]:
-    """Corners of a shape on the ground [m], those of a polygon for round ones.
+    """Corners of a shape on the ground [m], those of a polygon for shapes without any.
 
     Args:
         shape: The shape.
         ground: The plane.
         count: Of the polygon's corners.
     """
+    if isinstance(shape, Prism):
+        return contour(shape)
     middle = torch.tensor(shape.place, dtype=torch.float64)
     if not shape.boxed:
         turns = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)

@@ -9,8 +9,9 @@ from scipy import sparse
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.discovery.clutter import Axis, axes_of
+from invertwin.discovery.clutter import DEGREES, Axis, axes_of
 from invertwin.errors import InputError
+from invertwin.inversion import speckle_weight
 from invertwin.progress import told
 from invertwin.radar import Radar
 from invertwin.radar.spectrum import aperture
@@ -155,7 +156,7 @@ def sharpened(
     rest: Float64[Tensor, "frame range u v"],
     *,
     steps: int = 40,
-    degrees: float = 4.0,
+    degrees: float = DEGREES,
 ) -> Float64[Tensor, " place"]:
     """The reflectivity under which the maps are likeliest, by multiplicative steps.
 
@@ -188,7 +189,7 @@ def sharpened(
     for _ in told(range(steps), "sharp image"):
         mean = matrix @ strength + known
         ratio = data / mean
-        brighter = back @ (ratio * (degrees + 1) / (degrees + ratio) / mean)
+        brighter = back @ (ratio * speckle_weight(ratio, degrees) / mean)
         alone = np.maximum(back @ (1 / mean), 1e-30)
         strength *= np.sqrt(brighter / alone)
     return torch.from_numpy(strength.astype(np.float64))

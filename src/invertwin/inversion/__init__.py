@@ -16,6 +16,7 @@ from invertwin.inversion.lines import losses_along as losses_along
 from invertwin.inversion.loss import CorrelationLoss as CorrelationLoss
 from invertwin.inversion.loss import SpectrumLoss as SpectrumLoss
 from invertwin.inversion.loss import speckle_divergence as speckle_divergence
+from invertwin.inversion.loss import speckle_weight as speckle_weight
 from invertwin.inversion.metrics import Residual as Residual
 from invertwin.inversion.metrics import ShapeMetrics as ShapeMetrics
 from invertwin.inversion.metrics import Topology as Topology

@@ -3,10 +3,12 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
+from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.errors import InputError
@@ -19,6 +21,7 @@ _BLOCK = 2**16  # bins that are worked on at a time: what they need stays in a c
 
 KINDS = ("mse", "likelihood", "heavy_tailed")
 BACKGROUNDS = ("none", "level", "static")
+Power = TypeVar("Power", Tensor, NDArray[np.float32])
 _Block = tuple[Tensor, Tensor, Tensor]  # of a simulated map, what it holds of power, the measured
 Maps = Sequence[tuple[Tensor, Tensor]]
 """The predicted and the observed map of every observation."""
@@ -58,6 +61,16 @@ def speckle_divergence(ratio: Tensor, degrees: float = math.inf) -> Tensor:
         return ratio - ratio.log() - 1
     tail = torch.log1p(ratio / degrees) - math.log1p(1 / degrees)
     return (degrees + 1) * tail - ratio.log()
+
+
+def speckle_weight(ratio: Power, degrees: float) -> Power:
+    """By how much less a bin counts in slopes than under plain speckle: (ν + 1) / (ν + q).
+
+    Args:
+        ratio: q, power over its mean.
+        degrees: ν.
+    """
+    return (degrees + 1) / (degrees + ratio)
 
 
 @dataclass(frozen=True)
@@ -133,7 +146,7 @@ class SpectrumLoss:
         return self.degrees if self.kind == "heavy_tailed" else math.inf
 
     def _heeded(self, power: Tensor, inverse: Tensor | float = 1.0) -> Tensor:
-        """Power as it counts in slopes: (ν + 1) / (ν + q) of it, all of it under plain speckle.
+        """Power as it counts in slopes, see ``speckle_weight``; all of it under plain speckle.
 
         Args:
             power: Measured.
@@ -141,7 +154,7 @@ class SpectrumLoss:
         """
         if self.kind == "likelihood":
             return power
-        return (self.degrees + 1) * power / (self.degrees + power * inverse)
+        return power * speckle_weight(power * inverse, self.degrees)
 
     def __call__(
         self,

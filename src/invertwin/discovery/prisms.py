@@ -1,0 +1,190 @@
+"""Things whose outline on the ground is free: what no simple shape explains."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from skimage.measure import find_contours
+from torch import Tensor, nn
+
+from invertwin.discovery.primitives import Figure, Primitive, Unknown
+from invertwin.inversion.initial import Ground
+from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
+from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.parameters import Coordinate
+
+_SMOOTH = 20.0  # of signed distances, see ``DistanceGrid``
+_MARGIN = 6  # nodes around what a prism starts from
+_NODES = 60  # along a side, at most
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Prism(Figure):
+    """A thing with vertical sides, of any outline. It has no yaw.
+
+    Attributes:
+        distances: Signed distances to the outline at nodes on the ground, negative inside [m].
+        spacing: Between nodes [m].
+        middle: Of the nodes, along the two axes of the ground [m].
+    """
+
+    distances: Float64[Tensor, "a b"]
+    spacing: float
+    middle: tuple[float, float]
+
+
+def prism_of(figures: Sequence[Figure], ground: Ground, level: float, spacing: float) -> Prism:
+    """One prism in place of some shapes: their union, of the largest one's height.
+
+    Args:
+        figures: The shapes.
+        ground: The plane.
+        level: Height of the ground [m].
+        spacing: Between nodes at least [m].
+    """
+    up, axes = ground.vertical, list(ground.level)
+    with torch.no_grad():
+        meshes = [unknown("", one, ground, level).item.mesh for one in figures]
+    points = torch.cat([mesh.vertices for mesh in meshes])[:, axes]
+    low, high = points.amin(0), points.amax(0)
+    step = max(spacing, float((high - low).max()) / (_NODES - 2 * _MARGIN))
+    counts = [math.ceil(float(side) / step) + 2 * _MARGIN + 1 for side in high - low]
+    middle = 0.5 * (low + high)
+    lines = [
+        float(m) + step * (torch.arange(n, dtype=torch.float64) - 0.5 * (n - 1))
+        for m, n in zip(middle, counts, strict=True)
+    ]
+    places = torch.cartesian_prod(*lines)
+    nodes = torch.zeros(len(places), 3, dtype=torch.float64)
+    nodes[:, axes] = places
+    parts: list[Tensor] = []
+    for mesh in meshes:
+        nodes[:, up] = 0.5 * (mesh.vertices[:, up].amin() + mesh.vertices[:, up].amax())
+        parts.append(signed_distance(mesh, nodes))
+    largest = max(figures, key=lambda one: one.length * one.width)
+    x, y = middle.tolist()
+    return Prism(
+        "prism",
+        (x, y),
+        height=largest.height,
+        brightness=largest.brightness,
+        distances=torch.stack(parts).amin(0).reshape(counts),
+        spacing=step,
+        middle=(x, y),
+    )
+
+
+class Outline(Unknown):
+    """A prism as an unknown: its outline, place, height and brightness.
+
+    Args:
+        name: Of the object.
+        start: Its first numbers.
+        ground: The plane, and which way is up.
+        level: Height of the ground [m].
+
+    Attributes:
+        sides: Signed distances to the outline.
+        place: Parameter [2], middle of their nodes [m].
+        size: Parameter, a third of the logarithm of the height.
+    """
+
+    def __init__(self, name: str, start: Prism, ground: Ground, level: float = 0.0) -> None:
+        super().__init__(name, ground, level, start.middle, start.brightness)
+        self.start = start
+        counts = torch.tensor(start.distances.shape, dtype=torch.float64)
+        half = torch.ones(3, dtype=torch.float64)
+        half[list(ground.level)] = 0.5 * start.spacing * (counts - 1)
+        # The same at two heights; half way between them both count alike, so that they stay alike.
+        same = torch.stack([start.distances] * 2, dim=ground.vertical)
+        self.sides = DistanceGrid(name, (-half).tolist(), half.tolist(), same, _SMOOTH)
+        size = math.log(start.height) / self.SIZE
+        self.size = nn.Parameter(torch.tensor(size, dtype=torch.float64))
+
+    @property
+    def height(self) -> Float64[Tensor, ""]:
+        """Of the prism [m]."""
+        return (self.SIZE * self.size).exp()
+
+    @property
+    def figure(self) -> Prism:
+        """Its present numbers."""
+        with torch.no_grad():
+            sides = self.mesh().vertices[:, list(self.ground.level)]
+            low, high = sides.amin(0), sides.amax(0)
+            x, y = (0.5 * (low + high)).tolist()
+            length, width = (high - low).tolist()
+            a, b = self.place.tolist()
+            distances = self.sides.distances.select(self.ground.vertical, 0).clone()
+        return replace(
+            self.start,
+            place=(x, y),
+            length=length,
+            width=width,
+            height=float(self.height.detach()),
+            brightness=float(self.brightness.detach()),
+            distances=distances,
+            middle=(a, b),
+        )
+
+    def mesh(self) -> Mesh:
+        """The surface in the world, differentiable by all parameters."""
+        up, grid = self.ground.vertical, self.sides.lattice
+        low, high, counts = grid.low.clone(), grid.high.clone(), list(grid.counts)
+        place = torch.zeros(3, dtype=torch.float64)
+        place[up] = self.level
+        place = place.index_put((torch.tensor(self.ground.level),), self.place)
+        step, tall = self.start.spacing, float(self.height.detach())
+        counts[up] = math.ceil(tall / step) + 4
+        low[up], high[up] = -2 * step, tall + 2 * step
+
+        def field(points: Tensor) -> Tensor:
+            local = points - place
+            beside = local.index_fill(1, torch.tensor([up]), 0.0)
+            half = 0.5 * self.height
+            above = (local[:, up] - half).abs() - half
+            return torch.maximum(self.sides.distance(beside), above)
+
+        at = place.detach()
+        return iso_surface(field, Lattice.between(at + low, at + high, counts))
+
+    def values(self) -> dict[str, Tensor]:
+        """What is fitted by name, in SI units."""
+        found = {"place": self.place, "height": self.height, "brightness": self.brightness}
+        return {f"{self.object}.{name}": value.detach().clone() for name, value in found.items()}
+
+    def coordinates(self) -> list[Coordinate]:
+        """Place, height and brightness; the outline moves as a whole."""
+        height = float(self.height.detach())
+        slope = torch.tensor(1 / (self.SIZE * height), dtype=torch.float64)
+        tall = Coordinate(f"{self.object}.height", "m", {"size": slope}, 0.1)
+        return [*self.places(), tall, self.bright()]
+
+
+def unknown(name: str, figure: Figure, ground: Ground, level: float) -> Primitive | Outline:
+    """A shape as an unknown.
+
+    Args:
+        name: Of the object.
+        figure: Its first numbers.
+        ground: The plane.
+        level: Height of the ground [m].
+    """
+    if isinstance(figure, Prism):
+        return Outline(name, figure, ground, level)
+    return Primitive(name, figure, ground, level)
+
+
+def contour(prism: Prism) -> Float64[Tensor, "corner 2"]:
+    """The longest closed line of a prism's outline on the ground [m].
+
+    Args:
+        prism: The prism.
+    """
+    lines = find_contours(prism.distances.numpy(), 0.0)
+    longest = torch.from_numpy(max(lines, key=len)[:-1].copy())
+    counts = torch.tensor(prism.distances.shape, dtype=torch.float64)
+    middle = torch.tensor(prism.middle, dtype=torch.float64)
+    return middle + prism.spacing * (longest - 0.5 * (counts - 1))

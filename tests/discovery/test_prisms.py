@@ -1,0 +1,107 @@
+"""Things with vertical sides of any outline."""
+
+import math
+from typing import Literal
+
+import pytest
+import torch
+
+from invertwin.discovery.primitives import Figure, Primitive
+from invertwin.discovery.prisms import Outline, Prism, contour, prism_of, unknown
+from invertwin.inversion.initial import Ground
+from invertwin.scene import Mesh, Scene
+
+BOX = Figure("box", (0.3, -0.4), 0.5, 0.8, 0.5, 1.1, 0.05)
+POST = Figure("cylinder", (-0.05, -0.21), 0.0, 0.3, 0.3, 0.7, 0.2)
+LEVEL, SPACING = -0.2, 0.04
+
+
+def volume(mesh: Mesh) -> torch.Tensor:
+    """Of a closed mesh [m³], with derivatives."""
+    a, b, c = mesh.vertices[mesh.faces].unbind(1)
+    return (a * torch.linalg.cross(b, c)).sum() / 6
+
+
+def outline_of(*figures: Figure, up: Literal["y", "z"] = "y") -> Outline:
+    ground = Ground(up)
+    return Outline("thing", prism_of(figures, ground, LEVEL, SPACING), ground, LEVEL)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_prism_starts_as_what_it_is_made_from(up):
+    ground = Ground(up)
+    one = outline_of(BOX, up=up)
+    mesh, true = one.mesh(), Primitive("thing", BOX, ground, LEVEL).mesh()
+    # Faces look outward, and all of the box is there; corners are rounded by less than a node.
+    assert float(volume(mesh).detach()) == pytest.approx(0.8 * 0.5 * 1.1, rel=0.02)
+    for low in (True, False):
+        ends = [m.vertices.amin(0) if low else m.vertices.amax(0) for m in (mesh, true)]
+        assert float((ends[0] - ends[1]).detach().abs().max()) < 0.5 * SPACING
+    found = one.figure
+    assert (found.kind, found.named, found.turned, found.ball) == ("prism", "prism", False, False)
+    assert found.place == pytest.approx(BOX.place, abs=0.01)
+    assert (found.height, found.brightness) == pytest.approx((1.1, 0.05))
+    # Written down and begun anew, it is the same.
+    again = unknown("thing", found, ground, LEVEL)
+    assert isinstance(again, Outline)
+    assert torch.allclose(again.mesh().vertices, mesh.vertices, atol=1e-9)
+
+
+def area(line: torch.Tensor) -> float:
+    x, y = line.unbind(1)
+    return 0.5 * float((x * y.roll(-1) - y * x.roll(-1)).sum().abs())
+
+
+def test_shapes_that_touch_become_one_of_the_largest_ones_height():
+    one = prism_of([BOX, POST], Ground(), LEVEL, SPACING)
+    assert (one.height, one.brightness) == (1.1, 0.05)
+    box, post = (prism_of([part], Ground(), LEVEL, SPACING) for part in (BOX, POST))
+    assert area(contour(box)) == pytest.approx(0.8 * 0.5, rel=0.01)
+    assert area(contour(post)) == pytest.approx(math.pi * 0.15**2, rel=0.03)
+    # The post stands to a half in the box.
+    assert 0.4 + 0.02 < area(contour(one)) < 0.4 + 0.05
+    # One line goes around both.
+    line = contour(one)
+    for place in (BOX.place, POST.place):
+        turn = line - torch.tensor(place)
+        angle = torch.atan2(turn[:, 1], turn[:, 0])
+        winding = (angle.roll(-1) - angle + math.pi).remainder(2 * math.pi) - math.pi
+        assert abs(float(winding.sum())) == pytest.approx(2 * math.pi)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_the_surface_follows_all_numbers(up):
+    ground = Ground(up)
+    one = outline_of(BOX, up=up)
+    mesh = one.mesh()
+    (slope,) = torch.autograd.grad(volume(mesh), one.size)
+    # A third of the logarithm of the height.
+    assert float(slope) == pytest.approx(3 * 0.8 * 0.5 * 1.1, rel=0.05)
+    # All distances less by d: the outline moves out by d everywhere.
+    (slope,) = torch.autograd.grad(volume(one.mesh()), one.sides.value)
+    assert float(-slope.sum()) == pytest.approx(2 * (0.8 + 0.5) * 1.1, rel=0.06)
+    with torch.no_grad():
+        one.place.add_(torch.tensor([0.1, -0.05]))
+    moved = one.mesh().vertices.mean(0) - mesh.vertices.mean(0)
+    expected = torch.zeros(3, dtype=torch.float64)
+    expected[list(ground.level)] = torch.tensor([0.1, -0.05], dtype=torch.float64)
+    assert torch.allclose(moved, expected, atol=1e-6)
+    rows = {row.name: row for row in one.coordinates()}
+    assert list(rows) == [
+        "thing.x",
+        f"thing.{'z' if up == 'y' else 'y'}",
+        "thing.height",
+        "thing.brightness",
+    ]
+    # By one metre and by one unit.
+    assert float(rows["thing.height"].tangents["size"]) == pytest.approx(1 / (3 * 1.1))
+    assert float(rows["thing.brightness"].tangents["strength"]) == pytest.approx(1 / (10 * 0.05))
+
+
+def test_it_is_an_object_of_a_scene():
+    one = outline_of(BOX)
+    scene = one(Scene({"thing": Primitive("thing", POST, Ground()).item}))
+    assert len(scene["thing"].mesh.faces) == len(one.mesh().faces)
+    assert set(one.values()) == {"thing.place", "thing.height", "thing.brightness"}
+    assert math.isclose(float(one.values()["thing.height"]), 1.1)
+    assert isinstance(one.figure, Prism)
