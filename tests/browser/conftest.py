@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from browser.references import PICTURES
+
 INSTALL = "run: make test-browser"
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="session")
@@ -41,9 +43,20 @@ def chromium() -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def pictures() -> Path:
     """Where screenshots and measured figures go."""
-    folder = REPOSITORY / "out" / "browser"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    return PICTURES
+
+
+@pytest.fixture(scope="session")
+def note(pictures: Path) -> Callable[..., None]:
+    """Keeps measured figures."""
+
+    def keep(**figures: float) -> None:
+        file = pictures / "figures.json"
+        known = json.loads(file.read_text()) if file.exists() else {}
+        file.write_text(json.dumps(known | figures, indent=2) + "\n")
+
+    return keep
 
 
 class Watched:

@@ -1,9 +1,9 @@
 """The viewer in a real browser: it loads, follows, answers clicks, and is alone with its server."""
 
-import json
 import math
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from browser.ball import EVIL, shown
+from browser.references import APART, apart
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, planar_array, plate, rigid, sphere
 from invertwin.viewer import Body, Link, Maps, Step, Viewer, body_of, display_of
@@ -20,13 +22,6 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 LOADED = 3.0  # s
 RATE = 5.0  # maps a second, with 20 000 triangles
-
-
-def note(pictures: Path, **figures: float) -> None:
-    """Keep measured figures."""
-    file = pictures / "figures.json"
-    known = json.loads(file.read_text()) if file.exists() else {}
-    file.write_text(json.dumps(known | figures, indent=2) + "\n")
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +49,8 @@ def viewer(chromium: Any):
         for k in range(6)
     ]
     display = display_of(scene, {"": (radar, grid)}, "<script>alert(1)</script>", fitted=["ball"])
-    display = type(display)(
-        display.title, display.layers, steps, Maps.of({"measured": measured}, grid)
-    )
-    with Viewer(display, link, port=0) as found:
+    display = replace(display, steps=steps, maps={"": Maps.of({"measured": measured}, grid)})
+    with Viewer(display, {"": link}, port=0) as found:
         yield found
 
 
@@ -82,7 +75,7 @@ def seen_at(viewer: Viewer, place: Any) -> tuple[float, float]:
     return 512 + scale * (away @ right), 320 - scale * (away @ np.cross(right, ahead))
 
 
-def test_it_loads_and_reaches_nobody_else(watched, viewer, pictures):
+def test_it_loads_and_reaches_nobody_else(watched, viewer, pictures, note):
     seconds = min(opened(watched, viewer) for _ in range(3))  # others use the machine too
     watched.page.wait_for_timeout(2000)
     watched.page.screenshot(path=str(pictures / "viewer.png"))
@@ -91,11 +84,11 @@ def test_it_loads_and_reaches_nobody_else(watched, viewer, pictures):
         urlsplit(url).hostname for url in watched.requests if url.split(":")[0] in "http ws wss"
     }
     assert hosts == {"127.0.0.1"}
-    note(pictures, viewer_load_seconds=seconds)
+    note(viewer_load_seconds=seconds)
     assert seconds <= LOADED
 
 
-def test_the_map_follows_what_a_person_drags(watched, viewer, pictures):
+def test_the_map_follows_what_a_person_drags(watched, viewer, pictures, note):
     opened(watched, viewer)
     page = watched.page
     page.wait_for_timeout(2000)
@@ -121,7 +114,7 @@ def test_the_map_follows_what_a_person_drags(watched, viewer, pictures):
     moved = np.linalg.norm(np.array(viewer._gizmo.position) - begun)
     page.get_by_role("combobox").click()
     page.get_by_role("option", name="nothing").click()
-    note(pictures, updates_per_second=rate, triangles=20_480)
+    note(updates_per_second=rate, triangles=20_480)
     assert moved > 0.01
     assert watched.errors == []
     assert rate >= RATE
@@ -148,14 +141,17 @@ def test_the_slider_moves_the_mesh(watched, viewer, pictures, blue):
     page.wait_for_timeout(2500)
     hidden = page.get_by_role("checkbox")  # what is seen would cover the mesh
     hidden.nth(list(viewer._visible).index("what is seen")).click()
-    columns = []
+    columns, scenes = [], {}
     for number, key in ((5, "End"), (0, "Home")):
         page.get_by_role("slider").first.press(key)
         page.wait_for_timeout(2500)
         page.screenshot(path=str(pictures / f"step_{number}.png"))
         whole = {"x": 0, "y": 0, "width": 680, "height": 640}  # left of the window's panel
         columns.append(blue(page.screenshot(clip=whole)))
+        # Below what viser says where there is no GPU.
+        scenes[f"viewer_step_{number}"] = page.screenshot(clip=whole | {"y": 192, "height": 448})
     away = [seen_at(viewer, [-0.1 * k, 0.0, 2.0])[0] for k in (5, 0)]
+    assert max([apart(png, name) for name, png in scenes.items()]) <= APART
     assert columns[0] - columns[1] == pytest.approx(away[0] - away[1], rel=0.25)
     assert watched.errors == []
 
@@ -166,7 +162,7 @@ def test_a_click_on_a_map_lights_the_points_that_feed_it(watched, viewer, pictur
     page.wait_for_timeout(1000)
     page.get_by_role("slider").first.press("End")
     page.wait_for_timeout(2500)
-    grid = viewer._link.grid
+    grid = viewer._links[""].grid
     # The last step has the ball at x = -0.5 m.
     row = round((math.hypot(0.5, 2.0) - 0.3 - grid.range_start) / grid.range_step)
     column = round((-0.5 / math.hypot(0.5, 2.0) - grid.u_start) / grid.u_step)
@@ -182,6 +178,33 @@ def test_a_click_on_a_map_lights_the_points_that_feed_it(watched, viewer, pictur
     ranges = np.linalg.norm(fed, axis=1)
     assert len(fed) > 3
     assert np.abs(ranges - float(grid.ranges[row])).max() <= 1.01 * grid.range_step
+    assert watched.errors == []
+
+
+def test_each_sensor_has_its_maps_and_its_points(watched, pictures, chromium):
+    display, links = shown()
+    other = links[EVIL]
+    with Viewer(display, links, port=0) as viewer:
+        opened(watched, viewer)
+        page = watched.page
+        page.wait_for_timeout(2500)
+        assert viewer._frame.visible
+        before = viewer._panels._known["simulated"][0]
+        page.get_by_role("combobox").first.click()
+        page.get_by_role("option", name=EVIL).click()
+        page.wait_for_timeout(2500)
+        page.screenshot(path=str(pictures / "other_sensor.png"))
+        assert not viewer._frame.visible  # it has one position
+        now = viewer._panels._known["simulated"][0]
+        assert now.shape == other.grid.shape[:2]
+        assert np.abs(now / now.max() - before / before.max()).max() > 0.5
+        # From x = -2.5 m, along x, the ball at x = 0.8 m is straight ahead.
+        row = round((3.3 - 0.3 - other.grid.range_start) / other.grid.range_step)
+        viewer._choose(bin=(row, other.grid.u_count // 2))
+        page.wait_for_timeout(2500)
+        fed = viewer._nodes["chosen bin"].points
+        assert len(fed) > 3
+        assert np.linalg.norm(fed - [0.5, 0.0, 2.0], axis=1).max() < 0.15
     assert watched.errors == []
 
 

@@ -22,14 +22,13 @@ NEEDS_VISER = pytest.mark.skipif(
 
 
 def test_a_run_file_shows_the_truth_and_can_be_moved(run_file):
-    display, link = shown_of(run_file)
+    display, links = shown_of(run_file)
     run = load_run(run_file)
     layers = {layer.name: layer for layer in display.layers}
     name = next(iter(run.truth))
     center = (layers[f"twin/{name}"].points.min(0) + layers[f"twin/{name}"].points.max(0)) / 2
     assert center == pytest.approx(run.truth[name].position, abs=1e-5)
-    assert link is not None
-    assert link.names == tuple(run.scene)
+    assert links[""].names == tuple(run.scene)
 
 
 def test_a_fit_leaves_its_steps_and_a_report_in_which_no_name_acts(run_file, monkeypatch, capsys):
@@ -38,7 +37,7 @@ def test_a_fit_leaves_its_steps_and_a_report_in_which_no_name_acts(run_file, mon
     assert call(monkeypatch, "reconstruct", run_file) == 0
     folder = Path("out/small")
     metrics = read_metrics(folder)
-    display, link = shown_of(folder)
+    display, links = shown_of(folder)
     assert [step.number for step in display.steps] == list(range(metrics["steps"] + 1))
     assert display.steps[0].label == "start"
     assert f"{metrics['loss']:.4g}" in display.steps[-1].label
@@ -48,10 +47,8 @@ def test_a_fit_leaves_its_steps_and_a_report_in_which_no_name_acts(run_file, mon
     layers = {layer.name: layer for layer in display.layers}
     assert layers[f"twin/{EVIL}"].points == pytest.approx(ended, abs=1e-6)
     assert {"truth", "start", "radar", "95 % ellipsoid"} <= set(display.groups)
-    assert display.maps is not None
-    assert set(display.maps.power) == {"measured", "simulated"}
-    assert link is not None
-    assert link.scene[EVIL].vertices.numpy() == pytest.approx(ended, abs=1e-6)
+    assert set(display.maps[""].power) == {"measured", "simulated"}
+    assert links[""].scene[EVIL].vertices.numpy() == pytest.approx(ended, abs=1e-6)
     report = (folder / "report.html").read_text()
     assert "<script>alert" not in report
     assert 'id="view-data"' in report
@@ -62,11 +59,10 @@ def test_a_fit_leaves_its_steps_and_a_report_in_which_no_name_acts(run_file, mon
 
 def test_a_capture_shows_its_maps(run_file, monkeypatch):
     assert call(monkeypatch, "simulate", run_file) == 0
-    display, link = shown_of(Path("out/small/capture.nc"))
-    assert link is None
-    assert display.maps is not None
-    assert len(display.maps.frames) == len(display.layers[0].points)
-    assert shown_of(Path("out/small"))[0].maps is not None
+    display, links = shown_of(Path("out/small/capture.nc"))
+    assert links == {}
+    assert len(display.maps[""].frames) == len(display.layers[0].points)
+    assert set(shown_of(Path("out/small"))[0].maps) == {""}
 
 
 @pytest.mark.parametrize("target", ["none.toml", "empty", "picture.png"])
@@ -94,19 +90,34 @@ def test_a_damaged_view_is_refused(run_file, monkeypatch, capsys):
 
 @NEEDS_VISER
 def test_a_fit_is_seen_while_it_goes_on(run_file, monkeypatch, capsys):
-    seen = []
+    seen, maps, begun = [], [], []
     plain = Viewer.add_step
 
-    def noted(self: Viewer, step) -> None:
-        plain(self, step)
+    def noted(self: Viewer, step, found) -> None:
+        plain(self, step, found)
         port = self._server.get_port()
         with socket.create_connection(("127.0.0.1", port), timeout=5):
             seen.append(step.number)
+        (own,) = found.values()
+        (known,) = self._display.maps.values()
+        begun.append(known.at(0)["simulated"])
+        maps.append(own.at(0)["simulated"])
 
     monkeypatch.setattr(Viewer, "add_step", noted)
-    assert call(monkeypatch, "reconstruct", run_file, "--view") == 0
+    assert call(monkeypatch, "reconstruct", run_file, "--view", "-o", "watched") == 0
     assert "open http://127.0.0.1:" in capsys.readouterr().out
-    assert seen == list(range(read_metrics(Path("out/small"))["steps"] + 1))
+    assert seen == list(range(read_metrics(Path("watched"))["steps"] + 1))
+    # At first what the start has for it, at last what the twin has.
+    (kept,) = Display.load(Path("watched") / VIEW).maps.values()
+    ended = kept.at(0)["simulated"]
+    peak = float(ended.max())
+    assert maps[0] == pytest.approx(begun[0], abs=1e-5 * peak)
+    assert maps[-1] == pytest.approx(ended, abs=1e-5 * peak)
+    assert abs(maps[-1] - maps[0]).max() > 0.01 * peak
+    # To look on changes nothing.
+    assert call(monkeypatch, "reconstruct", run_file) == 0
+    losses = [read_metrics(Path(folder))["loss"] for folder in ("watched", "out/small")]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
 
 
 def test_workers_cannot_be_viewed(run_file, monkeypatch, capsys):

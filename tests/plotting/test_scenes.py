@@ -79,6 +79,22 @@ def test_views_follow_the_radar():
     assert labels(figure) == ["cube", "radar, 2 positions"]
 
 
+def test_the_views_are_mirrored_and_say_so():
+    """Who stands at the radar has +x on the left; in the picture it is on the right."""
+    scene = Scene({"box": at(1.0, 0.0, 4.0), "wall": at(0.0, 0.0, 6.0, plate(6.0, 4.0))})
+    figure = plotting.scene(scene, radar([[0.0, 0.0, 0.0]]), highlight=["box"])
+    ahead, up = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    assert np.cross(ahead, up) @ [1.0, 0.0, 0.0] == -1.0  # the right of who stands there is −x
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    shown = np.asarray(Image.open(buffer).convert("RGB"), float)
+    frame = figure.axes[0].get_window_extent()
+    front = shown[:, int(frame.x0) : int(frame.x1)]
+    blue = np.nonzero(front[..., 2] - front[..., 0] > 60)[1]
+    assert blue.mean() > 0.55 * front.shape[1]
+    assert "mirrored" in figure.legends[0].get_title().get_text()
+
+
 def test_what_is_near_is_painted_last():
     near, far = at(0, 0, 2.0, plate(1.0, 1.0)), at(0, 0, 4.0, plate(1.0, 1.0))
     figure = plotting.scene(Scene({"near": near, "far": far}), highlight=["near"])

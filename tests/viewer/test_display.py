@@ -38,7 +38,7 @@ def display() -> Display:
         for k in range(3)
     ]
     power = torch.rand(2, 60, 21, 1, generator=torch.Generator().manual_seed(1))
-    return replace(made, steps=steps, maps=Maps.of({"measured": power}, GRID))
+    return replace(made, steps=steps, maps={"": Maps.of({"measured": power}, GRID)})
 
 
 def test_layers_are_where_things_are():
@@ -72,9 +72,7 @@ def test_a_file_holds_everything_and_triangles_once(tmp_path):
     assert [step.label for step in read.steps] == ["step 0", "step 1", "step 2"]
     one, other = (x.steps[1].bodies["a/cube"].vertices for x in (read, made))
     assert np.array_equal(one, other)
-    assert read.maps is not None
-    assert made.maps is not None
-    assert np.array_equal(read.maps.at(1)["measured"], made.maps.at(1)["measured"])
+    assert np.array_equal(read.maps[""].at(1)["measured"], made.maps[""].at(1)["measured"])
     assert (read.title, read.up, read.ahead) == (made.title, made.up, made.ahead)
     names = np.load(tmp_path / "view.npz").files
     assert len(names) < 1 + 2 * len(made.layers) + 2 * len(made.steps)

@@ -7,17 +7,28 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import pytest
+import torch
 
-from invertwin.viewer import Body, Display, Layer, Step, page_html, policy, view_html
+from invertwin.channel import Grid
+from invertwin.viewer import Body, Display, Layer, Maps, Step, page_html, policy, view_html
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
 
 
 def display() -> Display:
+    grid = Grid(1.0, 0.1, 4, -0.5, 0.25, 5)
+    power = torch.full((1, 4, 5, 1), 1e-9)
+    power[0, 2, 3], power[0, 0, 1] = 1.0, 0.01
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
     steps = [Step(k, f"{EVIL} {k}", {EVIL: Body(points + k, faces)}) for k in range(5)]
-    return Display(EVIL, [Layer(f"twin/{EVIL}", "surface", points, faces)], steps)
+    return Display(
+        EVIL,
+        [Layer(f"twin/{EVIL}", "surface", points, faces)],
+        steps,
+        maps={EVIL: Maps.of({"measured": power}, grid)},
+    )
 
 
 def test_names_do_not_act():
@@ -50,6 +61,18 @@ def test_steps_hold_numbers_as_they_are_and_triangles_where_they_change():
     assert points.tolist() == [[3, 3, 3], [4, 3, 3], [3, 4, 3]]
     assert "faces" not in body
     assert [step["label"][-1] for step in data["steps"]] == ["0", "1", "2", "3", "4"]
+
+
+def test_maps_are_bytes_of_decibels_below_the_peak():
+    found = re.search(r'id="view-data">(.*?)</script>', view_html(display()), re.S)
+    assert found is not None
+    (sensor,) = json.loads(found[1])["sensors"]
+    assert sensor["name"] == EVIL
+    assert sensor["simulated"] is None
+    levels = np.frombuffer(base64.b64decode(sensor["measured"]), np.uint8).reshape(sensor["shape"])
+    assert levels[2, 3] == 255
+    assert levels[0, 1] == pytest.approx(127.5, abs=1)  # 20 of 40 dB
+    assert np.count_nonzero(levels) == 2
 
 
 def test_large_steps_are_thinned_out():

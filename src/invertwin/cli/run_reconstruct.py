@@ -6,16 +6,19 @@ import time
 import tomllib
 from collections.abc import Callable
 from contextlib import nullcontext
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 
 from invertwin.cli.fits.displays import (
     VIEW,
     display_of_fit,
     display_of_problem,
+    maps_of_sensors,
     steps_file,
     steps_in,
 )
@@ -55,11 +58,15 @@ from invertwin.cli.shape_tables import Mover
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.inversion.certainty import certainty, coverage
+from invertwin.inversion.fit import Fit
 from invertwin.memory import peak_memory
 from invertwin.runs import CHECKPOINT, RunFolder
+from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry.density import without_clouds
-from invertwin.viewer import Viewer, view_html
+from invertwin.viewer import MEASURED, SIMULATED, Display, Link, Step, Viewer, view_html
+
+_VALUES_OF_STEPS = 200_000  # of the maps of a step that is shown while the fit goes on
 
 
 def run_reconstruct(
@@ -113,16 +120,16 @@ def run_reconstruct(
         fit_elsewhere(_fit_one, run, folder, console, workers, fits)
     rows: dict[str, list[dict[str, Any]]] = {}
     outcomes: dict[int, Callable[[], Reconstruction]] = {}
-    live = Viewer(display_of_problem(problem, starts[0])) if view else None
+    live = Viewer(_begun(problem, starts[0])) if view else None
     with live or nullcontext():
         if live is not None:
             console.print(f"open {live.address}", markup=False, soft_wrap=True)
-        show = live and live.add_step
         for mode in modes:
             rows[mode] = []
             for i, start in enumerate(starts):
                 checkpoint = CHECKPOINT if single else None
                 own = recorded_for(whole, i, console)
+                show = None if live is None else partial(_show, live, own)
                 row, outcome = fit(own, start, i, mode, folder, console, checkpoint, show)
                 rows[mode].append(row)
                 if mode == modes[0]:
@@ -173,7 +180,11 @@ def run_reconstruct(
     steps = steps_in(folder.file(steps_file(best["checkpoint"])))
     display = display_of_fit(problem, start, twin, maps, metrics, steps)
     display.save(folder.file(VIEW))
-    parts = [result, View(view_html(display)), *pictures_of(fitted, folder), *tables]
+    links = {
+        name: Link(twin, radar, sight.grid, settings_of(run).depth)
+        for (name, sight), radar in zip(problem.sights.items(), radars, strict=True)
+    }
+    parts = [result, View(view_html(display, links)), *pictures_of(fitted, folder), *tables]
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:
         save_mesh(folder.file("twin.glb"), twin)
@@ -182,6 +193,23 @@ def run_reconstruct(
     title, outcome = run.title or "Reconstruction", status(run, metrics)
     tables = finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note)
     return tables, outcome
+
+
+def _begun(problem: Problem, start: Scene) -> Display:
+    """A display of a fit that has not begun: what was measured, and what the start has for it."""
+    display, radars = display_of_problem(problem, start), problem.sights.values()
+    spectra = {
+        MEASURED: [s.capture.spectrum(s.grid).float() for s in radars],
+        SIMULATED: sharp_maps(problem, start, [s.radar for s in radars]),
+    }
+    return replace(display, maps=maps_of_sensors(problem, spectra))
+
+
+def _show(live: Viewer, problem: Problem, going: Fit, step: Step) -> None:
+    """Show a step of a fit with what its sensors would see."""
+    with torch.no_grad():
+        simulated = sharp_maps(problem, *going.applied())
+    live.add_step(step, maps_of_sensors(problem, {SIMULATED: simulated}, _VALUES_OF_STEPS))
 
 
 def _fit_one(run: RunFile, mode: str, number: int, folder: RunFolder) -> None:

@@ -43,19 +43,19 @@ def run_view(
     """
     if record is None:
         Guard(host, token)  # its errors come before any work
-    display, link = shown_of(target)
+    display, links = shown_of(target)
     if record is not None:
-        record.write_text(page_html(display), encoding="utf-8")
+        record.write_text(page_html(display, links), encoding="utf-8")
         console.print(f"written: {record}", markup=False, soft_wrap=True)
         return
-    with Viewer(display, link, host=host, port=port, token=token) as viewer:
+    with Viewer(display, links, host=host, port=port, token=token) as viewer:
         console.print(f"open {viewer.address} (Ctrl-C ends)", markup=False, soft_wrap=True)
         console.file.flush()  # a log shows it while the viewer runs
         viewer.wait()
 
 
-def shown_of(target: Path) -> tuple[Display, Link | None]:
-    """What there is to see of a target, and what lets people move it.
+def shown_of(target: Path) -> tuple[Display, dict[str, Link]]:
+    """What there is to see of a target, and by sensor what lets people move it.
 
     Args:
         target: A run folder, a run file or a capture.
@@ -72,7 +72,7 @@ def shown_of(target: Path) -> tuple[Display, Link | None]:
             )
         return _of_run(file, target)
     if target.suffix == ".nc":
-        return _of_capture(target), None
+        return _of_capture(target), {}
     if target.suffix == ".toml":
         return _of_run(target, None)
     raise InputError(
@@ -81,7 +81,7 @@ def shown_of(target: Path) -> tuple[Display, Link | None]:
     )
 
 
-def _of_run(file: Path, folder: Path | None) -> tuple[Display, Link | None]:
+def _of_run(file: Path, folder: Path | None) -> tuple[Display, dict[str, Link]]:
     run: RunFile = load_run(file)
     with about_file(file):
         scene, truth = build.scene(run), build.true_scene(run)
@@ -90,26 +90,27 @@ def _of_run(file: Path, folder: Path | None) -> tuple[Display, Link | None]:
         names = fitted_objects(run)
         # Without a fit what stands there is shown where it stands.
         own = truth if folder is None or not (folder / VIEW).exists() else scene
-        link = None
-        if radars:
-            radar, grid = next(iter(radars.values()))
-            if grid is not None:
-                depth = run.reconstruct.depth if run.reconstruct else getattr(run.data, "depth", 1)
-                link = Link(own, radar, grid, depth)
+        depth = run.reconstruct.depth if run.reconstruct else getattr(run.data, "depth", 1)
+        links = {
+            name: Link(own, radar, grid, depth)
+            for name, (radar, grid) in radars.items()
+            if grid is not None
+        }
         display = display_of(own, radars, title, fitted=names or list(run.truth))
     if folder is not None and (folder / VIEW).exists():
         display = Display.load(folder / VIEW)
-        if link is not None and display.steps:
-            link.take(display.steps[-1].bodies)
-    elif folder is not None and (folder / "capture.nc").exists() and link is not None:
-        capture = Capture.load(folder / "capture.nc")
-        display = replace(display, maps=Maps.of({MEASURED: capture.spectrum(link.grid)}, link.grid))
-    return display, link
+        for link in links.values():
+            if display.steps:
+                link.take(display.steps[-1].bodies)
+    elif folder is not None and (folder / "capture.nc").exists() and "" in links:
+        capture, grid = Capture.load(folder / "capture.nc"), links[""].grid
+        display = replace(display, maps={"": Maps.of({MEASURED: capture.spectrum(grid)}, grid)})
+    return display, links
 
 
 def _radars(run: RunFile) -> dict[str, tuple[Radar, Grid | None]]:
     """The radars of a run file with their bins, by name; none where it has no map of them."""
-    if run.data is not None and run.grid is not None and not run.map:
+    if (run.observations or (run.data and run.grid)) and not run.map:
         return {name: (own.radar, own.grid) for name, own in sensors_of(run).items()}
     if run.radar is None:
         return {}
@@ -121,9 +122,9 @@ def _of_capture(file: Path) -> Display:
     capture = Capture.load(file)
     radar, grid = capture.radar(), None
     low, high = shown_ranges(capture, None, None) if "beat" in capture.dataset else (0.0, 0.0)
-    maps = None
+    maps = {}
     if high > low:
         grid = radar.grid(low, high)
-        maps = Maps.of({MEASURED: capture.spectrum(grid)}, grid)
+        maps[""] = Maps.of({MEASURED: capture.spectrum(grid)}, grid)
     display = display_of(None, {"": (radar, grid)}, file.name)
     return replace(display, layers=[*capture_layers(capture), *display.layers], maps=maps)

@@ -20,6 +20,7 @@ _BACKGROUND = "#b9bec7"
 _OUTLINE = "#c0143c"
 _MARKED_SHARE = 0.015  # of a view: objects that look smaller get a mark
 _TRACK_COUNT = 24  # radar positions: more of them are drawn as dots
+_MIRRORED = "drawn with the radar's right to the right: mirrored against right-handed axes"
 # What runs across, up, and in depth: 0, 1, 2 = the radar's right, up, boresight.
 _VIEWS = {"from the radar": (0, 1, 2), "from above": (0, 2, 1), "from the side": (2, 1, 0)}
 
@@ -33,7 +34,9 @@ def scene(
 ) -> Figure:
     """Three views of a scene in a row; several scenes are one column each.
 
-    Each view looks along the world axis nearest to the radar's boresight, up or right.
+    Each view looks along the world axis nearest to the radar's boresight, up or right. Its x is to
+    the right, as in maps; somebody who stands at the radar, and the viewer, have it on the left.
+    The figure says so.
 
     Args:
         scenes: What is drawn, by title.
@@ -191,4 +194,12 @@ def _legend(
     if places is not None:
         label = f"radar, {len(places)} positions" if len(places) > 1 else "radar"
         handles.append(Line2D([], [], color="black", ls="", label=label, **_mark(places)))
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=6,
+        fontsize=8,
+        frameon=False,
+        title=_MIRRORED,
+        title_fontsize=7,
+    )

@@ -13,7 +13,7 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.untrusted import read_arrays, reading
 
-_FORMAT = 1
+_FORMAT = 2
 _DO = "repeat the run with --overwrite"
 _MOST_VALUES = 2_000_000  # of maps that are kept
 
@@ -91,15 +91,16 @@ class Maps:
     power: Mapping[str, NDArray[np.float32]]
 
     @classmethod
-    def of(cls, spectra: Mapping[str, Tensor], grid: Grid) -> "Maps":
+    def of(cls, spectra: Mapping[str, Tensor], grid: Grid, most: int = _MOST_VALUES) -> "Maps":
         """Maps of spectra [frame, range, u, v]; of many frames, evenly chosen ones.
 
         Args:
             spectra: By what is shown, all of one shape.
             grid: Their bins.
+            most: Values that are kept, about.
         """
         frames, ranges, across, _ = next(iter(spectra.values())).shape
-        count = max(1, min(frames, _MOST_VALUES // (len(spectra) * ranges * across)))
+        count = max(1, min(frames, most // (len(spectra) * ranges * across)))
         chosen = np.unique(np.linspace(0, frames - 1, count).astype(int)).tolist()
         return cls(
             chosen,
@@ -131,7 +132,7 @@ class Display:
         title: Of the window.
         layers: In the order in which they are listed.
         steps: Of a fit, in order; they move the layers "twin/<object>".
-        maps: Of the first radar, where there are data.
+        maps: Of every sensor that has data, by its name; the only one has an empty name.
         up: The direction that points up.
         ahead: The direction in which the radar looks.
     """
@@ -139,7 +140,7 @@ class Display:
     title: str
     layers: Sequence[Layer]
     steps: Sequence[Step] = ()
-    maps: Maps | None = None
+    maps: Mapping[str, Maps] = field(default_factory=dict)
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     ahead: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
@@ -220,7 +221,7 @@ class Display:
             read = whole(json.loads(str(arrays["header"])))
             if read.pop("format") != _FORMAT:
                 raise ValueError("of another version")
-            maps = read.pop("maps")
+            maps = {name: Maps(**own) for name, own in read.pop("maps").items()}
             steps = [
                 Step(**step | {"bodies": {n: Body(**body) for n, body in step["bodies"].items()}})
                 for step in read.pop("steps")
@@ -231,7 +232,7 @@ class Display:
             read |= {key: tuple(read[key]) for key in ("up", "ahead")}
             for body in (*layers, *(body for step in steps for body in step.bodies.values())):
                 _check(body)
-            return cls(**read, layers=layers, steps=steps, maps=maps and Maps(**maps))
+            return cls(**read, layers=layers, steps=steps, maps=maps)
 
 
 def _check(body: Layer | Body) -> None:

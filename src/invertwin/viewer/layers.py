@@ -18,7 +18,16 @@ from invertwin.viewer.display import Body, Display, Layer
 _GREY, _RADAR = (185, 190, 199), (110, 120, 140)
 _COLORS = {"truth": (192, 20, 60), "start": (224, 128, 60)}
 _TWIN = (76, 120, 168)
-_MOST_BEAMS = 24  # positions whose beams are drawn
+# Layers of the present position: their names, their colours, and how large their points are.
+PATHS, SEEN, EDGES, FED = "sampled paths", "what is seen", "boundary paths", "chosen bin"
+OF_POSITION: dict[str, tuple[tuple[int, int, int], float]] = {
+    PATHS: ((120, 170, 220), 1.0),
+    SEEN: ((30, 140, 90), 0.4),
+    EDGES: ((200, 40, 160), 0.7),
+    FED: ((255, 220, 0), 1.5),
+}
+ELLIPSOID = "95 % ellipsoid"
+_MOST_BEAMS = 6  # positions whose beams are drawn
 _RINGS = 32  # corners of an ellipsoid's circles
 _LEVEL = 7.815  # squared radius of the ellipsoid that holds 95 % of a normal law in space
 
@@ -148,7 +157,7 @@ def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[Layer]:
         rings = [(radii[:, [i, j]] @ circle).T for i, j in ((0, 1), (1, 2), (0, 2))]
         pairs = [np.stack([ring[:-1], ring[1:]], axis=1).reshape(-1, 3) for ring in rings]
         points = floats(np.concatenate(pairs)) + floats(scene[name].center)
-        layers.append(Layer(f"95 % ellipsoid/{name}", "lines", points, color=(230, 160, 0)))
+        layers.append(Layer(f"{ELLIPSOID}/{name}", "lines", points, color=(230, 160, 0)))
     return layers
 
 

@@ -36,8 +36,8 @@ def show_scene(
         InputError: No `viser`, or a host without a token.
     """
     display: Display = display_of(scene, {} if radar is None else {"": (radar, grid)}, "scene")
-    link = None if radar is None or grid is None else Link(scene, radar, grid)
-    viewer = Viewer(display, link, **options)
+    links = {} if radar is None or grid is None else {"": Link(scene, radar, grid)}
+    viewer = Viewer(display, links, **options)
     print(f"open {viewer.address}")
     return viewer
 

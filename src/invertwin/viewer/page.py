@@ -4,6 +4,8 @@ import base64
 import hashlib
 import html
 import json
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -12,34 +14,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from invertwin.viewer.display import Display, Step
+from invertwin.viewer.layers import ELLIPSOID, OF_POSITION, PATHS
+from invertwin.viewer.link import Link
+from invertwin.viewer.panels import (
+    APART,
+    DARKEST,
+    LARGEST,
+    MEASURED,
+    POWER,
+    RESIDUAL,
+    SIMULATED,
+    decibels,
+)
+from invertwin.viewer.sensor_maps import SensorMaps, sensor_maps
 
 _MOST_BYTES = 1_500_000  # of the steps on a page
 
 
-def page_html(display: Display) -> str:
+def page_html(display: Display, links: Mapping[str, Link] | None = None) -> str:
     """A whole page with a display.
 
     Args:
         display: What is shown.
+        links: As of `view_html`.
     """
     title = html.escape(display.title)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{policy()}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>body {{ font: 15px/1.5 system-ui, sans-serif; margin: 1rem; "
-        "color-scheme: light dark; }</style></head>\n"
-        f"<body><h1>{title}</h1>\n{view_html(display)}</body></html>\n"
+        f"<title>{title}</title><style>:root {{ color-scheme: light dark; }} "
+        "body { font: 15px/1.5 system-ui, sans-serif; margin: 1rem; }</style></head>\n"
+        f"<body><h1>{title}</h1>\n{view_html(display, links)}</body></html>\n"
     )
 
 
-def view_html(display: Display) -> str:
+def view_html(display: Display, links: Mapping[str, Link] | None = None) -> str:
     """A display as a part of a page; one page may hold it once.
 
     Of many steps it keeps as many as fit into 1.5 MB, evenly chosen, the last one among them.
 
     Args:
         display: What is shown.
+        links: The forward model of each sensor, by its name: the page has the maps that it
+            simulates at every step, and says which points feed a bin. None shows what was
+            measured alone.
     """
     faces = {x.name.removeprefix("twin/"): x.faces for x in display.layers}
 
@@ -56,7 +75,8 @@ def view_html(display: Display) -> str:
     size = sum(len(json.dumps(packed(step))) for step in display.steps[-1:])
     count = max(2, min(len(display.steps), _MOST_BYTES // max(size, 1)))
     chosen = np.unique(np.linspace(0, len(display.steps) - 1, count).astype(int))
-    steps = [packed(display.steps[k]) for k in chosen] if display.steps else []
+    kept = [display.steps[k] for k in chosen] if display.steps else []
+    maps = sensor_maps(replace(display, steps=kept), links or {})
     low, high = display.box
     data = {
         "up": display.up,
@@ -70,11 +90,21 @@ def view_html(display: Display) -> str:
                 "color": layer.color,
                 "opacity": layer.opacity,
                 "shown": layer.shown,
+                "through": layer.group == ELLIPSOID,  # it is inside of its object
                 **_arrays(layer.points, layer.faces),
             }
             for layer in display.layers
         ],
-        "steps": steps,
+        "steps": [packed(step) for step in kept],
+        "sensors": [_sensor(name, own) for name, own in maps.items()],
+        "position": [
+            {"name": name, "color": color, "size": size, "shown": name != PATHS}
+            for name, (color, size) in OF_POSITION.items()
+        ],
+        "pictures": {"measured": MEASURED, "simulated": SIMULATED, "residual": RESIDUAL},
+        "colors": {"power": _colors(POWER), "apart": _colors(APART)},
+        "depth": -DARKEST,
+        "largest": LARGEST,
     }
     # The only character that could end the element.
     text = json.dumps(data).replace("<", "\\u003c")
@@ -94,12 +124,45 @@ def policy() -> str:
     )
 
 
+def _sensor(name: str, maps: SensorMaps) -> dict[str, Any]:
+    """Maps of a sensor, each value one byte: 255 is the peak of its map, 0 the darkest."""
+
+    def packed(power: NDArray[np.float32]) -> str:
+        return _text(np.rint(255 * (1 - decibels(power) / DARKEST)).astype(np.uint8))
+
+    some = maps.measured if maps.simulated is None else maps.simulated
+    assert some is not None
+    return {
+        "name": name,
+        "frames": maps.frames,
+        "grid": maps.grid,
+        "shape": some.shape[-2:],
+        "places": maps.places.tolist(),
+        "rotations": maps.rotations.tolist(),
+        "origins": maps.origins.tolist(),
+        "measured": None if maps.measured is None else packed(maps.measured),
+        "simulated": None if maps.simulated is None else [packed(x) for x in maps.simulated],
+    }
+
+
+def _colors(name: str) -> str:
+    """A colour map as 256 times red, green and blue."""
+    from matplotlib import colormaps
+
+    return _text(colormaps[name](np.arange(256), bytes=True)[:, :3])
+
+
+def _text(array: NDArray[Any]) -> str:
+    """Bytes of an array, as base64."""
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
 def _arrays(points: NDArray[Any], faces: NDArray[Any] | None) -> dict[str, str]:
     """Numbers in little-endian order, as base64."""
     found = {"points": points.astype("<f4")} | (
         {} if faces is None else {"faces": faces.astype("<u4")}
     )
-    return {name: base64.b64encode(array.tobytes()).decode() for name, array in found.items()}
+    return {name: _text(array) for name, array in found.items()}
 
 
 @cache
@@ -108,4 +171,4 @@ def _resource(name: str) -> str:
 
 
 def _script() -> str:
-    return _resource("page.js")
+    return _resource("sight.js") + _resource("page.js")

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from invertwin.viewer.display import Display
 
 MEASURED, SIMULATED, RESIDUAL = "measured", "simulated", "residual"
-_DARKEST = -40.0  # dB below the peak
-_LARGEST = 15.0  # dB of a residual
+POWER, APART = "viridis", "RdBu_r"  # colour maps
+DARKEST = -40.0  # dB below the peak
+LARGEST = 15.0  # dB of a residual
 _PIXELS = 200  # along the shorter side of a picture, at least
 
 
@@ -21,24 +22,21 @@ class Panels:
         server: Of viser.
         display: Tells where the scene is.
         shown: Names of the pictures.
-        shape: Numbers of ranges and of directions.
 
     Attributes:
         right: The direction in which u grows.
         offset: From the middle of the scene to that of the pictures.
     """
 
-    def __init__(
-        self, server: Any, display: Display, shown: Sequence[str], shape: tuple[int, int]
-    ) -> None:
+    def __init__(self, server: Any, display: Display, shown: Sequence[str]) -> None:
         low, high = display.box
         up, ahead = np.array(display.up), np.array(display.ahead)
         self.right, self.offset = np.cross(up, ahead), np.zeros(3)
+        self._shape = (1, 1)
         self._nodes: dict[str, Any] = {}
         self._places: dict[str, Any] = {}
         if not shown:
             return
-        self._shape = shape
         self._size = 0.5 * (float(np.linalg.norm(high - low)) or 1.0)
         self._axes = self.right, up
         self.offset = up * (float((high - low) @ np.abs(up)) / 2 + 0.65 * self._size)
@@ -98,13 +96,14 @@ class Panels:
         """
         from matplotlib import colormaps
 
-        levels = {name: _decibels(power) for name, power in maps.items()}
-        pictures = {
-            name: colormaps["viridis"](1 - level / _DARKEST) for name, level in levels.items()
-        }
+        self._shape = next(iter(maps.values())).shape if maps else (1, 1)
+        levels = {name: decibels(power) for name, power in maps.items()}
+        pictures = {name: colormaps[POWER](1 - level / DARKEST) for name, level in levels.items()}
         if MEASURED in levels and SIMULATED in levels:
             apart = levels[MEASURED] - levels[SIMULATED]
-            pictures[RESIDUAL] = colormaps["RdBu_r"](0.5 + apart / (2 * _LARGEST))
+            pictures[RESIDUAL] = colormaps[APART](0.5 + apart / (2 * LARGEST))
+        for name, node in self._nodes.items():
+            node.visible = name in pictures
         for name, colors in pictures.items():
             if name in self._nodes and not (name in maps and self._has(name, maps[name], chosen)):
                 self._nodes[name].image = _drawn(np.uint8(255 * colors[..., :3]), chosen)
@@ -113,12 +112,18 @@ class Panels:
         """Whether a picture shows that already; from now on it does."""
         before, frame = self._known.get(name, (None, None))
         self._known[name] = power, chosen
-        return before is not None and frame == chosen and bool((before == power).all())
+        return before is not None and frame == chosen and np.array_equal(before, power)
 
 
-def _decibels(power: NDArray[np.float32]) -> NDArray[Any]:
-    peak = float(power.max()) or 1.0
-    return (10 * np.log10(np.maximum(power / peak, 1e-30))).clip(_DARKEST, 0.0)
+def decibels(power: NDArray[np.float32]) -> NDArray[Any]:
+    """A map below its own peak [dB], none below the darkest.
+
+    Args:
+        power: The map, or several of them [..., range, u].
+    """
+    peak = power.max((-2, -1), keepdims=True)
+    level = 10 * np.log10(np.maximum(power / np.where(peak > 0, peak, 1.0), 1e-30))
+    return level.clip(DARKEST, 0.0)
 
 
 def _drawn(colors: Any, chosen: tuple[int, int] | None) -> NDArray[np.uint8]:

@@ -5,31 +5,27 @@ import io
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from invertwin.errors import InputError
 from invertwin.scene import rigid, rotation_from_quaternion
-from invertwin.viewer.display import Display, Layer, Step
+from invertwin.viewer.display import Display, Layer, Maps, Step
 from invertwin.viewer.guard import LOOPBACK, Guard, guarding
-from invertwin.viewer.layers import floats
+from invertwin.viewer.layers import EDGES, ELLIPSOID, FED, OF_POSITION, PATHS, SEEN, floats
 from invertwin.viewer.link import Link, Seen
 from invertwin.viewer.panels import MEASURED, RESIDUAL, SIMULATED, Panels
 
 _NOBODY = "nothing"
-_SHOWN_PATHS = 300  # rays that are drawn
+_SHOWN_PATHS = 100  # rays that are drawn
 _TIMES = 10  # updates over which their rate is taken
 _PAUSE = 1.0  # seconds: later updates do not follow each other
 _STILL = 0.4  # seconds after which nothing moves
-# Layers of the present position, and their colours.
-_PATHS, _SEEN, _EDGES, _FED = "sampled paths", "what is seen", "boundary paths", "chosen bin"
-_OWN = {_PATHS: (120, 170, 220), _SEEN: (30, 140, 90), _EDGES: (200, 40, 160), _FED: (255, 220, 0)}
 
 
 @dataclass
@@ -37,6 +33,7 @@ class _Wish:
     """What the person has chosen last."""
 
     step: int
+    sensor: str
     frame: int = 0
     moved: str = _NOBODY
     turn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
@@ -51,7 +48,8 @@ class Viewer:
 
     Args:
         display: What is shown.
-        link: Lets people move objects, and shows maps and paths; None = it only shows.
+        links: Of each sensor by its name: let people move objects, and show maps and paths.
+            None = it only shows.
         host: Where it listens.
         port: The first one that is tried.
         token: See ``Guard``.
@@ -66,7 +64,7 @@ class Viewer:
     def __init__(
         self,
         display: Display,
-        link: Link | None = None,
+        links: Mapping[str, Link] | None = None,
         *,
         host: str = LOOPBACK,
         port: int = 8080,
@@ -77,15 +75,17 @@ class Viewer:
         query = "" if token is None else f"/?token={token}"
         named = f"[{host}]" if ":" in host else host
         self.address = f"http://{named}:{self._server.get_port()}{query}"
-        self._link, self._steps = link, list(display.steps)
+        self._links, self._steps = dict(links or {}), list(display.steps)
         self._display = display
         self._lock, self._due, self._closed = threading.Lock(), threading.Event(), False
-        self._wish = _Wish(step=len(self._steps) - 1)
+        self._sensors = list(dict.fromkeys([*display.maps, *self._links]))
+        self._wish = _Wish(step=len(self._steps) - 1, sensor=next(iter(self._sensors), ""))
+        self._found: dict[int, Mapping[str, Maps]] = {}  # what sensors see at steps as they come
         self._taken: int | None = None  # the step whose bodies the link has
         self._times: deque[float] = deque(maxlen=_TIMES)
         self._seen: Seen | None = None
         self._nodes: dict[str, Any] = {}
-        self._visible = display.groups | {name: name != _PATHS for name in _OWN if link}
+        self._visible = display.groups | {x: x != PATHS for x in OF_POSITION if links}
         self._arrange()
         self._worker = threading.Thread(target=self._work, daemon=True)
         self._worker.start()
@@ -97,14 +97,16 @@ class Viewer:
         times = list(self._times)
         return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
 
-    def add_step(self, step: Step) -> None:
+    def add_step(self, step: Step, maps: Mapping[str, Maps] | None = None) -> None:
         """Show a further step of a fit that goes on; who looks at the last one follows.
 
         Args:
             step: The step.
+            maps: Of sensors at this step, in place of those of the display.
         """
         with self._lock:
             follows = self._wish.step == len(self._steps) - 1
+            self._found[len(self._steps)] = maps or {}
             self._steps.append(step)
         self._step.max = max(1, len(self._steps) - 1)
         self._step.visible = len(self._steps) > 1
@@ -161,8 +163,7 @@ class Viewer:
         self._where = gui.add_text("fit", "", disabled=True, visible=count > 1)
         low, high = display.box
         self._size = float(np.linalg.norm(high - low)) or 1.0
-        link, maps = self._link, display.maps
-        self._arrange_link()
+        self._arrange_sensors()
         with gui.add_folder("layers"):
             for group, shown in self._visible.items():
                 box = gui.add_checkbox(group, shown)
@@ -170,11 +171,10 @@ class Viewer:
         self._said = gui.add_text("note", "", disabled=True, visible=False)
         for layer in display.layers:
             self._put(layer)
-        shown = [MEASURED] if maps is not None else []
-        if link is not None:
+        shown = [MEASURED] if display.maps else []
+        if self._links or any(SIMULATED in maps.power for maps in display.maps.values()):
             shown += [SIMULATED, RESIDUAL] if shown else [SIMULATED]
-        shape = (len(maps.ranges), len(maps.across)) if maps else (0, 0)
-        self._panels = Panels(self._server, display, shown, link.grid.shape[:2] if link else shape)
+        self._panels = Panels(self._server, display, shown)
         self._panels.on_click(lambda found: self._choose(bin=found))
         camera = self._server.initial_camera
         middle = (low + high) / 2
@@ -186,23 +186,35 @@ class Viewer:
         )
         camera.up = up
 
-    def _arrange_link(self) -> None:
-        gui, link, maps = self._server.gui, self._link, self._display.maps
-        if link is None and maps is None:
+    def _arrange_sensors(self) -> None:
+        gui = self._server.gui
+        if not self._sensors:
             return
-        frames = link.radar.frame_count if link else maps.frames[-1] + 1 if maps else 1
-        self._frame = gui.add_slider("position", 0, max(1, frames - 1), 1, 0, visible=frames > 1)
+        several = len(self._sensors) > 1
+        self._sensor = gui.add_dropdown("sensor", self._sensors, visible=several)
+        self._sensor.on_update(lambda _: self._sense(str(self._sensor.value)))
+        self._frame = gui.add_slider("position", 0, 1, 1, 0)
         self._frame.on_update(lambda _: self._choose(frame=int(self._frame.value)))
-        self._bin = gui.add_text("bin", "click a map", disabled=True)
-        if link is None:
+        self._bin = gui.add_text("bin", "", disabled=True)
+        self._sense(self._wish.sensor)
+        if not self._links:
             return
-        self._mover = gui.add_dropdown("move", (_NOBODY, *link.names), initial_value=_NOBODY)
+        names = next(iter(self._links.values())).names
+        self._mover = gui.add_dropdown("move", (_NOBODY, *names), initial_value=_NOBODY)
         self._mover.on_update(lambda _: self._grab(str(self._mover.value)))
         self._rate = gui.add_text("maps a second", "", disabled=True)
         self._gizmo = self._server.scene.add_transform_controls(
             "/gizmo", scale=0.4 * self._size, depth_test=False, visible=False
         )
         self._gizmo.on_update(lambda _: self._move())
+
+    def _sense(self, name: str) -> None:
+        """Look through another sensor, from its first position."""
+        link, maps = self._links.get(name), self._display.maps.get(name)
+        frames = link.radar.frame_count if link else maps.frames[-1] + 1 if maps else 1
+        self._frame.max, self._frame.value = max(1, frames - 1), 0
+        self._frame.visible, self._bin.value = frames > 1, "click a map"
+        self._choose(sensor=name, frame=0, bin=None)
 
     def _switch(self, group: str) -> Callable[[Any], None]:
         def switch(event: Any) -> None:
@@ -215,10 +227,10 @@ class Viewer:
 
     def _grab(self, name: str) -> None:
         """Let the person move an object, from where the step has it."""
-        assert self._link is not None
         self._release()
         if name != _NOBODY:
-            center = tuple(self._link.scene[name].center.detach().tolist())
+            link = self._links[self._wish.sensor]
+            center = tuple(link.scene[name].center.detach().tolist())
             self._gizmo.position, self._gizmo.wxyz = center, (1.0, 0.0, 0.0, 0.0)
             self._center = np.array(center)
             self._choose(moved=name, turn=(1.0, 0.0, 0.0, 0.0), place=center)
@@ -273,6 +285,11 @@ class Viewer:
             pairs = layer.points.reshape(-1, 2, 3)
             thick = {"thickness": 1.5, "thickness_units": "screen"}
             made = scene.add_line_segments(node, pairs, colors=layer.color, **thick, **how)
+            if layer.group == ELLIPSOID:
+                # It is inside of its object; only labels show through.
+                middle = (layer.points.min(0) + layer.points.max(0)) / 2
+                radius = np.linalg.norm(layer.points - middle, axis=1).max()
+                scene.add_label(f"{node}/radius", f"95 %: {1e3 * radius:.2g} mm", position=middle)
         else:
             made = scene.add_point_cloud(
                 node,
@@ -296,7 +313,7 @@ class Viewer:
                 wish = self._wish
             try:
                 self._show_step(wish)
-                if self._link is not None or self._display.maps is not None:
+                if self._sensors:
                     self._follow(wish)
                 self._said.visible = False
             except InputError as error:
@@ -316,13 +333,15 @@ class Viewer:
                 else:
                     self._put(layer)
         self._where.visible, self._where.value = True, step.label
-        if self._link is not None:
-            self._link.take(step.bodies)
+        for link in self._links.values():
+            link.take(step.bodies)
 
     def _follow(self, wish: _Wish) -> None:
         """Show the maps of a position, and its paths once nothing moves."""
-        link, known = self._link, self._display.maps
+        link, known = self._links.get(wish.sensor), self._display.maps.get(wish.sensor)
         maps = known.at(wish.frame) if known else {}
+        if (found := self._found.get(wish.step, {}).get(wish.sensor)) is not None:
+            maps |= found.at(wish.frame)
         if link is None:
             scene = None
         elif wish.moved == _NOBODY:
@@ -333,7 +352,7 @@ class Viewer:
             maps |= {SIMULATED: floats(link.map(scene, wish.frame))}
         self._panels.show(maps, wish.bin)
         if wish.bin is not None:
-            self._bin.value = self._told(*wish.bin)
+            self._bin.value = self._told(wish.sensor, *wish.bin)
         if link is None or scene is None:
             return
         now = time.perf_counter()
@@ -345,14 +364,14 @@ class Viewer:
         if not self._due.wait(_STILL):
             self._show_paths(link.seen(scene, wish.frame), wish.bin)
 
-    def _told(self, row: int, column: int) -> str:
+    def _told(self, sensor: str, row: int, column: int) -> str:
         """A bin in words."""
-        if self._link is not None:
-            grid = self._link.grid
+        if sensor in self._links:
+            grid = self._links[sensor].grid
             away, across = float(grid.ranges[row]), float(grid.u[column])
         else:
-            assert self._display.maps is not None
-            away, across = self._display.maps.ranges[row], self._display.maps.across[column]
+            maps = self._display.maps[sensor]
+            away, across = maps.ranges[row], maps.across[column]
         return f"range {away:.2f} m, u {across:.3f}"
 
     def _show_paths(self, seen: Seen, chosen: tuple[int, int] | None) -> None:
@@ -361,15 +380,12 @@ class Viewer:
         place = np.broadcast_to(floats(seen.place), some[:, 0].shape)
         corners = np.stack([place, some[:, 0], some[:, 0], some[:, 1]], axis=1)
         fed = floats(seen.feeding(*chosen)) if chosen else np.zeros((0, 3), np.float32)
-        found: dict[str, tuple[str, NDArray[np.float32], float]] = {
-            _PATHS: ("lines", corners.reshape(-1, 3), 1.0),
-            _SEEN: ("points", points[:, 1], 0.4),
-            _EDGES: ("points", floats(seen.edges), 0.7),
-            _FED: ("points", fed, 1.5),
-        }
+        found = {PATHS: corners.reshape(-1, 3), SEEN: points[:, 1], EDGES: seen.edges, FED: fed}
         with self._server.atomic():
-            for name, (kind, places, size) in found.items():
-                self._put(Layer(name, kind, places, color=_OWN[name]), size)  # type: ignore[arg-type]
+            for name, places in found.items():
+                color, size = OF_POSITION[name]
+                kind = "lines" if name == PATHS else "points"
+                self._put(Layer(name, kind, floats(places), color=color), size)
 
 
 def _started(guard: Guard, host: str, port: int) -> Any:

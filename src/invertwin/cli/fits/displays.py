@@ -52,7 +52,7 @@ class KeptSteps(Callback):
         names: Collection[str],
         total: int,
         every: int,
-        show: Callable[[Step], None] | None,
+        show: Callable[[Fit, Step], None] | None,
     ) -> None:
         self._file, self._names, self._show = file, names, show
         self._apart, self._every = math.ceil(total / _MOST_STEPS), every
@@ -64,7 +64,7 @@ class KeptSteps(Callback):
         if not self._steps:
             self._steps = steps_in(self._file)
         if not self._steps:
-            self._keep(Step(0, "start", self._bodies(fit.twin())))
+            self._keep(fit, Step(0, "start", self._bodies(fit.twin())))
 
     def step(self, fit: Fit, row: dict[str, Any]) -> None:
         """Keep some of the steps."""
@@ -75,7 +75,7 @@ class KeptSteps(Callback):
             label = f"step {number}, loss {row['loss']:.4g}"
             # Parameters that the scene refuses have no picture; the fit ends as diverged.
             with suppress(InputError):
-                self._keep(Step(number, label, self._bodies(fit.twin())))
+                self._keep(fit, Step(number, label, self._bodies(fit.twin())))
         if fit.progress.step % self._every == 0:
             self._write()
 
@@ -83,10 +83,10 @@ class KeptSteps(Callback):
         """Write what is kept."""
         self._write()
 
-    def _keep(self, step: Step) -> None:
+    def _keep(self, fit: Fit, step: Step) -> None:
         self._steps.append(step)
         if self._show is not None:
-            self._show(step)
+            self._show(fit, step)
 
     def _write(self) -> None:
         if self._written != self._steps[-1].number or not self._file.exists():
@@ -144,13 +144,29 @@ def display_of_fit(
     display = display_of_problem(problem, twin)
     names = [name for name in fitted_objects(problem.run) if name in start.names]
     more = scene_layers(start, "start", fitted=names, only=True)
-    shown = {MEASURED: maps["measured"][0], SIMULATED: maps["twin"][0]}
     return replace(
         display,
         layers=[*display.layers, *more, *ellipsoid_layers(twin, metrics)],
         steps=steps,
-        maps=Maps.of(shown, problem.first.grid),
+        maps=maps_of_sensors(problem, {MEASURED: maps["measured"], SIMULATED: maps["twin"]}),
     )
+
+
+def maps_of_sensors(
+    problem: Problem, spectra: Mapping[str, Sequence[Tensor]], most: int | None = None
+) -> dict[str, Maps]:
+    """What the sensors of a fit see, by their names.
+
+    Args:
+        problem: What is fitted.
+        spectra: Power [frame, range, u, v] of every sensor, by what is shown.
+        most: Values that are kept of a sensor, about; None = of a few megabytes.
+    """
+    limit = {} if most is None else {"most": most}
+    return {
+        name: Maps.of({what: own[k] for what, own in spectra.items()}, sight.grid, **limit)
+        for k, (name, sight) in enumerate(problem.sights.items())
+    }
 
 
 def display_of_problem(problem: Problem, scene: Scene) -> Display:

@@ -46,6 +46,7 @@ from invertwin.inversion import (
 )
 from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.certainty import certainty
+from invertwin.inversion.fit import Fit
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runs import RunFolder
 from invertwin.scene import Object, Scene
@@ -100,7 +101,7 @@ def fit(
     folder: RunFolder,
     console: Console,
     checkpoint: str | None,
-    show: Callable[[Step], None] | None = None,
+    show: Callable[[Fit, Step], None] | None = None,
 ) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
     """One fit, or what an interrupted run has kept of it.
 
@@ -156,7 +157,7 @@ def _staged(
     index: int,
     folder: RunFolder,
     checkpoint: str,
-    show: Callable[[Step], None] | None,
+    show: Callable[[Fit, Step], None] | None,
     shown: Sequence[Report] = (),
 ) -> tuple[Reconstruction, dict[str, Any]]:
     """A fit, or a search about its start; and what the row says of the search."""

@@ -1,0 +1,127 @@
+"""Maps of every sensor at every step, for pages that cannot trace, and what links them."""
+
+import warnings
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from invertwin.errors import InputError, PhysicsWarning
+from invertwin.viewer.display import Display
+from invertwin.viewer.layers import floats
+from invertwin.viewer.link import Link
+from invertwin.viewer.panels import MEASURED
+
+_MOST_MAPS = 144  # simulated ones of a page, over sensors, steps and positions
+_MOST_FRAMES = 8  # positions of a sensor
+_MOST_BINS = 96  # of a map along range, and across
+
+
+@dataclass(frozen=True, eq=False)
+class SensorMaps:
+    """What a page shows of one sensor.
+
+    Attributes:
+        frames: Numbers of its positions.
+        grid: Middle of the first bin and distance of the bins, of range [m] and of u.
+        places: Of the radar [m], [frame, 3]; none where nothing links maps to places.
+        rotations: Columns are the radar's axes, [frame, 3, 3].
+        origins: Range from which each position counts its own [m].
+        measured: Power [frame, range, u], if there is any.
+        simulated: Power [step, frame, range, u], if there is any; without steps one of the scene.
+    """
+
+    frames: list[int]
+    grid: tuple[float, float, float, float]
+    places: NDArray[np.float32]
+    rotations: NDArray[np.float32]
+    origins: NDArray[np.float32]
+    measured: NDArray[np.float32] | None
+    simulated: NDArray[np.float32] | None
+
+
+def sensor_maps(display: Display, links: Mapping[str, Link]) -> dict[str, SensorMaps]:
+    """Maps of all sensors at some of their positions, by the name of the sensor.
+
+    The links are left with the bodies of the last step.
+
+    Args:
+        display: With its steps and with what was measured.
+        links: The forward model of each sensor.
+    """
+    names = list(dict.fromkeys([*display.maps, *links]))
+    count = _MOST_MAPS // (max(1, len(display.steps)) * max(1, len(names)))
+    found = {
+        name: _of_sensor(display, name, links.get(name), min(max(1, count), _MOST_FRAMES))
+        for name in names
+    }
+    return {
+        name: own
+        for name, own in found.items()
+        if own.measured is not None or own.simulated is not None
+    }
+
+
+def _of_sensor(display: Display, name: str, link: Link | None, count: int) -> SensorMaps:
+    known = display.maps.get(name)
+    if known is None:
+        assert link is not None
+        frames, ranges, across = (
+            list(range(link.radar.frame_count)),
+            link.grid.ranges.tolist(),
+            link.grid.u.tolist(),
+        )
+    else:
+        frames, ranges, across = known.frames, known.ranges, known.across
+    chosen = np.unique(np.linspace(0, len(frames) - 1, count).astype(int)).tolist()
+    frames = [frames[k] for k in chosen]
+    blocks = [-(-len(axis) // _MOST_BINS) for axis in (ranges, across)]
+
+    def coarse(power: Tensor) -> NDArray[np.float32]:
+        """The strongest of each block of bins."""
+        flat = power.reshape(-1, 1, *power.shape[-2:])
+        pooled = torch.nn.functional.max_pool2d(flat, blocks, ceil_mode=True)
+        return floats(pooled.reshape(*power.shape[:-2], *pooled.shape[-2:]))
+
+    measured = None
+    if known is not None and MEASURED in known.power:
+        measured = coarse(torch.from_numpy(known.power[MEASURED][chosen]))
+    simulated = None if link is None else _simulated(display, link, frames)
+    places, rotations, origins = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
+    if link is not None:
+        radar = link.radar.frames(frames)
+        places, rotations, origins = radar.positions, radar.link().rotations, radar.origins
+    start, step = zip(*(_axis(*x) for x in zip((ranges, across), blocks, strict=True)), strict=True)
+    return SensorMaps(
+        frames,
+        (start[0], step[0], start[1], step[1]),
+        floats(places),
+        floats(rotations),
+        floats(origins),
+        measured,
+        None if simulated is None else coarse(simulated),
+    )
+
+
+def _simulated(display: Display, link: Link, frames: list[int]) -> Tensor | None:
+    """Power [step, frame, range, u]; None for scenes that have no smooth map."""
+    found = []
+    with warnings.catch_warnings(), suppress(InputError):
+        warnings.simplefilter("ignore", PhysicsWarning)  # of bins that are coarse for a fit
+        for step in display.steps or [None]:
+            if step is not None:
+                link.take(step.bodies)
+            found.append(torch.stack([link.map(link.scene, frame).float() for frame in frames]))
+    if len(found) < max(1, len(display.steps)):
+        return None
+    return torch.stack(found)
+
+
+def _axis(centers: list[float], block: int) -> tuple[float, float]:
+    """Middle of the first block of bins, and the distance of blocks."""
+    step = centers[1] - centers[0] if len(centers) > 1 else 1.0
+    return centers[0] + (block - 1) / 2 * step, block * step

@@ -1,0 +1,61 @@
+"""A ball that moves before a wall, seen by two sensors; one of the names tries to act."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import torch
+
+from invertwin.radar import FMCW, Radar
+from invertwin.scene import (
+    Object,
+    RoughDielectric,
+    Scene,
+    planar_array,
+    plate,
+    rigid,
+    rotation_from_vector,
+    sphere,
+)
+from invertwin.viewer import MEASURED, Body, Display, Link, Maps, Step, body_of, display_of
+
+EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
+
+
+@cache
+def shown() -> tuple[Display, dict[str, Link]]:
+    """At step k the ball is at x = 0.2 k m, z = 2 m; measured at x = 0.5 m. One sensor is aside."""
+    material = RoughDielectric(4.0)
+    ball = Object(sphere(0.3, 4), material, rigid(translation=[0.0, 0.0, 2.0]))
+    wall = Object(plate(3.0, 2.4), material, rigid(translation=[0.0, 0.0, 3.3]))
+    scene = Scene({EVIL: ball, "wall": wall})
+    body, away = body_of(ball), np.array([0.2, 0.0, 0.0], np.float32)
+    steps = [
+        Step(k, f"{EVIL} {k}", {EVIL: Body(body.vertices + k * away, body.faces)}) for k in range(5)
+    ]
+    one, array = planar_array((1, 1), (1.9e-3, 1.9e-3)), planar_array((16, 4), (1.9e-3, 1.9e-3))
+    waveform = FMCW(77e9, 2e9, 50e-6, 128)
+    places = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0]], dtype=torch.float64)
+    turned = rotation_from_vector(torch.tensor([0.0, np.pi / 2, 0.0], dtype=torch.float64))
+    beside = torch.tensor([[-2.5, 0.0, 2.0]], dtype=torch.float64)
+    radars = {
+        "front": Radar(one, array, waveform, places),
+        EVIL: Radar(one, array, waveform, beside, turned[None]),
+    }
+    grids = {name: radar.grid(1.0, 4.5, 0.6, 0.5) for name, radar in radars.items()}
+    links = {name: Link(scene, radar, grids[name]) for name, radar in radars.items()}
+    truth = links["front"].moved(EVIL, rigid(translation=[0.5, 0.0, 0.0]))
+    maps = {
+        name: Maps.of(
+            {
+                MEASURED: torch.stack(
+                    [link.map(truth, k)[..., None] for k in range(link.radar.frame_count)]
+                )
+            },
+            grids[name],
+        )
+        for name, link in links.items()
+    }
+    sights = {name: (radar, grids[name]) for name, radar in radars.items()}
+    made = display_of(scene, sights, EVIL, fitted=[EVIL])
+    return replace(made, steps=steps, maps=maps), links
