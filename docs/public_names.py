@@ -59,13 +59,13 @@ def examples(page: Path) -> list[doctest.Example]:
     """The examples `>>>` of a page, in order."""
     if page.suffix != ".md":
         return []
-    parser = doctest.DocTestParser()
-    return [
-        example
-        for kind, text in FENCE.findall(page.read_text())
-        if kind == "pycon"
-        for example in parser.get_examples(text)
-    ]
+    parser, text = doctest.DocTestParser(), page.read_text()
+    found: list[doctest.Example] = []
+    for block in FENCE.finditer(text):
+        for example in parser.get_examples(block[2]) if block[1] == "pycon" else ():
+            example.lineno += text.count("\n", 0, block.start(2))
+            found.append(example)
+    return found
 
 
 def cells(page: Path) -> list[str]:
@@ -101,6 +101,27 @@ def used(text: str) -> set[str]:
             found.add(node.id)
         elif isinstance(node, ast.Attribute):
             found.add(node.attr)
+    return found
+
+
+def shown(page: Path) -> set[str]:
+    """Dotted names of the package that the examples of a page use, not merely import.
+
+    Args:
+        page: A Markdown page with examples `>>>`.
+    """
+    origin: dict[str, str] = {}
+    found: set[str] = set()
+    for node in ast.walk(ast.parse("\n".join(example.source for example in examples(page)))):
+        if isinstance(node, ast.Import):
+            origin |= {alias.asname or alias.name: alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            origin |= {
+                alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names
+            }
+        elif isinstance(node, ast.Name | ast.Attribute):
+            first, *rest = ast.unparse(node).split(".")
+            found.add(".".join([origin.get(first, first), *rest]))
     return found
 
 

@@ -89,8 +89,22 @@ def escape(
     lines[:] = text.split("\n")
 
 
+def shorten(
+    app: Sphinx,
+    what: str,
+    name: str,
+    thing: object,
+    options: object,
+    signature: str | None,
+    returns: str | None,
+) -> tuple[str | None, str | None]:
+    """Hundreds of numbers of a default tell nobody anything."""
+    return signature and re.sub(r"tensor\([^()]*\)", "tensor(...)", signature), returns
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", escape, priority=100)
+    app.connect("autodoc-process-signature", shorten)
     app.add_directive("run-files", RunFiles)
     app.add_directive("names", Names)
     return {"parallel_read_safe": True}

@@ -5,6 +5,7 @@ import pytest
 pytest.importorskip("bs4", reason="pip install -e '.[docs]'")
 
 from check_site import problems
+from site_directives import shorten
 
 PAGE = '<html><head>{head}</head><body><h1 id="top">Title</h1>{body}</body></html>'
 
@@ -46,3 +47,10 @@ def test_what_leads_nowhere_or_is_fetched_is_told(tmp_path, head, body, problem)
 def test_styles_that_fetch_are_told(tmp_path):
     (tmp_path / "style.css").write_text("@import url('https://fonts.example/a.css');")
     assert site(tmp_path) == ["style.css: fetches from elsewhere"]
+
+
+def test_numbers_of_default_tensors_are_left_out_of_signatures():
+    default = "(a: float = 1.0, b: Tensor = tensor([[0., 1.],\n        [1., 0.]], dtype=float64))"
+    short, returns = shorten(None, "class", "Thing", None, None, default, "int")
+    assert (short, returns) == ("(a: float = 1.0, b: Tensor = tensor(...))", "int")
+    assert shorten(None, "class", "Thing", None, None, None, None) == (None, None)

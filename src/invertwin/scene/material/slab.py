@@ -78,12 +78,12 @@ def slab_coefficients(
     The transmission is from the entry face to the exit face, at the same place along them.
 
     Args:
-        layers: the layers in the order in which the wave meets them.
+        layers: those of ``Layer.sheet``, in the order in which the wave meets them.
         cos_theta: cosine of the angle of incidence, in [0, 1].
         frequency: [Hz].
 
     Raises:
-        InputError: no layers.
+        InputError: no layers, or layers without a frequency.
     """
     s, p = _both(layers, cos_theta, frequency)
     return FieldCoefficients(s.reflection, p.reflection, s.transmission, p.transmission)
@@ -152,6 +152,11 @@ def _both(
 ) -> tuple[_Response, _Response]:
     if not layers:
         raise InputError("expected at least one layer, got none; give the layers of the slab")
+    for layer in layers:
+        if not isinstance(layer, Sheet):
+            raise InputError(
+                f"expected layers at a frequency, got {type(layer).__name__}; give layer.sheet(f)"
+            )
     cosine = cos_theta.clamp(min=LEAST_COSINE)
     return (
         _response(layers, cosine, frequency, parallel=False),
