@@ -44,8 +44,8 @@ the extra `bench`; without it those rows stay empty.
 """
 
 import argparse
+import math
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -68,6 +68,7 @@ from throughput import WAVEFORM, sionna_version
 from invertwin.channel import Sampling, backend, deposit_power
 from invertwin.channel.rays.backend import mi
 from invertwin.channel.rays.topology import Topology
+from invertwin.memory import peak_memory
 from invertwin.radar import Radar
 from invertwin.scene import Object, RoughConductor, Scene
 from invertwin.scene.antenna import linear_array
@@ -334,7 +335,7 @@ def history(act: Callable[[], Any]) -> list[dict[str, Any]]:
     return found
 
 
-def peak_memory(samples: int, depth: int) -> float:
+def peak_of_steps(samples: int, depth: int) -> float:
     """Peak resident memory of a fresh process that does three steps [GB]."""
     command = [sys.executable, __file__, "--memory", str(samples), str(depth)]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
@@ -345,8 +346,7 @@ def memory_of_steps(samples: int, depth: int) -> float:
     task = room()
     for number in range(3):
         step(task, number, samples, depth)
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+    return (peak_memory() or math.nan) / 1e9
 
 
 def measure(
@@ -362,8 +362,6 @@ def measure(
         "load_average": os.getloadavg()[0],
         "sionna_rt_version": sionna_version(),
     }
-    # First, since on Linux a child's peak counts from its parent's size when it was started.
-    peaks = {depth: peak_memory(memory_samples, depth) for depth in DEPTHS}
     metrics["step"] = repeated(steps)
     try:
         theirs = Theirs()
@@ -373,7 +371,7 @@ def measure(
     for depth in DEPTHS:
         found = compared(depth, samples, steps, theirs, metrics["bare_rays_per_second"])
         metrics[f"depth{depth}"] = found
-        metrics[f"depth{depth}"]["peak_memory_gb"] = peaks[depth]
+        metrics[f"depth{depth}"]["peak_memory_gb"] = peak_of_steps(memory_samples, depth)
     return metrics
 
 

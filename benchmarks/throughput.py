@@ -7,8 +7,8 @@ the extra `bench`; without it that row stays empty.
 """
 
 import argparse
+import math
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -30,6 +30,7 @@ from invertwin.channel import Grid, Sampling, backend, deposit_power, trace_powe
 from invertwin.channel.rays.backend import mi
 from invertwin.channel.rays.geometry import flatten
 from invertwin.channel.rays.scene import RayScene, visible
+from invertwin.memory import peak_memory
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array
@@ -147,7 +148,7 @@ def compiled(act: Callable[[], Any]) -> int:
     return sum(not kernel["cache_hit"] for kernel in history)
 
 
-def peak_memory(samples: int) -> float:
+def peak_of_steps(samples: int) -> float:
     """Peak resident memory of a fresh process that does three steps [GB]."""
     command = [sys.executable, __file__, "--memory", str(samples)]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
@@ -158,8 +159,7 @@ def memory_of_steps(samples: int) -> float:
     task = Task.build()
     for number in range(3):
         task.step(number, samples, BOUNDARY_SAMPLES)
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+    return (peak_memory() or math.nan) / 1e9
 
 
 def useful_paths(rays: int, steps: int) -> dict[str, Any]:
@@ -275,8 +275,7 @@ def measure(
         "cpu_count": os.cpu_count(),
         "load_average": os.getloadavg()[0],
     }
-    # First, since on Linux a child's peak counts from its parent's size when it was started.
-    metrics |= {"memory_samples": memory_samples, "peak_memory_gb": peak_memory(memory_samples)}
+    metrics |= {"memory_samples": memory_samples, "peak_memory_gb": peak_of_steps(memory_samples)}
     metrics |= speed(task, samples, boundary_samples, steps)
     metrics |= useful_paths(samples, steps)
     metrics["sionna_rt_version"] = sionna_version()
@@ -321,7 +320,7 @@ def table(metrics: dict[str, Any]) -> Table:
     row(
         "peak_memory_gb",
         ".2f",
-        f"ru_maxrss of a fresh process: three steps of {m['memory_samples']} samples, imports "
+        f"most memory of a fresh process: three steps of {m['memory_samples']} samples, imports "
         "included",
     )
     row(

@@ -20,6 +20,9 @@ def free_memory() -> float:
 
 def peak_memory() -> float | None:
     """Most bytes that this process has held at a time; None where the system does not say."""
+    # First, since Linux's getrusage counts the parent's size when this process was started.
+    if (held := _stated("/proc/self/status", "VmHWM")) is not None:
+        return held
     try:
         import resource
     except ImportError:  # Windows
@@ -74,13 +77,20 @@ def gigabytes(count: float) -> str:
     return f"{min(count, 1e300) / 1e9:.3g} GB"
 
 
-def _of_machine() -> float:
+def _stated(file: str, name: str) -> float | None:
+    """Bytes that Linux states in a line of a file; None where there is no such file or line."""
     try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
+        for line in Path(file).read_text().splitlines():
+            if line.startswith(f"{name}:"):
                 return 1024.0 * int(line.split()[1])
     except OSError:
         pass
+    return None
+
+
+def _of_machine() -> float:
+    if (free := _stated("/proc/meminfo", "MemAvailable")) is not None:
+        return free
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):
