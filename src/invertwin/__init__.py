@@ -17,7 +17,7 @@ from typing import Any
 
 from invertwin import doctor, threads
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _ROOMS = (
     "capture",

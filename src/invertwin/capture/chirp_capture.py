@@ -105,9 +105,9 @@ class ChirpCapture:
         """One beat signal per frame and channel, for a scene that stands still within a frame.
 
         A static scene is the same in every chirp, so the mean over the chirps is the recording with
-        less noise; echoes that move by λ/4 or more during a frame vanish in it. One chosen chirp
-        keeps them, but its transmitters still send one after the other: what moves has phase steps
-        from TX to TX, which `invertwin.radar.compensate_tdm` takes out of whole frames.
+        less noise; echoes that move by λ/2 or more during a frame fade in it, by 13 dB or more. One
+        chosen chirp keeps them, but its transmitters still send one after the other: what moves has
+        phase steps from TX to TX, which `invertwin.radar.compensate_tdm` takes out of whole frames.
 
         Args:
             chirp: "mean", or the number from 0 of the chirp to take.
