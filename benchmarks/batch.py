@@ -10,10 +10,10 @@ many boundary samples as samples of a scene. Prints a table and writes `metrics.
 
 - `step_ratio.depth<n>_<samples>`: seconds of a step of 32 scenes over those of one (medians, in
   turns in one process); `map_ratio` without derivatives. Of few samples a call is mostly launches,
-  of many samples rays: then 32 scenes cost 32 times their rays, and the ratio must not hold.
+  of many samples it is rays, of which 32 scenes have 32 times as many: there the ratio grows.
 - `of_alone.depth<n>_<samples>`: seconds of a step of 32 scenes over 32 times those of one.
-- `map_noise_ratio.depth<n>`: standard deviation of the maps of a batch over that of single calls, at
-  as many samples a scene; `slope_noise_ratio` that of the derivatives.
+- `map_noise_ratio.depth<n>`: standard deviation of the maps of a batch over that of single calls,
+  at as many samples a scene; `slope_noise_ratio` that of the derivatives.
 - `compile_seconds_ratio.depth<n>`: seconds in which Dr.Jit generates and compiles code in the first
   step of a fresh process without a cache on disk, for 32 scenes over those for 2.
 """
