@@ -1,6 +1,7 @@
 """Batches of scenes in one launch: maps and derivatives of each are those of the scene alone."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +9,13 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_batch, deposit_power
+from invertwin.channel.power.edges import EdgeSampler, InteriorEdgeSampler
+from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.rays.apart import stand_apart
+from invertwin.channel.rays.arrays import to_torch
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene import RayScene
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cloud,
@@ -124,7 +132,7 @@ def test_boundary_terms_are_what_makes_derivatives_right(field):
     """Without silhouettes, or without the curves where surfaces meet, they are others."""
     around = link(((0.2, 0.3, -0.2),))
     whole = Sampling(depth=1, samples=40_000, boundary_samples=40_000)
-    part = Sampling(depth=1, samples=40_000, boundary_samples=40_000, **{field: False})
+    part = replace(whole, **{field: False})
     slopes = [
         estimates(sunk_into_the_floor, around, drawn, [1], at_once=True)[2][0]
         for drawn in (whole, part)
@@ -145,6 +153,7 @@ def test_forward_mode_agrees_with_reverse_mode():
     assert x.grad is not None
     with forward_ad.dual_level():
         pushed = forward_ad.unpack_dual(maps(forward_ad.make_dual(float64(PLACES), along))).tangent
+    assert pushed is not None
     torch.testing.assert_close(weighted(pushed), (x.grad * along).float(), rtol=2e-3, atol=0)
     columns = torch.func.jvp(maps, (float64(PLACES),), (along,))[1]
     torch.testing.assert_close(columns, pushed, rtol=1e-3, atol=1e-4 * float(pushed.abs().max()))
@@ -184,6 +193,29 @@ def test_no_path_comes_from_another_scene():
     far = grid.ranges > 4.0  # three bounces within a scene are shorter
     assert (maps.flatten(1).sum(1) > 0).all()
     assert maps[:, :, far].abs().max() == 0
+
+
+def test_scenes_far_and_near_get_as_many_boundary_samples():
+    near, around = before_a_wall(float64(0.0)), link(((0, 0, -0.2),), rx=((0.17, 0.2, -0.2),))
+    away = rigid(translation=float64([0.0, 0.0, 20.0]))
+    far = {
+        f"far {name}": Object(item.mesh, item.material, compose(item.transform, away))
+        for name, item in near.objects.items()
+    }
+    both = flatten(Scene({**near.objects, **far}), around.wavelength)
+    with tracing():
+        rays = RayScene(*stand_apart(both, around, torch.tensor([0, 0, 1, 1])))
+        inputs = Inputs.of(rays)
+        edges = rays.topology.edges
+        scene = rays.topology.vertex_object[edges[:, 0]] // 2
+        samplers = (
+            EdgeSampler(rays, inputs, ("tx", "rx"), 100, 1),
+            InteriorEdgeSampler(rays, inputs, 100, 1),
+        )
+        for sampler in samplers:
+            weights = to_torch(sampler.choice.weights).reshape(-1, len(edges)).sum(0)
+            shares = torch.zeros(2).scatter_add(0, scene, weights) / weights.sum()
+            torch.testing.assert_close(shares, torch.tensor([0.5, 0.5]))
 
 
 def test_one_scene_is_a_batch():
