@@ -19,6 +19,7 @@ from invertwin.channel.rays.scene import RayScene
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cloud,
+    Mesh,
     Object,
     PerfectConductor,
     RoughDielectric,
@@ -28,6 +29,7 @@ from invertwin.scene import (
     compose,
     plate,
     rigid,
+    sphere,
 )
 from scenes import float64, link, thing
 
@@ -193,6 +195,38 @@ def test_no_path_comes_from_another_scene():
     far = grid.ranges > 4.0  # three bounces within a scene are shorter
     assert (maps.flatten(1).sum(1) > 0).all()
     assert maps[:, :, far].abs().max() == 0
+
+
+def test_boundary_terms_are_right_in_large_batches_of_small_distant_things():
+    """Coordinates count from the middle of all boxes, here a kilometre away from some."""
+    around, far = link(((0, 0, 0),)), Grid(140.0, 4.0, 60)
+    ball, ground = sphere(0.05, 4), thing(plate(500, 500), (0, 0, 210))
+
+    def slopes(count: int, seed: int, *, boundary: bool) -> Tensor:
+        size = torch.ones(count, dtype=torch.float64).requires_grad_()
+        drawn = Sampling(depth=1, samples=10_000, boundary_samples=10_000, boundary=boundary)
+        pose = rigid(translation=float64([0, 2, 200]))
+        scenes = [
+            Scene(
+                {
+                    "ball": Object(Mesh(ball.vertices * s, ball.faces), RoughDielectric(4.0), pose),
+                    "ground": ground,
+                }
+            )
+            for s in size
+        ]
+        deposit_batch(scenes, around, far, sampling=drawn, seed=seed).sum().backward()
+        assert size.grad is not None
+        return size.grad
+
+    means = []
+    for calls in ([(32, 99)], [(1, seed) for seed in range(16)]):
+        whole, smooth = (
+            torch.cat([slopes(*call, boundary=on) for call in calls]) for on in (True, False)
+        )
+        means.append((whole.mean(), (whole - smooth).mean()))
+    for one, many in zip(means[1], means[0], strict=True):
+        assert abs(many / one - 1) < 5e-3
 
 
 def test_scenes_far_and_near_get_as_many_boundary_samples():
