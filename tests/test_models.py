@@ -371,3 +371,22 @@ def test_responses_are_those_of_the_paths():
     assert torch.equal(model.observe(expected), torch.view_as_real(expected))
     with pytest.raises(InputError, match="measured responses"):
         model.observe(expected[:, :2])
+
+
+def test_a_batch_of_scenes_is_predicted_as_each_alone():
+    device = radar(((0.0, 0.0, 0.0), (0.2, 0.0, 0.0)))
+    grid = device.grid(0.7, 2.3, 0.5)
+    drawn = Sampling(depth=2, samples=100_000, boundary_samples=20_000)
+    model = SurrogateMap(grid, Surrogate(range_width=1.0), drawn)
+    scenes = [
+        occluder(),
+        occluder().replace("occluder", pose=thing(plate(1, 1), (0.2, 0, 1.3)).pose),
+    ]
+    batch = model.predict_batch(scenes, device, 1)
+    assert batch.shape == (2, 2, *grid.shape)
+    for scene, found in zip(scenes, batch, strict=True):
+        assert relative(found, model.predict(scene, device, 2)) < 0.03
+    assert relative(batch[0], batch[1]) > 0.1
+    fixed = model.for_differences(scenes[0], device, 1_000, "rays")
+    with pytest.raises(InputError, match="made for differences"):
+        fixed.predict_batch(scenes, device, 1)

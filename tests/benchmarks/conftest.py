@@ -20,6 +20,7 @@ def script(name: str) -> Any:
 
 
 basin = script("basin")
+batch = script("batch")
 channels = script("channels")
 crash_safety = script("crash_safety")
 dataset = script("dataset")

@@ -17,6 +17,7 @@ from invertwin.channel.paths import Link as Link
 from invertwin.channel.paths import Paths as Paths
 from invertwin.channel.paths import Pattern as Pattern
 from invertwin.channel.power.clouds import deposit_density as deposit_density
+from invertwin.channel.power.deposit import deposit_batch as deposit_batch
 from invertwin.channel.power.deposit import deposit_power as deposit_power
 from invertwin.channel.ray_paths import KINDS as KINDS
 from invertwin.channel.ray_paths import METASURFACE as METASURFACE

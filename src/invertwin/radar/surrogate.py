@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
@@ -11,7 +12,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, Sampling, deposit_power
+from invertwin.channel import Grid, Link, Sampling, deposit_batch, deposit_power
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.point_spread import airy, airy_radii, array_point_spread, range_point_spread
@@ -206,6 +207,33 @@ def surrogate_spectrum(
         scene, radar.link(), grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
     )
     return surrogate.shape(deposit, radar, grid).clamp_min(0.0)
+
+
+def surrogate_spectra(
+    scenes: Sequence[Scene],
+    radar: Radar,
+    grid: Grid,
+    surrogate: Surrogate,
+    *,
+    sampling: Sampling,
+    seed: int,
+) -> Float[Tensor, "scene frame range u v"]:
+    """``surrogate_spectrum`` of many scenes at once, see ``deposit_batch``.
+
+    Args:
+        scenes: What is seen.
+        radar: Arrays, waveform and poses, the same for all scenes.
+        grid: Bins, see ``Radar.grid``.
+        surrogate: Kernels and their extra widths.
+        sampling: How many paths are drawn of each scene.
+        seed: Same seed and scenes, same spectra.
+
+    Raises:
+        InputError: See ``deposit_batch``.
+    """
+    deposit = deposit_batch(scenes, radar.link(), grid, sampling=sampling, seed=seed)
+    shaped = surrogate.shape(deposit.flatten(0, 1), radar, grid)
+    return shaped.clamp_min(0.0).reshape(deposit.shape)
 
 
 @dataclass(frozen=True, eq=False)

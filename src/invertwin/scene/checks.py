@@ -79,8 +79,9 @@ def refuse_batch(value: Tensor) -> Tensor:
     """
     if is_batchedtensor(value):
         raise InputError(
-            "expected the tensors of one scene, got a batch of torch.func.vmap; call for one scene "
-            "after another and torch.stack the maps (torch.func.jacfwd and jacrev may batch them)"
+            "expected the tensors of one scene, got a batch of torch.func.vmap; give a list of "
+            "scenes to SurrogateMap.predict_batch, or call for one scene after another and "
+            "torch.stack the maps (torch.func.jacfwd and jacrev may batch them)"
         )
     return value
 

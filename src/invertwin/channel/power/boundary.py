@@ -99,7 +99,7 @@ class BoundaryPoints:
             chunks: Splits a number of samples into index arrays.
         """
         self.depth = depth = sampling.depth
-        samples = sampling.boundary_samples
+        samples = sampling.boundary_samples * rays.scenes
         centres = ("tx",) if rays.link.shared_visibility and depth == 1 else ("tx", "rx")
         inner = depth > 1 and sampling.interior_edges
         close = contacts is not None and contacts.close

@@ -13,7 +13,13 @@ from typing import Any
 
 from invertwin.channel.power import integrand, walk
 from invertwin.channel.power.bins import Contribution
-from invertwin.channel.power.edges import Drawn, Proportional, barycentric, place_along
+from invertwin.channel.power.edges import (
+    Drawn,
+    Proportional,
+    barycentric,
+    by_scene,
+    place_along,
+)
 from invertwin.channel.power.integrand import Inputs, Place
 from invertwin.channel.power.passage import Passage, land, passage
 from invertwin.channel.power.walk import State, Walk
@@ -123,15 +129,22 @@ class ContactSampler:
         self.ends = list(map(to_points, ends))
         self.faces = [to_index(face) for face in (contacts.first, contacts.second)]
         self.segments = len(contacts.first)
-        entries = dr.arange(mi.UInt32, self.segments * rays.link.frame_count)
+        owner = rays.geometry.face_object[contacts.first]
+        self.first_frame = rays.object_scene(to_index(owner)) * rays.looks
+        entries = dr.arange(mi.UInt32, self.segments * rays.looks)
         start, offset, frame = self._segment(entries)
         legs = [dr.norm(start + 0.5 * offset - point_at(t, frame)) for t in (rays.tx, rays.rx)]
-        self.choice = Proportional(dr.norm(offset) / (legs[0] * legs[1]))
+        weight = dr.norm(offset) / (legs[0] * legs[1])
+        self.choice = Proportional(by_scene(rays, rays.frame_scene(frame), weight))
         self.seeds = [scrambled(seed, stream) for stream in (12, 13, 14)]
 
     def _segment(self, entry: Any) -> tuple[Any, Any, Any]:
-        start, end = (point_at(ends, entry % self.segments) for ends in self.ends)
-        return start, end - start, entry // self.segments
+        segment = entry % self.segments
+        start, end = (point_at(ends, segment) for ends in self.ends)
+        frame = entry // self.segments
+        if self.rays.scenes > 1:
+            frame += dr.gather(mi.UInt32, self.first_frame, segment)
+        return start, end - start, frame
 
     def draw(self, index: Any) -> Drawn:
         """The samples of the given indices below ``size``; those out of sight are void."""
@@ -159,7 +172,8 @@ class ContactSampler:
         if deep:
             ray, key = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(way)), (index, self.seeds[2])
             hit = land(rays, inputs, ray, valid & (count > 0), key, coherent=False)
-            exists, odds, source = exists | hit.valid, hit.chance, Spot(hit.face, hit.b1, hit.b2)
+            met = hit.valid & rays.in_scene(frame, hit.face, hit.valid)
+            exists, odds, source = exists | met, hit.chance, Spot(hit.face, hit.b1, hit.b2)
             transmittance = dr.select(count > 0, hit.transmittance, transmittance)
             extra = dr.select(count > 0, hit.extra, extra)
         weight = dr.norm(offset) / (chance * self.size * odds)
@@ -304,7 +318,8 @@ def require_unlit(
     Raises:
         InputError: There are such paths.
     """
-    sampler = ContactSampler(rays, fixed, contacts, _LOOKED_AT, depth - 1, seed)
+    looked_at = _LOOKED_AT * rays.scenes
+    sampler = ContactSampler(rays, fixed, contacts, looked_at, depth - 1, seed)
     found = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept()
     if not dr.width(found.drawn.index):
         return

@@ -4,7 +4,7 @@ No path is ever stored for torch: paths are walked, deposited and forgotten, or 
 while these fit the memory budget, and replayed for the derivative.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -19,11 +19,13 @@ from invertwin.channel.power import bins, replay
 from invertwin.channel.power.clouds import deposit_density
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
 from invertwin.channel.power.trace import Trace, tables_of, without_derivatives
+from invertwin.channel.rays.apart import stand_apart
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, tracing
-from invertwin.channel.rays.geometry import differentiated, flatten, require_edges
+from invertwin.channel.rays.geometry import Geometry, differentiated, flatten, require_edges
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
+from invertwin.limits import MOST
 from invertwin.scene.checks import plain
 from invertwin.scene.scene import Object, Scene
 
@@ -79,31 +81,100 @@ def deposit_power(
         fixed = None
         if reference is not None and (hard := _sorted(reference[0])[0]) is not None:
             fixed = flatten(hard, link.wavelength), reference[1]
-        if sampling.boundary:
-            require_edges(geometry, link, sampling.boundary_samples)
-        if any(differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
+        shares = _shares(geometry, link, grid, sampling, seed, scheme=scheme, reference=fixed)
+    return _total([*soft, *shares])
+
+
+def deposit_batch(
+    scenes: Sequence[Scene], link: Link, grid: Grid, *, sampling: Sampling, seed: int
+) -> Float32[Tensor, "scene frame range u v"]:
+    """``deposit_power`` of many scenes at once: one launch of the kernels serves all of them.
+
+    For small numbers of samples a call is mostly launches, so that many scenes cost little more
+    than one. All scenes stand in one tree of triangles, each in a box of its own with antennas of
+    its own. No segment within a scene leaves its box, and what a ray meets in another box counts
+    as nothing: paths, boundary paths and derivatives (in both modes) are exactly those of
+    ``deposit_power``, with other random numbers. Coordinates count in float32 from the middle of
+    all boxes, so that roundings are those of a scene as large as the batch.
+
+    Args:
+        scenes: What is seen. Every object of the batch gets as many samples as any other: scenes
+            of as many objects are sampled alike.
+        link: Antennas, per frame: the same for all scenes.
+        grid: Bins.
+        sampling: How many paths are drawn of each scene, on average.
+        seed: Same seed and scenes, same result; draws of one scene are independent of the others'.
+
+    Source: as ``deposit_power``; ``rays.apart`` says why boxes keep scenes apart.
+
+    Raises:
+        InputError: No scenes, clouds, more samples than numbers, or as of ``deposit_power``.
+    """
+    objects, owners = {}, []
+    for number, scene in enumerate(scenes):
+        clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
+        if clouds:
             raise InputError(
-                "expected an antenna pattern without derivatives, got one that carries them; "
-                "power paths do not differentiate patterns: detach its values"
+                f"expected scenes of surfaces in a batch, got the cloud {clouds[0]!r} in scene "
+                f"{number}; call deposit_power for one scene after another"
             )
-        turned = geometry.surfaces.depolarisation
-        depolarised = differentiated(turned) or bool(turned.any())
-        parts = list(soft)
-        for share in power_shares(link, depolarised=depolarised):
-            lossy = geometry
-            if share.loss:
-                surfaces = geometry.surfaces.scaled(1 - share.loss * turned)
-                lossy = replace(geometry, surfaces=surfaces)
-            with _DisableFuncTorch():
-                bare = without_derivatives(lossy, link)
-                coupling = share.odd, share.even
-                trace = Trace(
-                    *bare, sampling, seed, scheme=scheme, reference=fixed, coupling=coupling
-                )
-            tables = tables_of(lossy, link)
-            layout = bins.Layout.of(grid, link)
-            parts.append(_Deposit.apply(trace, layout, any(map(differentiated, tables)), *tables))
-    return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
+        objects |= {f"{name} of scene {number}": item for name, item in scene.objects.items()}
+        owners += [number] * len(scene.objects)
+    if not objects:
+        raise InputError("expected at least one scene, got none; give a list of scenes")
+    drawn = len(scenes) * max(sampling.samples, sampling.boundary_samples)
+    if drawn > MOST:
+        raise InputError(
+            f"expected at most {MOST} samples of all scenes, got {drawn}; give fewer scenes or "
+            "samples at a time"
+        )
+    with tracing(sampling.backend), torch_threads(1):
+        geometry = flatten(Scene(objects), link.wavelength)
+        geometry, links = stand_apart(geometry, link, torch.tensor(owners))
+        total = _total(_shares(geometry, links, grid, sampling, seed))
+    return total.unflatten(0, (len(scenes), link.frame_count))
+
+
+def _shares(
+    geometry: Geometry,
+    link: Link,
+    grid: Grid,
+    sampling: Sampling,
+    seed: int,
+    *,
+    scheme: str = "rays",
+    reference: tuple[Geometry, Link] | None = None,
+) -> list[Tensor]:
+    """Maps of the surfaces whose sum counts: one for every share of polarised power."""
+    if sampling.boundary:
+        require_edges(geometry, link, sampling.boundary_samples)
+    if any(differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
+        raise InputError(
+            "expected an antenna pattern without derivatives, got one that carries them; "
+            "power paths do not differentiate patterns: detach its values"
+        )
+    turned = geometry.surfaces.depolarisation
+    depolarised = differentiated(turned) or bool(turned.any())
+    maps = []
+    for share in power_shares(link, depolarised=depolarised):
+        lossy = geometry
+        if share.loss:
+            surfaces = geometry.surfaces.scaled(1 - share.loss * turned)
+            lossy = replace(geometry, surfaces=surfaces)
+        with _DisableFuncTorch():
+            bare = without_derivatives(lossy, link)
+            coupling = share.odd, share.even
+            trace = Trace(
+                *bare, sampling, seed, scheme=scheme, reference=reference, coupling=coupling
+            )
+        tables = tables_of(lossy, link)
+        layout = bins.Layout.of(grid, link)
+        maps.append(_Deposit.apply(trace, layout, any(map(differentiated, tables)), *tables))
+    return maps
+
+
+def _total(maps: list[Tensor]) -> Tensor:
+    return torch.stack(maps).sum(0) if len(maps) > 1 else maps[0]
 
 
 def _sorted(scene: Scene) -> tuple[Scene | None, list[Object]]:

@@ -56,24 +56,24 @@ class Directions:
         self.shares = to_float(shares)
         self.width = shares.shape[1]
 
-    def draw(self, point: Place, back: Any, numbers: list[Any]) -> Direction:
+    def draw(self, point: Place, back: Any, numbers: list[Any], scene: Any) -> Direction:
         """A direction from five uniform numbers.
 
         Args:
             point: The vertex.
             back: Unit direction from where the path comes.
             numbers: Five uniform numbers.
+            scene: Whose objects are aimed at.
         """
         facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, back)))
         omega = self._scattered(point, back, facing, numbers)
         group, aimed = mi.UInt32(_ANY), mi.UInt32(_ANY)
         spheres = self.spheres
-        if spheres.count > 1:
+        if spheres.most > 1:
             towards, rest = numbers[0] < _TOWARDS, numbers[4]
-            drawn = dr.minimum(
-                mi.UInt32(numbers[0] / _TOWARDS * spheres.groups), spheres.groups - 1
-            )
-            members = dr.minimum(spheres.size, spheres.count - drawn * spheres.size)
+            first, groups = spheres.groups_of(scene)
+            drawn = first + dr.minimum(mi.UInt32(numbers[0] / _TOWARDS * groups), groups - 1)
+            members = spheres.members(drawn)
             axis, height = mi.Vector3f(0, 0, 1), mi.Float(2.0)
             # One of the group that the point is outside of, if a few tries find one.
             for _ in range(_TRIES):
@@ -94,28 +94,29 @@ class Directions:
             density = dr.select(lost, dr.inf, density)
         return Direction(omega, density, group, aimed)
 
-    def density(self, point: Place, drawn: Direction, face: Any, active: Any) -> Any:
+    def density(self, point: Place, drawn: Direction, face: Any, active: Any, scene: Any) -> Any:
         """Probability per solid angle of a direction that ends on a triangle; 0 if it is void.
 
         Args:
             point: The vertex.
             drawn: The direction.
-            face: The triangle.
+            face: The triangle, in that scene.
             active: Lanes.
+            scene: Whose objects were aimed at.
         """
         spheres = self.spheres
-        if spheres.count == 1:
+        if spheres.most == 1:
             return drawn.scattered
         group = spheres.group(face, active)
         found, around = spheres.density(
             self.rays, group, point.position, drawn.omega, active, drawn.aimed
         )
-        members = mi.Float(dr.minimum(spheres.size, spheres.count - group * spheres.size))
+        members, (_, groups) = mi.Float(spheres.members(group)), spheres.groups_of(scene)
         # Tries fail with the share of spheres that the point is inside of.
         failing = around / members
         tries: Any = sum(failing**k for k in range(_TRIES))
-        scattered = 1 - _TOWARDS + _TOWARDS / spheres.groups * failing**_TRIES
-        density = scattered * drawn.scattered + _TOWARDS / spheres.groups * tries / members * found
+        scattered = 1 - _TOWARDS + _TOWARDS / groups * failing**_TRIES
+        density = scattered * drawn.scattered + _TOWARDS / groups * tries / members * found
         return dr.select((drawn.group == _ANY) | (drawn.group == group), density, 0.0)
 
     def _scattered(self, point: Place, back: Any, facing: Any, numbers: list[Any]) -> Any:

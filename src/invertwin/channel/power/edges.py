@@ -153,7 +153,7 @@ def by_object(rays: RayScene, edge: Any, weight: Any, receiver: Any, centres: in
     """Weights of edges by which no object drowns another.
 
     An object gets the square root of the sum of its edges' weights, which is between a share by
-    size and one share for each. Both antennas get the same sum.
+    size and one share for each. Both antennas get the same sum, and so do all scenes.
 
     Args:
         rays: The scene.
@@ -165,12 +165,29 @@ def by_object(rays: RayScene, edge: Any, weight: Any, receiver: Any, centres: in
     objects = len(rays.geometry.names)
     antenna = dr.select(receiver, mi.UInt32(1), 0)
     row = dr.gather(mi.UInt32, rays.topology.device_edge_object, edge) + antenna * objects
-    totals, sums = dr.zeros(mi.Float, centres * objects), dr.zeros(mi.Float, centres)
+    totals, sums = dr.zeros(mi.Float, centres * objects), dr.zeros(mi.Float, centres * rays.scenes)
     dr.scatter_add(totals, weight, row)
-    roots = dr.sqrt(totals)
-    dr.scatter_add(sums, roots, dr.arange(mi.UInt32, centres * objects) // objects)
-    share: Any = weight / (dr.gather(mi.Float, roots, row) * dr.gather(mi.Float, sums, antenna))
+    roots, rows = dr.sqrt(totals), dr.arange(mi.UInt32, centres * objects)
+    scene = rays.object_scene(rows % objects)
+    dr.scatter_add(sums, roots, rows // objects * rays.scenes + scene)
+    part = antenna * rays.scenes + rays.edge_scene(edge)
+    share: Any = weight / (dr.gather(mi.Float, roots, row) * dr.gather(mi.Float, sums, part))
     return dr.select(weight > 0, share, 0.0)
+
+
+def by_scene(rays: RayScene, scene: Any, weight: Any) -> Any:
+    """Weights of which all scenes have the same sum, if they have any.
+
+    Args:
+        rays: The scenes.
+        scene: Of each weight.
+        weight: The weights.
+    """
+    if rays.scenes == 1:
+        return weight
+    totals = dr.zeros(mi.Float, rays.scenes)
+    dr.scatter_add(totals, weight, scene)
+    return dr.select(weight > 0, weight / dr.gather(mi.Float, totals, scene), 0.0)
 
 
 class EdgeSampler:
@@ -185,7 +202,7 @@ class EdgeSampler:
         rays: The scene and its antennas.
         inputs: Detached tables.
         centres: Antennas whose silhouettes count: ``tx``, ``rx`` or both.
-        samples: Points over all frames.
+        samples: Points over all frames and scenes.
         seed: Of the points.
         close: Whether other surfaces may be close to edges.
     """
@@ -202,7 +219,7 @@ class EdgeSampler:
     ) -> None:
         topology = rays.topology
         self.rays, self.inputs, self.centres, self.close = rays, inputs, centres, close
-        entries = len(centres) * rays.link.frame_count * len(topology.edges)
+        entries = len(centres) * rays.looks * len(topology.edges)
         edge, _, receiver, origin = self._seen(dr.arange(mi.UInt32, entries))
         y0, y1 = rays.exact_ends(edge)
         away = 0.5 * (y0 + y1) - mi.Vector3d(origin)
@@ -217,12 +234,13 @@ class EdgeSampler:
     def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
         """Edge, frame, whether the antenna is the receiver of two, and its place."""
         rays, edges = self.rays, len(self.rays.topology.edges)
-        frame, edge = entry // edges, entry % edges
+        look, edge = entry // edges, entry % edges
+        first = rays.edge_scene(edge) * rays.looks
         if len(self.centres) == 1:
-            origin = point_at(getattr(rays, self.centres[0]), frame)
-            return edge, frame, False, origin
-        receiver = frame >= rays.link.frame_count
-        frame = dr.select(receiver, frame - rays.link.frame_count, frame)
+            frame = first + look
+            return edge, frame, False, point_at(getattr(rays, self.centres[0]), frame)
+        receiver = look >= rays.looks
+        frame = first + dr.select(receiver, look - rays.looks, look)
         origin = dr.select(receiver, point_at(rays.rx, frame), point_at(rays.tx, frame))
         return edge, frame, receiver, origin
 
@@ -249,6 +267,7 @@ class EdgeSampler:
             dealt=index,
         )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
+        valid &= rays.in_scene(frame, hit.face, hit.valid)
         found = EdgePoints(
             index, receiver, frame, first, second, sides.side, along, hit.face,
             weight=1 / (pmf * self.size * hit.chance),
@@ -270,7 +289,7 @@ class InteriorEdgeSampler:
     Args:
         rays: The scene and its antennas.
         inputs: Detached tables.
-        samples: Points over all frames.
+        samples: Points over all frames and scenes.
         seed: Of the points.
         weighted: False takes edges by length alone and directions from the whole sphere: what the
             benchmark compares with.
@@ -289,7 +308,6 @@ class InteriorEdgeSampler:
     ) -> None:
         topology = rays.topology
         self.rays, self.inputs, self.weighted, self.close = rays, inputs, weighted, close
-        self.frames = rays.link.frame_count
         edge = dr.arange(mi.UInt32, len(topology.edges))
         y0, y1 = rays.exact_ends(edge)
         length = mi.Float(dr.norm(y1 - y0))
@@ -297,16 +315,17 @@ class InteriorEdgeSampler:
         weight = dr.select(span > _FLAT, length, 0.0)
         if weighted:
             middle = mi.Point3f(0.5 * (y0 + y1))
-            near = mi.Float(0.0)
-            for frame in range(min(self.frames, 8)):
-                at = mi.UInt32(frame * self.frames // min(self.frames, 8))
+            near, first = mi.Float(0.0), rays.edge_scene(edge) * rays.looks
+            for look in range(min(rays.looks, 8)):
+                at = first + look * rays.looks // min(rays.looks, 8)
                 legs = [dr.norm(middle - point_at(t, at)) + length for t in (rays.tx, rays.rx)]
                 near += 1 / (legs[0] * legs[1])
             weight *= span * near
-        self.per_frame = max(1, samples // self.frames)
-        self.size = self.per_frame * self.frames if len(topology.edges) else 0
+        # Poses of the same number in all scenes share one choice of edges.
+        self.per_look = max(1, samples // rays.looks)
+        self.size = self.per_look * rays.looks if len(topology.edges) else 0
         if self.size:
-            self.choice = Proportional(weight)
+            self.choice = Proportional(by_scene(rays, rays.edge_scene(edge), weight))
         self.seeds = scrambled(seed, 4), scrambled(seed, 5)
         self.dice = scrambled(seed, 10), scrambled(seed, 11)
 
@@ -355,8 +374,9 @@ class InteriorEdgeSampler:
     def draw(self, index: Any) -> Drawn:
         """The samples of the given indices below ``size``; those that hide nothing are void."""
         rays, topology = self.rays, self.rays.topology
-        frame, within = index // self.per_frame, index % self.per_frame
-        edge, along, pmf = place_along(self.choice, within, self.per_frame, self.seeds[0], index)
+        look, within = index // self.per_look, index % self.per_look
+        edge, along, pmf = place_along(self.choice, within, self.per_look, self.seeds[0], index)
+        frame = rays.edge_scene(edge) * rays.looks + look
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = rays.exact_ends(edge)
         omega, density = self._direction(index, edge, y0, y1)
@@ -375,6 +395,7 @@ class InteriorEdgeSampler:
                 (index, dice), close=self.close and sign > 0,
             )  # fmt: skip
             valid &= hit.valid & _not_grazing(rays, hit.face, omega, hit.valid)
+            valid &= rays.in_scene(frame, hit.face, hit.valid)
             hits.append(hit)
         behind, ahead = hits
         triangle = p0, p1, p2 = rays.corners(behind.face, valid)
@@ -385,7 +406,7 @@ class InteriorEdgeSampler:
         chance = behind.chance * ahead.chance
         points = EdgePoints(
             index, False, frame, first, second, sides.side, along, ahead.face,
-            weight=measure / (pmf * density * self.per_frame * chance),
+            weight=measure / (pmf * density * self.per_look * chance),
             transmittance=behind.transmittance * ahead.transmittance,
             extra=behind.extra + ahead.extra,
             open=sides.open, open_extra=sides.open_extra,

@@ -47,7 +47,7 @@ class RaySampler:
 
     Args:
         rays: The scene and its antennas.
-        samples: Rays over all frames, about.
+        samples: Rays over all frames and scenes, about.
         seed: Of the rays.
         reference: What the caps are around, instead of the scene; they are a tenth larger.
     """
@@ -63,7 +63,7 @@ class RaySampler:
         if reference:
             self.spheres = Spheres(reference[0], rays.origin, margin=1.1)
             self.centres = to_points(reference[1].tx.detach() - rays.origin)
-        blocks = rays.link.frame_count * self.spheres.count
+        blocks = rays.looks * self.spheres.count
         self.rows = max(1, int(np.sqrt(samples / blocks)))
         self.columns = max(1, samples // blocks // self.rows)
         self.size = blocks * self.rows * self.columns
@@ -78,7 +78,8 @@ class RaySampler:
         """
         rays, per_block = self.rays, self.rows * self.columns
         block, place = index // per_block, index % per_block
-        frame, own = block // self.spheres.count, block % self.spheres.count
+        own, scene = self.spheres.listed(block % self.spheres.count)
+        frame = scene * rays.looks + block // self.spheres.count
         centre = point_at(self.centres, frame)
         axis, height, _ = self.spheres.cap(own, centre)
         jitter = uniform_pair(index, self.seed)

@@ -84,7 +84,7 @@ class Trace:
         self.recorded: Records | None = None  # the last paths, where they fit
         self.rays = RayScene(geometry, link)
         sampler = RaySampler if scheme == "rays" else AreaSampler
-        self.sampler = sampler(self.rays, sampling.samples, seed, reference)
+        self.sampler = sampler(self.rays, sampling.samples * self.rays.scenes, seed, reference)
         one_place = bool((link.tx == link.rx).all())
         self.fixed = replace(Inputs.of(self.rays, monostatic=one_place), coupling=coupling)
         self._walk = Walk(self.rays, self.fixed, seed)

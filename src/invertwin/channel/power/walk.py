@@ -159,7 +159,8 @@ class Walk:
         """Draw the next vertex into the state; paths that miss or are too long end."""
         active = state["active"] & (state["number"] < state["last"])
         back = state["back"]
-        drawn = directions.draw(point, back, self._numbers(state, 0, 1, 2))
+        scene = self.rays.frame_scene(state["frame"])
+        drawn = directions.draw(point, back, self._numbers(state, 0, 1, 2), scene)
         omega = drawn.omega
         scattered = self.inputs.surfaces.scattered(
             point.surface, point.normal, back, mi.Vector3f(omega), active
@@ -176,13 +177,13 @@ class Walk:
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
         key = state["index"], self.seed + (state["number"] * 5 + 4) * _STREAM
         hit = land(self.rays, self.inputs, ray, active, key, coherent=False)
-        active &= hit.valid
+        active &= hit.valid & self.rays.in_scene(state["frame"], hit.face, active)
         found = integrand.place(self.inputs, hit.face, hit.b1, hit.b2, active)
         to_point, distance = integrand.segment(found.position, point.position)
         cosine: Any = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
         inside = integrand.medium(self.inputs, point, found, -to_point, active)
-        density = directions.density(point, drawn, hit.face, active)
+        density = directions.density(point, drawn, hit.face, active, scene)
         active &= density > 0
         odds = density * survival * cosine * hit.chance
         weight = scattered * hit.transmittance * dr.exp(-inside.attenuation * distance) / odds

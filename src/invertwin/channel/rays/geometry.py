@@ -52,6 +52,8 @@ class Geometry:
         deforming: Per object, whether they flow through its shape.
         topology: What depends on the connectivity only.
         velocities: World velocities of the vertices [m/s]; None = all at rest.
+        object_scene: Per object, the scene that it belongs to, where several stand apart (see
+            ``rays.apart``); None = one scene.
     """
 
     vertices: Float64[Tensor, "v 3"]
@@ -68,6 +70,7 @@ class Geometry:
     deforming: tuple[bool, ...]
     topology: Topology
     velocities: Float64[Tensor, "v 3"] | None = None
+    object_scene: Int64[Tensor, " object"] | None = None
 
     def corners(self, faces: Int64[Tensor, " n"]) -> tuple[Tensor, Tensor, Tensor]:
         """The three corners of the given triangles, ``[n, 3]`` each."""

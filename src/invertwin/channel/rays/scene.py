@@ -10,7 +10,14 @@ from torch import Tensor
 
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import arrays
-from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_points, to_torch
+from invertwin.channel.rays.arrays import (
+    opaque,
+    to_double,
+    to_float,
+    to_index,
+    to_points,
+    to_torch,
+)
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.spheres import Spheres
@@ -96,6 +103,11 @@ class RayScene(Occluders):
         self.rx = to_points(link.rx - origin)
         # Lanes without a hit are evaluated on a sound triangle, then masked: no NaN can leak.
         self.sound_face = opaque(_sound_face(geometry))
+        owners = geometry.object_scene
+        self.scenes = 1 if owners is None else int(owners.max()) + 1
+        #: Radar poses that look at one scene; those of the first scene come first.
+        self.looks = link.frame_count // self.scenes
+        self._scene_of = None if owners is None else to_index(owners)
 
     @cached_property
     def spheres(self) -> Spheres:
@@ -124,6 +136,50 @@ class RayScene(Occluders):
         """
         first, second = self.topology.device_edges
         return tuple(self.exact(dr.gather(mi.UInt32, ends, edge)) for ends in (first, second))  # type: ignore[return-value]
+
+    def object_scene(self, number: Any) -> Any:
+        """The scenes of objects.
+
+        Args:
+            number: Of the objects.
+        """
+        if self._scene_of is None:
+            return mi.UInt32(0)
+        return dr.gather(mi.UInt32, self._scene_of, number)
+
+    def edge_scene(self, edge: Any) -> Any:
+        """The scenes of edges.
+
+        Args:
+            edge: Their numbers.
+        """
+        if self._scene_of is None:
+            return mi.UInt32(0)
+        return self.object_scene(dr.gather(mi.UInt32, self.topology.device_edge_object, edge))
+
+    def frame_scene(self, frame: Any) -> Any:
+        """The scenes that radar poses look at.
+
+        Args:
+            frame: Radar poses.
+        """
+        return mi.UInt32(0) if self._scene_of is None else frame // self.looks
+
+    def in_scene(self, frame: Any, face: Any, active: Any = True) -> Any:
+        """Whether triangles belong to the scene that a radar pose looks at.
+
+        A ray that leaves its scene ends for it, whatever it meets in another one.
+
+        Args:
+            frame: Radar pose.
+            face: Triangle.
+            active: Lanes.
+        """
+        if self._scene_of is None:
+            return mi.Bool(True)
+        owner = dr.gather(mi.UInt32, self.topology.device_face_object, face, active)
+        scene = dr.gather(mi.UInt32, self._scene_of, owner, active)
+        return scene == self.frame_scene(frame)
 
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Corners of triangles, detached.

@@ -33,15 +33,71 @@ class Spheres:
         """
         centres, radii = _around(geometry)
         order = _side_by_side(centres)
-        self.count = len(order)
-        self.groups = -(-self.count // _TOGETHER)
-        self.size = -(-self.count // self.groups)
-        rows = np.full((self.groups * self.size, 4), _NOWHERE)
-        rows[: self.count] = np.column_stack([centres - origin.numpy(), margin * radii])[order]
+        self.count = len(order)  # of all scenes
+        scene = np.zeros(self.count, dtype=np.int64)
+        if geometry.object_scene is not None:
+            scene = geometry.object_scene.numpy()
+            order = order[np.argsort(scene[order], kind="stable")]
+        counts = np.bincount(scene)
+        self.most = int(counts.max())  # of one scene
+        self.size = -(-self.most // -(-self.most // _TOGETHER))
+        groups = -(-counts // self.size)
+        first = np.cumsum(groups) - groups
+        rank = np.arange(self.count) - (np.cumsum(counts) - counts)[scene[order]]
+        places = first[scene[order]] * self.size + rank
+        rows = np.full((int(groups.sum()) * self.size, 4), _NOWHERE)
+        rows[places] = np.column_stack([centres - origin.numpy(), margin * radii])[order]
         self.table = to_float(torch.from_numpy(rows))
-        self._group = to_index(torch.from_numpy(np.argsort(order) // self.size))
+        of_object = np.empty_like(order)
+        of_object[order] = places // self.size
+        self.groups = len(rows) // self.size  # of all scenes
+        self._group = to_index(torch.from_numpy(of_object))
         self._owner = geometry.topology.device_face_object
         self._size = opaque(self.size)
+        self._scenes: dict[str, Any] | None = None
+        if geometry.object_scene is not None:
+            members = np.bincount(of_object)
+            columns = {"place": places, "scene": scene[order], "first": first, "groups": groups}
+            self._scenes = {
+                name: to_index(torch.from_numpy(column))
+                for name, column in {**columns, "members": members}.items()
+            }
+
+    def listed(self, number: Any) -> tuple[Any, Any]:
+        """Place in the table and scene of objects, in the order of the table.
+
+        Args:
+            number: From 0 to ``count``.
+        """
+        if self._scenes is None:
+            return number, mi.UInt32(0)
+        place, scene = (
+            dr.gather(mi.UInt32, self._scenes[name], number) for name in ("place", "scene")
+        )
+        return place, scene
+
+    def groups_of(self, scene: Any) -> tuple[Any, Any]:
+        """The first group of a scene, and how many it has.
+
+        Args:
+            scene: Number of the scene.
+        """
+        if self._scenes is None:
+            return 0, self.groups
+        first, groups = (
+            dr.gather(mi.UInt32, self._scenes[name], scene) for name in ("first", "groups")
+        )
+        return first, groups
+
+    def members(self, group: Any) -> Any:
+        """How many objects a group has.
+
+        Args:
+            group: The group.
+        """
+        if self._scenes is None:
+            return dr.minimum(self.size, self.count - group * self.size)
+        return dr.gather(mi.UInt32, self._scenes["members"], group)
 
     def cap(self, place: Any, point: Any) -> tuple[Any, Any, Any]:
         """Axis and height 1 − cos of the cap of directions in which an object lies.

@@ -1,0 +1,66 @@
+"""Several scenes in one set of tables: they stand side by side, where none is in another's way."""
+
+from dataclasses import replace
+from math import prod
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.paths import Link
+from invertwin.channel.rays.geometry import Geometry
+from invertwin.scene.checks import plain
+
+_GAP = 0.02  # between scenes, of the largest side of any
+
+
+def stand_apart(
+    geometry: Geometry, link: Link, object_scene: Int64[Tensor, " object"]
+) -> tuple[Geometry, Link]:
+    """Move every scene, with radar poses of its own, into a box of its own.
+
+    A segment between two points of a box stays in it. So no scene hides anything in another one,
+    and what a ray meets after it has left its box counts as nothing (``RayScene.in_scene``): paths
+    are those of the scenes one by one. Derivatives pass, since the moves are constants.
+
+    Args:
+        geometry: The objects of all scenes, where they are in their own one.
+        link: The antennas that look at every scene.
+        object_scene: The scene of each object, from 0 on.
+
+    Returns:
+        The scenes apart, and the antennas in front of them, scene after scene.
+    """
+    owner = object_scene[geometry.topology.vertex_object]
+    count = int(object_scene.max()) + 1
+    points, antennas = plain(geometry.vertices), torch.cat([plain(link.tx), plain(link.rx)])
+    rows = owner[:, None].expand(-1, 3)
+    low, high = (
+        around.expand(count, 3).scatter_reduce(0, rows, points, how)
+        for around, how in ((antennas.amin(0), "amin"), (antennas.amax(0), "amax"))
+    )
+    shift = _places(count, (high - low).amax(0)) - 0.5 * (low + high)
+    vertices = geometry.vertices + shift[owner]
+
+    def moved(places: Tensor) -> Tensor:
+        return (places + shift[:, None]).flatten(0, 1)
+
+    origin = None if link.range_origin is None else link.range_origin.repeat(count)
+    moved_link = replace(
+        link,
+        tx=moved(link.tx),
+        rx=moved(link.rx),
+        rotations=link.rotations.repeat(count, 1, 1),
+        range_origin=origin,
+    )
+    return replace(geometry, vertices=vertices, object_scene=object_scene), moved_link
+
+
+def _places(count: int, sides: Float64[Tensor, "3"]) -> Float64[Tensor, "scene 3"]:
+    """Middles of boxes of these sides, as close together as a lattice has them."""
+    cell = sides + _GAP * sides.max()
+    lattice = [1, 1, 1]
+    while prod(lattice) < count:
+        lattice[int((torch.tensor(lattice) * cell).argmin())] += 1
+    axes = (torch.arange(n, dtype=torch.float64) for n in lattice)
+    return torch.cartesian_prod(*axes)[:count] * cell
