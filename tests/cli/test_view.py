@@ -79,6 +79,18 @@ def test_a_host_of_others_without_a_token_is_refused(run_file, monkeypatch, caps
     assert "expected a token" in capsys.readouterr().err
 
 
+@NEEDS_VISER
+def test_it_ends_by_an_interruption_as_it_says(run_file, monkeypatch, capsys):
+    def interrupted(self: Viewer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "wait", interrupted)
+    assert call(monkeypatch, "view", run_file, "--port", "0") == 0
+    said = capsys.readouterr()
+    assert "(Ctrl-C ends)" in said.out
+    assert said.err == ""
+
+
 def test_a_damaged_view_is_refused(run_file, monkeypatch, capsys):
     folder = Path("out/small")
     folder.mkdir(parents=True)

@@ -1,5 +1,6 @@
 """`invertwin view`: a run folder, a run file or a capture in the browser, or on a page."""
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,7 +52,8 @@ def run_view(
     with Viewer(display, links, host=host, port=port, token=token) as viewer:
         console.print(f"open {viewer.address} (Ctrl-C ends)", markup=False, soft_wrap=True)
         console.file.flush()  # a log shows it while the viewer runs
-        viewer.wait()
+        with suppress(KeyboardInterrupt):  # that is how it is meant to end
+            viewer.wait()
 
 
 def shown_of(target: Path) -> tuple[Display, dict[str, Link]]:
