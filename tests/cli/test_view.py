@@ -65,6 +65,15 @@ def test_a_capture_shows_its_maps(run_file, monkeypatch):
     assert set(shown_of(Path("out/small"))[0].maps) == {""}
 
 
+def test_a_folder_of_a_twin_shows_what_was_found(run_file):
+    folder = Path("found")
+    folder.mkdir()
+    (folder / "twin.toml").write_text(RUN)
+    display, links = shown_of(folder)
+    assert set(links) == {""}
+    assert "twin/plate" in {layer.name for layer in display.layers}
+
+
 @pytest.mark.parametrize("target", ["none.toml", "empty", "picture.png"])
 def test_what_cannot_be_shown_is_one_line(target, run_file, monkeypatch, capsys):
     Path("empty").mkdir()

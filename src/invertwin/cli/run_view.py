@@ -66,11 +66,12 @@ def shown_of(target: Path) -> tuple[Display, dict[str, Link]]:
         InputError: It is none of these.
     """
     if target.is_dir():
-        file = target / "run.toml"
-        if not file.exists():
+        files = [target / name for name in ("run.toml", "twin.toml")]
+        file = next((file for file in files if file.exists()), None)
+        if file is None:
             raise InputError(
-                f"expected a run folder with its run.toml, got {target} without one; name a "
-                "folder of invertwin reconstruct or simulate, a run file, or a capture (.nc)"
+                f"expected a run folder with its run.toml, got {target} without one; name a folder "
+                "of invertwin reconstruct, simulate or twin, a run file, or a capture (.nc)"
             )
         return _of_run(file, target)
     if target.suffix == ".nc":
