@@ -8,12 +8,15 @@ imports, the first that traces rays for compilation. A cell that fails ends the 
 
 - `longest_s`: of the slowest cell; asked are at most 60 on two idle cores.
 - `total_s`: of all; asked are at most 1200.
-- `seconds.<page>`: of each of its cells.
+- `longest_processor_s`, `total_processor_s`: the same in time of processors, summed over threads
+  and processes; on a busy machine it tells more.
+- `seconds.<page>`, `processor_seconds.<page>`: of each of its cells.
 """
 
 import argparse
 import json
 import multiprocessing
+import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -31,15 +34,20 @@ def pages() -> list[Path]:
     return [REPOSITORY / "README.md", REPOSITORY / "docs" / "start.md", *tutorials]
 
 
-def timed(page: Path) -> list[float]:
-    """Seconds of each cell of a page, run in one session."""
+def timed(page: Path) -> list[tuple[float, float]]:
+    """Seconds of each cell of a page, run in one session: by the clock, and of processors."""
     session = {"__name__": "__main__"}
     seconds = []
     for number, code in enumerate(cells(page), 1):
-        begin = perf_counter()
+        begin, used = perf_counter(), processors()
         exec(compile(code, f"{page.name}, cell {number}", "exec"), session)
-        seconds.append(perf_counter() - begin)
+        seconds.append((perf_counter() - begin, processors() - used))
     return seconds
+
+
+def processors() -> float:
+    """Seconds that processors have worked for this process and its children that have ended."""
+    return sum(os.times()[:4])
 
 
 def main() -> None:
@@ -47,18 +55,28 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("out/newcomer"))
     parser.add_argument("pages", type=Path, nargs="*", default=pages())
     asked = parser.parse_args()
-    measured: dict[str, list[float]] = {}
+    measured: dict[str, list[tuple[float, float]]] = {}
     for page in asked.pages:
         # Not a Pool: its workers may not start workers of their own, as data sets do.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             measured[page.name] = pool.submit(timed, page).result()
-        for number, seconds in enumerate(measured[page.name], 1):
-            print(f"{page.name:42} cell {number:2} {seconds:6.1f} s", flush=True)
-    longest = max(max(rows) for rows in measured.values())
-    total = sum(sum(rows) for rows in measured.values())
+        for number, (seconds, used) in enumerate(measured[page.name], 1):
+            row = f"{page.name:42} cell {number:2} {seconds:6.1f} s, processors {used:6.1f} s"
+            print(row, flush=True)
+    every = [row for rows in measured.values() for row in rows]
+    longest, hardest = (max(column) for column in zip(*every, strict=True))
+    total, worked = (sum(column) for column in zip(*every, strict=True))
     print(f"longest {longest:.1f} s, all {total:.0f} s")
+    print(f"of processors: most {hardest:.1f} s, all {worked:.0f} s")
     asked.out.mkdir(parents=True, exist_ok=True)
-    metrics = {"longest_s": longest, "total_s": total, "seconds": measured}
+    metrics = {
+        "longest_s": longest,
+        "total_s": total,
+        "longest_processor_s": hardest,
+        "total_processor_s": worked,
+        "seconds": {page: [row[0] for row in rows] for page, rows in measured.items()},
+        "processor_seconds": {page: [row[1] for row in rows] for page, rows in measured.items()},
+    }
     (asked.out / "metrics.json").write_text(json.dumps(metrics, indent=2))
 
 

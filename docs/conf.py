@@ -3,6 +3,8 @@
 import sys
 from pathlib import Path
 
+from jupyter_client.manager import KernelManager  # pyright: ignore[reportMissingImports]
+
 import invertwin
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -24,6 +26,10 @@ nb_execution_mode = "force"
 nb_execution_timeout = 600  # s, of a cell
 nb_execution_raise_on_error = True
 nb_output_stderr = "error"
+# Kernels of late warn of a connection that others on the machine could read. No
+# option of myst-nb reaches what starts them.
+if hasattr(KernelManager, "transport_encryption"):
+    KernelManager.transport_encryption.default_value = "auto"
 
 default_role = "code"
 autodoc_typehints = "signature"

@@ -17,13 +17,17 @@ def test_cells_are_timed_in_one_session(newcomer, tmp_path, monkeypatch):
     page = tmp_path / "page.py"
     page.write_text(
         "# %% [markdown]\n# # Title\n\n# %%\nimport time\nfirst = 1\n\n# %% [markdown]\n# text\n\n"
-        "# %%\ntime.sleep(0.2)\nassert first == 1\n"
+        "# %%\ntime.sleep(0.2)\nassert first == 1\n\n"
+        "# %%\nend = time.process_time() + 0.3\nwhile time.process_time() < end: pass\n"
     )
     monkeypatch.setattr(sys, "argv", ["newcomer.py", "-o", str(tmp_path / "out"), str(page)])
     newcomer.main()
     found = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert len(found["seconds"]["page.py"]) == 2
-    assert 0.2 < found["longest_s"] < 5
+    assert len(found["seconds"]["page.py"]) == 3
+    assert 0.2 < found["seconds"]["page.py"][1] < 5
+    _, slept, worked = found["processor_seconds"]["page.py"]
+    assert slept < 0.1
+    assert 0.25 < worked == found["longest_processor_s"] < 0.6
     assert found["total_s"] == pytest.approx(sum(found["seconds"]["page.py"]))
 
 

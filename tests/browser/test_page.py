@@ -190,6 +190,15 @@ def test_a_report_is_legible_in_the_dark_and_on_paper(
     watched.page.emulate_media(color_scheme="dark", media="print")
     assert contrast(*watched.page.locator("body").evaluate(look)) > 7
     assert not watched.page.get_by_role("slider", name="step").is_visible()
+    # The layers that are drawn have their colours as a key.
+    assert watched.page.locator("label", has_text="boundary paths").is_visible()
+    assert "■" in watched.page.locator("label", has_text="boundary paths").inner_text()
+    assert not watched.page.locator("label", has_text="sampled paths").is_visible()
+    # The scene keeps its shape where paper is narrower than the window.
+    assert (
+        watched.page.locator("canvas").first.evaluate("x => getComputedStyle(x).objectFit")
+        == "contain"
+    )
     label = watched.page.locator("canvas").first.get_attribute("aria-label")
     assert label.startswith("Scene in three")
     (pictures / "report.pdf").write_bytes(watched.page.pdf())

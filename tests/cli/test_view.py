@@ -65,6 +65,15 @@ def test_a_capture_shows_its_maps(run_file, monkeypatch):
     assert set(shown_of(Path("out/small"))[0].maps) == {""}
 
 
+def test_a_folder_of_a_twin_shows_what_was_found(run_file):
+    folder = Path("found")
+    folder.mkdir()
+    (folder / "twin.toml").write_text(RUN)
+    display, links = shown_of(folder)
+    assert set(links) == {""}
+    assert "twin/plate" in {layer.name for layer in display.layers}
+
+
 @pytest.mark.parametrize("target", ["none.toml", "empty", "picture.png"])
 def test_what_cannot_be_shown_is_one_line(target, run_file, monkeypatch, capsys):
     Path("empty").mkdir()
@@ -77,6 +86,18 @@ def test_what_cannot_be_shown_is_one_line(target, run_file, monkeypatch, capsys)
 def test_a_host_of_others_without_a_token_is_refused(run_file, monkeypatch, capsys):
     assert call(monkeypatch, "view", run_file, "--host", "0.0.0.0") == 2
     assert "expected a token" in capsys.readouterr().err
+
+
+@NEEDS_VISER
+def test_it_ends_by_an_interruption_as_it_says(run_file, monkeypatch, capsys):
+    def interrupted(self: Viewer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "wait", interrupted)
+    assert call(monkeypatch, "view", run_file, "--port", "0") == 0
+    said = capsys.readouterr()
+    assert "(Ctrl-C ends)" in said.out
+    assert said.err == ""
 
 
 def test_a_damaged_view_is_refused(run_file, monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 import http.client
 import importlib.util
+import socket
 from contextlib import closing
 from email.message import Message
 
@@ -100,6 +101,12 @@ def test_a_wrong_token_gets_403_and_the_right_one_a_cookie():
         upgrade |= {"Sec-WebSocket-Key": "MDEyMzQ1Njc4OWFiY2RlZg=="}
         assert answered(viewer, **upgrade).status == 403
         assert answered(viewer, Cookie=cookie.split(";")[0], **upgrade).status == 101
+
+
+@NEEDS_VISER
+def test_the_address_for_others_names_this_machine():
+    with Viewer(display_of(cube(), {}, "cube"), host="0.0.0.0", port=0, token=TOKEN) as viewer:
+        assert viewer.address.startswith(f"http://{socket.gethostname()}:")
 
 
 @NEEDS_VISER

@@ -122,7 +122,10 @@ def run_gradcheck(
         metrics |= compared
     rows = [_row(*item) for item in scenes.items()]
     legend = texts("notes")["gradcheck"]
-    table = Table("Agreement with central differences", _COLUMNS, rows, legend)
+    # What no scene has, such as contacts, takes the room of numbers in a terminal.
+    told = [k for k in range(len(_COLUMNS)) if any(row[k] is not None for row in rows)]
+    columns, rows = [_COLUMNS[k] for k in told], [[row[k] for k in told] for row in rows]
+    table = Table("Agreement with central differences", columns, rows, legend)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
     parts = [table, *studies, *pictures]
     return finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")

@@ -1,5 +1,6 @@
 """`invertwin view`: a run folder, a run file or a capture in the browser, or on a page."""
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,7 +52,8 @@ def run_view(
     with Viewer(display, links, host=host, port=port, token=token) as viewer:
         console.print(f"open {viewer.address} (Ctrl-C ends)", markup=False, soft_wrap=True)
         console.file.flush()  # a log shows it while the viewer runs
-        viewer.wait()
+        with suppress(KeyboardInterrupt):  # that is how it is meant to end
+            viewer.wait()
 
 
 def shown_of(target: Path) -> tuple[Display, dict[str, Link]]:
@@ -64,11 +66,12 @@ def shown_of(target: Path) -> tuple[Display, dict[str, Link]]:
         InputError: It is none of these.
     """
     if target.is_dir():
-        file = target / "run.toml"
-        if not file.exists():
+        files = [target / name for name in ("run.toml", "twin.toml")]
+        file = next((file for file in files if file.exists()), None)
+        if file is None:
             raise InputError(
-                f"expected a run folder with its run.toml, got {target} without one; name a "
-                "folder of invertwin reconstruct or simulate, a run file, or a capture (.nc)"
+                f"expected a run folder with its run.toml, got {target} without one; name a folder "
+                "of invertwin reconstruct, simulate or twin, a run file, or a capture (.nc)"
             )
         return _of_run(file, target)
     if target.suffix == ".nc":

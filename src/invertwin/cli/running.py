@@ -179,14 +179,22 @@ def now_and_then(shown: Console = console, last: float = -math.inf) -> Callable[
 
 
 def print_tables(tables: Sequence[Table]) -> None:
-    """Print tables with their notes."""
+    """Print tables with their notes; a narrow terminal wraps headings and words, never a number."""
     for table in tables:
         grid = RichTable(title=Text(table.title), title_justify="left")
         for i, column in enumerate(table.columns):
-            numbers = any(is_number(row[i]) for row in table.rows)
-            grid.add_column(Text(column), justify="right" if numbers else "left", no_wrap=i == 0)
+            numbers = [len(shown(row[i])) for row in table.rows if is_number(row[i])]
+            grid.add_column(
+                Text(column),
+                justify="right" if numbers else "left",
+                no_wrap=i == 0,
+                min_width=max(numbers, default=None),
+                overflow="fold",
+            )
         for row in table.rows:
             grid.add_row(*(Text(shown(cell)) for cell in row))
-        console.print(grid)
+        least = grid.__rich_measure__(console, console.options).minimum
+        grid.width = least if least > console.width else None
+        console.print(grid, crop=False)
         if table.note:
             console.print(table.note, markup=False)

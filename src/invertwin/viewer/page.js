@@ -254,7 +254,16 @@
       for (const layer of layers) if (layer.group === group) layer.shown = box.checked;
       draw();
     });
-    label.append(box, ` ${group} `);
+    label.append(box);
+    // The colours of what is drawn are its key.
+    for (const color of new Set(layers.filter((layer) => layer.group === group).map((layer) => `rgb(${layer.color})`))) {
+      const key = document.createElement("span");
+      key.textContent = " ■";
+      key.ariaHidden = "true";
+      key.style = `color: ${color}; print-color-adjust: exact; -webkit-print-color-adjust: exact`;
+      label.append(key);
+    }
+    label.append(` ${group} `);
     label.style = "display: inline-block; margin-right: 1em";
     part("layers").append(label);
   }

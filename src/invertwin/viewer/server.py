@@ -2,6 +2,7 @@
 
 import importlib
 import io
+import socket
 import threading
 import time
 from collections import deque
@@ -73,7 +74,9 @@ class Viewer:
         guard = Guard(host, token)
         self._server = _started(guard, host, port)
         query = "" if token is None else f"/?token={token}"
-        named = f"[{host}]" if ":" in host else host
+        # A host that means every address of this machine is none that a browser could open.
+        reached = socket.gethostname() if host in ("0.0.0.0", "::") else host
+        named = f"[{reached}]" if ":" in reached else reached
         self.address = f"http://{named}:{self._server.get_port()}{query}"
         self._links, self._steps = dict(links or {}), list(display.steps)
         self._display = display
@@ -195,6 +198,7 @@ class Viewer:
         self._sensor.on_update(lambda _: self._sense(str(self._sensor.value)))
         self._frame = gui.add_slider("position", 0, 1, 1, 0)
         self._frame.on_update(lambda _: self._choose(frame=int(self._frame.value)))
+        self._axes = gui.add_markdown("")
         self._bin = gui.add_text("bin", "", disabled=True)
         self._sense(self._wish.sensor)
         if not self._links:
@@ -214,6 +218,11 @@ class Viewer:
         frames = link.radar.frame_count if link else maps.frames[-1] + 1 if maps else 1
         self._frame.max, self._frame.value = max(1, frames - 1), 0
         self._frame.visible, self._bin.value = frames > 1, "click a map"
+        ranges, across = self._axes_of(name)
+        self._axes.content = (
+            f"Maps: range upwards from {ranges[0]:.2f} to {ranges[-1]:.2f} m, "
+            f"u from {across[-1]:.2f} on the left to {across[0]:.2f}."
+        )
         self._choose(sensor=name, frame=0, bin=None)
 
     def _switch(self, group: str) -> Callable[[Any], None]:
@@ -364,15 +373,18 @@ class Viewer:
         if not self._due.wait(_STILL):
             self._show_paths(link.seen(scene, wish.frame), wish.bin)
 
-    def _told(self, sensor: str, row: int, column: int) -> str:
-        """A bin in words."""
+    def _axes_of(self, sensor: str) -> tuple[list[float], list[float]]:
+        """Range [m] of each row and u of each column of a sensor's maps."""
         if sensor in self._links:
             grid = self._links[sensor].grid
-            away, across = float(grid.ranges[row]), float(grid.u[column])
-        else:
-            maps = self._display.maps[sensor]
-            away, across = maps.ranges[row], maps.across[column]
-        return f"range {away:.2f} m, u {across:.3f}"
+            return grid.ranges.tolist(), grid.u.tolist()
+        maps = self._display.maps[sensor]
+        return maps.ranges, maps.across
+
+    def _told(self, sensor: str, row: int, column: int) -> str:
+        """A bin in words."""
+        ranges, across = self._axes_of(sensor)
+        return f"range {ranges[row]:.2f} m, u {across[column]:.3f}"
 
     def _show_paths(self, seen: Seen, chosen: tuple[int, int] | None) -> None:
         points = floats(seen.points)
