@@ -216,8 +216,11 @@ def _touch(vertices: Array, one: Index, other: Index, apart: float) -> NDArray[n
     height = np.einsum("pvx,px->pv", corners - beyond[:, :1], normal)
 
     def over(points: Array) -> NDArray[np.bool_]:
-        return np.asarray((np.einsum("px,psx->ps", points, inwards)
-                           > np.einsum("psx,psx->ps", beyond, inwards)).all(1))
+        return np.asarray(
+            (
+                np.einsum("px,psx->ps", points, inwards) > np.einsum("psx,psx->ps", beyond, inwards)
+            ).all(1)
+        )
 
     bad = np.zeros(len(one), dtype=bool)
     for v in range(3):
@@ -230,14 +233,13 @@ def _touch(vertices: Array, one: Index, other: Index, apart: float) -> NDArray[n
         bad |= free & (height[:, v] * height[:, w] < 0) & over(meets)
         for s in range(3):
             e = (s + 1) % 3
-            alone = ~(
-                (one[:, [v, w], None] == other[:, None, [s, e]]).any((1, 2))
-            )
+            alone = ~((one[:, [v, w], None] == other[:, None, [s, e]]).any((1, 2)))
             gap = _between(corners[:, v], corners[:, w], beyond[:, s], beyond[:, e])
             bad |= alone & (gap < apart)
             # A corner that ends on a side, of which a neighbour is at the other end.
-            bad |= ~shared[:, v] & (_between(corners[:, v], corners[:, v], beyond[:, s],
-                                             beyond[:, e]) < apart)
+            bad |= ~shared[:, v] & (
+                _between(corners[:, v], corners[:, v], beyond[:, s], beyond[:, e]) < apart
+            )
     return bad
 
 
@@ -245,13 +247,15 @@ def _between(a: Array, b: Array, c: Array, d: Array) -> Array:
     """Distances of the lines from a to b and from c to d (Ericson, Real-Time Collision Detection,
     §5.1.9)."""
     first, second, apart = b - a, d - c, a - c
-    square, other, both = (np.einsum("px,px->p", x, y)
-                           for x, y in ((first, first), (second, second), (first, second)))
+    square, other, both = (
+        np.einsum("px,px->p", x, y) for x, y in ((first, first), (second, second), (first, second))
+    )
     begin, end = (np.einsum("px,px->p", x, apart) for x in (first, second))
     least = 1e-30
     determinant = square * other - both**2
-    s = (both * end - begin * other) / np.where(determinant > 1e-12 * square * other + least,
-                                                determinant, np.inf)
+    s = (both * end - begin * other) / np.where(
+        determinant > 1e-12 * square * other + least, determinant, np.inf
+    )
     s = np.clip(s, 0, 1)
     t = np.clip((both * s + end) / np.maximum(other, least), 0, 1)
     s = np.clip((both * t - begin) / np.maximum(square, least), 0, 1)

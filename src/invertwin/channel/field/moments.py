@@ -37,8 +37,11 @@ _ONE_POINT = 1e-12  # of the wavelength: nearer places are one
 
 def _rule(*orbits: tuple[float, float]) -> tuple[Tensor, Tensor]:
     """Shares and weights of points: each orbit has one large or small share, and a weight."""
-    shares = [[far if turn == at else (1 - far) / 2 for at in range(3)]
-              for far, _ in orbits for turn in range(3 if far != 1 / 3 else 1)]
+    shares = [
+        [far if turn == at else (1 - far) / 2 for at in range(3)]
+        for far, _ in orbits
+        for turn in range(3 if far != 1 / 3 else 1)
+    ]
     weights = [weight for far, weight in orbits for _ in range(3 if far != 1 / 3 else 1)]
     return torch.tensor(shares, dtype=torch.float64), torch.tensor(weights, dtype=torch.float64)
 
@@ -194,7 +197,7 @@ class Moments:
         count = len(self.faces)
         points, products = self._points(vertices)
         points = points.to(self.kind).reshape(-1, 3)
-        every = np.arange(count)
+
         face, corner = self.functions.face.numpy(), self.functions.corner.numpy()
         shape = (self.count, 3 * count)
         parts = []
@@ -228,9 +231,7 @@ class Moments:
             for part, share in zip(parts, scale, strict=True):
                 sent = torch.from_numpy(part[:, 3 * begin :] @ flat)
                 left = part[mine, 3 * begin : 3 * end].toarray()
-                found.addmm_(
-                    sent.view(2 * self.count, -1), torch.from_numpy(left).T, alpha=share
-                )
+                found.addmm_(sent.view(2 * self.count, -1), torch.from_numpy(left).T, alpha=share)
             both = found.view(self.count, 2, len(mine)).permute(2, 0, 1).contiguous()
             total[torch.from_numpy(mine)] += torch.view_as_complex(both)
         return total
@@ -269,7 +270,7 @@ class Moments:
         shares, weights = SEVEN
         point = shares @ here
         spot = shares @ there
-        level, first = potentials(there, point)
+        level, first, _ = potentials(there, point)
         double = torch.linalg.cross(there[:, 1] - there[:, 0], there[:, 2] - there[:, 0])
         scale = 1 / (2 * math.pi * double.norm(dim=1))[:, None]
         away = point[:, :, None] - spot[:, None]
@@ -304,8 +305,9 @@ class Moments:
         pairs = self.near(vertices.detach())
         ends = (self.halves(left), self.halves(right))
         aspects = torch.arange(left.shape[1]).split(_ASPECTS_AT_ONCE)
-        parts = [self._bilinear(vertices, pairs, *(end[:, :, some] for end in ends))
-                 for some in aspects]
+        parts = [
+            self._bilinear(vertices, pairs, *(end[:, :, some] for end in ends)) for some in aspects
+        ]
         return 1j * self.k * torch.cat(parts)
 
     def _bilinear(self, vertices: Tensor, pairs: Tensor, left: Tensor, right: Tensor) -> Tensor:
@@ -313,8 +315,9 @@ class Moments:
         points, products = self._points(vertices)
         points = points.to(self.kind).reshape(-1, 3)
         scale = products.new_tensor([1.0, 1.0, 1.0, 1 / self.k])
-        scale = torch.complex(scale * products.new_tensor([1.0, 1, 1, 0]),
-                              scale * products.new_tensor([0.0, 0, 0, 1]))
+        scale = torch.complex(
+            scale * products.new_tensor([1.0, 1, 1, 0]), scale * products.new_tensor([0.0, 0, 0, 1])
+        )
         kind = torch.complex128 if self.kind == torch.float64 else torch.complex64
         # The divergence's share j/k, twice, makes −1/k².
         strengths = [
@@ -356,47 +359,75 @@ class Moments:
             swapped = swapped + kept(close, vertices, some) / 2
         return total + swapped.mT
 
+    def sampled(
+        self, vertices: Float64[Tensor, "v 3"], current: Complex128[Tensor, "unknown column"]
+    ) -> tuple[Float64[Tensor, "point 3"], Complex128[Tensor, "point column 3"]]:
+        """Places, and J dA there.
+
+        Args:
+            vertices: [m].
+            current: across all sides.
+        """
+        points, products = self._points(vertices)
+        flowing = torch.einsum("fiqx,fic->fqcx", products[..., :3] + 0j, self.halves(current))
+        return points.flatten(0, 1) + vertices.detach().mean(0), flowing.flatten(0, 1)
+
     def inside(
         self, vertices: Float64[Tensor, "v 3"], places: Float64[Tensor, "place 3"]
-    ) -> Complex128[Tensor, "place 3 unknown"]:
-        """Fields that currents make at places, with the sign that balances a wave's.
+    ) -> Complex128[Tensor, "row unknown"]:
+        """x, y and z of the field that must reach places for currents to cancel it there.
 
         Args:
             vertices: [m].
             places: off the surface [m].
         """
         corners = vertices[self.faces]
+        middle = corners.mean(1)
         shares, weights = SEVEN
         spot = shares @ corners
-        along = spot[:, None] - corners[:, :, None]
-        found = []
-        for some in places.split(max(1, (_ENTRIES_AT_ONCE >> 3) // len(corners))):
-            away = some[:, None, None] - spot
-            square = dot(away, away)
-            apart = square.sqrt()
+        beside = spot - middle[:, None]
+        offset = corners - middle[:, None]
+        double = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        scale = (1 / (2 * math.pi * double.norm(dim=1)))[:, None]
+
+        def local(some: Tensor) -> Tensor:
+            level, first, slope = potentials(corners, some.expand(len(corners), -1, 3))
+            away = some[:, None] - spot[:, None]
+            apart = dot(away, away).sqrt()
             turn = self.k * apart
-            wave = torch.polar(weights / (4 * math.pi * apart), -turn)
-            slope = wave * torch.complex(torch.ones_like(turn), turn) / square
-            part = 0.5j * self.k * torch.einsum("yfq,fiqx->fiyx", wave, along + 0j)
-            charge = 1j / self.k * torch.einsum("yfq,yfqx->fyx", slope, away + 0j)
-            found.append(self._flowing(part - charge[:, None]))
-        return torch.cat(found, 1).permute(1, 2, 0)
+            smooth = torch.complex(-2 * (turn / 2).sin().square(), -turn.sin())
+            # The gradient of (exp(−jkR) − 1)/R.
+            fall = -(1j * turn * torch.polar(torch.ones_like(turn), -turn) + smooth)
+            smooth = smooth / (4 * math.pi * apart) * weights
+            fall = fall / (4 * math.pi * apart**3) * weights
+            flat = level * scale + smooth.sum(2)
+            sloped = (first + (some - middle[:, None]) * level[..., None]) * scale[..., None]
+            sloped = sloped + torch.einsum("fyq,fqx->fyx", smooth, beside + 0j)
+            part = sloped[:, None] - flat[:, None, :, None] * offset[:, :, None]
+            charge = slope * scale[..., None] + (fall[..., None] * away).sum(2)
+            return self._flowing(0.5j * self.k * part + 1j / self.k * charge[:, None])
+
+        size = max(1, (_ENTRIES_AT_ONCE >> 6) // len(corners))
+        found = [checkpoint(local, some, use_reentrant=False) for some in places.split(size)]
+        return torch.cat(found, 1).flatten(1).T
 
 
 def potentials(
     corners: Float64[Tensor, "row 3 3"], points: Float64[Tensor, "row point 3"]
-) -> tuple[Float64[Tensor, "row point"], Float64[Tensor, "row point 3"]]:
-    """∫ 1/R and ∫ (y − x)/R over triangles, the second with y − x along the plane and away from it.
+) -> tuple[
+    Float64[Tensor, "row point"], Float64[Tensor, "row point 3"], Float64[Tensor, "row point 3"]
+]:
+    """Potentials 1/R of triangles in closed form.
 
     Args:
         corners: of the triangles.
         points: x, on no side.
 
     Returns:
-        ∫ 1/R dy, and ∫ (y − x)/R dy.
+        ∫ 1/R dy, ∫ (y − x)/R dy, and the gradient of the first by x.
 
-    Source: Wilton et al. 1984, with the logarithm as ln((R⁺ + R⁻ + L)/(R⁺ + R⁻ − L)), and the sum of
-    arcs as the solid angle of Van Oosterom and Strackee.
+    Source: Wilton et al. 1984, with the logarithm as ln((R⁺ + R⁻ + L)/(R⁺ + R⁻ − L)), and the sum
+    of arcs as the solid angle of Van Oosterom and Strackee.
     """
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = (normal / normal.norm(dim=1, keepdim=True))[:, None]
@@ -405,6 +436,7 @@ def potentials(
     height = -dot(away[0], normal)
     level = torch.zeros_like(height)
     first = torch.zeros_like(points)
+    slope = torch.zeros_like(points)
     for v in range(3):
         w = (v + 1) % 3
         side = (corners[:, w] - corners[:, v])[:, None]
@@ -415,6 +447,7 @@ def potentials(
         both = far[v] + far[w]
         logarithm = ((both + length) / (both - length)).log()
         level = level + distance * logarithm
+        slope = slope - outwards * logarithm[..., None]
         square = distance.square() + height.square()
         ends = dot(away[w], along) * far[w] - dot(away[v], along) * far[v]
         first = first + outwards * ((square * logarithm + ends) / 2)[..., None]
@@ -422,5 +455,6 @@ def potentials(
     volume = dot(a, torch.linalg.cross(b, c))
     base = far[0] * far[1] * far[2]
     base = base + dot(a, b) * far[2] + dot(b, c) * far[0] + dot(c, a) * far[1]
-    level = level - height * 2 * torch.atan2(-volume, base)
-    return level, first - normal * (height * level)[..., None]
+    angle = 2 * torch.atan2(-volume, base)
+    level = level - height * angle
+    return level, first - normal * (height * level)[..., None], slope - normal * angle[..., None]
