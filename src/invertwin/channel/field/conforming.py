@@ -85,7 +85,7 @@ def conforming(
         mine = edge[number]
         inner, local = _pattern(
             tuple(int(n) for n in parts[mine]),
-            tuple(float(x) for x in (length[mine] / side).round(3)),
+            _shape(vertices[face] / side),
         )
         rim: list[Index] = []
         for corner in range(3):
@@ -123,28 +123,39 @@ def _joined(vertices: Array, faces: Index) -> tuple[Index, bool]:
     return joined, bool(len(pairs))
 
 
+def _shape(corner: Array) -> tuple[float, float, float]:
+    """The first side's length, and the last corner's place along it and beside it.
+
+    Rounded: what is inside depends on corners in steps, alike in faces that are alike.
+    """
+    base, other = corner[1] - corner[0], corner[2] - corner[0]
+    length = float(np.linalg.norm(base))
+    along = float(base @ other) / length
+    beside = math.sqrt(max(float(other @ other) - along**2, 0.0))
+    return round(length, 1) + 0.05, round(along, 1), round(beside, 1) + 0.05
+
+
 @lru_cache(maxsize=4096)
-def _pattern(parts: tuple[int, ...], lengths: tuple[float, ...]) -> tuple[Array, Index]:
+def _pattern(parts: tuple[int, ...], shape: tuple[float, float, float]) -> tuple[Array, Index]:
     """Shares of the vertices inside a face, and its triangles.
 
     Their vertices are those of the rim in turn, from the first corner on, and then those inside.
 
     Args:
         parts: of the three sides, the first from the first corner to the second.
-        lengths: of these, in sides of a small triangle.
+        shape: of the face, in sides of a small triangle.
     """
     if parts == (1, 1, 1):
         return np.zeros((0, 3)), np.array([[0, 1, 2]])
-    a, b, c = lengths
-    along = (a**2 + c**2 - b**2) / (2 * a)
-    corner = np.array([[0, 0], [a, 0], [along, math.sqrt(max(c**2 - along**2, 1e-6))]])
+    corner = np.array([[0, 0], [shape[0], 0], shape[1:]])
     at = [np.arange(n)[:, None] / n for n in parts]
     following = np.roll(corner, -1, 0)
     rim = np.concatenate(
         [(1 - t) * p + t * q for t, p, q in zip(at, corner, following, strict=True)]
     )
     # A little outwards, so that the rim's parts are sides of triangles.
-    outwards = (following - corner)[:, ::-1] * [1, -1] / np.array(lengths)[:, None]
+    outwards = (following - corner)[:, ::-1] * [1, -1]
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     bulge = np.concatenate([4 * t * (1 - t) * u for t, u in zip(at, outwards, strict=True)])
     inner = _lattice(corner, outwards)
     count = len(rim)

@@ -51,9 +51,11 @@ class SolvedMeshes:
         up: Float64[Tensor, "3"],
     ) -> None:
         self.vertices, self.faces, self.solid, self.up = vertices, faces, solid, up
-        corners = vertices.detach()[faces]
-        sides = corners[:, 1:] - corners[:, :1]
-        self.area = float(torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1).sum() / 2)
+        corners = vertices[faces]
+        self.double = torch.linalg.cross(
+            corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        )
+        self.area = float(self.double.detach().norm(dim=1).sum() / 2)
         self._mesh: tuple[float, Conforming | None] = (math.inf, None)
 
     def scattered(
@@ -111,7 +113,7 @@ class _Equation:
     """The integral equation at one frequency, solved."""
 
     def __init__(self, target: SolvedMeshes, mesh: Conforming, wave_number: float) -> None:
-        self.k, self.up = wave_number, target.up
+        self.k, self.up, self.target = wave_number, target.up, target
         functions = functions_of(mesh.faces)
         self.moments = Moments(torch.from_numpy(mesh.faces), functions, wave_number)
         shares = torch.from_numpy(mesh.shares)[..., None]
@@ -182,7 +184,9 @@ class _Equation:
             left = torch.einsum("yn,nat->yat", inner, current)
             left = self._arriving(self.places, transmitters) - left
             taken = torch.einsum("yn,nar->yar", inner.conj(), back)
-            change = change + self.weight * torch.einsum("yar,yat->art", taken, left)
+            some = self.target.double[self.target.double.detach().norm(dim=1) > 0].norm(dim=1).sum()
+            weight = some / (2 * len(self.inner))
+            change = change + weight * torch.einsum("yar,yat->art", taken, left)
         return value + scale * (change - change.detach())
 
     def keeps_power(self, current: Tensor, towards: Tensor) -> bool:
@@ -202,9 +206,7 @@ def _places(
     # Even shares of the surface.
     inside = inside[:: max(1, len(inside) // wanted)]
     corners = target.vertices[target.faces]
-    double = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = double / double.detach().norm(dim=1, keepdim=True).clamp_min(1e-300)
-    normal = normal / normal.norm(dim=1, keepdim=True).clamp_min(1e-300)
+    normal = torch.nn.functional.normalize(target.double, dim=1)
     start = vertices[torch.from_numpy(mesh.faces)[inside]].mean(1)
     mine = normal[origin[inside]]
     opposite, met = _opposite(target, start.detach(), -mine.detach(), corners.detach())
@@ -214,11 +216,7 @@ def _places(
     room = thick.clamp_max(_DEEP * wavelength)
     places = start - (depth * room)[:, None] * mine
     skin = corners.detach()[target.solid]
-    clear = (
-        torch.stack([_distance(place, skin) for place in places.detach()])
-        if len(places)
-        else room.detach()
-    )
+    clear = torch.tensor([_distance(place, skin) for place in places.detach()])
     return places[clear >= _CLEAR * room.detach()]
 
 
@@ -240,14 +238,12 @@ def _opposite(
         far = dot(second, across) / safe
         hit = target.solid & (scale != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (far > size)
         far = torch.where(hit, far, math.inf)
-        found.append(far.argmin())
-        met.append(hit.any())
-    if not found:
-        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
-    return torch.stack(found), torch.stack(met)
+        found.append(int(far.argmin()))
+        met.append(bool(hit.any()))
+    return torch.tensor(found, dtype=torch.int64), torch.tensor(met, dtype=torch.bool)
 
 
-def _distance(place: Tensor, corners: Tensor) -> Tensor:
+def _distance(place: Tensor, corners: Tensor) -> float:
     """From a place to the nearest of triangles."""
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     square = dot(normal, normal).clamp_min(1e-300)
@@ -260,4 +256,4 @@ def _distance(place: Tensor, corners: Tensor) -> Tensor:
         share = (dot(away[:, v], side) / dot(side, side).clamp_min(1e-300)).clamp(0, 1)
         least = torch.minimum(least, (away[:, v] - share[:, None] * side).norm(dim=1))
     height = dot(away[:, 0], normal).abs() / square.sqrt()
-    return torch.where(inside, height, least).min()
+    return float(torch.where(inside, height, least).min())

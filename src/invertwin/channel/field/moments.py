@@ -340,24 +340,20 @@ class Moments:
             return torch.einsum("eapz,eaqz->apq", some, field).to(torch.complex128)
 
         def close(vertices: Tensor, some: Tensor) -> Tensor:
-            local = self._close(vertices, some)
-            field = torch.einsum("nij,njaq->niaq", local, right[some[:, 1]])
-            return torch.einsum("niap,niaq->apq", left[some[:, 0]], field)
-
-        def kept(found: object, *rows: object) -> Tensor:
-            return checkpoint(found, *rows, use_reentrant=False)
+            local = self._close(vertices, some) / 2
+            here, there = some.unbind(1)
+            # The mean of both orders, as in the matrix.
+            field = torch.einsum("nij,njaq->niaq", local, right[there])
+            back = torch.einsum("nij,niaq->njaq", local, right[here])
+            found = torch.einsum("niap,niaq->apq", left[here], field)
+            return found + torch.einsum("njap,njaq->apq", left[there], back)
 
         total = torch.zeros(*left.shape[2:], right.shape[-1], dtype=torch.complex128)
         for begin in range(0, count, size):
-            total = total + kept(far, points, *strengths, begin)
-        # The mean of both orders, as in the matrix.
+            total = total + checkpoint(far, points, *strengths, begin, use_reentrant=False)
         for some in pairs.split(_PAIRS_AT_ONCE):
-            total = total + kept(close, vertices, some) / 2
-        swapped = torch.zeros(*right.shape[2:], left.shape[-1], dtype=torch.complex128)
-        left, right = right, left
-        for some in pairs.split(_PAIRS_AT_ONCE):
-            swapped = swapped + kept(close, vertices, some) / 2
-        return total + swapped.mT
+            total = total + checkpoint(close, vertices, some, use_reentrant=False)
+        return total
 
     def sampled(
         self, vertices: Float64[Tensor, "v 3"], current: Complex128[Tensor, "unknown column"]
