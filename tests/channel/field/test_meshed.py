@@ -1,4 +1,4 @@
-"""Small conductors whose currents are solved on triangles: open, of few facets, with derivatives."""
+"""Small conductors whose currents are solved on triangles, with derivatives."""
 
 import math
 

@@ -160,7 +160,9 @@ def _pattern(parts: tuple[int, ...], shape: tuple[float, float, float]) -> tuple
     inner = _lattice(corner, outwards)
     count = len(rim)
     for _ in range(_EVENED if len(inner) else 0):
-        triangles = Delaunay(np.concatenate([rim + _BULGE * bulge, inner])).simplices
+        triangles = Delaunay(np.concatenate([rim + _BULGE * bulge, inner])).simplices.astype(
+            np.int64
+        )
         inner = _evened(np.concatenate([rim, inner]), triangles)[count:]
     triangles = Delaunay(np.concatenate([rim + _BULGE * bulge, inner])).simplices.astype(np.int64)
     places = np.concatenate([rim, inner])[triangles]

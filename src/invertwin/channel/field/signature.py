@@ -116,7 +116,7 @@ def trace_signature(
     """Scattering amplitudes S of every part of the field, about the world's origin; σ = 4π|S|².
 
     Rows are the receiving, columns the transmitting polarisation, V and H of ``polarisations``. The
-    parts are ``order 1``, ``order 2`` and so on, ``edges 1``, ``edges 2``, and of small closed
+    parts are ``order 1``, ``order 2`` and so on, ``edges 1``, ``edges 2``, and of small
     conductors ``rest``, which is what these leave out of the solved field.
 
     Args:
@@ -132,7 +132,8 @@ def trace_signature(
         boundary: False leaves out of derivatives what moving edges of beams change.
 
     Raises:
-        InputError: a cloud, a rough surface, derivatives of a scene of many triangles.
+        InputError: a cloud, a rough surface, derivatives of a scene of many triangles, or of a small
+            one whose vertices lie at one place.
     """
     with tracing():
         body = _body(scene, frequencies, up)
