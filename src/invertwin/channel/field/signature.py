@@ -132,8 +132,8 @@ def trace_signature(
         boundary: False leaves out of derivatives what moving edges of beams change.
 
     Raises:
-        InputError: a cloud, a rough surface, derivatives of a scene of many triangles, or of a small
-            one whose vertices lie at one place.
+        InputError: a cloud, a rough surface, derivatives of a scene of many triangles, or of a
+            small one of which vertices lie at one place.
     """
     with tracing():
         body = _body(scene, frequencies, up)
