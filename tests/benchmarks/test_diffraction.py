@@ -58,6 +58,7 @@ def test_table_says_what_must_hold(diffraction):
         "slope_jump": 1e-4,
         "slope_jump_plain": 0.2,
         "jump_db_next": 0.5,
+        "jump_db_second": 2.3,
         "jump_db_first": 5.0,
         "full_wave": 0.03,
         "full_wave_of": {"optics": 0.3},

@@ -186,6 +186,22 @@ def test_a_twin_that_has_collapsed_has_no_measures(tmp_path):
     assert ["Chamfer distance, mean of both directions [m]", None] in result.rows
 
 
+def test_a_start_that_is_lost_says_so_in_the_table(tmp_path):
+    problem = problem_of(check(letters(), tmp_path), Console(quiet=True))
+    rows = [
+        {"start": k, "loss": loss, "status": "converged", "lost": lost, "steps": 9, "seconds": 1.0}
+        for k, (loss, lost) in enumerate([(0.7, False), (1.0, True)])
+    ]
+    metrics = {"steps": 9, "status": "converged", "verdict": "unknown", "parameters": {}}
+    fitted = Fitted(problem, metrics, {FULL: rows}, problem.scene, problem.scene, {}, [])
+    starts = tables_of(fitted)[1]
+    ended = starts.columns.index("ended as")
+    assert [row[ended] for row in starts.rows] == [
+        "the loss no longer falls",
+        "lost: shows nothing of the data",
+    ]
+
+
 def test_labels_tell_whose_a_measure_is():
     assert is_shape_key("true_components")
     assert shape_label("components") == "separate parts"

@@ -193,6 +193,14 @@ def test_what_moves_and_what_stands_at_one_range_are_two():
     assert float(mover.position.norm()) == pytest.approx(way - 0.08, abs=0.1)
     assert float(mover.velocity.norm()) == pytest.approx(1.5 * 1.6 / way, abs=0.3)
     assert float(mover.position[0]) > 0.3
+    assert min(one.confidence for one in movers) > 0.05  # no line for what is not believed
+    # The echo comes from the front of the ball, three quarters of its radius before the middle.
+    truth = (1 - 0.075 / way) * torch.tensor([0.8, 0.0, 1.6], dtype=torch.float64)
+    sight = torch.nn.functional.normalize(truth, dim=0)
+    along = float((mover.position - truth) @ sight)
+    across = float((mover.position - truth - along * sight).norm())
+    assert abs(along) < 3 * mover.deviations["range"] < 0.15
+    assert across < 3 * mover.deviations["across"] < 0.6
     (rest,) = [one for one in found.things if one.velocity is None and one.confidence > 0.5]
     assert math.dist(rest.position[[0, 2]].tolist(), (-0.8, 1.6)) < 0.2
 

@@ -63,12 +63,15 @@ class Dark(Blob):
 def test_a_start_that_shows_nothing_is_lost():
     found = fitted(look(0), start=0.2, model=Dark())
     assert found.status == "budget"
+    assert found.lost
     assert found.verdict.word == "lost"
     assert "0 % of the power of observation 1" in found.verdict.reasons[0]
 
 
 def test_without_looks_it_is_not_known():
-    verdict = fitted(look(0), model=Blob(known=False)).verdict
+    found = fitted(look(0), model=Blob(known=False))
+    assert not found.lost
+    verdict = found.verdict
     assert verdict.word == "unknown"
     assert verdict.excess is None
 

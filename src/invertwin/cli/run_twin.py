@@ -132,8 +132,8 @@ def _table(found: Twin) -> Table:
     rows: list[list[Any]] = []
     for thing in found.things:
         figure = thing.figure
-        errors = [thing.deviations.get("xyz"[axis]) for axis in range(3) if axis != up]
-        known = [error for error in errors if error is not None]
+        along = [*("xyz"[axis] for axis in range(3) if axis != up), "range", "across"]
+        known = [thing.deviations[name] for name in along if name in thing.deviations]
         size, yaw, rate = None, None, None
         if figure is not None:
             size = None if figure.kind == "corner" else [figure.length, figure.width, figure.height]

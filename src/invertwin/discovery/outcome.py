@@ -51,7 +51,8 @@ class Thing:
         probabilities: Of every kind that was tried.
         position: Its middle [m].
         figure: All numbers of its shape; None = only a place is known.
-        deviations: Standard deviation of every number, by name, in SI units.
+        deviations: Standard deviation of every number, by name, in SI units. Of a mover that was
+            not followed: ``range``, ``across`` the sight, and ``range_rate``.
         confidence: Probability that it is there.
         velocity: Along the line of sight, or along the ground if there is a track [m/s]; None =
             it was found in what stands still.

@@ -70,6 +70,7 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
             for values in (points.range, rates)
         ]
         position = points.position[best].detach().double()
+        beam = cell_of(aperture(radar).x, radar) * float((position - origin).norm())
         found.append(
             Thing(
                 f"mover_{number + 1}",
@@ -79,6 +80,7 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
                 None,
                 {
                     "range": max(spread[0], 0.3 * radar.waveform.range_resolution),
+                    "across": _BEAM * beam,
                     "range_rate": max(spread[1], 0.3 * cell),
                 },
                 max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))

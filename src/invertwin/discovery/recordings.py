@@ -33,6 +33,7 @@ _NEAREST = 4  # range cells, in which transmitters leak into receivers
 _HEIGHT = 0.6  # of radars above a ground of which nothing is said [m]
 _STEPS = 50  # of the last fit
 _PLACES = 40_000  # of an image at most
+_FAINT = 0.05  # confidence of movers that are not worth a line
 _HOLD = 4  # every fourth frame is held out, where there are twice as many
 
 
@@ -144,7 +145,7 @@ def _moving(
     grid = radar.grid(near, min(range_max or math.inf, recording.max_range))
     if recording.frame_period is not None and recording.frame_count > 2:
         return tracks(recording, grid, ground)
-    return movers(recording, grid)
+    return [one for one in movers(recording, grid) if one.confidence > _FAINT]
 
 
 _CALIBRATED = (

@@ -12,9 +12,7 @@ from invertwin.capture import ChirpCapture
 from invertwin.channel import Grid
 from invertwin.discovery.outcome import Thing, Track
 from invertwin.discovery.places import movers
-from invertwin.discovery.sharp_image import cell_of
 from invertwin.inversion.initial import Ground
-from invertwin.radar.spectrum import aperture
 
 _GATE = 16.3  # squared distance in deviations of 0.1 % of three normal numbers
 _AGILE = 1.0  # acceleration that a mover may have [m/s²]
@@ -22,7 +20,6 @@ _ACROSS = 3.0  # velocity across the sight that a mover may have [m/s]
 _LEAST = 3  # frames of a track
 _LOST = 3  # frames in which a mover may be missed
 _FAINT = 0.1  # confidence of what may continue a track
-_SHARE = 0.3  # of a cell: how well a direction is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +96,9 @@ def _measured(one: Thing, recording: ChirpCapture, ground: Ground, frame: int) -
     distance = float(sight.norm())
     assert one.velocity is not None
     rate = float(one.velocity @ sight) / distance
-    wide = _SHARE * cell_of(aperture(radar).x, radar) * distance
     noise = torch.zeros(3, 3, dtype=torch.float64)
     noise[:2, :2] = one.deviations["range"] ** 2 * torch.outer(along, along)
-    noise[:2, :2] += wide**2 * torch.outer(across, across)
+    noise[:2, :2] += one.deviations["across"] ** 2 * torch.outer(across, across)
     noise[2, 2] = one.deviations["range_rate"] ** 2
     matrix = torch.zeros(3, 4, dtype=torch.float64)
     matrix[:2, :2] = torch.eye(2, dtype=torch.float64)

@@ -17,7 +17,7 @@ from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
 from invertwin.inversion.uncertainty import Evidence, Uncertainty
-from invertwin.inversion.verdict import Verdict, verdict
+from invertwin.inversion.verdict import LEAST_SHARE, Verdict, shares_explained, verdict
 from invertwin.models import ForwardModel
 from invertwin.outward import shown_by
 from invertwin.scene.geometry.density import without_clouds
@@ -54,6 +54,14 @@ class Reconstruction:
     def _repr_html_(self) -> str:
         """What a notebook shows."""
         return shown_by("reconstruction_html", self)
+
+    @cached_property
+    def lost(self) -> bool:
+        """Whether the twin shows next to nothing of what was observed, as in ``verdict``.
+
+        A fitted gain of zero has no gradient, so such a fit stays where it began.
+        """
+        return min(shares_explained(self.end)) < LEAST_SHARE
 
     @cached_property
     def uncertainty(self) -> Uncertainty:

@@ -16,9 +16,10 @@ from invertwin.inversion.rivals import Rival, rivals
 
 Word = Literal["consistent", "inconsistent", "ambiguous", "at a bound", "worse", "lost", "unknown"]
 
+LEAST_SHARE = 1e-3
+"""Of the observed power: a twin that explains less shows nothing."""
 _DOUBT = 3.5  # standard deviations of the loss on looks at the twin
 _MARKED = 5.0  # the same of a coarse bin
-_EMPTY = 1e-3  # of the observed power: a twin that explains less shows nothing
 _DEEPER = 3.0  # standard deviations by which more bounces must lower the loss to be named
 _WORSE = 1.02  # times the loss of the start: more than the noise of samples
 
@@ -66,12 +67,8 @@ def verdict(end: End) -> Verdict:
     Args:
         end: Of the fit.
     """
-    fit = end.fit
-    explained = [
-        gain * float(a.abs().mean()) / max(float(b.abs().mean()), 1e-300)
-        for gain, (a, b) in zip(end.gains, end.maps, strict=True)
-    ]
-    if min(explained) < _EMPTY:
+    fit, explained = end.fit, shares_explained(end)
+    if min(explained) < LEAST_SHARE:
         shown = f"{100 * min(explained):.2g} % of the power of observation {_least(explained)}"
         return Verdict("lost", reasons=(f"the twin explains {shown}; start nearer to the truth",))
     loss = float(fit.objective(end.maps))
@@ -99,6 +96,18 @@ def verdict(end: End) -> Verdict:
     open_ = [text for text, rival in zip(open_, others, strict=True) if not rival.rejected]
     word: Word = "at a bound" if bounds else "ambiguous" if open_ else "consistent"
     return Verdict(word, excess, structure, (*bounds, *open_), residuals, others)
+
+
+def shares_explained(end: End) -> list[float]:
+    """For every observation, how much of its power the twin explains.
+
+    Args:
+        end: Of the fit.
+    """
+    return [
+        gain * float(a.abs().mean()) / max(float(b.abs().mean()), 1e-300)
+        for gain, (a, b) in zip(end.gains, end.maps, strict=True)
+    ]
 
 
 def _score(rival: Rival) -> str:

@@ -136,6 +136,7 @@ def fit(
         **scores(own, start, found.scene),
         "loss": found.loss,
         "status": found.status,
+        "lost": found.lost,
         "steps": found.steps,
         "seconds": time.perf_counter() - begin,
         "values": _values(found.parameters),

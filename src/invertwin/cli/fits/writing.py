@@ -70,7 +70,10 @@ def tables_of(fitted: Fitted) -> list[Table]:
     for way, fits in fitted.ways:
         if len(fits) > 1:
             keys = [key for key in COLUMNS if key in fits[0]]
-            cells = [[row["start"] + 1, *(_cell(key, row[key]) for key in keys)] for row in fits]
+            cells = [
+                [row["start"] + 1, *(_cell(key, row[key], row.get("lost", False)) for key in keys)]
+                for row in fits
+            ]
             heads = ["start", *(COLUMNS[key] for key in keys)]
             tables.append(Table(f"Starts, {way}", heads, cells))
     if len(fitted.ways) > 1 and any(is_shape_key(key) for key in metrics):
@@ -255,8 +258,9 @@ def _limits(run: RunFile, metrics: dict[str, Any]) -> str:
     return f"{settings.position_limit:g} m{angle}"
 
 
-def _cell(key: str, value: Any) -> Any:
-    return texts("ends")[value] if key == "status" else value
+def _cell(key: str, value: Any, lost: bool = False) -> Any:
+    """What a table shows of a number; a start that is lost says so, however it ended."""
+    return texts("ends")["lost" if lost else value] if key == "status" else value
 
 
 def _clean(value: float) -> float:
