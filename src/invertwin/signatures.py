@@ -132,9 +132,10 @@ def rcs(
 ) -> Signature:
     """Compute the radar cross-section of smooth conductors and dielectrics, far away.
 
-    Scenes of at most 24 triangles are exact physical optics of every bounce, and differentiable
-    with respect to the scene; others are shot with ray tubes. Of small conductors, currents are
-    solved instead, with the same derivatives. Monostatic and bistatic results are reciprocal.
+    Scenes of at most 24 triangles are exact physical optics of every bounce; others are shot with
+    ray tubes. Of small conductors, currents are solved, and ``rest`` is what rays leave out. Scenes
+    of at most 24 triangles are differentiable with respect to vertices, ``rest`` included.
+    Monostatic and bistatic results are reciprocal.
 
     Args:
         scene: the target about the world's origin.
