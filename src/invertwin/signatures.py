@@ -132,9 +132,10 @@ def rcs(
 ) -> Signature:
     """Compute the radar cross-section of smooth conductors and dielectrics, far away.
 
-    Scenes of at most 24 triangles are exact physical optics of every bounce, and differentiable
-    with respect to the scene; others are shot with ray tubes. Of small closed conductors that have
-    more triangles, currents are solved instead. Monostatic and bistatic results are reciprocal.
+    Scenes of at most 24 triangles are exact physical optics of every bounce; others are shot with
+    ray tubes. Of small conductors, currents are solved, and ``rest`` is what rays leave out. Scenes
+    of at most 24 triangles are differentiable with respect to vertices, ``rest`` included.
+    Monostatic and bistatic results are reciprocal.
 
     Args:
         scene: the target about the world's origin.
@@ -146,7 +147,7 @@ def rcs(
         depth: most bounces.
         edges: most diffractions of a wave by sharp edges of conductors: 0 is physical optics alone,
             1 adds fringe currents, 2 the waves between the edges of a flat plate. From 1 on small
-            closed conductors are solved.
+            conductors are solved.
         tubes_per_wavelength: at the highest frequency, for scenes of many triangles.
         up: vertical axis.
         boundary: False leaves out of derivatives what moving edges of beams and shadows change:

@@ -20,8 +20,6 @@ from invertwin.scene import (
     Object,
     PerfectConductor,
     Scene,
-    box,
-    plate,
     rigid,
     sphere,
 )
@@ -140,8 +138,6 @@ def test_two_bodies_light_each_other():
     [
         (BALL, 5.0, {"edges": 0}),
         (BALL, 25.0, {}),
-        (Scene({"box": Object(box((0.2, 0.2, 0.2)), METAL)}), 5.0, {}),
-        (Scene({"sheet": Object(plate(0.2, 0.2, divisions=6), METAL)}), 5.0, {}),
         (Scene({"glass": Object(sphere(RADIUS, 3), Dielectric(4.0))}), 5.0, {}),
         (
             Scene(
@@ -154,7 +150,7 @@ def test_two_bodies_light_each_other():
             {},
         ),
     ],
-    ids=["optics alone", "large", "few facets", "open", "dielectric", "overlapping"],
+    ids=["optics alone", "large", "dielectric", "overlapping"],
 )
 @pytest.mark.filterwarnings("ignore::invertwin.errors.PhysicsWarning")
 def test_other_targets_are_left_to_rays(scene, size, options):
@@ -162,7 +158,7 @@ def test_other_targets_are_left_to_rays(scene, size, options):
     assert "rest" not in found
 
 
-def test_a_thin_body_is_left_to_rays():
+def test_a_thin_body_has_no_cells():
     """Its cells would have to be as small as it is thick."""
     flat = sphere(RADIUS, 4)
     disc = Mesh(flat.vertices * float64([1.0, 1.0, 0.02]), flat.faces)

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
+from invertwin.channel.field.meshed import SolvedMeshes
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
 from invertwin.channel.field.solved import SolvedBodies
@@ -91,9 +92,9 @@ class _Body:
         return bool((first.conducting & smooth).all())
 
     @property
-    def solvable(self) -> bool:
-        """Whether all is closed bodies of metal, which have too many facets for beams."""
-        return len(self.facets.normal) > FEW and self.plain and bool(self.facets.solid.all())
+    def closed(self) -> bool:
+        """Whether all is closed bodies, which have too many facets for beams."""
+        return len(self.facets.normal) > FEW and bool(self.facets.solid.all())
 
     def clear(self, points: Tensor, directions: Tensor) -> Tensor:
         """Whether nothing lies between points and the far end of directions."""
@@ -115,7 +116,7 @@ def trace_signature(
     """Scattering amplitudes S of every part of the field, about the world's origin; σ = 4π|S|².
 
     Rows are the receiving, columns the transmitting polarisation, V and H of ``polarisations``. The
-    parts are ``order 1``, ``order 2`` and so on, ``edges 1``, ``edges 2``, and of small closed
+    parts are ``order 1``, ``order 2`` and so on, ``edges 1``, ``edges 2``, and of small
     conductors ``rest``, which is what these leave out of the solved field.
 
     Args:
@@ -131,7 +132,8 @@ def trace_signature(
         boundary: False leaves out of derivatives what moving edges of beams change.
 
     Raises:
-        InputError: a cloud, a rough surface, derivatives of a scene of many triangles.
+        InputError: a cloud, a rough surface, derivatives of a scene of many triangles, or of a
+            small one of which vertices lie at one place.
     """
     with tracing():
         body = _body(scene, frequencies, up)
@@ -142,18 +144,16 @@ def trace_signature(
                 "ray tubes jump at edges; detach the scene, or fit with power paths"
             )
         spacing = None if count <= FEW else body.wavelength / tubes_per_wavelength
-        solves = edges > 0 and body.solvable
-        _warn(scene, body, tubes_per_wavelength, spacing, solves)
         ways = [(transmitters, transmitters if receivers is None else receivers)]
         if receivers is not None:
             ways.append((receivers, transmitters))
         found = [_View(body, *way).parts(depth, edges, spacing, boundary) for way in ways]
         # The mean of both ways between two antennas, or between polarisations of one.
         parts = {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
-        if solves:
-            rest = _rest(body, ways, torch.stack([*parts.values()]).sum(0))
-            parts |= {} if rest is None else {"rest": rest}
-        return parts
+        solved = edges > 0 and body.plain
+        rest = _rest(body, ways, torch.stack([*parts.values()]).sum(0)) if solved else None
+        _warn(scene, body, tubes_per_wavelength, spacing, rest is not None)
+        return parts if rest is None else parts | {"rest": rest}
 
 
 @dataclass(frozen=True)
@@ -295,12 +295,15 @@ class _View:
 
 
 def _rest(body: _Body, ways: Sequence[tuple[Tensor, Tensor]], known: Tensor) -> Tensor | None:
-    """What bounces and edges leave out of the fields of small bodies; of larger ones zero."""
-    bodies = SolvedBodies(body.facets.corners.detach(), body.up)
+    """What bounces and edges leave out of the fields of small targets; of larger ones zero."""
+    meshes = SolvedMeshes(body.vertices, body.topology.faces, body.facets.solid, body.up)
+    cells = SolvedBodies(body.facets.corners.detach(), body.up) if body.closed else None
     rest: dict[int, Tensor] = {}
     downwards = sorted(range(len(known)), key=lambda f: -body.wave_numbers[f])
     for f in told(downwards, "frequencies"):
-        found = bodies.scattered(body.wave_numbers[f], ways)
+        k = body.wave_numbers[f]
+        solver = cells if cells is not None and cells.serves(k) else meshes
+        found = solver.scattered(k, ways)
         if found is not None:
             rest[f] = (found[0] + found[-1].mT) / 2 - known[f]
     if not rest:
@@ -358,7 +361,7 @@ def _skins(scene: Scene, topology: Topology, frequency: float) -> Skins:
     return Skins(*map(torch.cat, columns))
 
 
-def _warn(scene: Scene, body: _Body, density: float, spacing: float | None, solves: bool) -> None:
+def _warn(scene: Scene, body: _Body, density: float, spacing: float | None, solved: bool) -> None:
     """Say where the physics ends."""
     found: list[str] = []
     if spacing is not None and density < 1:
@@ -378,7 +381,7 @@ def _warn(scene: Scene, body: _Body, density: float, spacing: float | None, solv
         own = faces == number
         points = body.facets.corners.detach()[own].reshape(-1, 3)
         size = float((points.amax(0) - points.amin(0)).norm())
-        if size < body.wavelength and not solves:
+        if size < body.wavelength and not solved:
             found.append(
                 f"{name} is {size / body.wavelength:.2g} wavelengths large: physical optics is for "
                 "objects of several"

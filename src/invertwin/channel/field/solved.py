@@ -80,13 +80,7 @@ class SolvedBodies:
                 sent = polarisations(transmitters[some], self.up)
                 current = equation.currents(-transmitters[some], sent)
                 if not parts and not equation.keeps_power(current, -transmitters[some], sent):
-                    warnings.warn(
-                        f"at {wave_number * SPEED_OF_LIGHT / (2 * math.pi) / 1e9:.4g} GHz solved "
-                        "currents do not keep the power, so bounces and edges alone are counted; "
-                        "look for thin or touching parts of the mesh",
-                        PhysicsWarning,
-                        stacklevel=5,
-                    )
+                    warn_of_power(wave_number)
                     return None
                 seen = polarisations(receivers[some], self.up).to(torch.complex128)
                 field = equation.sent(current, receivers[some])
@@ -94,12 +88,22 @@ class SolvedBodies:
             found.append(torch.cat(parts))
         return found
 
+    def serves(self, wave_number: float) -> bool:
+        """Whether cells hold the bodies, and are not too many.
+
+        Args:
+            wave_number: k [1/m].
+        """
+        return self._at(wave_number) is not None
+
     def _at(self, wave_number: float) -> Cells | None:
         """Cells for a wave; those of the last one where they are about as fine as needed."""
         needed = min(2 * math.pi / wave_number / _PER_WAVELENGTH, math.sqrt(self.area / _LEAST))
         side, cells = self._cells
-        if not side <= needed <= side * _ALIKE:
-            cells = self._cut(needed)
+        if side <= needed <= side * _ALIKE:
+            return cells
+        cells = self._cut(needed)
+        if cells is not None:
             self._cells = (needed, cells)
         return cells
 
@@ -223,23 +227,56 @@ class _Equation:
 
     def keeps_power(self, current: Tensor, direction: Tensor, field: Tensor) -> bool:
         """Whether the first wave's currents send out as much power as they take from the wave."""
-        current = current[:, :1]
-        phase = _turned(-self.k * self.point @ direction[0]) * self._phase(-direction[:1])
-        taken = torch.einsum("c,ctx,tx->t", self.area * phase.conj(), current[:, 0], field[0] + 0j)
-        extent = float(self.point.norm(dim=1).max())
-        level, share = np.polynomial.legendre.leggauss(math.ceil(self.k * extent) + 12)
-        turns = 2 * math.pi * torch.arange(2 * len(level), dtype=torch.float64) / (2 * len(level))
-        given = torch.zeros(2, dtype=torch.float64)
-        for z, weight in zip(level, share * math.pi / len(level), strict=True):
-            flat = math.sqrt(1 - z**2)
-            ways = torch.stack(
-                [flat * turns.cos(), flat * turns.sin(), torch.full_like(turns, z)], 1
-            )
-            wave = _turned(self.k * (ways @ self.point.T)) * self.area
-            sent = self.k / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, current[:, 0])
-            along = torch.einsum("stx,sx->st", sent, ways + 0j)
-            given += weight * (sent.abs().square().sum((0, 2)) - along.abs().square().sum(0))
-        return bool(((given / taken.real - 1).abs() < _TRUSTED).all())
+        flowing = current[:, 0] * self.area[:, None, None]
+        return keeps_power(self.k, self.point + self.origin, flowing, direction[0], field[0])
+
+
+def keeps_power(
+    wave_number: float,
+    point: Float64[Tensor, "point 3"],
+    flowing: Complex128[Tensor, "point 2 3"],
+    direction: Float64[Tensor, "3"],
+    field: Float64[Tensor, "2 3"],
+) -> bool:
+    """Whether currents send out as much power as they take from a wave.
+
+    Args:
+        wave_number: k [1/m].
+        point: where they flow [m].
+        flowing: η J dA there, for both polarisations.
+        direction: d of the wave.
+        field: E at the world's origin.
+    """
+    phase = _turned(-wave_number * point @ direction)
+    taken = torch.einsum("c,ctx,tx->t", phase.conj(), flowing, field + 0j)
+    place = point - point.mean(0)
+    extent = float(place.norm(dim=1).max())
+    level, share = np.polynomial.legendre.leggauss(math.ceil(wave_number * extent) + 12)
+    turns = 2 * math.pi * torch.arange(2 * len(level), dtype=torch.float64) / (2 * len(level))
+    given = torch.zeros(2, dtype=torch.float64)
+    for z, weight in zip(level, share * math.pi / len(level), strict=True):
+        flat = math.sqrt(1 - z**2)
+        ways = torch.stack([flat * turns.cos(), flat * turns.sin(), torch.full_like(turns, z)], 1)
+        wave = _turned(wave_number * (ways @ place.T))
+        sent = wave_number / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, flowing)
+        along = torch.einsum("stx,sx->st", sent, ways + 0j)
+        given += weight * (sent.abs().square().sum((0, 2)) - along.abs().square().sum(0))
+    return bool(((given / taken.real - 1).abs() < _TRUSTED).all())
+
+
+def warn_of_power(wave_number: float) -> None:
+    """Say that solved currents are not used.
+
+    Args:
+        wave_number: k [1/m].
+    """
+    warnings.warn(
+        f"at {wave_number * SPEED_OF_LIGHT / (2 * math.pi) / 1e9:.4g} GHz solved currents do not "
+        "keep the power, so bounces and edges alone are counted; look for thin or touching parts "
+        "of the mesh",
+        PhysicsWarning,
+        stacklevel=6,
+    )
 
 
 def _least_residual(
