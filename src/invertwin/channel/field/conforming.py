@@ -170,8 +170,8 @@ def _pattern(parts: tuple[int, ...], shape: tuple[float, float, float]) -> tuple
     back = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] < 0
     triangles[back] = triangles[back][:, ::-1]
     system = np.concatenate([corner.T, np.ones((1, 3))])
-    shares = np.linalg.solve(system, np.concatenate([inner.T, np.ones((1, len(inner)))])).T
-    return shares, triangles
+    shares = np.linalg.solve(system, np.concatenate([inner.T, np.ones((1, len(inner)))]))
+    return shares.T.astype(np.float64), triangles
 
 
 def _lattice(corner: Array, outwards: Array) -> Array:
