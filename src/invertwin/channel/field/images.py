@@ -156,6 +156,7 @@ def chains_between(
     source: Float64[Tensor, "3"],
     targets: Float64[Tensor, "target 3"],
     number: int,
+    rests: Int64[Tensor, " target"] | None = None,
 ) -> list[Chains]:
     """The paths that follow given sequences from one source to all targets.
 
@@ -164,6 +165,7 @@ def chains_between(
         steps: Sequences, see ``sequences``.
         source, targets: World positions [m].
         number: Of the source.
+        rests: Planes of the scene that targets lie in, −1 where in none; None = none does.
     """
     found: list[Chains] = []
     for some in steps.split(_LANES):
@@ -174,7 +176,8 @@ def chains_between(
             target = target + begin
             chosen = some[sequence]
             start = source.expand(len(chosen), 3)
-            good, faces = clear_ways(walls, chosen, start, targets[target])
+            lies = None if rests is None else rests[target]
+            good, faces = clear_ways(walls, chosen, start, targets[target], lies)
             found.append(
                 Chains(
                     torch.full((int(good.sum()),), number),
@@ -292,12 +295,14 @@ class _Segments:
     Attributes:
         start, end: [m].
         plane_before, plane: Of the surfaces at start and end.
+        rests: Planes that the ends of last pieces lie in, else −1.
     """
 
     start: Tensor
     end: Tensor
     plane_before: Tensor
     plane: Tensor
+    rests: Tensor
 
 
 def reaching(
@@ -339,6 +344,7 @@ def clear_ways(
     steps: Int64[Tensor, "row step"],
     source: Float64[Tensor, "row 3"],
     targets: Float64[Tensor, "row 3"],
+    rests: Int64[Tensor, " row"] | None = None,
 ) -> tuple[Bool[Tensor, " row"], Int64[Tensor, "row step"]]:
     """Which ways by given planes are free, and the triangles that they meet.
 
@@ -346,6 +352,7 @@ def clear_ways(
         walls: The scene.
         steps: Sequences, see ``sequences``.
         source, targets: World positions [m].
+        rests: Planes of the scene that targets lie in, −1 where in none; None = none does.
     """
     count, length = steps.shape
     if not count:
@@ -357,9 +364,10 @@ def clear_ways(
     nodes = torch.stack([place, *corners_of(target, seen, point, normal), target], 1)
     none = torch.full((count, 1), -1)
     before, after = torch.cat([none, plane], 1), torch.cat([plane, none], 1)
-    pieces = _Segments(
-        nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3), before.ravel(), after.ravel()
-    )
+    lies = none if rests is None else rests[:, None]
+    last = torch.cat([torch.full_like(plane, -1), lies], 1)
+    starts, ends = nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3)
+    pieces = _Segments(starts, ends, before.ravel(), after.ravel(), last.ravel())
     met, good = _tried(walls, pieces)
     met, good = met.view(count, length + 1), good.view(count, length + 1)
     apart = (target - seen[-1]).norm(dim=1) > _EXACT * walls.size
@@ -380,7 +388,7 @@ def _tried(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
         if number == 3:
             aside = torch.zeros_like(aside)
         start = pieces.start + _in_plane(walls, aside, unit, pieces.plane_before)
-        end = pieces.end + _in_plane(walls, aside, unit, pieces.plane)
+        end = pieces.end + _in_plane(walls, aside, unit, torch.maximum(pieces.plane, pieces.rests))
         face = _cast(walls, start, end, pieces)
         good = torch.where(pieces.plane >= 0, face >= 0, face == -1)
         votes += good
@@ -410,9 +418,9 @@ def _cast(walls: Walls, start: Tensor, end: Tensor, pieces: _Segments) -> Tensor
     unit = normalize(way, dim=1)
     before = planes.normal[pieces.plane_before.clamp_min(0)]
     lift = torch.where(pieces.plane_before >= 0, margin * dot(unit, before).sign(), 0.0)
-    after = planes.normal[pieces.plane.clamp_min(0)]
-    over = 2 * margin / dot(unit, after).abs().clamp_min(1e-3)
-    over = torch.where(pieces.plane >= 0, over, -margin)
+    held = torch.maximum(pieces.plane, pieces.rests)
+    over = 2 * margin / dot(unit, planes.normal[held.clamp_min(0)]).abs().clamp_min(1e-3)
+    over = torch.where(pieces.plane >= 0, over, torch.where(held >= 0, -over, -margin))
     begin = (start + lift[:, None] * before).to(torch.float32)
     origin = _vector(mi.Point3f, begin)
     direction = _vector(mi.Vector3f, unit.to(torch.float32))
@@ -458,6 +466,7 @@ def _decided(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
 
         own = planes.face_plane
         ends = (own == pieces.plane_before[some, None]) | (own == pieces.plane[some, None])
+        ends |= (own == pieces.rests[some, None]) & (own >= 0)
         between = (share * length > near) & (share * length < length - near)
         crossing = between & (falls != 0) & ~ends & (own >= 0)
         blocked = crossing & (inside(start + share[..., None] * way) >= -wide)
