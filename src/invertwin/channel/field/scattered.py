@@ -31,7 +31,7 @@ from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
 from invertwin.channel.field.waves import dot
 from invertwin.channel.paths import Link
 from invertwin.channel.ray_paths import REFLECTION, RayPaths, joined
-from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.backend import torch_threads, tracing
 from invertwin.channel.rays.contacts import contacts_of
 from invertwin.channel.rays.geometry import Geometry, differentiated, flatten
 from invertwin.channel.rays.scene import RayScene
@@ -44,7 +44,7 @@ from invertwin.scene.checks import ArrayLike, plain
 from invertwin.scene.scene import Scene
 
 _AT_ONCE = 1 << 14  # points
-_SAMPLES = 32  # rays of power paths that cost as much as a point here
+_SAMPLES = 16  # rays of power paths that cost as much as a point here
 _PLASTIC = (0.754_877_666_246_692_8, 0.569_840_290_998_053_3)  # steps of an even plane sequence
 
 #: Takes ways from transmitters and from receivers to the same points, the share of power that
@@ -89,7 +89,7 @@ def trace_scattered(
 ) -> Float64[Tensor, "tx rx amount"]:
     """Sums over paths that are scattered once, and mirrored at least once before or after.
 
-    One point is drawn for every 32 of ``sampling.samples``, shared by all receivers.
+    One point is drawn for every 16 of ``sampling.samples``, shared by all receivers.
 
     Args:
         scene: What mirrors, lets through and hides.
@@ -111,7 +111,7 @@ def trace_scattered(
     """
     still = (0.0, 0.0, 0.0)
     stage = replace(staged(scene, tx, rx, frequency, still, still), velocities=None)
-    with tracing(sampling.backend):
+    with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(rough, SPEED_OF_LIGHT / frequency)
         trace = _Trace(stage, geometry, measure, width, depth, rays, sampling, seed)
         if not trace.lit.any() or not any(map(len, trace.sequences[0] + trace.sequences[1])):
@@ -203,6 +203,8 @@ class _Trace:
                 )  # fmt: skip
             for some in met:
                 found = rims(self.walls, corners, some, (stage.tx, stage.rx)[end], stage.vertices)
+                if not len(found.face):
+                    continue
                 with _DisableFuncTorch():
                     # Rims of a transmitter's regions serve the receivers in turn.
                     place = None if end else found.edge_point % receivers
