@@ -10,7 +10,7 @@ is tried by four rays a little apart, and where they disagree, float64 decides o
 Source: derivations §10.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -156,7 +156,6 @@ def chains_between(
     source: Float64[Tensor, "3"],
     targets: Float64[Tensor, "target 3"],
     number: int,
-    rests: Int64[Tensor, " target"] | None = None,
 ) -> list[Chains]:
     """The paths that follow given sequences from one source to all targets.
 
@@ -165,57 +164,76 @@ def chains_between(
         steps: Sequences, see ``sequences``.
         source, targets: World positions [m].
         number: Of the source.
+    """
+    own = torch.zeros(len(targets), dtype=torch.int64)
+    found = chains_from(walls, steps, source[None], own, targets)
+    return [replace(some, source=torch.full_like(some.source, number)) for some in found]
+
+
+def chains_from(
+    walls: Walls,
+    steps: Int64[Tensor, "sequence step"],
+    sources: Float64[Tensor, "source 3"],
+    number: Int64[Tensor, " target"],
+    targets: Float64[Tensor, "target 3"],
+    rests: Int64[Tensor, " target"] | None = None,
+) -> list[Chains]:
+    """The paths that follow given sequences to each target from its own source.
+
+    Args:
+        walls: The scene.
+        steps: Sequences, see ``sequences``.
+        sources, targets: World positions [m].
+        number: Of the source of each target.
         rests: Planes of the scene that targets lie in, −1 where in none; None = none does.
     """
     found: list[Chains] = []
-    for some in steps.split(_LANES):
-        screen = _Screen(walls, some, source)
+    for some in steps.split(max(1, _LANES // len(sources))):
+        screen = _Screen(walls, some, sources)
         block = max(1, _LANES // len(some))
         for begin in range(0, len(targets), block):
-            target, sequence = screen.passed(targets[begin : begin + block])
+            rows = slice(begin, begin + block)
+            target, sequence = screen.passed(targets[rows], number[rows])
             target = target + begin
-            chosen = some[sequence]
-            start = source.expand(len(chosen), 3)
+            chosen, source = some[sequence], number[target]
             lies = None if rests is None else rests[target]
-            good, faces = clear_ways(walls, chosen, start, targets[target], lies)
-            found.append(
-                Chains(
-                    torch.full((int(good.sum()),), number),
-                    target[good],
-                    faces[good],
-                    (chosen[good] & 1).bool(),
-                )
-            )
+            good, faces = clear_ways(walls, chosen, sources[source], targets[target], lies)
+            through = (chosen[good] & 1).bool()
+            found.append(Chains(source[good], target[good], faces[good], through))
     return found
 
 
 class _Screen:
-    """Tries all sequences from one source by one ray a segment, in kernels of many lanes."""
+    """Tries all sequences from some sources by one ray a segment, in kernels of many lanes."""
 
-    def __init__(self, walls: Walls, steps: Tensor, source: Tensor) -> None:
+    def __init__(self, walls: Walls, steps: Tensor, sources: Tensor) -> None:
         self.walls = walls
         self.length = steps.shape[1]
         self.count = len(steps)
         planes = walls.planes
-        place = (source - walls.origin).expand(self.count, 3)
-        plane = steps >> 1
-        seen = images(place, planes.point[plane], planes.normal[plane], (steps & 1).bool())
+        place = (sources - walls.origin).repeat_interleave(self.count, 0)
+        every = steps.repeat(len(sources), 1)
+        plane = every >> 1
+        seen = images(place, planes.point[plane], planes.normal[plane], (every & 1).bool())
         self.images = to_double(torch.stack(seen, 1))
         self.steps = to_index(steps) if self.length else None
 
-    def passed(self, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """Targets and sequences of what may be paths."""
+    def passed(self, targets: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+        """Targets and sequences of what may be paths from the sources of these numbers."""
         lane = dr.arange(mi.UInt32, self.count * len(targets))
         count = opaque(self.count)
         target, row = lane // count, lane % count
         places = to_double(targets - self.walls.origin)
         end = dr.gather(mi.Vector3d, places, target)
-        ok, corners, planes, normals = self._corners(row, end)
-        good = to_torch(self._clear(row, ok, [*corners, end], planes, normals))
+        first = (dr.gather(mi.UInt32, to_index(number), target) * count + row) * (self.length + 1)
+        ok, corners, planes, normals = self._corners(row, first, end)
+        good = to_torch(self._clear(first, ok, [*corners, end], planes, normals))
         keep = torch.nonzero(good)[:, 0]
         return keep // self.count, keep % self.count
 
-    def _corners(self, row: Any, end: Any) -> tuple[Any, list[Any], list[Any], list[Any]]:
+    def _corners(
+        self, row: Any, first: Any, end: Any
+    ) -> tuple[Any, list[Any], list[Any], list[Any]]:
         """Where the lines to the images cut the planes, inside of their rectangles."""
         walls, table = self.walls, self.walls.device_planes
         near = opaque(_EXACT * walls.size, "Float64")
@@ -227,7 +245,7 @@ class _Screen:
             plane, through = code >> 1, (code & 1) == 1
             point = dr.gather(mi.Vector3d, table["point"], plane)
             normal = dr.gather(mi.Vector3d, table["normal"], plane)
-            image = dr.gather(mi.Vector3d, self.images, row * (self.length + 1) + step + 1)
+            image = dr.gather(mi.Vector3d, self.images, first + step + 1)
             way = image - place
             falls = dr.dot(way, normal)
             ok &= falls != 0
@@ -248,7 +266,7 @@ class _Screen:
         return ok, corners, planes, normals
 
     def _clear(
-        self, row: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
+        self, first: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
     ) -> Any:
         """Whether one ray a segment meets nothing, or what it should; seams let rays through.
 
@@ -256,7 +274,7 @@ class _Screen:
         """
         walls = self.walls
         margin, scene = opaque(walls.margin, "Float64"), walls.scene
-        start = dr.gather(mi.Vector3d, self.images, row * (self.length + 1))
+        start = dr.gather(mi.Vector3d, self.images, first)
         for step, end in enumerate(ends):
             way = end - start
             length = dr.norm(way)

@@ -24,7 +24,7 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel.field.images import Chains, Walls, chains_between
+from invertwin.channel.field.images import Chains, Walls, chains_from
 from invertwin.channel.field.sequences import every_sequence, sequences_from_edges
 from invertwin.channel.field.shadow_edges import OwnSurfaces, rim_points, rims
 from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
@@ -245,26 +245,22 @@ class _Trace:
         self, end: int, points: Tensor, place: Int64[Tensor, " row"] | None, face: Tensor
     ) -> list[Chains]:
         """From all antennas of one end to points, or to each point from that of its number."""
-        plane = self.walls.planes.face_plane
+        plane, sources = self.walls.planes.face_plane, self.ends[end]
+        every = torch.ones(len(points), dtype=torch.int64)
+        numbers = [place] if place is not None else [every * k for k in range(len(sources))]
         found: list[Chains] = []
-        for number, source in enumerate(self.ends[end]):
-            rows = torch.arange(len(points))
-            if place is not None:
-                rows = torch.nonzero(place == number)[:, 0]
-            for steps in (torch.zeros(1, 0, dtype=torch.int64), *self.sequences[end]):
-                for some in chains_between(
-                    self.walls, steps, source, points[rows], number, plane[face[rows]]
+        for steps in (torch.zeros(1, 0, dtype=torch.int64), *self.sequences[end]):
+            for own in numbers:
+                used, number = own.unique(return_inverse=True)
+                for some in chains_from(
+                    self.walls, steps, sources[used], number, points, plane[face]
                 ):
-                    target = rows[some.target]
                     # A point has no image in its own plane.
-                    kept = torch.ones(len(target), dtype=torch.bool)
+                    kept = torch.ones(len(some.target), dtype=torch.bool)
                     if steps.shape[1]:
-                        kept = plane[some.faces[:, -1]] != plane[face[target]]
-                    found.append(
-                        Chains(
-                            some.source[kept], target[kept], some.faces[kept], some.through[kept]
-                        )
-                    )
+                        kept = plane[some.faces[:, -1]] != plane[face[some.target]]
+                    source, target, faces, through = (c[kept] for c in vars(some).values())
+                    found.append(Chains(used[source], target, faces, through))
         return found
 
     def _pairs(
