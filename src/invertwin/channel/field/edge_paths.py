@@ -171,7 +171,7 @@ class Route:
     Attributes:
         edges: in order.
         offsets: places of its points along the edges, from their starts [row, edge] [m].
-        points: of the path, antennas included.
+        vertices: of the path, antennas included [m].
         hessian: second derivatives of the length by the offsets.
         stationary: whether it is smooth there.
     """

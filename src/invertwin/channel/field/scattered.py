@@ -148,6 +148,7 @@ class _Trace:
         with _DisableFuncTorch():
             rows = plain(geometry.surfaces.diffuse) > 0
             rows |= (plain(geometry.surfaces.lobes) > 0).any(1)
+            rows &= (plain(geometry.surfaces.amplitude) > 0).any(1)
             self.lit: Bool[Tensor, " f"] = rows[geometry.face_surface]
             self.walls = Walls(plain(stage.vertices), stage.topology, torch.cat(self.ends))
             self.sequences = tuple(self._sequences(number, rays) for number in range(2))
