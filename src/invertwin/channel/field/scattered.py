@@ -159,13 +159,14 @@ class _Trace:
         if most < 1 or not bool(self.powers.reflect.any()):
             return ()
         if rays is None:
-            return every_sequence(planes, self.powers, most).steps
+            found = every_sequence(planes, self.powers, most).steps
+            return tuple(steps for steps in found if len(steps))
         starts = self.ends[end][torch.arange(rays) % len(self.ends[end])]
         alike = torch.zeros(rays, dtype=torch.int64)
-        found = sequences_from_edges(
+        drawn = sequences_from_edges(
             self.walls, planes, self.powers, starts, alike, most, self.seed + end
         )
-        return tuple(steps[:, 1:] for steps in found if len(steps))
+        return tuple(steps[:, 1:] for steps in drawn if len(steps))
 
     def interior(self, stage: Stage, geometry: Geometry) -> Float64[Tensor, "tx rx amount"]:
         """At fixed visibility; a derivative computes the paths again, and keeps none."""
