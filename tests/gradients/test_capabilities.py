@@ -19,11 +19,13 @@ from invertwin.capture.track import Track
 from invertwin.channel import (
     Link,
     Paths,
+    RayPaths,
     Sampling,
     deposit_power,
     trace_chains,
     trace_field,
     trace_paths,
+    trace_scattered,
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -46,6 +48,7 @@ from invertwin.scene import (
     Slab,
     Table,
     linear_array,
+    plate,
     rotation_from_vector,
 )
 from invertwin.scene.parameters import (
@@ -56,7 +59,7 @@ from invertwin.scene.parameters import (
     Vertices,
 )
 from invertwin.signatures import rcs
-from scenes import float64, occluder, relative
+from scenes import float64, occluder, relative, thing
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "limitations.md"
 MECHANISMS = {
@@ -69,6 +72,7 @@ MECHANISMS = {
     "signature": "signature",
     "paths between antennas": "antennas",
     "coverage maps": "coverage",
+    "mirrored scattering": "mirrored",
     "chains": "chains",
     "metasurfaces": "panels",
     "images": "images",
@@ -405,6 +409,62 @@ def coverage_case(parameter: str) -> Found:
     )
 
 
+MIRROR = thing(plate(1.0, 1.0), (0.9, 0.0, 1.3), (0.0, 1.4, 0.0), METAL)
+AIR = Dielectric(1.0)
+RECEIVERS = float64([[0.3, 0.35, 0.7], [-0.2, -0.3, 0.6]])
+
+
+def strengths(out: RayPaths, home: RayPaths, turned: Tensor, *_: Tensor) -> Tensor:
+    """What points bring that change the share χ of the power, of ways there and back."""
+    power = [way.coefficient.abs().square().sum((1, 2)) for way in (out, home)]
+    return (power[0] * power[1] * (1 - turned))[:, None]
+
+
+def by_mirrors(scene: Scene, place: Tensor, sampling: Sampling, seed: int) -> Tensor:
+    """Power that the wall scatters once, with a mirror before or after."""
+    scene = Scene({"mirror": MIRROR, **scene.objects})
+    rough = scene.replace("occluder", material=AIR).replace("mirror", material=AIR)
+    tx = place + float64([-0.07, 0.04, 0.19])
+    return trace_scattered(
+        scene,
+        rough,
+        tx,
+        RECEIVERS,
+        1e9,
+        strengths,
+        1,
+        depth=2,
+        rays=None,
+        sampling=sampling,
+        seed=seed,
+    )
+
+
+def mirrored_case(parameter: str) -> Found:
+    wall = COATED if parameter in GEOMETRY else ROUGH
+    scene, radar, move = occluder(wall=wall, occluder=METAL), power_radar(), MOVES[parameter]
+    if parameter == "pose":  # turned, the occluder's shadow hardly changes
+        scene = Scene({**scene.objects, "mirror": MIRROR})
+        move = Move(Pose("mirror"), move.tangent)
+    moves = parameter in GEOMETRY or parameter == "radar position"
+
+    def value(theta: Tensor, samples: int, seed: int, boundary: bool = True) -> Tensor:
+        changed = move(scene, radar, theta)
+        own = Sampling(1, samples, 40_000, boundary=boundary)
+        return by_mirrors(changed[0], changed[1].positions[0], own, seed)
+
+    # Where no shadow moves, few points are as smooth as their derivative.
+    step, samples, seeds = (0.02, 3_200_000, 2) if moves else (1e-4, 100_000, 1)
+    parts = []
+    for seed in range(seeds):
+        ends = [value(torch.tensor(sign * step).double(), samples, seed) for sign in (1, -1)]
+        parts.append((ends[0] - ends[1]) / (2 * step))
+    own = 800_000 if moves else samples
+    full = pushed(lambda theta: value(theta, own, 0))
+    interior = pushed(lambda theta: value(theta, own, 0, False))
+    return Found(full, interior, torch.stack(parts).mean(0), 0.0)
+
+
 def chain_case(parameter: str) -> Found:
     """Chains between two plates, one of which hides the other; no random numbers."""
     scene, radar, moves = occluder(wall=METAL, occluder=METAL), field_radar(0.3), MOVES[parameter]
@@ -507,6 +567,8 @@ def case(parameter: str, mechanism: str) -> Found:
         return chain_case(parameter)
     if mechanism == "coverage":
         return coverage_case(parameter)
+    if mechanism == "mirrored":
+        return mirrored_case(parameter)
     if mechanism == "panels":
         return panel_case(parameter)
     if mechanism == "images":
@@ -569,6 +631,9 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
         return
     if mechanism == "coverage":
         covered(scene, radar.positions[0], CellSampling(1))
+        return
+    if mechanism == "mirrored":
+        by_mirrors(scene, radar.positions[0], Sampling(1, 1_000, 100), 0)
         return
     if mechanism == "panels":
         by_panel(scene, radar.positions)

@@ -39,6 +39,15 @@ CRATE = box(0.5)
 ONE_BOUNCE = Sampling(depth=1, samples=400_000)
 
 
+def lit(tx: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+    """Power and length of the paths by way of the wall's points."""
+    axis = (torch.arange(600, dtype=torch.float64) + 0.5) / 150 - 2
+    points = torch.cartesian_prod(axis, axis, torch.zeros(1, dtype=torch.float64))
+    ways = [(points - end).norm(dim=1) for end in (tx, place)]
+    part = (WAVELENGTH / (4 * math.pi)) ** 2 / math.pi / 150**2
+    return part * float(tx[2] * place[2]) / (ways[0] * ways[1]) ** 3, ways[0] + ways[1]
+
+
 def summed(
     place: Tensor, gain: Callable[[Tensor, Tensor], Tensor] | None = None
 ) -> tuple[float, float]:
@@ -156,3 +165,155 @@ def test_refusals_name_what_is_wrong():
     turned = replace(MAST, terminals=Terminals(rotations=turns[0].clone().requires_grad_()))
     with pytest.raises(InputError, match="detach them"):
         reception.at(WALL, turned, SPOTS, 0)
+
+
+MIRROR = Object(
+    plate(40.0, 40.0),
+    PerfectConductor(),
+    rigid(rotation_from_vector(float64([0.0, math.pi / 2, 0.0])), float64([3.0, 0.0, 0.0])),
+)
+BESIDE_MIRROR = Scene({"wall": WALL.objects["wall"], "mirror": MIRROR})
+
+
+def imaged(place: Tensor) -> Tensor:
+    """In the mirror."""
+    return float64([6.0, 0.0, 0.0]) - place * float64([1.0, -1.0, -1.0])
+
+
+def mixed(
+    scene: Scene, tx: Tensor, places: Tensor, depth: int, seed: int = 0, **how: int
+) -> Tensor:
+    """Power of paths that scatter once and are mirrored too, and its moments over excess delay."""
+    sampling = replace(ONE_BOUNCE, **how)
+    found = [
+        Reception(FREQUENCY, depth=d, rays=None, rough=sampling).scattered(
+            scene, Transmitters(tx), places, seed
+        )[0]
+        for d in (depth, 1)
+    ]
+    return found[0] - found[1]
+
+
+@pytest.mark.parametrize("depth", [2, 3])
+def test_a_mirror_shows_the_wall_and_the_antennas_at_their_images(depth):
+    tx, place = MAST.positions[0], SPOTS[0]
+    ways = [(imaged(tx), place), (tx, imaged(place)), (imaged(tx), imaged(place))]
+    power, length = (torch.cat(c) for c in zip(*(lit(*w) for w in ways[:depth]), strict=True))
+    excess = (length - (tx - place).norm()) / SPEED_OF_LIGHT
+    expected = torch.stack([(power * excess**n).sum() for n in range(3)])
+    found = mixed(BESIDE_MIRROR, tx, place[None], depth)[0]
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+
+
+def test_energy_that_meets_a_rough_plate_leaves_it_again():
+    """Over all ways: what the plate gets directly and by the mirror crosses a far sphere."""
+    small = Object(plate(0.5, 0.5), CHALK, rigid(rotation_from_vector(float64([0.3, 0.2, 0.0]))))
+    scene = Scene({"wall": small, "mirror": MIRROR})
+    tx = MAST.positions[0]
+    normal = torch.linalg.cross(*(small.vertices[[1, 2]] - small.vertices[0]).unbind(0))
+    normal = normal / normal.norm()
+    axis = (torch.arange(40, dtype=torch.float64) + 0.5) / 40
+    corner, first, second = small.vertices[0], *(small.vertices[[1, 2]] - small.vertices[0])
+    points = corner + axis[:, None, None] * first + axis[:, None] * second
+    arrived = 0.0
+    for source in (tx, imaged(tx)):
+        way = source - points
+        arrived += (
+            float(((way @ normal).abs() / way.norm(dim=-1) ** 3).mean()) * 0.25 / (4 * math.pi)
+        )
+    radius, count = 1000.0, 4000
+    z = 1 - (2 * torch.arange(count, dtype=torch.float64) + 1) / count
+    turn = math.pi * (1 + math.sqrt(5)) * torch.arange(count, dtype=torch.float64)
+    ring = (1 - z**2).sqrt()
+    sphere = radius * torch.stack([ring * turn.cos(), ring * turn.sin(), z], 1)
+    reception = Reception(
+        FREQUENCY, depth=3, rays=None, rough=replace(ONE_BOUNCE, samples=1_600_000)
+    )
+    gain = reception.scattered(scene, Transmitters(tx), sphere, 0)[0, :, 0]
+    left = float(gain.mean()) * 4 * math.pi / WAVELENGTH**2 * 4 * math.pi * radius**2
+    assert left == pytest.approx(arrived, rel=0.01)
+
+
+def test_both_ways_are_alike():
+    scene = shaded(float64(0.1))
+    scene = Scene({**scene.objects, "mirror": MIRROR})
+    ends = MAST.positions[0], SPOTS[0]
+    there, back = (
+        mixed(scene, tx, rx[None], 3, samples=1_600_000) for tx, rx in (ends, ends[::-1])
+    )
+    torch.testing.assert_close(there, back, rtol=5e-3, atol=0)
+
+
+def test_what_heights_take_off_the_mirror_is_scattered():
+    """A height makes a lobe, by quadrature; its derivative is that of differences."""
+    height = float64(0.01)
+    place = float64([[0.9, 0.2, 1.8]])
+
+    def scene(height: Tensor) -> Scene:
+        gritty = RoughConductor(scattering=0.0, rms_slope=0.3, rms_height=height)
+        return Scene({**BESIDE_MIRROR.objects, "wall": Object(plate(4.0, 4.0), gritty)})
+
+    def total(height: Tensor, depth: int) -> Tensor:
+        how = Reception(FREQUENCY, depth=depth, rays=None, rough=ONE_BOUNCE)
+        return how.scattered(scene(height), MAST, place, 0).sum((0, 1))[0]
+
+    surface = RoughConductor(scattering=0.0, rms_slope=0.3).surface(FREQUENCY)
+
+    def expected(tx: Tensor, rx: Tensor) -> float:
+        axis = (torch.arange(600, dtype=torch.float64) + 0.5) / 150 - 2
+        points = torch.cartesian_prod(axis, axis, torch.zeros(1, dtype=torch.float64))
+        ways = [(points - end).norm(dim=1) for end in (tx, rx)]
+        cosine = [float(end[2]) / way for end, way in zip((tx, rx), ways, strict=True)]
+        k = 4 * math.pi * height / WAVELENGTH
+        kept = [(1 - torch.exp(-((k * c) ** 2))).sqrt() for c in cosine]
+        between = ((tx - points) * (rx - points)).sum(1) / (ways[0] * ways[1])
+        lobe = (0.5 * (1 + 2 * cosine[0] * cosine[1] - between)) ** surface.exponents[0]
+        law = surface.lobes[0] * lobe * kept[0] * kept[1] * cosine[0] * cosine[1]
+        part = (WAVELENGTH / (4 * math.pi)) ** 2 / 150**2 * law / (ways[0] * ways[1]) ** 2
+        return float(part.sum())
+
+    tx, rx = MAST.positions[0], place[0]
+    assert float(total(height, 1)) == pytest.approx(expected(tx, rx), rel=5e-3)
+    both = expected(imaged(tx), rx) + expected(tx, imaged(rx))
+    assert float(total(height, 2) - total(height, 1)) == pytest.approx(both, rel=5e-3)
+    assert float(total(float64(0.0), 2)) == 0
+    rate = jvp(lambda x: total(x, 2), (height,), (torch.ones_like(height),))[1]
+    ends = [total(height + way, 2) for way in (1e-5, -1e-5)]
+    assert float(rate) == pytest.approx(float(ends[0] - ends[1]) / 2e-5, rel=2e-3)
+
+
+def test_derivative_by_the_size_of_a_mirror():
+    """At fixed visibility it is zero: only the rims of the mirrored beams move."""
+    sampling = replace(ONE_BOUNCE, boundary_samples=40_000)
+    at, tilted = float64(1.0), rotation_from_vector(float64([0.0, math.pi / 2, 0.0]))
+
+    def total(size: Tensor, sampling: Sampling) -> Tensor:
+        glass = plate(2.0, 2.0)
+        glass = replace(glass, vertices=glass.vertices * size)
+        mirror = Object(glass, PerfectConductor(), rigid(tilted, float64([3.0, 0.0, 1.2])))
+        scene = Scene({"wall": WALL.objects["wall"], "mirror": mirror})
+        reception = Reception(FREQUENCY, depth=3, rays=None, rough=sampling)
+        return reception.scattered(scene, MAST, float64([[-1.0, -0.5, 1.5]]), 0)[0, 0, 0]
+
+    def rate(sampling: Sampling) -> float:
+        return float(jvp(lambda x: total(x, sampling), (at,), (torch.ones_like(at),))[1])
+
+    many = replace(sampling, samples=3_200_000)
+    ends = [total(at + way, many) for way in (0.05, -0.05)]
+    truth = float(ends[0] - ends[1]) / 0.1
+    assert rate(sampling) == pytest.approx(truth, rel=0.03)
+    assert abs(rate(replace(sampling, boundary=False))) < 1e-6 * abs(truth)
+
+
+def test_surfaces_that_meet_and_move_are_refused_by_name():
+    at = float64(0.25).requires_grad_()
+    pose = rigid(translation=torch.stack([*float64([0.1, 0.2]), at]))
+    scene = Scene({**BESIDE_MIRROR.objects, "box": Object(CRATE, PerfectConductor(), pose)})
+    sampling = Sampling(depth=1, samples=1000, boundary_samples=1000)
+    reception = Reception(FREQUENCY, depth=2, rays=None, rough=sampling)
+    with pytest.raises(InputError, match="wall and box that meet; leave a gap"):
+        reception.scattered(scene, MAST, SPOTS, 0)
+    reception = replace(reception, rough=replace(sampling, contacts=False))
+    reception.scattered(scene, MAST, SPOTS, 0).sum().backward()
+    assert at.grad is not None
+    assert bool(at.grad.isfinite())

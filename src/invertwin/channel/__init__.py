@@ -7,6 +7,7 @@ from invertwin.channel.field.field import trace_field as trace_field
 from invertwin.channel.field.lit import PanelCells as PanelCells
 from invertwin.channel.field.lit import lit_fractions as lit_fractions
 from invertwin.channel.field.rough_points import densities_of as densities_of
+from invertwin.channel.field.scattered import trace_scattered as trace_scattered
 from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle
 from invertwin.channel.field.speckle import draw_speckle as draw_speckle

@@ -218,7 +218,15 @@ class Reception:
         if self.rough is None:
             return places.new_zeros(len(sensor.positions), len(places), 3)
         return scattered_moments(
-            scene, sensor, self.receivers, places, self.frequency, self.rough, seed
+            scene,
+            sensor,
+            self.receivers,
+            places,
+            self.frequency,
+            self.rough,
+            seed,
+            depth=self.depth,
+            rays=self.rays,
         )
 
     def responses(

@@ -1,9 +1,12 @@
 """What rough surfaces scatter from transmitters to receivers: powers without phases.
 
 Mirrored paths hold what smooth surfaces keep together (``trace_paths``). What they lose by their
-roughness goes everywhere: paths that scatter at each of their bounces, by the lobes of
-``EffectiveRoughness`` but the one about the mirror direction. Paths that are mirrored at one
-surface and scattered at another are left out.
+roughness goes everywhere, by ``Material.incoherent``: the lobes of ``EffectiveRoughness``, of which
+the one about the mirror direction has what heights take off the mirror.
+
+Two kinds of paths add up: those that scatter at each of their bounces (``deposit_power``), and
+those that scatter once, with mirrors before or after (``trace_scattered``). Paths that scatter
+twice and are mirrored as well are left out.
 """
 
 import math
@@ -11,10 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, Sampling, deposit_power
+from invertwin.channel import Grid, Link, RayPaths, Sampling, deposit_power, trace_scattered
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.responses import Terminals
@@ -35,6 +38,9 @@ def scattered_moments(
     frequency: float,
     sampling: Sampling,
     seed: int,
+    *,
+    depth: int = 1,
+    rays: int | None = None,
 ) -> Float64[Tensor, "tx place 3"]:
     """Scattered over sent power, and that times the excess delay [s] and its square [s²].
 
@@ -47,8 +53,11 @@ def scattered_moments(
         receivers: Antenna and axes of every receiver.
         places: Of the receivers [m].
         frequency: [Hz].
-        sampling: How many paths are drawn, over all receivers; most bounces of a path.
+        sampling: How many paths are drawn, over all receivers; most bounces of a path that
+            scatters at each.
         seed: Same seed, same paths.
+        depth: Most surfaces that a path with mirrors meets.
+        rays: Shot to find these mirrors; None tries every sequence.
 
     Raises:
         InputError: Axes of antennas that carry derivatives, or axes of its own for each receiver
@@ -74,7 +83,55 @@ def scattered_moments(
             power = deposit_power(rough, link, grid, sampling=drawn, seed=seed + batch)
             found.append(_moments(power[..., 0, 0].double(), grid, link))
         rows.append(torch.cat(found))
-    return torch.stack(rows)
+    total = torch.stack(rows)
+    if depth < 2:
+        return total
+
+    def measure(out: RayPaths, home: RayPaths, turned: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
+        power = _taken(sensor.terminals, out, receivers, home, turned)
+        straight = (rx[home.tx] - tx[out.tx]).norm(dim=1)
+        excess = out.delay + home.delay - straight / SPEED_OF_LIGHT
+        return torch.stack([power, power * excess, power * excess**2], 1)
+
+    return total + trace_scattered(
+        scene,
+        rough,
+        sensor.positions,
+        places,
+        frequency,
+        measure,
+        3,
+        depth=depth,
+        rays=rays,
+        sampling=sampling,
+        seed=seed,
+    )
+
+
+def _taken(
+    tx: Terminals, out: RayPaths, rx: Terminals, home: RayPaths, turned: Float64[Tensor, " pair"]
+) -> Float64[Tensor, " pair"]:
+    """What antennas take of the power that points scatter, V and H about the world's z axis.
+
+    In Stokes parameters, as ``channel.coupling`` has it for one bounce: ``½(I I' + (1 − 2χ)(q q' +
+    u u') − (1 − 4χ) v v')``, here of the fields that ways bring to the points.
+    """
+    sent = _stokes(out, tx.weights(out.departure, out.tx))
+    taken = _stokes(home, rx.weights(home.departure, home.tx))
+    whole, q, u, v = (0.5 * sent * taken).unbind(1)
+    return whole + (1 - 2 * turned) * (q + u) - (1 - 4 * turned) * v
+
+
+def _stokes(
+    paths: RayPaths, weights: Complex128[Tensor, "path element 2"]
+) -> Float64[Tensor, "path 4"]:
+    """Mean Stokes parameters, over the elements of an antenna, at the far ends of paths."""
+    field = torch.einsum("pij,pej->pei", paths.coefficient, weights)
+    power = torch.view_as_real(field).square().sum(-1)
+    both = field[..., 0] * field[..., 1].conj()
+    first, second = power.unbind(-1)
+    rows = torch.stack([first + second, first - second, 2 * both.real, 2 * both.imag], -1)
+    return rows.mean(1)
 
 
 def _link(sensor: Transmitters, receivers: Terminals, places: Tensor, frequency: float) -> Link:
@@ -120,11 +177,8 @@ class _Scattering(Material):
         return self.of.faces
 
     def surface(self, frequency: float) -> Surface:
-        """That of the material; a surface that is only rough keeps all of it."""
-        surface = self.of.surface(frequency)
-        if self.of.skin(frequency) is None:
-            return surface
-        return replace(surface, lobes=surface.lobes * surface.lobes.new_tensor([0.0, 1.0, 1.0]))
+        """See ``Material.incoherent``."""
+        return self.of.incoherent(frequency)
 
 
 def _scattering(scene: Scene, frequency: float) -> Scene | None:

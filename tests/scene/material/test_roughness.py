@@ -1,16 +1,20 @@
 """Lobes: normalised, reciprocal, never more power than came in; gradients."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import (
     Dielectric,
+    Layer,
     Material,
+    Multilayer,
     PerfectConductor,
     RoughConductor,
     RoughDielectric,
@@ -44,7 +48,11 @@ ROUGH: list[Material] = [
 
 def amplitude_at(surface: Surface, cosine: Tensor) -> Tensor:
     """The tabulated amplitude, linear between nodes and 0 below the horizon."""
-    table = surface.amplitude.detach().numpy()
+    return between_nodes(surface.amplitude, cosine)
+
+
+def between_nodes(values: Tensor, cosine: Tensor) -> Tensor:
+    table = values.detach().numpy()
     nodes = np.linspace(0, 1, len(table))
     value = torch.as_tensor(np.interp(cosine.numpy(), nodes, table))
     return torch.where(cosine > 0, value, 0.0)
@@ -100,6 +108,32 @@ def test_energy_never_exceeds_what_came_in():
             worst = max(worst, float(albedo(material.surface(FREQUENCY), ANGLES).max()))
         worst = max(worst, float(albedo(PerfectConductor(float(width)).surface(1e9), ANGLES).max()))
     assert 0.9 < worst <= 1 + 2e-5
+
+
+@pytest.mark.parametrize("height", [0.0, 0.2e-3, 0.4e-3, 2e-3])
+def test_mirrored_and_incoherent_power_are_all_that_is_reflected(height):
+    """exp(−(2kσ cosθ)²) of the mirror-like part stays one wave, and the rest is scattered."""
+    metal = RoughConductor(scattering=0.5, rms_slope=0.02, rms_height=height)
+    angles = cosines(0.5, 0.8, 1.0)
+    mirrored = metal.coefficients(FREQUENCY, angles, torch.zeros(3, dtype=torch.int64))
+    kept = mirrored.reflection_s.abs().square()
+    surface = metal.incoherent(FREQUENCY)
+    lobe = replace(surface, diffuse=torch.zeros_like(surface.diffuse), spread=surface.spread**0)
+    # A narrow lobe leaves at the angle at which the wave came in.
+    spread = albedo(lobe, angles) * between_nodes(surface.spread, angles) ** 2
+    rest = albedo(replace(surface, lobes=torch.zeros(3, dtype=torch.float64)), angles)
+    torch.testing.assert_close(kept + spread + rest, torch.ones(3).double(), rtol=0, atol=2e-3)
+    k = 2 * math.pi * FREQUENCY / SPEED_OF_LIGHT
+    expected = 0.75 * torch.exp(-((2 * k * height * angles) ** 2))
+    torch.testing.assert_close(kept, expected, rtol=1e-12, atol=0)
+    if not height:
+        assert not surface.lobes[0]
+
+
+def test_stacks_lose_what_they_mirror():
+    stack = Multilayer([Layer(4.0, thickness=1e-3), Layer(2.0, thickness=2e-3)], scattering=0.3)
+    assert float(stack.surface(FREQUENCY).lobes[0]) > 0
+    assert not stack.incoherent(FREQUENCY).lobes[0]
 
 
 @pytest.mark.parametrize("width", [0.5, 5.0, 60.0, 180.0])

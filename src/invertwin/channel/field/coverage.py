@@ -196,7 +196,7 @@ class _Trace:
             )  # fmt: skip
         crossings: list[Crossing] = []
         for some in met:
-            found = rims(self.walls, self.screen, some, stage.tx, stage.vertices)
+            found = rims(self.walls, self.screen.corners, some, stage.tx, stage.vertices)
             here = _fixed(stage, found.place)
             with torch.no_grad():
                 paths = joined(paths_of(here, found.chains))

@@ -10,7 +10,7 @@ is tried by four rays a little apart, and where they disagree, float64 decides o
 Source: derivations §10.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -165,54 +165,75 @@ def chains_between(
         source, targets: World positions [m].
         number: Of the source.
     """
+    own = torch.zeros(len(targets), dtype=torch.int64)
+    found = chains_from(walls, steps, source[None], own, targets)
+    return [replace(some, source=torch.full_like(some.source, number)) for some in found]
+
+
+def chains_from(
+    walls: Walls,
+    steps: Int64[Tensor, "sequence step"],
+    sources: Float64[Tensor, "source 3"],
+    number: Int64[Tensor, " target"],
+    targets: Float64[Tensor, "target 3"],
+    rests: Int64[Tensor, " target"] | None = None,
+) -> list[Chains]:
+    """The paths that follow given sequences to each target from its own source.
+
+    Args:
+        walls: The scene.
+        steps: Sequences, see ``sequences``.
+        sources, targets: World positions [m].
+        number: Of the source of each target.
+        rests: Planes of the scene that targets lie in, −1 where in none; None = none does.
+    """
     found: list[Chains] = []
-    for some in steps.split(_LANES):
-        screen = _Screen(walls, some, source)
+    for some in steps.split(max(1, _LANES // len(sources))):
+        screen = _Screen(walls, some, sources)
         block = max(1, _LANES // len(some))
         for begin in range(0, len(targets), block):
-            target, sequence = screen.passed(targets[begin : begin + block])
+            rows = slice(begin, begin + block)
+            target, sequence = screen.passed(targets[rows], number[rows])
             target = target + begin
-            chosen = some[sequence]
-            start = source.expand(len(chosen), 3)
-            good, faces = clear_ways(walls, chosen, start, targets[target])
-            found.append(
-                Chains(
-                    torch.full((int(good.sum()),), number),
-                    target[good],
-                    faces[good],
-                    (chosen[good] & 1).bool(),
-                )
-            )
+            chosen, source = some[sequence], number[target]
+            lies = None if rests is None else rests[target]
+            good, faces = clear_ways(walls, chosen, sources[source], targets[target], lies)
+            through = (chosen[good] & 1).bool()
+            found.append(Chains(source[good], target[good], faces[good], through))
     return found
 
 
 class _Screen:
-    """Tries all sequences from one source by one ray a segment, in kernels of many lanes."""
+    """Tries all sequences from some sources by one ray a segment, in kernels of many lanes."""
 
-    def __init__(self, walls: Walls, steps: Tensor, source: Tensor) -> None:
+    def __init__(self, walls: Walls, steps: Tensor, sources: Tensor) -> None:
         self.walls = walls
         self.length = steps.shape[1]
         self.count = len(steps)
         planes = walls.planes
-        place = (source - walls.origin).expand(self.count, 3)
-        plane = steps >> 1
-        seen = images(place, planes.point[plane], planes.normal[plane], (steps & 1).bool())
+        place = (sources - walls.origin).repeat_interleave(self.count, 0)
+        every = steps.repeat(len(sources), 1)
+        plane = every >> 1
+        seen = images(place, planes.point[plane], planes.normal[plane], (every & 1).bool())
         self.images = to_double(torch.stack(seen, 1))
         self.steps = to_index(steps) if self.length else None
 
-    def passed(self, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """Targets and sequences of what may be paths."""
+    def passed(self, targets: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+        """Targets and sequences of what may be paths from the sources of these numbers."""
         lane = dr.arange(mi.UInt32, self.count * len(targets))
         count = opaque(self.count)
         target, row = lane // count, lane % count
         places = to_double(targets - self.walls.origin)
         end = dr.gather(mi.Vector3d, places, target)
-        ok, corners, planes, normals = self._corners(row, end)
-        good = to_torch(self._clear(row, ok, [*corners, end], planes, normals))
+        first = (dr.gather(mi.UInt32, to_index(number), target) * count + row) * (self.length + 1)
+        ok, corners, planes, normals = self._corners(row, first, end)
+        good = to_torch(self._clear(first, ok, [*corners, end], planes, normals))
         keep = torch.nonzero(good)[:, 0]
         return keep // self.count, keep % self.count
 
-    def _corners(self, row: Any, end: Any) -> tuple[Any, list[Any], list[Any], list[Any]]:
+    def _corners(
+        self, row: Any, first: Any, end: Any
+    ) -> tuple[Any, list[Any], list[Any], list[Any]]:
         """Where the lines to the images cut the planes, inside of their rectangles."""
         walls, table = self.walls, self.walls.device_planes
         near = opaque(_EXACT * walls.size, "Float64")
@@ -224,7 +245,7 @@ class _Screen:
             plane, through = code >> 1, (code & 1) == 1
             point = dr.gather(mi.Vector3d, table["point"], plane)
             normal = dr.gather(mi.Vector3d, table["normal"], plane)
-            image = dr.gather(mi.Vector3d, self.images, row * (self.length + 1) + step + 1)
+            image = dr.gather(mi.Vector3d, self.images, first + step + 1)
             way = image - place
             falls = dr.dot(way, normal)
             ok &= falls != 0
@@ -245,7 +266,7 @@ class _Screen:
         return ok, corners, planes, normals
 
     def _clear(
-        self, row: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
+        self, first: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
     ) -> Any:
         """Whether one ray a segment meets nothing, or what it should; seams let rays through.
 
@@ -253,7 +274,7 @@ class _Screen:
         """
         walls = self.walls
         margin, scene = opaque(walls.margin, "Float64"), walls.scene
-        start = dr.gather(mi.Vector3d, self.images, row * (self.length + 1))
+        start = dr.gather(mi.Vector3d, self.images, first)
         for step, end in enumerate(ends):
             way = end - start
             length = dr.norm(way)
@@ -292,12 +313,14 @@ class _Segments:
     Attributes:
         start, end: [m].
         plane_before, plane: Of the surfaces at start and end.
+        rests: Planes that the ends of last pieces lie in, else −1.
     """
 
     start: Tensor
     end: Tensor
     plane_before: Tensor
     plane: Tensor
+    rests: Tensor
 
 
 def reaching(
@@ -339,6 +362,7 @@ def clear_ways(
     steps: Int64[Tensor, "row step"],
     source: Float64[Tensor, "row 3"],
     targets: Float64[Tensor, "row 3"],
+    rests: Int64[Tensor, " row"] | None = None,
 ) -> tuple[Bool[Tensor, " row"], Int64[Tensor, "row step"]]:
     """Which ways by given planes are free, and the triangles that they meet.
 
@@ -346,6 +370,7 @@ def clear_ways(
         walls: The scene.
         steps: Sequences, see ``sequences``.
         source, targets: World positions [m].
+        rests: Planes of the scene that targets lie in, −1 where in none; None = none does.
     """
     count, length = steps.shape
     if not count:
@@ -357,9 +382,10 @@ def clear_ways(
     nodes = torch.stack([place, *corners_of(target, seen, point, normal), target], 1)
     none = torch.full((count, 1), -1)
     before, after = torch.cat([none, plane], 1), torch.cat([plane, none], 1)
-    pieces = _Segments(
-        nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3), before.ravel(), after.ravel()
-    )
+    lies = none if rests is None else rests[:, None]
+    last = torch.cat([torch.full_like(plane, -1), lies], 1)
+    starts, ends = nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3)
+    pieces = _Segments(starts, ends, before.ravel(), after.ravel(), last.ravel())
     met, good = _tried(walls, pieces)
     met, good = met.view(count, length + 1), good.view(count, length + 1)
     apart = (target - seen[-1]).norm(dim=1) > _EXACT * walls.size
@@ -380,7 +406,7 @@ def _tried(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
         if number == 3:
             aside = torch.zeros_like(aside)
         start = pieces.start + _in_plane(walls, aside, unit, pieces.plane_before)
-        end = pieces.end + _in_plane(walls, aside, unit, pieces.plane)
+        end = pieces.end + _in_plane(walls, aside, unit, torch.maximum(pieces.plane, pieces.rests))
         face = _cast(walls, start, end, pieces)
         good = torch.where(pieces.plane >= 0, face >= 0, face == -1)
         votes += good
@@ -410,9 +436,9 @@ def _cast(walls: Walls, start: Tensor, end: Tensor, pieces: _Segments) -> Tensor
     unit = normalize(way, dim=1)
     before = planes.normal[pieces.plane_before.clamp_min(0)]
     lift = torch.where(pieces.plane_before >= 0, margin * dot(unit, before).sign(), 0.0)
-    after = planes.normal[pieces.plane.clamp_min(0)]
-    over = 2 * margin / dot(unit, after).abs().clamp_min(1e-3)
-    over = torch.where(pieces.plane >= 0, over, -margin)
+    held = torch.maximum(pieces.plane, pieces.rests)
+    over = 2 * margin / dot(unit, planes.normal[held.clamp_min(0)]).abs().clamp_min(1e-3)
+    over = torch.where(pieces.plane >= 0, over, torch.where(held >= 0, -over, -margin))
     begin = (start + lift[:, None] * before).to(torch.float32)
     origin = _vector(mi.Point3f, begin)
     direction = _vector(mi.Vector3f, unit.to(torch.float32))
@@ -458,6 +484,7 @@ def _decided(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
 
         own = planes.face_plane
         ends = (own == pieces.plane_before[some, None]) | (own == pieces.plane[some, None])
+        ends |= (own == pieces.rests[some, None]) & (own >= 0)
         between = (share * length > near) & (share * length < length - near)
         crossing = between & (falls != 0) & ~ends & (own >= 0)
         blocked = crossing & (inside(start + share[..., None] * way) >= -wide)

@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from invertwin.channel.field.images import Chains, Walls, chains_between, images
 from invertwin.channel.field.sequences import Powers
-from invertwin.channel.field.waves import cross, dot, mirrored
+from invertwin.channel.field.waves import cross, dot, mirrored, points_at
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, Occluders
@@ -52,6 +52,17 @@ class Screen(Occluders):
 
 
 @dataclass(frozen=True)
+class OwnSurfaces:
+    """Triangles of the scene itself that receive power.
+
+    Attributes:
+        lit: Which of them do.
+    """
+
+    lit: Bool[Tensor, " f"]
+
+
+@dataclass(frozen=True)
 class Rims:
     """Points on rims of lit regions, of paths with one number of steps.
 
@@ -60,12 +71,14 @@ class Rims:
         place: Rim points on the surface, detached [m].
         face: Triangle of the surface.
         rate: Area newly lit, of the sample's share of the rim [m²]; zero in value, attached.
+        edge_point: Number of the edge point that draws each.
     """
 
     chains: Chains
     place: Float64[Tensor, "row 3"]
     face: Int64[Tensor, " row"]
     rate: Float64[Tensor, " row"]
+    edge_point: Int64[Tensor, " row"]
 
 
 @dataclass(frozen=True)
@@ -139,7 +152,7 @@ class RimPoints:
 
 def rim_points(
     walls: Walls,
-    screen: Screen,
+    screen: Screen | OwnSurfaces,
     tx: Float64[Tensor, "tx 3"],
     sequences: tuple[Tensor, ...],
     powers: Powers,
@@ -265,13 +278,13 @@ def _passing(
 
 
 def _followed(
-    walls: Walls, screen: Screen, legs: _Legs, powers: Powers, depth: int
+    walls: Walls, screen: Screen | OwnSurfaces, legs: _Legs, powers: Powers, depth: int
 ) -> Iterator[tuple[_Legs, Tensor]]:
     """Where rays meet the surface, and by which steps: legs with the triangle of the surface."""
     step = int(legs.before[0]) if len(legs.row) else depth
     while len(legs.row):
         face, distance = _next(walls, legs.origin, legs.direction)
-        for rows, triangle in _crossings(screen, legs, distance):
+        for rows, triangle in _received(screen, legs, face, distance):
             some = legs.chosen(rows)
             steps = {"faces": some.faces[:, :step], "through": some.through[:, :step]}
             yield replace(some, **steps), triangle
@@ -315,6 +328,17 @@ def _next(rays: Occluders, origin: Tensor, direction: Tensor) -> tuple[Tensor, T
     return to_torch(face).long(), to_torch(distance).double()
 
 
+def _received(
+    screen: Screen | OwnSurfaces, legs: _Legs, face: Tensor, distance: Tensor
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Rows and triangles that receive power on the way to the next wall, or where it is met."""
+    if isinstance(screen, Screen):
+        yield from _crossings(screen, legs, distance)
+        return
+    rows = torch.nonzero((face >= 0) & screen.lit[face.clamp_min(0)] & (distance > legs.after))
+    yield rows[:, 0], face[rows[:, 0]]
+
+
 def _crossings(screen: Screen, legs: _Legs, until: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows and triangles of the surface that they cross, past the edge and before the next wall."""
     rows, at = torch.arange(len(legs.row)), legs.after.clamp_min(0.0)
@@ -334,7 +358,7 @@ def _crossings(screen: Screen, legs: _Legs, until: Tensor) -> Iterator[tuple[Ten
 
 def rims(
     walls: Walls,
-    screen: Screen,
+    surface: Float64[Tensor, "face 3 3"],
     found: RimPoints,
     tx: Float64[Tensor, "tx 3"],
     vertices: Float64[Tensor, "v 3"],
@@ -343,7 +367,7 @@ def rims(
 
     Args:
         walls: The scene.
-        screen: Where power is received.
+        surface: Corners of the triangles where power is received, attached where they move [m].
         found: The points.
         tx: Transmitters in the world, attached [m].
         vertices: Of the scene in the world, attached [m].
@@ -358,23 +382,26 @@ def rims(
     kept = legs.through | (torch.arange(legs.faces.shape[1]) < legs.before[:, None])
     y0, y1 = vertices[edges.first], vertices[edges.second]
     y = images(torch.lerp(y0, y1, edges.along[:, None]), point, normal, kept)[-1]
-    p0, p1, p2 = screen.corners[found.face].unbind(1)
+    receiving = surface[found.face]
+    p0, p1, p2 = receiving.unbind(1)
     up = normalize(cross(p1 - p0, p2 - p0), dim=1)
     ray = y - seen
     stretch = dot(p0 - seen, up) / dot(ray, up)
     rim = seen + stretch[:, None] * ray
+    material = points_at(receiving, plain(receiving), plain(rim))
 
+    up = plain(up)
     fixed = plain(ray), plain(stretch), plain(normal)
     edge, aside = (_shifted(v, fixed, kept, up) for v in (plain(y1 - y0), legs.aside))
     outwards = cross(up, edge)
     outwards = outwards * -dot(outwards, aside).sign()[:, None]
-    rate = dot(outwards, rim - plain(rim)) * edges.weight
+    rate = dot(outwards, rim - material) * edges.weight
     steep = dot(fixed[0], up).abs() > _GRAZING * fixed[0].norm(dim=1)
     rows = torch.nonzero(steep)[:, 0]
     chains = Chains(
         legs.source[rows], torch.arange(len(rows)), legs.faces[rows], legs.through[rows]
     )
-    return Rims(chains, plain(rim)[rows], found.face[rows], rate[rows])
+    return Rims(chains, plain(rim)[rows], found.face[rows], rate[rows], legs.row[rows])
 
 
 def _shifted(vector: Tensor, fixed: tuple[Tensor, ...], kept: Tensor, up: Tensor) -> Tensor:

@@ -33,7 +33,13 @@ from invertwin.channel.field.sequences import (
     every_sequence,
     shot_sequences,
 )
-from invertwin.channel.field.waves import dot, mirrored, plane_of_incidence, polarisations
+from invertwin.channel.field.waves import (
+    dot,
+    mirrored,
+    plane_of_incidence,
+    points_at,
+    polarisations,
+)
 from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION, RayPaths, joined
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import vertex_velocities
@@ -354,7 +360,7 @@ def _approach(
     rate = dot(ways[0], stage.tx_velocity[tx]) - dot(ways[-1], stage.rx_velocity[rx])
     if stage.velocities is not None and faces.shape[1]:
         triangles = stage.topology.faces[faces]
-        moved = _at_points(stage.velocities[triangles], stage.vertices[triangles], vertices)
+        moved = points_at(stage.velocities[triangles], stage.vertices[triangles], vertices)
         for step in range(faces.shape[1]):
             rate = rate + dot(ways[step + 1] - ways[step], moved[:, step])
     return rate
@@ -431,17 +437,6 @@ def _columns(stage: Stage, chains: Chains) -> tuple[Tensor, ...]:
         vertices,
         stage.frequency / SPEED_OF_LIGHT * rate,
     )
-
-
-def _at_points(values: Tensor, corners: Tensor, points: Tensor) -> Tensor:
-    """Values at the corners of triangles, interpolated at points in them."""
-    a, b, c = corners.unbind(-2)
-    area = torch.linalg.cross(b - a, c - a)
-    square = dot(area, area)
-    v = dot(torch.linalg.cross(b - a, points - a), area) / square
-    u = dot(torch.linalg.cross(points - a, c - a), area) / square
-    share = torch.stack([1 - u - v, u, v], -1)
-    return (share[..., None] * values).sum(-2)
 
 
 def _field(

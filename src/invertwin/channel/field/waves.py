@@ -343,3 +343,24 @@ def area_vector(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "ro
     """
     spokes = polygon - polygon[:, :1]
     return torch.linalg.cross(spokes, spokes.roll(-1, 1), dim=-1).sum(1) / 2
+
+
+def points_at(
+    values: Float64[Tensor, "*row 3 3"],
+    corners: Float64[Tensor, "*row 3 3"],
+    points: Float64[Tensor, "*row 3"],
+) -> Float64[Tensor, "*row 3"]:
+    """Vectors at the corners of triangles, interpolated at points in these.
+
+    Args:
+        values: At the corners.
+        corners: Of the triangles [m].
+        points: In them [m].
+    """
+    a, b, c = corners.unbind(-2)
+    area = cross(b - a, c - a)
+    square = dot(area, area)
+    v = dot(cross(b - a, points - a), area) / square
+    u = dot(cross(points - a, c - a), area) / square
+    share = torch.stack([1 - u - v, u, v], -1)
+    return (share[..., None] * values).sum(-2)

@@ -26,6 +26,7 @@ class Surfaces:
     lobed: tuple[bool, ...]  # which lobes have weight anywhere
     sheets: bool  # whether something passes straight through any surface
     bodies: bool  # whether any surface is the skin of a refracting body
+    spread: bool  # whether any specular lobe lacks what is mirrored
 
     @staticmethod
     def of(geometry: Geometry) -> "Surfaces":
@@ -36,6 +37,7 @@ class Surfaces:
             lobed=geometry.lobed,
             sheets=geometry.sheets,
             bodies=geometry.bodies,
+            spread=geometry.spread,
         )
 
     def value(self, name: str, row: Any, active: Any = True) -> Any:
@@ -124,6 +126,10 @@ class Surfaces:
         for number, present in enumerate(self.lobed):
             if present:
                 lobe, _ = self.lobe(number, row, normal, back, on, active)
+                if number == 0 and self.spread:
+                    for direction in (back, on):
+                        cosine = dr.abs(dr.dot(normal, direction))
+                        lobe *= self.tabulated("spread", row, cosine, active)
                 shape += dr.gather(mi.Float, self.tables["lobes"], row * 3 + number, active) * lobe
         value = dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
         if self.bodies and on is not back:

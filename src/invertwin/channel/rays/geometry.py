@@ -46,6 +46,7 @@ class Geometry:
         lobed: Which lobes have weight, or a derivative that could give them some.
         sheets: Whether something passes straight through any surface.
         bodies: Whether any surface is the skin of a refracting body.
+        spread: Whether any specular lobe lacks what is mirrored.
         names: Of the objects.
         coherent: Per object, whether its field paths have a deterministic phase.
         moving: Per object, whether derivatives flow through its place or its shape.
@@ -64,6 +65,7 @@ class Geometry:
     lobed: tuple[bool, ...]
     sheets: bool
     bodies: bool
+    spread: bool
     names: tuple[str, ...]
     coherent: tuple[bool, ...]
     moving: tuple[bool, ...]
@@ -191,6 +193,7 @@ def flatten(
         lobed=tuple(free or bool(weight.any()) for weight in weights.T),
         sheets=bool(surfaces.transmittance.any()),
         bodies=bool(skins.any()),
+        spread=bool((surfaces.spread != 1).any()),
         names=tuple(scene.objects),
         coherent=tuple(item.material.coherent for item in objects),
         moving=tuple(map(differentiated, placed)),

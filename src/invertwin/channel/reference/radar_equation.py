@@ -162,7 +162,7 @@ def radar_equation(
         spread = spread * torch.exp(-attenuation * distances[number]) / distances[number] ** 2
         length = length + index * distances[number]
     *earlier, last = (
-        point.jacobian * _scattered(geometry, point, -back, on)
+        point.jacobian * scattered(geometry, point, -back, on)
         for point, back, on in zip(places, ways, ways[1:], strict=False)
     )
     arriving = math.prod(earlier, start=(link.wavelength / (4 * torch.pi)) ** 2 * spread)
@@ -179,11 +179,17 @@ def _depolarisation(geometry: Geometry, point: Place, back: Tensor, on: Tensor) 
     return torch.where(back * on > 0, geometry.surfaces.depolarisation[point.row], 0.0)
 
 
-def _scattered(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Tensor:
+def scattered(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Tensor:
     """``f |cosθ| |cosθ'|`` between unit directions that point away from the surface.
 
     On one side, ``f`` is the distribution of ``scene.material``; through the skin of a body, see
     ``Surfaces.refracted``.
+
+    Args:
+        geometry: The scene.
+        point: Where on it.
+        back: To where the path comes from.
+        on: To where it goes on.
     """
     surfaces, row, normal = geometry.surfaces, point.row, point.normal
     first, second, between = ((a * b).sum(1) for a, b in ((normal, back), (normal, on), (back, on)))
@@ -192,7 +198,11 @@ def _scattered(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Te
     for number, cosine in enumerate((2 * product - between, 2 * product - between, between)):
         if geometry.lobed[number]:
             half = (0.5 * (1 + cosine)).clamp_min(1e-7)
-            shape = shape + surfaces.lobes[row, number] * half ** surfaces.exponents[row, number]
+            lobe = surfaces.lobes[row, number] * half ** surfaces.exponents[row, number]
+            if number == 0 and geometry.spread:
+                for tilt in (first, second):
+                    lobe = lobe * _tabulated(surfaces.spread, row, tilt)
+            shape = shape + lobe
     outer = [_outside(geometry, row, cosine) for cosine in (first, second)]
     reflectance = torch.ones_like(product)
     for cosine, total in outer:

@@ -349,6 +349,10 @@ class Multilayer(_Values, EffectiveRoughness, Material):
         kept = self.skin_of(None).rows(triangle).kept(frequency, cosine)
         return sheet_coefficients(layers, cosine, frequency).mirroring(kept)
 
+    def incoherent(self, frequency: float) -> Surface:
+        """What it does beside mirroring. See `Material.incoherent`."""
+        return self.surface(frequency).less_mirror(self.skin_of(None), frequency)
+
 
 def _value_names(holder: object) -> list[str]:
     return [entry.name for entry in fields(holder) if entry.name in RANGES]  # type: ignore[arg-type]

@@ -10,6 +10,8 @@ direction of ωi, cosψ = 2 (n·ωi)(n·ωo) − ωi·ωo, and a backscattering 
 cosψ = ωi·ωo; all directions point away from the surface. The distribution is reciprocal, and
 reflects at most what came in: each weight is the lobe's share of the power divided by its integral
 at normal incidence, where the integral is largest (the lobe and the cosine share their axis).
+The specular lobe is also multiplied by two roots of a share, `spread(cosθi) spread(cosθo)`: what a
+smooth surface mirrors as one wave is no part of what it scatters (`Material.incoherent`).
 
 What passes goes straight through a sheet (`transmittance`, longer by `extra_length`) or is
 refracted into a solid body (`refraction`, `index`, `attenuation`).
@@ -41,6 +43,8 @@ _SCALARS = ("diffuse", "index", "attenuation", "depolarisation")  # the other fi
 
 _NONE = torch.zeros(LOBE_COUNT, dtype=torch.float64)
 _DARK = torch.zeros(ANGLE_COUNT, dtype=torch.float64)
+_WHOLE = torch.ones(ANGLE_COUNT, dtype=torch.float64)
+_COSINES = torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
 _ZERO, _ONE = _DARK[0], torch.ones((), dtype=torch.float64)
 _INFINITE = torch.full((), torch.inf, dtype=torch.float64)
 
@@ -67,6 +71,7 @@ class Surface:
         index: real refractive index of that body, else 1.
         attenuation: power attenuation in that body [1/m], else 0.
         depolarisation: share of the scattered power that goes from V to H and from H to V.
+        spread: root of the share of the specular lobe that is scattered; 1 = all of it.
     """
 
     amplitude: Float64[Tensor, "*#row 256"]
@@ -79,6 +84,7 @@ class Surface:
     index: Float64[Tensor, "*#row"] = _ONE
     attenuation: Float64[Tensor, "*#row"] = _ZERO
     depolarisation: Float64[Tensor, "*#row"] = _ZERO
+    spread: Float64[Tensor, "*#row 256"] = _WHOLE
 
     def __post_init__(self) -> None:
         """Give all fields the same rows."""
@@ -97,6 +103,24 @@ class Surface:
             share: of each row.
         """
         return replace(self, diffuse=self.diffuse * share, lobes=self.lobes * share[..., None])
+
+    def less_mirror(self, skin: "Skin", frequency: float) -> "Surface":
+        """The surface without what `skin` keeps together in the mirror direction.
+
+        Of the specular lobe's power the share 1 − exp(−(2kσ cosθ)²) is left: what heights take off
+        the mirrored wave.
+
+        Args:
+            skin: what the surface does to fields.
+            frequency: [Hz].
+        """
+        height = skin.rms_height
+        if not bool((height > 0).any()):
+            return replace(self, lobes=self.lobes * self.lobes.new_tensor([0.0, 1.0, 1.0]))
+        k = 2 * math.pi * frequency / SPEED_OF_LIGHT
+        share = -torch.expm1(-((2 * k * height[..., None] * _COSINES) ** 2))
+        lit = share > 0  # a root of zero has no derivative
+        return replace(self, spread=torch.where(lit, torch.where(lit, share, 1.0).sqrt(), 0.0))
 
 
 class Skin(NamedTuple):
@@ -186,3 +210,9 @@ class Material(ABC):
     @abstractmethod
     def surface(self, frequency: float) -> Surface:
         """What the surface does at `frequency` [Hz]; its values keep their gradients."""
+
+    def incoherent(self, frequency: float) -> Surface:
+        """What it does beside mirroring: `surface` without what `coefficients` reflect."""
+        skin = self.skin(frequency)
+        surface = self.surface(frequency)
+        return surface if skin is None else surface.less_mirror(skin, frequency)
