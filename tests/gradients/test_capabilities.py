@@ -433,9 +433,8 @@ def by_mirrors(scene: Scene, place: Tensor, sampling: Sampling, seed: int) -> Te
         1e9,
         strengths,
         1,
-        depth=2,
         rays=None,
-        sampling=sampling,
+        sampling=replace(sampling, depth=2),
         seed=seed,
     )
 

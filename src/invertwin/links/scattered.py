@@ -101,9 +101,8 @@ def scattered_moments(
         frequency,
         measure,
         3,
-        depth=depth,
         rays=rays,
-        sampling=sampling,
+        sampling=replace(sampling, depth=depth),
         seed=seed,
     )
 

@@ -82,7 +82,6 @@ def trace_scattered(
     measure: Measure,
     width: int,
     *,
-    depth: int,
     rays: int | None,
     sampling: Sampling,
     seed: int,
@@ -99,11 +98,10 @@ def trace_scattered(
         frequency: Of the coefficients [Hz].
         measure: What a pair of ways adds, over the area and the scattering of its point.
         width: Numbers that it adds.
-        depth: Most surfaces that a path meets, the rough one included.
         rays: Shot from all transmitters together, and from all receivers, to find sequences of
             surfaces; None tries every one.
         sampling: How many points and, for derivatives, edge points; whether boundary paths and
-            contacts count.
+            contacts count; ``depth``: most surfaces that a path meets, the rough one included.
         seed: Of all that is drawn.
 
     Raises:
@@ -113,7 +111,7 @@ def trace_scattered(
     stage = replace(staged(scene, tx, rx, frequency, still, still), velocities=None)
     with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(rough, SPEED_OF_LIGHT / frequency)
-        trace = _Trace(stage, geometry, measure, width, depth, rays, sampling, seed)
+        trace = _Trace(stage, geometry, measure, width, rays, sampling, seed)
         if not trace.lit.any() or not any(map(len, trace.sequences[0] + trace.sequences[1])):
             return torch.zeros(len(stage.tx), len(stage.rx), width, dtype=torch.float64)
         total = trace.interior(stage, geometry)
@@ -135,12 +133,11 @@ class _Trace:
         geometry: Geometry,
         measure: Measure,
         width: int,
-        depth: int,
         rays: int | None,
         sampling: Sampling,
         seed: int,
     ) -> None:
-        self.measure, self.width, self.depth = measure, width, depth
+        self.measure, self.width, self.depth = measure, width, sampling.depth
         self.sampling, self.seed = sampling, seed
         self.ends = plain(stage.tx), plain(stage.rx)
         self.powers = powers_of(stage)
