@@ -423,7 +423,9 @@ def strengths(out: RayPaths, home: RayPaths, turned: Tensor, *_: Tensor) -> Tens
 def by_mirrors(scene: Scene, place: Tensor, sampling: Sampling, seed: int) -> Tensor:
     """Power that the wall scatters once, with a mirror before or after."""
     scene = Scene({"mirror": MIRROR, **scene.objects})
-    rough = scene.replace("occluder", material=AIR).replace("mirror", material=AIR)
+    rough = scene.replace("mirror", material=AIR)
+    if rough["occluder"].cloud is None:
+        rough = rough.replace("occluder", material=AIR)
     tx = place + float64([-0.07, 0.04, 0.19])
     return trace_scattered(
         scene,

@@ -259,13 +259,22 @@ def test_what_heights_take_off_the_mirror_is_scattered():
 
     surface = RoughConductor(scattering=0.0, rms_slope=0.3).surface(FREQUENCY)
 
+    def fall(cosine: Tensor) -> Tensor:
+        """What the lobe sends back over what it does straight back."""
+        gauss = torch.distributions.Normal(float64(0.0), (2 / surface.exponents[0]).sqrt())
+
+        def above(c: Tensor) -> Tensor:
+            return c * gauss.cdf(c) + gauss.variance * gauss.log_prob(c).exp()
+
+        return above(cosine) / above(float64(1.0))
+
     def expected(tx: Tensor, rx: Tensor) -> float:
         axis = (torch.arange(600, dtype=torch.float64) + 0.5) / 150 - 2
         points = torch.cartesian_prod(axis, axis, torch.zeros(1, dtype=torch.float64))
         ways = [(points - end).norm(dim=1) for end in (tx, rx)]
         cosine = [float(end[2]) / way for end, way in zip((tx, rx), ways, strict=True)]
         k = 4 * math.pi * height / WAVELENGTH
-        kept = [(1 - torch.exp(-((k * c) ** 2))).sqrt() for c in cosine]
+        kept = [((1 - torch.exp(-((k * c) ** 2))) / fall(c)).sqrt() for c in cosine]
         between = ((tx - points) * (rx - points)).sum(1) / (ways[0] * ways[1])
         lobe = (0.5 * (1 + 2 * cosine[0] * cosine[1] - between)) ** surface.exponents[0]
         law = surface.lobes[0] * lobe * kept[0] * kept[1] * cosine[0] * cosine[1]

@@ -108,7 +108,9 @@ class Surface:
         """The surface without what `skin` keeps together in the mirror direction.
 
         Of the specular lobe's power the share 1 − exp(−(2kσ cosθ)²) is left: what heights take off
-        the mirrored wave.
+        the mirrored wave. A lobe that is normalised at normal incidence sends back less at other
+        angles. The share is divided by how much: the mean of cosθo, with cosθo spread about cosθ
+        like a Gaussian of the lobe's variance 2/p, where it is above the horizon.
 
         Args:
             skin: what the surface does to fields.
@@ -119,6 +121,10 @@ class Surface:
             return replace(self, lobes=self.lobes * self.lobes.new_tensor([0.0, 1.0, 1.0]))
         k = 2 * math.pi * frequency / SPEED_OF_LIGHT
         share = -torch.expm1(-((2 * k * height[..., None] * _COSINES) ** 2))
+        width = (2 / self.exponents[..., :1]).sqrt()
+        at = _COSINES / width
+        above = at * torch.special.ndtr(at) + torch.exp(-0.5 * at**2) / math.sqrt(2 * math.pi)
+        share = share * above[..., -1:] / above
         lit = share > 0  # a root of zero has no derivative
         return replace(self, spread=torch.where(lit, torch.where(lit, share, 1.0).sqrt(), 0.0))
 
