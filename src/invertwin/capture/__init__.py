@@ -3,6 +3,11 @@
 from invertwin.capture.backprojection import backproject as backproject
 from invertwin.capture.backprojection import calibrate as calibrate
 from invertwin.capture.backprojection import locate as locate
+from invertwin.capture.bags import Messages as Messages
+from invertwin.capture.bags import bag_topics as bag_topics
+from invertwin.capture.bags import read_clouds as read_clouds
+from invertwin.capture.bags import read_topic as read_topic
+from invertwin.capture.bags import read_track as read_track
 from invertwin.capture.capture import Capture as Capture
 from invertwin.capture.channels import ChannelCalibration as ChannelCalibration
 from invertwin.capture.channels import estimate_channels as estimate_channels

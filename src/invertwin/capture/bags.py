@@ -1,0 +1,221 @@
+"""Recordings of the Robot Operating System, read without it: bags of ROS 1 and of ROS 2.
+
+The package rosbags reads them, which is plain Python; the extra ``ros`` installs it.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from numpy.typing import NDArray
+from torch import Tensor
+
+from invertwin.capture.track import Track
+from invertwin.errors import InputError
+from invertwin.untrusted import reader
+
+# Where messages with poses keep the place, by the names of their fields.
+_PLACES = ("pose.pose.position", "pose.position", "transform.translation", "point", "position")
+# Numbers of `sensor_msgs/PointField`, and what they are to NumPy.
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+@dataclass(frozen=True, eq=False)
+class Messages:
+    """A field of all messages of a topic.
+
+    Attributes:
+        times: When each was stamped, or else recorded, since 1970 [s].
+        values: What the field holds, an array a message.
+    """
+
+    times: Float64[Tensor, " message"]
+    values: list[NDArray[Any]]
+
+    def stacked(self) -> Tensor:
+        """All values as one tensor, messages first.
+
+        Raises:
+            InputError: Messages of different sizes.
+        """
+        shapes = {value.shape for value in self.values}
+        if len(shapes) != 1:
+            raise InputError(
+                f"expected messages of one size, got {len(shapes)} sizes, such as "
+                f"{sorted(shapes)[:2]}; take those that are whole"
+            )
+        return torch.from_numpy(np.stack(self.values))
+
+
+@reader("a bag of ROS 1 or ROS 2")
+def bag_topics(path: str | Path) -> dict[str, str]:
+    """What a bag holds: the type of the messages of every topic.
+
+    Args:
+        path: A ``.bag`` file of ROS 1, or the folder of a bag of ROS 2.
+
+    Raises:
+        InputError: No bag, or the package rosbags is missing.
+    """
+    with _opened(path) as bag:
+        return dict(sorted((one.topic, one.msgtype) for one in bag.connections))
+
+
+@reader("a bag of ROS 1 or ROS 2")
+def read_topic(path: str | Path, topic: str, field: str) -> Messages:
+    """Read one field of all messages of a topic, such as the samples of a radar.
+
+    Radars have no common message, so name the field that holds the samples, and arrange them:
+    ``ChirpData(messages.stacked().view(…), settings)``. What a DCA1000 sent as bytes goes into a
+    ``.bin`` file, which ``read`` reads.
+
+    Args:
+        path: A ``.bag`` file of ROS 1, or the folder of a bag of ROS 2.
+        topic: Its name.
+        field: Its name; dots lead into messages within messages, such as ``"pose.position.x"``.
+
+    Raises:
+        InputError: No bag, no such topic or field, a field that is no array of numbers, or the
+            package rosbags is missing.
+    """
+    found = list(_messages(path, topic, lambda message: _array(message, field)))
+    return Messages(_times(found), [value for _, value in found])
+
+
+@reader("a bag of ROS 1 or ROS 2")
+def read_track(path: str | Path, topic: str) -> Track:
+    """Read where something was over time, such as the radar, from messages that hold its pose.
+
+    These are ``Odometry``, ``PoseStamped``, ``PoseWithCovarianceStamped``, ``TransformStamped`` and
+    ``PointStamped``. Repeated times count once.
+
+    Args:
+        path: A ``.bag`` file of ROS 1, or the folder of a bag of ROS 2.
+        topic: Its name.
+
+    Raises:
+        InputError: No bag, no such topic, messages without a pose, or the package rosbags is
+            missing.
+    """
+
+    def place(message: Any) -> list[float]:
+        for name in _PLACES:
+            held = message
+            for part in name.split("."):
+                held = getattr(held, part, None)
+            if held is not None:
+                return [held.x, held.y, held.z]
+        raise InputError(
+            f"expected messages with a pose on {topic}, got {message.__msgtype__}; give a topic of "
+            "Odometry, PoseStamped or TransformStamped, or read_topic"
+        )
+
+    found = dict(_messages(path, topic, place))
+    times = sorted(found)
+    rows = [found[time] for time in times]
+    return Track(
+        torch.tensor(times, dtype=torch.float64),
+        torch.tensor(rows, dtype=torch.float64).reshape(-1, 3),
+    )
+
+
+@reader("a bag of ROS 1 or ROS 2")
+def read_clouds(path: str | Path, topic: str) -> list[dict[str, Float64[Tensor, " point"]]]:
+    """Read all point clouds of a topic of ``sensor_msgs/PointCloud2``.
+
+    Args:
+        path: A ``.bag`` file of ROS 1, or the folder of a bag of ROS 2.
+        topic: Its name.
+
+    Returns:
+        For every message the values of each field by name, such as ``x``, ``y``, ``z`` and
+        ``doppler``, one per point.
+
+    Raises:
+        InputError: No bag, no such topic, other messages, or the package rosbags is missing.
+    """
+
+    def cloud(message: Any) -> dict[str, Tensor]:
+        if not hasattr(message, "point_step"):
+            raise InputError(
+                f"expected point clouds on {topic}, got {message.__msgtype__}; give a topic of "
+                "sensor_msgs/PointCloud2"
+            )
+        order = ">" if message.is_bigendian else "<"
+        kind = np.dtype(
+            {
+                "names": [one.name for one in message.fields],
+                "formats": [order + _NUMBERS[one.datatype] for one in message.fields],
+                "offsets": [one.offset for one in message.fields],
+                "itemsize": message.point_step,
+            }
+        )
+        rows = np.asarray(message.data, np.uint8).reshape(message.height, message.row_step)
+        rows = np.ascontiguousarray(rows[:, : message.width * message.point_step])
+        points = rows.reshape(-1).view(kind)
+        return {
+            name: torch.from_numpy(points[name].astype(np.float64)) for name in kind.names or ()
+        }
+
+    return [one for _, one in _messages(path, topic, cloud)]
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[Any]:
+    """A bag that can be read."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise InputError(
+            "expected the package rosbags, got none; install it with pip install 'invertwin[ros]'"
+        ) from None
+    if not Path(path).exists():
+        raise InputError(f"expected a bag, got no file or folder {path}; check the path")
+    # Bags of ROS 2 need not say what their messages are made of.
+    usual = get_typestore(Stores.LATEST)
+    with AnyReader([Path(path)], default_typestore=usual) as bag:
+        yield bag
+
+
+def _messages(
+    path: str | Path, topic: str, act: Callable[[Any], Any]
+) -> Iterator[tuple[float, Any]]:
+    """Time of every message of a topic [s], and what a function makes of it."""
+    with _opened(path) as bag:
+        chosen = [one for one in bag.connections if one.topic == topic]
+        if not chosen:
+            known = ", ".join(sorted({one.topic for one in bag.connections})) or "none"
+            raise InputError(f"expected a topic of the bag, got {topic!r}; it has {known}")
+        for connection, recorded, raw in bag.messages(connections=chosen):
+            message = bag.deserialize(raw, connection.msgtype)
+            stamp = getattr(getattr(message, "header", None), "stamp", None)
+            time = recorded * 1e-9 if stamp is None else stamp.sec + stamp.nanosec * 1e-9
+            yield time, act(message)
+
+
+def _array(message: Any, field: str) -> NDArray[Any]:
+    held = message
+    for part in field.split("."):
+        known = [name for name in getattr(held, "__dataclass_fields__", {}) if name[0] != "_"]
+        if part not in known:
+            raise InputError(
+                f"expected a field of the messages, got {field!r}; they have {', '.join(known)}"
+            )
+        held = getattr(held, part)
+    value = np.asarray(held)
+    if value.dtype.kind not in "iufb":
+        raise InputError(
+            f"expected numbers in the field {field!r}, got {type(held).__name__}; name a field "
+            "that holds some"
+        )
+    return value
+
+
+def _times(found: list[tuple[float, Any]]) -> Float64[Tensor, " message"]:
+    return torch.tensor([time for time, _ in found], dtype=torch.float64)
