@@ -78,6 +78,20 @@ def test_a_file_holds_everything_and_triangles_once(tmp_path):
     assert len(names) < 1 + 2 * len(made.layers) + 2 * len(made.steps)
 
 
+def test_a_file_stays_whole_while_the_next_one_is_written(tmp_path, monkeypatch):
+    file = tmp_path / "view.npz"
+    Display("first", []).save(file)
+
+    def ended(part, **_):
+        part.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", ended)
+    with pytest.raises(KeyboardInterrupt):
+        Display("second", []).save(file)
+    assert Display.load(file).title == "first"
+
+
 def test_damaged_files_are_refused(tmp_path):
     (tmp_path / "view.npz").write_bytes(b"no archive")
     with pytest.raises(InputError, match="npz"):

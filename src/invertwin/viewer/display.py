@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.folders import replacing
 from invertwin.untrusted import read_arrays, reading
 
 _FORMAT = 2
@@ -195,8 +196,9 @@ class Display:
 
         header = np.array(json.dumps(plain(self) | {"format": _FORMAT}))
         named = {f"a{number}": array for number, array in enumerate(arrays.values())}
-        with Path(path).open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, header=header, **named)
+        # A run that is killed meanwhile goes on from the file before.
+        with replacing(path) as part:
+            np.savez_compressed(part, allow_pickle=False, header=header, **named)
 
     @classmethod
     def load(cls, path: str | Path) -> "Display":
