@@ -27,6 +27,7 @@ from invertwin.channel.field.corners import face_share
 from invertwin.channel.field.edge_paths import several_turning_points, turning_points
 from invertwin.channel.field.edged import EdgedScene, exterior
 from invertwin.channel.field.images import clear_ways, images, reaching
+from invertwin.channel.field.joint import joint
 from invertwin.channel.field.sequences import (
     Powers,
     every_sequence,
@@ -300,16 +301,12 @@ def _once(around: EdgedScene, one: _Reach, other: _Reach, depth: int) -> Iterato
 
 def _pairs(one: _Reach, other: _Reach, count: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows of both that have an edge in common, in pieces."""
-    number = torch.bincount(other.edge, minlength=count)
-    begin = number.cumsum(0) - number
-    partners = number[one.edge]
+    partners = torch.bincount(other.edge, minlength=count)[one.edge]
     piece = (partners.cumsum(0) - 1).clamp_min(0) // _ROWS_AT_ONCE
     for rows in torch.arange(len(one.edge)).split(torch.bincount(piece).tolist()):
-        some = partners[rows]
-        first = rows.repeat_interleave(some)
-        within = torch.arange(len(first)) - (some.cumsum(0) - some).repeat_interleave(some)
+        first, second = joint(one.edge[rows], other.edge, count)
         if len(first):
-            yield first, begin[one.edge[first]] + within
+            yield rows[first], second
 
 
 def _several(around: EdgedScene, tx: Tensor, rx: Tensor, order: int) -> Iterator[Bends]:
@@ -358,13 +355,7 @@ def _longer(
     chains: Tensor, between: Tensor, pairs: Tensor, beside: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Chains of edges with one edge more."""
-    order = pairs[:, 0].argsort(stable=True)
-    number = torch.bincount(pairs[:, 0], minlength=int(pairs.max()) + 1)
-    begin = number.cumsum(0) - number
-    some = number[chains[:, -1]]
-    row = torch.arange(len(chains)).repeat_interleave(some)
-    within = torch.arange(len(row)) - (some.cumsum(0) - some).repeat_interleave(some)
-    pair = order[begin[chains[row, -1]] + within]
+    row, pair = joint(chains[:, -1], pairs[:, 0], int(pairs.max()) + 1)
     found = torch.cat([chains[row], pairs[pair, 1:]], 1)
     return found, torch.cat([between[row], beside[pair]], 1)
 
@@ -400,17 +391,7 @@ def _along(
             for first, second in ((leg, leg + 1), (leg + 1, leg)):
                 outside = exterior(rows[first], points[:, second])
                 good &= outside | (found.between[:, leg, 0] >= 0)
-        stops = [tx[source]]
-        for number in range(chains.shape[1]):
-            edge, place = found.edge[:, number], points[:, number]
-            good &= around.free(edge, place)
-            stops.append(around.beside(edge, place))
-        stops.append(rx[target])
-        for start, end in pairwise(stops):
-            at = torch.nonzero(good)[:, 0]
-            good[at], _ = clear_ways(around.walls, none[at], start[at], end[at])
-        if bool(good.any()):
-            yield found.rows(torch.nonzero(good)[:, 0])
+        yield from _open(around, found, tx, rx, points, good)
         yield from _round_corners(around, tx, rx, found)
 
 
@@ -446,19 +427,24 @@ def _round_corners(around: EdgedScene, tx: Tensor, rx: Tensor, found: Bends) -> 
         else:
             points, good = several_turning_points(between, source, target)
         both = [points, at[rows, None]] if corner == "last" else [at[rows, None], points]
-        points = torch.cat(both, 1)
-        stops = [source]
-        for number in numbers:
-            edge = some.edge[:, number]
-            good &= around.free(edge, points[:, number])
-            stops.append(around.beside(edge, points[:, number]))
-        stops.append(target)
-        none = some.before.faces
-        for start, stop in pairwise(stops):
-            left = torch.nonzero(good)[:, 0]
-            good[left], _ = clear_ways(around.walls, none[left], start[left], stop[left])
-        if bool(good.any()):
-            yield some.rows(torch.nonzero(good)[:, 0])
+        yield from _open(around, some, tx, rx, torch.cat(both, 1), good)
+
+
+def _open(
+    around: EdgedScene, found: Bends, tx: Tensor, rx: Tensor, points: Tensor, good: Tensor
+) -> Iterator[Bends]:
+    """The good ones of paths over points of edges whose legs, all of them straight, are free."""
+    good, none = good.clone(), found.before.faces
+    stops = [tx[found.tx]]
+    for edge, place in zip(found.edge.T, points.unbind(1), strict=True):
+        good &= around.free(edge, place)
+        stops.append(around.beside(edge, place))
+    stops.append(rx[found.rx])
+    for start, end in pairwise(stops):
+        rows = torch.nonzero(good)[:, 0]
+        good[rows], _ = clear_ways(around.walls, none[rows], start[rows], end[rows])
+    if bool(good.any()):
+        yield found.rows(torch.nonzero(good)[:, 0])
 
 
 def along_faces(around: EdgedScene, bends: Bends) -> Float64[Tensor, "row leg 2"]:

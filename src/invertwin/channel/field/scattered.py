@@ -25,6 +25,7 @@ from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel.field.images import Chains, Walls, chains_from
+from invertwin.channel.field.joint import joint
 from invertwin.channel.field.sequences import every_sequence, sequences_from_edges
 from invertwin.channel.field.shadow_edges import OwnSurfaces, rim_points, rims
 from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
@@ -34,7 +35,7 @@ from invertwin.channel.ray_paths import REFLECTION, RayPaths, joined
 from invertwin.channel.rays.backend import torch_threads, tracing
 from invertwin.channel.rays.contacts import contacts_of
 from invertwin.channel.rays.geometry import Geometry, differentiated, flatten
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.scene import RayScene, face_areas
 from invertwin.channel.reference.radar_equation import Place, SurfacePaths, scattered
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
@@ -168,7 +169,7 @@ class _Trace:
     def interior(self, stage: Stage, geometry: Geometry) -> Float64[Tensor, "tx rx amount"]:
         """At fixed visibility; a derivative computes the paths again, and keeps none."""
         with _DisableFuncTorch():
-            drawn = self._drawn(plain(geometry.vertices)[geometry.faces])
+            drawn = self._drawn(replace(geometry, vertices=plain(geometry.vertices)))
         again = any(t.requires_grad for t in (stage.vertices, stage.tx, stage.rx))
         total = torch.zeros(len(stage.tx), len(stage.rx), self.width, dtype=torch.float64)
         for rows in torch.arange(len(drawn.place)).split(_AT_ONCE):
@@ -217,13 +218,11 @@ class _Trace:
                 total = total + self._added(replace(jumps, amount=amount))
         return total
 
-    def _drawn(self, corners: Float64[Tensor, "f 3 3"]) -> _Points:
+    def _drawn(self, geometry: Geometry) -> _Points:
         """As many points for each receiver, spread evenly over all that scatters."""
         receivers = len(self.ends[1])
         count = max(1, self.sampling.samples // (_SAMPLES * receivers))
-        sides = corners[:, 1:] - corners[:, :1]
-        area = 0.5 * torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1)
-        reached = (area * self.lit).cumsum(0)
+        reached = (face_areas(geometry) * self.lit).cumsum(0)
         numbers = np.random.default_rng(np.random.SeedSequence([self.seed, 4]))
         shift, jitter = (torch.from_numpy(numbers.random((k, receivers, 1))) for k in (2, 1))
         index = torch.arange(count)
@@ -279,7 +278,7 @@ class _Trace:
                 strict=True,
             )
         )
-        first, second = _joint(out.rx, home.rx, len(area))
+        first, second = joint(out.rx, home.rx, len(area))
         mirrors, steps, side = (
             (values[0][first], values[1][second])
             for values in (
@@ -321,19 +320,6 @@ class _Pairs:
     rx: Int64[Tensor, " pair"]
     row: Int64[Tensor, " pair"]
     amount: Float64[Tensor, "pair amount"]
-
-
-def _joint(
-    first: Int64[Tensor, " n"], second: Int64[Tensor, " m"], count: int
-) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
-    """Rows of all pairs with the same number, which is below ``count``."""
-    order = second.argsort(stable=True)
-    many = torch.bincount(second, minlength=count)
-    begin = many.cumsum(0) - many
-    times = many[first]
-    row = torch.arange(len(first)).repeat_interleave(times)
-    within = torch.arange(len(row)) - (times.cumsum(0) - times)[row]
-    return row, order[begin[first[row]] + within]
 
 
 def _between(stage: Stage, first: Tensor, second: Tensor) -> Stage:
