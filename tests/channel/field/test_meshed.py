@@ -99,7 +99,7 @@ def test_a_box_at_a_resonance_of_its_inside(monkeypatch):
         cube = box((side,) * 3)
         solid = torch.full((12,), places > 0)
         target = meshed.SolvedMeshes(cube.vertices, cube.faces, solid, float64([0.0, 0.0, 1.0]))
-        mesh = target._at(2 * math.pi)
+        mesh = target.pieces(2 * math.pi)
         assert mesh is not None
         equations = [meshed._Equation(target, mesh, 2 * math.pi * f) for f in (0.999, 1.0)]
         first, second = (equation.currents(TOWARDS) for equation in equations)

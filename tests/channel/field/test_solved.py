@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel import SphereSection, trace_signature
-from invertwin.channel.field import solved
+from invertwin.channel.field import currents, solved
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import (
@@ -183,7 +183,7 @@ def test_frequencies_that_are_too_high_have_no_rest():
 
 
 def test_currents_that_do_not_keep_the_power_are_not_used(monkeypatch):
-    monkeypatch.setattr(solved, "_TRUSTED", 1e-9)
+    monkeypatch.setattr(currents, "_TRUSTED", 1e-9)
     with pytest.warns(PhysicsWarning, match="do not keep the power"):
         found = parts_of(BALL, 5.0, [[0.3, 0.5, 0.8]])
     assert "rest" not in found

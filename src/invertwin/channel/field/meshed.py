@@ -5,7 +5,6 @@ c (dVᵀ J + λᵀ (dV − dM J)), where Mᵀ λ = V of the receiver. Small tria
 """
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -13,19 +12,16 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.field.conforming import Conforming, conforming
+from invertwin.channel.field.currents import Currents, keeps_power
 from invertwin.channel.field.moments import Moments, functions_of
-from invertwin.channel.field.solved import keeps_power, warn_of_power
-from invertwin.channel.field.waves import cross, dot, polarisations
+from invertwin.channel.field.waves import cross, dot, polarisations, turned
 from invertwin.channel.rays.geometry import differentiated
 from invertwin.errors import InputError
+from invertwin.scene import Mesh, signed_distance
 
 MOST_SIDES = 12000
 """Unknowns up to which currents are solved: sides that two small triangles share."""
-_PER_WAVELENGTH = 7.0  # small triangles' sides
-_LEAST = 100  # squares of a side in the area, however small
 _FEWEST = 2.0  # unknowns in such a square, at least
-_ALIKE = 1.25  # ratio of frequencies that share a mesh
-_ASPECTS_AT_ONCE = 64
 _PLACES = 160  # inside closed bodies, at most,
 _PLACES_PER_AREA = 2.5  # and for a square wavelength of their surface
 _DEEP = 0.6  # wavelengths, or less where bodies are thinner,
@@ -33,8 +29,8 @@ _DEPTHS = (0.3, 0.5)  # of which they are below the surface,
 _CLEAR = 0.25  # and off all of it
 
 
-class SolvedMeshes:
-    """Conductors whose currents are solved, at the frequencies at which they are small.
+class SolvedMeshes(Currents[Conforming]):
+    """Conductors whose currents are solved on triangles, see ``Currents``.
 
     Args:
         vertices: with or without derivatives [m].
@@ -42,6 +38,8 @@ class SolvedMeshes:
         solid: whether a triangle is the skin of a closed body, its normal outwards.
         up: V lies in a plane with this unit vector.
     """
+
+    LEAST = 100
 
     def __init__(
         self,
@@ -55,58 +53,30 @@ class SolvedMeshes:
         self.double = torch.linalg.cross(
             corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         )
-        self.area = float(self.double.detach().norm(dim=1).sum() / 2)
-        self._mesh: tuple[float, Conforming | None] = (math.inf, None)
+        super().__init__(float(self.double.detach().norm(dim=1).sum() / 2))
 
-    def scattered(
-        self, wave_number: float, ways: Sequence[tuple[Tensor, Tensor]]
-    ) -> list[Complex128[Tensor, "aspect 2 2"]] | None:
-        """S of the whole field for each way; None where the conductors are too large for it.
+    def cut(self, side: float) -> Conforming | None:
+        """Small triangles that fit together, if they are not too many."""
+        if max(self.area / side**2 * _FEWEST, len(self.faces)) > MOST_SIDES:
+            return None
+        mesh = conforming(self.vertices.detach().numpy(), self.faces.numpy(), side)
+        if mesh is None or len(functions_of(mesh.faces).face) > MOST_SIDES:
+            return None
+        return mesh
 
-        Args:
-            wave_number: k [1/m].
-            ways: unit vectors from the scene to transmitters and to receivers, [aspect, 3] each.
+    def equation(self, pieces: Conforming, wave_number: float, waves: int) -> "_Equation":
+        """See ``Currents.equation``.
 
         Raises:
             InputError: derivatives where vertices at one place were joined.
         """
-        mesh = self._at(wave_number)
-        if mesh is None:
-            return None
-        moved = differentiated(self.vertices)
-        if moved and mesh.seams:
+        if differentiated(self.vertices) and pieces.seams:
             raise InputError(
                 "expected meshes without vertices at one place for derivatives of a small target, "
                 "got some: currents stop where they part; join the meshes, or give edges=0 for "
                 "physical optics alone"
             )
-        equation = _Equation(self, mesh, wave_number)
-        found: list[Tensor] = []
-        for transmitters, receivers in ways:
-            parts: list[Tensor] = []
-            for some in torch.arange(len(transmitters)).split(_ASPECTS_AT_ONCE):
-                sent, seen = transmitters[some], receivers[some]
-                current = equation.currents(sent)
-                if not found and not parts and not equation.keeps_power(current, sent):
-                    warn_of_power(wave_number)
-                    return None
-                parts.append(equation.received(current, sent, seen, moved))
-            found.append(torch.cat(parts))
-        return found
-
-    def _at(self, wave_number: float) -> Conforming | None:
-        """The mesh for a wave; that of the last one where it is about as fine as needed."""
-        needed = min(2 * math.pi / wave_number / _PER_WAVELENGTH, math.sqrt(self.area / _LEAST))
-        side, mesh = self._mesh
-        if side <= needed <= side * _ALIKE:
-            return mesh
-        if max(self.area / needed**2 * _FEWEST, len(self.faces)) > MOST_SIDES:
-            return None
-        mesh = conforming(self.vertices.detach().numpy(), self.faces.numpy(), needed)
-        if mesh is None or len(functions_of(mesh.faces).face) > MOST_SIDES:
-            return None
-        self._mesh = (needed, mesh)
-        return mesh
+        return _Equation(self, pieces, wave_number)
 
 
 class _Equation:
@@ -153,25 +123,23 @@ class _Equation:
 
     def _arriving(self, places: Tensor, towards: Tensor) -> Tensor:
         """Fields of the waves at the places inside: [row, aspect, 2]."""
-        turn = self.k * (places @ towards.T)
-        wave = torch.polar(torch.ones_like(turn), turn)
+        wave = turned(self.k * (places @ towards.T))
         field = polarisations(towards, self.up) + 0j
         return torch.einsum("ya,atx->yxat", wave, field).flatten(0, 1)
 
     def received(
-        self, current: Tensor, transmitters: Tensor, receivers: Tensor, moved: bool
+        self, current: Tensor, transmitters: Tensor, receivers: Tensor
     ) -> Complex128[Tensor, "aspect 2 2"]:
         """S of currents, with derivatives where vertices move.
 
         Args:
             current: η J of the transmitters' waves.
             transmitters, receivers: where these are.
-            moved: whether to give derivatives.
         """
         scale = -1j * self.k / (4 * math.pi)
         seen = self._excited(self.still, receivers)
         value = scale * torch.einsum("nar,nat->art", seen, current)
-        if not moved:
+        if not differentiated(self.target.vertices):
             return value
         # The solution of the transposed equation.
         back = self._solved(seen.conj(), adjoint=True).conj()
@@ -201,6 +169,8 @@ def _places(
     """Places inside closed bodies, which move with the surface below which they are."""
     origin = torch.from_numpy(mesh.origin)
     inside = torch.nonzero(target.solid[origin])[:, 0]
+    if not len(inside):
+        return torch.zeros(0, 3, dtype=torch.float64)
     wavelength = 2 * math.pi / wave_number
     wanted = min(_PLACES, math.ceil(_PLACES_PER_AREA * target.area / wavelength**2) + 8)
     # Even shares of the surface.
@@ -215,8 +185,8 @@ def _places(
     depth = torch.tensor(_DEPTHS, dtype=torch.float64).repeat(len(start))[: len(start)]
     room = thick.clamp_max(_DEEP * wavelength)
     places = start - (depth * room)[:, None] * mine
-    skin = corners.detach()[target.solid]
-    clear = torch.tensor([_distance(place, skin) for place in places.detach()])
+    skin = Mesh(target.vertices.detach(), target.faces[target.solid])
+    clear = signed_distance(skin, places.detach()).abs()
     return places[clear >= _CLEAR * room.detach()]
 
 
@@ -241,19 +211,3 @@ def _opposite(
         found.append(int(far.argmin()))
         met.append(bool(hit.any()))
     return torch.tensor(found, dtype=torch.int64), torch.tensor(met, dtype=torch.bool)
-
-
-def _distance(place: Tensor, corners: Tensor) -> float:
-    """From a place to the nearest of triangles."""
-    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    square = dot(normal, normal).clamp_min(1e-300)
-    away = place - corners
-    inside = torch.ones(len(corners), dtype=torch.bool)
-    least = torch.full((len(corners),), math.inf, dtype=torch.float64)
-    for v in range(3):
-        side = corners[:, (v + 1) % 3] - corners[:, v]
-        inside &= dot(torch.linalg.cross(side, away[:, v]), normal) >= 0
-        share = (dot(away[:, v], side) / dot(side, side).clamp_min(1e-300)).clamp(0, 1)
-        least = torch.minimum(least, (away[:, v] - share[:, None] * side).norm(dim=1))
-    height = dot(away[:, 0], normal).abs() / square.sqrt()
-    return float(torch.where(inside, height, least).min())

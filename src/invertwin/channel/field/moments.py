@@ -25,7 +25,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel.field.waves import cross, dot
+from invertwin.channel.field.waves import cross, dot, turned
 
 _NEAR = 1.6  # of the radii of two triangles, up to which their distance counts as near
 _DOUBLE = 2500  # unknowns up to which all is in double precision
@@ -95,6 +95,7 @@ class Moments:
         self.faces, self.functions, self.k = faces, functions, wave_number
         self.count = len(functions.face)
         self.kind = torch.float64 if self.count <= _DOUBLE else torch.float32
+        self.complex = self.kind.to_complex()
 
     def excited(
         self,
@@ -114,7 +115,7 @@ class Moments:
         middle = corners.mean(1)
         beside = shares @ (corners - middle[:, None])
         turn = self.k * ((beside + middle[:, None]) @ directions.T)
-        wave = torch.polar(torch.ones_like(turn), turn) * weights[:, None] / 2
+        wave = turned(turn) * weights[:, None] / 2
         along = torch.einsum("fqa,fqx,atx->fat", wave, beside + 0j, fields + 0j)
         level = torch.einsum("fvx,atx->fvat", corners - middle[:, None], fields)
         local = along[:, None] - wave.sum(1)[:, None, :, None] * level
@@ -213,8 +214,7 @@ class Moments:
                 csr_array((np.concatenate([v.ravel() for v in value]), spots), shape=shape)
             )
         scale = [1.0, 1.0, 1.0, -1 / self.k**2]
-        kind = torch.complex128 if self.kind == torch.float64 else torch.complex64
-        total = torch.zeros(self.count, self.count, dtype=kind)
+        total = torch.zeros(self.count, self.count, dtype=self.complex)
         bounds = torch.searchsorted(pairs[:, 0].contiguous(), torch.arange(count + 1))
         size = max(1, _ENTRIES_AT_ONCE // (9 * count))
         for begin in range(0, count, size):
@@ -269,26 +269,43 @@ class Moments:
         centre, middle = here.mean(1), there.mean(1)
         shares, weights = SEVEN
         point = shares @ here
-        spot = shares @ there
-        level, first, _ = potentials(there, point)
-        double = torch.linalg.cross(there[:, 1] - there[:, 0], there[:, 2] - there[:, 0])
-        scale = 1 / (2 * math.pi * double.norm(dim=1))[:, None]
-        away = point[:, :, None] - spot[:, None]
-        apart = (dot(away, away) + (_ONE_POINT / self.k) ** 2).sqrt()
-        turn = self.k * apart
-        # (exp(−jkR) − 1)/R without cancellation.
-        smooth = torch.complex(-2 * (turn / 2).sin().square(), -turn.sin())
-        smooth = smooth / (4 * math.pi * apart) * weights
-        flat = level * scale + smooth.sum(2)
-        beside = spot - middle[:, None]
-        sloped = (first + (point - middle[:, None]) * level[..., None]) * scale[..., None]
-        sloped = sloped + torch.einsum("pqr,prx->pqx", smooth, beside + 0j)
+        flat, sloped, _ = self._sent(there, point)
         along = (point - centre[:, None])[:, None] - (here - centre[:, None])[:, :, None]
         along = along * (weights / 4)[:, None]
         offset = (there - middle[:, None]) + 0j
         inner = sloped[:, :, None] - flat[..., None, None] * offset[:, None]
         found = torch.einsum("piqx,pqjx->pij", along + 0j, inner)
         return found - ((weights * flat).sum(1) / self.k**2)[:, None, None]
+
+    def _sent(
+        self, corners: Tensor, points: Tensor, *, gradient: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Of triangles' even and linear currents (from their middle on) at points, over their area.
+
+        1/R is integrated in closed form; what is left of exp(−jkR)/R is smooth.
+
+        Returns:
+            [triangle, point], [triangle, point, 3], and the gradient of the first, if asked for.
+        """
+        middle = corners.mean(1)[:, None]
+        shares, weights = SEVEN
+        spot = shares @ corners
+        level, first, slope = potentials(corners, points)
+        double = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        scale = 1 / (2 * math.pi * double.norm(dim=1))[:, None]
+        away = points[:, :, None] - spot[:, None]
+        apart = (dot(away, away) + (_ONE_POINT / self.k) ** 2).sqrt()
+        turn = self.k * apart
+        # exp(−jkR) − 1 without cancellation.
+        rest = torch.complex(-2 * (turn / 2).sin().square(), -turn.sin())
+        smooth = rest / (4 * math.pi * apart) * weights
+        flat = level * scale + smooth.sum(2)
+        sloped = (first + (points - middle) * level[..., None]) * scale[..., None]
+        sloped = sloped + torch.einsum("pqr,prx->pqx", smooth, (spot - middle) + 0j)
+        if not gradient:
+            return flat, sloped, None
+        fall = -(1j * turn * turned(-turn) + rest) / (4 * math.pi * apart**3) * weights
+        return flat, sloped, slope * scale[..., None] + (fall[..., None] * away).sum(2)
 
     def bilinear(
         self,
@@ -318,10 +335,9 @@ class Moments:
         scale = torch.complex(
             scale * products.new_tensor([1.0, 1, 1, 0]), scale * products.new_tensor([0.0, 0, 0, 1])
         )
-        kind = torch.complex128 if self.kind == torch.float64 else torch.complex64
         # The divergence's share j/k, twice, makes −1/k².
         strengths = [
-            torch.einsum("fcqz,fcap->fqapz", products * scale, half).flatten(0, 1).to(kind)
+            torch.einsum("fcqz,fcap->fqapz", products * scale, half).flatten(0, 1).to(self.complex)
             for half in (left, right)
         ]
         bounds = torch.searchsorted(pairs[:, 0].contiguous(), torch.arange(count + 1))
@@ -378,29 +394,13 @@ class Moments:
             places: off the surface [m].
         """
         corners = vertices[self.faces]
-        middle = corners.mean(1)
-        shares, weights = SEVEN
-        spot = shares @ corners
-        beside = spot - middle[:, None]
-        offset = corners - middle[:, None]
-        double = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        scale = (1 / (2 * math.pi * double.norm(dim=1)))[:, None]
+        offset = corners - corners.mean(1)[:, None]
 
         def local(some: Tensor) -> Tensor:
-            level, first, slope = potentials(corners, some.expand(len(corners), -1, 3))
-            away = some[:, None] - spot[:, None]
-            apart = dot(away, away).sqrt()
-            turn = self.k * apart
-            smooth = torch.complex(-2 * (turn / 2).sin().square(), -turn.sin())
-            # The gradient of (exp(−jkR) − 1)/R.
-            fall = -(1j * turn * torch.polar(torch.ones_like(turn), -turn) + smooth)
-            smooth = smooth / (4 * math.pi * apart) * weights
-            fall = fall / (4 * math.pi * apart**3) * weights
-            flat = level * scale + smooth.sum(2)
-            sloped = (first + (some - middle[:, None]) * level[..., None]) * scale[..., None]
-            sloped = sloped + torch.einsum("fyq,fqx->fyx", smooth, beside + 0j)
+            points = some.expand(len(corners), -1, 3)
+            flat, sloped, charge = self._sent(corners, points, gradient=True)
+            assert charge is not None
             part = sloped[:, None] - flat[:, None, :, None] * offset[:, :, None]
-            charge = slope * scale[..., None] + (fall[..., None] * away).sum(2)
             return self._flowing(0.5j * self.k * part + 1j / self.k * charge[:, None])
 
         size = max(1, (_ENTRIES_AT_ONCE >> 6) // len(corners))

@@ -13,8 +13,6 @@ left out where cells do not resolve the gap.
 """
 
 import math
-import warnings
-from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -23,15 +21,11 @@ from jaxtyping import Complex64, Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel.field.cells import Cells, cells_of
-from invertwin.channel.field.waves import cross, dot, polarisations
-from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.errors import PhysicsWarning
+from invertwin.channel.field.currents import Currents, keeps_power
+from invertwin.channel.field.waves import cross, dot, polarisations, turned
 
 MOST = 6000
 """Cells up to which currents are solved: twice as many unknowns."""
-_PER_WAVELENGTH = 7.0  # cells
-_LEAST = 250  # cells of a body, however small
-_ALIKE = 1.25  # ratio of frequencies that share cells
 _INSIDE = 0.25  # wavelengths to the second surface,
 _OF_BALL = 0.8  # but less of the ball that fits in,
 _RESOLVED = 0.7  # and at least so many cells' sides
@@ -40,74 +34,26 @@ _WIDTHS = ((0.25, 1.0), (0.05, 0.3))  # of how many cells the balls may be how m
 _WORTH = 75  # cells per wave, below which the matrix is factorised
 _ROUNDS = 80
 _RESIDUAL = 3e-5  # of the right-hand side
-_TRUSTED = 0.05  # share of the power that may get lost or be won
-_ASPECTS_AT_ONCE = 64
 _ROWS_AT_ONCE = 1 << 20
 
 
-class SolvedBodies:
-    """Conductors whose currents are solved, at the frequencies at which they are small.
+class SolvedBodies(Currents[Cells]):
+    """Closed conductors whose currents are solved on cells, see ``Currents``.
 
     Args:
         corners: of the triangles of closed bodies, normals outwards [m].
         up: V lies in a plane with this unit vector.
     """
 
+    LEAST = 250
+
     def __init__(self, corners: Float64[Tensor, "facet 3 3"], up: Float64[Tensor, "3"]) -> None:
         self.corners, self.up = corners.numpy(), up
         sides = self.corners[:, 1:] - self.corners[:, :1]
         normals = np.cross(sides[:, 0], sides[:, 1])
-        self.area = float(np.linalg.norm(normals, axis=1).sum() / 2)
-        self._cells: tuple[float, Cells | None] = (math.inf, None)
+        super().__init__(float(np.linalg.norm(normals, axis=1).sum() / 2))
 
-    def scattered(
-        self, wave_number: float, ways: Sequence[tuple[Tensor, Tensor]]
-    ) -> list[Complex128[Tensor, "aspect 2 2"]] | None:
-        """S of the whole field for each way; None where the bodies are too large for it.
-
-        Args:
-            wave_number: k [1/m].
-            ways: unit vectors from the scene to transmitters and to receivers, [aspect, 3] each.
-        """
-        cells = self._at(wave_number)
-        if cells is None:
-            return None
-        equation = _Equation(cells, wave_number, 2 * sum(len(way[0]) for way in ways))
-        found: list[Tensor] = []
-        for transmitters, receivers in ways:
-            parts: list[Tensor] = []
-            for some in torch.arange(len(transmitters)).split(_ASPECTS_AT_ONCE):
-                sent = polarisations(transmitters[some], self.up)
-                current = equation.currents(-transmitters[some], sent)
-                if not parts and not equation.keeps_power(current, -transmitters[some], sent):
-                    warn_of_power(wave_number)
-                    return None
-                seen = polarisations(receivers[some], self.up).to(torch.complex128)
-                field = equation.sent(current, receivers[some])
-                parts.append(torch.einsum("arx,atx->art", seen, field))
-            found.append(torch.cat(parts))
-        return found
-
-    def serves(self, wave_number: float) -> bool:
-        """Whether cells hold the bodies, and are not too many.
-
-        Args:
-            wave_number: k [1/m].
-        """
-        return self._at(wave_number) is not None
-
-    def _at(self, wave_number: float) -> Cells | None:
-        """Cells for a wave; those of the last one where they are about as fine as needed."""
-        needed = min(2 * math.pi / wave_number / _PER_WAVELENGTH, math.sqrt(self.area / _LEAST))
-        side, cells = self._cells
-        if side <= needed <= side * _ALIKE:
-            return cells
-        cells = self._cut(needed)
-        if cells is not None:
-            self._cells = (needed, cells)
-        return cells
-
-    def _cut(self, side: float) -> Cells | None:
+    def cut(self, side: float) -> Cells | None:
         """Cells that a thin body's width holds, if they are not too many."""
         if self.area / side**2 > MOST:
             return None
@@ -119,13 +65,19 @@ class SolvedBodies:
             cells = cells_of(self.corners, width)
         return cells if cells.closed else None
 
+    def equation(self, pieces: Cells, wave_number: float, waves: int) -> "_Equation":
+        """See ``Currents.equation``."""
+        return _Equation(pieces, wave_number, self.up, waves)
+
 
 class _Equation:
     """The integral equation of cells at one frequency: [t₁ of all cells, t₂ of all cells]."""
 
-    def __init__(self, cells: Cells, wave_number: float, columns: int) -> None:
-        self.k = wave_number
-        self.direct = columns * _WORTH > len(cells.point)
+    def __init__(
+        self, cells: Cells, wave_number: float, up: Float64[Tensor, "3"], waves: int
+    ) -> None:
+        self.k, self.up = wave_number, up
+        self.direct = waves * _WORTH > len(cells.point)
         self.origin = torch.from_numpy(cells.point.mean(0))
         self.point = torch.from_numpy(cells.point) - self.origin
         self.normal, self.axes = torch.from_numpy(cells.normal), torch.from_numpy(cells.axes)
@@ -177,19 +129,19 @@ class _Equation:
         return lower, pivots
 
     def currents(
-        self, direction: Float64[Tensor, "aspect 3"], field: Float64[Tensor, "aspect 2 3"]
+        self, towards: Float64[Tensor, "aspect 3"]
     ) -> Complex128[Tensor, "cell aspect 2 3"]:
         """η J of plane waves of 1 V/m.
 
         Args:
-            direction: d of the waves.
-            field: E at the world's origin.
+            towards: the antennas.
         """
-        columns = self._incident(direction, field)
+        direction = -towards
+        columns = self._incident(direction, polarisations(towards, self.up))
         wave = -self.k * self.point @ direction.T
         inner = self.k * self.gap[:, None] * (self.normal @ direction.T)
-        phase = _turned(wave) * (1 + self.share[:, None] * _turned(inner))
-        columns = columns * phase[None, :, :, None] * self._phase(-direction)[:, None]
+        phase = turned(wave) * (1 + self.share[:, None] * turned(inner))
+        columns = columns * phase[None, :, :, None] * self._phase(towards)[:, None]
         shape = columns.shape
         right = columns.reshape(shape[0] * shape[1], -1).to(torch.complex64)
         if self.direct:
@@ -207,76 +159,31 @@ class _Equation:
 
     def _phase(self, towards: Tensor) -> Tensor:
         """Of the cells' middle against the world's origin."""
-        return _turned(self.k * (towards @ self.origin))
+        return turned(self.k * (towards @ self.origin))
 
-    def sent(
+    def received(
         self,
         current: Complex128[Tensor, "cell aspect 2 3"],
-        towards: Float64[Tensor, "aspect 3"],
-    ) -> Complex128[Tensor, "aspect 2 3"]:
-        """F of each wave's currents, with its part along s.
+        transmitters: Float64[Tensor, "aspect 3"],
+        receivers: Float64[Tensor, "aspect 3"],
+    ) -> Complex128[Tensor, "aspect 2 2"]:
+        """S of currents, at the receiver of each wave.
 
         Args:
-            current: η J.
-            towards: s, to the receiver of each wave.
+            current: η J of the transmitters' waves.
+            transmitters, receivers: where these are.
         """
-        phase = _turned(self.k * (self.point @ towards.T)) * self.area[:, None]
+        phase = turned(self.k * (self.point @ receivers.T)) * self.area[:, None]
         total = torch.einsum("ca,catx->atx", phase, current)
-        scale = -1j * self.k / (4 * math.pi)
-        return scale * self._phase(towards)[:, None, None] * total
+        field = -1j * self.k / (4 * math.pi) * self._phase(receivers)[:, None, None] * total
+        seen = polarisations(receivers, self.up).to(torch.complex128)
+        return torch.einsum("arx,atx->art", seen, field)
 
-    def keeps_power(self, current: Tensor, direction: Tensor, field: Tensor) -> bool:
+    def keeps_power(self, current: Tensor, towards: Tensor) -> bool:
         """Whether the first wave's currents send out as much power as they take from the wave."""
         flowing = current[:, 0] * self.area[:, None, None]
-        return keeps_power(self.k, self.point + self.origin, flowing, direction[0], field[0])
-
-
-def keeps_power(
-    wave_number: float,
-    point: Float64[Tensor, "point 3"],
-    flowing: Complex128[Tensor, "point 2 3"],
-    direction: Float64[Tensor, "3"],
-    field: Float64[Tensor, "2 3"],
-) -> bool:
-    """Whether currents send out as much power as they take from a wave.
-
-    Args:
-        wave_number: k [1/m].
-        point: where they flow [m].
-        flowing: η J dA there, for both polarisations.
-        direction: d of the wave.
-        field: E at the world's origin.
-    """
-    phase = _turned(-wave_number * point @ direction)
-    taken = torch.einsum("c,ctx,tx->t", phase.conj(), flowing, field + 0j)
-    place = point - point.mean(0)
-    extent = float(place.norm(dim=1).max())
-    level, share = np.polynomial.legendre.leggauss(math.ceil(wave_number * extent) + 12)
-    turns = 2 * math.pi * torch.arange(2 * len(level), dtype=torch.float64) / (2 * len(level))
-    given = torch.zeros(2, dtype=torch.float64)
-    for z, weight in zip(level, share * math.pi / len(level), strict=True):
-        flat = math.sqrt(1 - z**2)
-        ways = torch.stack([flat * turns.cos(), flat * turns.sin(), torch.full_like(turns, z)], 1)
-        wave = _turned(wave_number * (ways @ place.T))
-        sent = wave_number / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, flowing)
-        along = torch.einsum("stx,sx->st", sent, ways + 0j)
-        given += weight * (sent.abs().square().sum((0, 2)) - along.abs().square().sum(0))
-    return bool(((given / taken.real - 1).abs() < _TRUSTED).all())
-
-
-def warn_of_power(wave_number: float) -> None:
-    """Say that solved currents are not used.
-
-    Args:
-        wave_number: k [1/m].
-    """
-    warnings.warn(
-        f"at {wave_number * SPEED_OF_LIGHT / (2 * math.pi) / 1e9:.4g} GHz solved currents do not "
-        "keep the power, so bounces and edges alone are counted; look for thin or touching parts "
-        "of the mesh",
-        PhysicsWarning,
-        stacklevel=6,
-    )
+        sent = polarisations(towards[:1], self.up)[0]
+        return keeps_power(self.k, self.point + self.origin, flowing, -towards[0], sent)
 
 
 def _least_residual(
@@ -311,8 +218,3 @@ def _gradient(k: float, square: Tensor, weight: Tensor) -> Tensor:
     turn = k * distance
     wave = torch.polar(-weight / distance**3, -turn)
     return wave * torch.complex(torch.ones_like(turn), turn)
-
-
-def _turned(phase: Tensor) -> Tensor:
-    """exp(j phase)."""
-    return torch.polar(torch.ones_like(phase), phase)

@@ -322,16 +322,20 @@ def polygon_integral(
 
     def at(k: float) -> Tensor:
         broad = largest * k**2 < 1e-6
-        exact = (share * _sinc(k * turn) * _turned(k * phase)).sum(1)
+        exact = (share * _sinc(k * turn) * turned(k * phase)).sum(1)
         exact = exact / torch.where(broad, torch.ones_like(square), square * k) / 1j
         series = weight + 1j * k * mean - k**2 * second / 2
-        return torch.where(broad, series, exact) * _turned(k * whole)
+        return torch.where(broad, series, exact) * turned(k * whole)
 
     return at
 
 
-def _turned(phase: Tensor) -> Tensor:
-    """exp(j phase)."""
+def turned(phase: Tensor) -> Tensor:
+    """exp(j phase).
+
+    Args:
+        phase: [rad].
+    """
     return torch.complex(phase.cos(), phase.sin())
 
 
