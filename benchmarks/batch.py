@@ -22,14 +22,12 @@ import argparse
 import json
 import os
 import statistics
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import torch
+from first_calls import compiled, fresh
 from report import MetricTable, write
 from rich.table import Table
 from torch import Tensor
@@ -150,23 +148,8 @@ def noise(depth: int, samples: int, count: int, draws: int) -> dict[str, float]:
 
 def compile_seconds(count: int, depth: int, samples: int) -> float:
     """Seconds of code generation and compilation in the first step of this process."""
-    import drjit as dr
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        Steps(depth, samples).step(places(count, 0), 0, at_once=True)
-        launched = dr.kernel_history()
-    return sum(e.get("codegen_time", 0) + e.get("backend_time", 0) for e in launched) / 1e3
-
-
-def fresh(count: int, depth: int, samples: int) -> float:
-    """``compile_seconds`` of a fresh process with an empty cache."""
-    command = [sys.executable, __file__, "--first", str(count), str(depth), str(samples)]
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "DRJIT_CACHE_DIR": folder}
-        found = subprocess.run(
-            command, env=environment, check=True, capture_output=True, text=True
-        ).stdout
-    return float(json.loads(found))
+    made = Steps(depth, samples)
+    return compiled(lambda: made.step(places(count, 0), 0, at_once=True))[1]
 
 
 def measure(
@@ -193,7 +176,7 @@ def measure(
         typical = TYPICAL if TYPICAL in sizes else sizes[0]
         for key, value in noise(depth, typical, count, draws).items():
             keep(key, f"depth{depth}", value)
-        made = [fresh(number, depth, typical) for number in (FEW, count)]
+        made = [fresh(__file__, number, depth, typical) for number in (FEW, count)]
         keep("compile_seconds_ratio", f"depth{depth}", made[1] / made[0])
     return metrics
 

@@ -17,14 +17,12 @@ import argparse
 import json
 import os
 import statistics
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import torch
+from first_calls import compiled, fresh
 from report import MetricTable, write
 from rich.table import Table
 
@@ -93,24 +91,8 @@ def repeated(depth: int, count: int, samples: int, steps: int) -> dict[str, floa
 
 def first_call(count: int, depth: int, samples: int) -> dict[str, float]:
     """Seconds of the first call of this process: all, and in code generation and compilation."""
-    import drjit as dr
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        seconds = Boxes(count).call(0, depth, samples)
-        launched = dr.kernel_history()
-    made = sum(e.get("codegen_time", 0) + e.get("backend_time", 0) for e in launched) / 1e3
+    seconds, made = compiled(lambda: Boxes(count).call(0, depth, samples))
     return {"call": seconds, "compile": made}
-
-
-def fresh(count: int, depth: int, samples: int) -> dict[str, float]:
-    """``first_call`` of a fresh process with an empty cache."""
-    command = [sys.executable, __file__, "--first", str(count), str(depth), str(samples)]
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "DRJIT_CACHE_DIR": folder}
-        found = subprocess.run(
-            command, env=environment, check=True, capture_output=True, text=True
-        ).stdout
-    return json.loads(found)
 
 
 def measure(
@@ -135,7 +117,7 @@ def measure(
         part, calls = f"depth{depth}", repeated(depth, many, samples, steps)
         metrics["second_call_ratio"][part] = calls["ratio"]
         metrics["second_call_seconds"][part] = calls["many_s"]
-        made = {count: fresh(count, depth, samples) for count in (few, most)}
+        made = {count: fresh(__file__, count, depth, samples) for count in (few, most)}
         metrics["compile_seconds"][part] = made[most]["compile"]
         metrics["compile_seconds_ratio"][part] = made[most]["compile"] / made[few]["compile"]
         metrics["first_call_seconds"] = {str(count): made[count]["call"] for count in made}

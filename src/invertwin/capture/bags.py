@@ -84,7 +84,8 @@ def read_topic(path: str | Path, topic: str, field: str) -> Messages:
             package rosbags is missing.
     """
     found = list(_messages(path, topic, lambda message: _array(message, field)))
-    return Messages(_times(found), [value for _, value in found])
+    times = torch.tensor([time for time, _ in found], dtype=torch.float64)
+    return Messages(times, [value for _, value in found])
 
 
 @reader("a bag of ROS 1 or ROS 2")
@@ -215,7 +216,3 @@ def _array(message: Any, field: str) -> NDArray[Any]:
             "that holds some"
         )
     return value
-
-
-def _times(found: list[tuple[float, Any]]) -> Float64[Tensor, " message"]:
-    return torch.tensor([time for time, _ in found], dtype=torch.float64)
