@@ -16,11 +16,21 @@ A receiver walks round a conducting cube of five wavelengths in steps of a twent
 wavelength. Wherever a path comes or goes between two steps, the place is found to 1e-4 of a
 wavelength. `jump_db_next` is the largest jump of the field there, of either polarisation of the
 transmitter, with paths over up to three edges; `jump_db_second` and `jump_db_first` are the same
-with two edges and one at most. `full_wave` is the error of a dipole's field on a ring about a
-cube of 3.12 wavelengths, over the field, in the mean of squares, with the dipole's own field near
-by and the waves' fields along their ways; `full_wave_of.<order>` without these. The truth is in
-`benchmarks/full_wave_data/cube_dipole.npz`; `--solve` computes it anew with bempp-cl,
-with a mesh of that step in wavelengths.
+with two edges and one at most.
+
+A dipole's field beside a conducting cube is held against the method of moments, in two places.
+
+- `full_wave` is the *normalised error* of an upright dipole's upright field on a plane that cuts
+  the cube: the sum of (|E| − |E_true|)² over that of |E_true|². Cube, dipole, plane and measure
+  are those of the audit of WiTwin channel 0.5, which states 0.0351 against finite differences, of
+  a scaled field; nothing is scaled here. `full_wave_with_phases` is the same of the complex field.
+  Paths go over up to two edges.
+- `ring_rms` is the *root* of the normalised error of the complex field, all three components of
+  two dipoles, on a ring of which 150° are behind the cube: with the dipole's own field near by and
+  the waves' fields along their ways. `ring_rms_of.<order>` is without these.
+
+The truth is in `benchmarks/full_wave_data/cube_plane.npz` and `cube_dipole.npz`; `--solve`
+computes both anew with bempp-cl, with a mesh of that step in wavelengths.
 """
 
 import argparse
@@ -37,7 +47,7 @@ import numpy as np
 import torch
 from full_wave import SEVEN_POINTS, bodies, functions, system
 from full_wave import SIDE as SOLVED_SIDE
-from jaxtyping import Float64
+from jaxtyping import Complex128, Float64
 from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
@@ -60,6 +70,7 @@ from invertwin.channel.reference.wedges import (
     half_plane_of_point_source,
     wedge_of_plane_wave,
 )
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import box
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 from invertwin.scene.material.slab import Sheet, slab_coefficients
@@ -78,8 +89,10 @@ REQUIRED: Required = {
     "reciprocity": ("<=", 1e-9),
     "jump_db_next": ("<=", 1.0),
     "full_wave": ("<=", 0.035),
+    "full_wave_with_phases": ("<=", 0.035),
 }
-STORED = Path(__file__).parent / "full_wave_data" / "cube_dipole.npz"
+DATA = Path(__file__).parent / "full_wave_data"
+CELLS = 48  # of the plane, along either axis
 SIDE, RADIUS, HEIGHT = 5.0, 6.0, 0.7  # of the cube, and of the way round it, in wavelengths
 PLACES = ((9.0, 5.3, 1.1), (9.0, 8.3, 2.1), (9.0, 7.3, 4.1))  # of the transmitter
 STEP = 1e-6  # of differences, in wavelengths
@@ -524,49 +537,118 @@ def largest_jump(order: int) -> float:
     return worst
 
 
-def full_wave_error() -> dict[str, float]:
+def ring() -> "Solved":
+    """A ring about the cube, two dipoles across the way to its middle."""
+    angle = torch.deg2rad(torch.arange(360, dtype=torch.float64) + 0.5)
+    tx = torch.tensor([10.0, 5.5, 2.5], dtype=torch.float64)
+    rx = torch.stack([5 * angle.cos(), 5 * angle.sin(), 0 * angle + 0.5], 1)
+    return Solved("cube_dipole", SOLVED_SIDE, tx, rx, polarised(tx))
+
+
+def plane() -> "Solved":
+    """The plane of the audit: 5 GHz, a cube of 0.2 m, 1.6 m of a plane 5 cm under its middle."""
+    wavelength = SPEED_OF_LIGHT / 5e9
+    step = 1.6 / CELLS
+    x, y = torch.cartesian_prod(*[(torch.arange(CELLS).double() + 0.5) * step - 0.8] * 2).T
+    outside = (x.abs() > 0.1) | (y.abs() > 0.1)
+    rx = torch.stack([x, y, torch.full_like(x, -0.05)], 1)[outside]
+    tx = torch.tensor([-0.2, -0.5, 0.27], dtype=torch.float64)
+    upright = torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64)
+    return Solved("cube_plane", 0.2 / wavelength, tx / wavelength, rx / wavelength, upright)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Dipoles beside a cube about the origin; a wavelength is a metre.
+
+    Attributes:
+        name: of the file of the truth.
+        side: of the cube.
+        tx: where the dipoles are.
+        rx: where their field is.
+        dipoles: unit vectors [3, dipole].
+    """
+
+    name: str
+    side: float
+    tx: Float64[Tensor, "3"]
+    rx: Float64[Tensor, "row 3"]
+    dipoles: Float64[Tensor, "3 dipole"]
+
+    @property
+    def truth(self) -> Complex128[Tensor, "row 3 dipole"]:
+        """Stored."""
+        with np.load(DATA / f"{self.name}.npz") as stored:
+            return torch.from_numpy(stored["total"]).to(torch.complex128)
+
+    def field(self, order: int) -> Complex128[Tensor, "row 3 dipole"]:
+        """Of waves across their ways, as traced, with up to so many edges."""
+        sent, _ = Cube(self.side).field(self.tx.expand(len(self.rx), 3), self.rx, order)
+        return sent @ self.dipoles.to(torch.complex128)
+
+    def solve(self, step: float) -> None:
+        """Store the field by the method of moments.
+
+        Args:
+            step: of its mesh.
+        """
+        from scipy.linalg import lu_factor, lu_solve
+
+        points, faces = bodies()["cube"].shape(step * SOLVED_SIDE / self.side)
+        points = points * (self.side / SOLVED_SIDE)
+        tx, rx, vectors = (t.numpy() for t in (self.tx, self.rx, self.dipoles.T))
+        matrix, currents = system(points, faces, WAVE_NUMBER)
+        spots, parts, charge = functions(points, faces, currents, SEVEN_POINTS)
+        driven = [
+            sum(p.T @ e for p, e in zip(parts, dipole(v, tx, spots).T, strict=True))
+            for v in vectors
+        ]
+        factors = lu_factor(matrix, overwrite_a=True, check_finite=False)
+        excited = np.stack(driven, 1).astype(np.complex64)
+        answer = lu_solve(factors, excited, check_finite=False)
+        flow, ends = np.stack([part @ answer for part in parts], 1), charge @ answer
+        total = np.stack([dipole(vector, tx, rx) for vector in vectors], 2)
+        for row, place in enumerate(rx):
+            apart = place - spots
+            distance = np.linalg.norm(apart, axis=1)
+            wave = np.exp(1j * WAVE_NUMBER * distance) / (4 * np.pi * distance)
+            slope = (wave * (1j * WAVE_NUMBER - 1 / distance) / distance)[:, None] * apart
+            total[row] += 1j * WAVE_NUMBER * np.einsum("s,sip->ip", wave, flow)
+            total[row] += 1j / WAVE_NUMBER * np.einsum("si,sp->ip", slope, ends)
+        # The solver's fields turn with exp(−iωt); ours are the conjugates.
+        np.savez_compressed(
+            DATA / f"{self.name}.npz", total=total.conj().astype(np.complex64), step=step
+        )
+
+
+def ring_error() -> dict[str, float]:
     """Of the field on the ring, without diffraction, and with up to three edges.
 
     Of waves across their ways, as traced, and with what they have along them.
     """
-    stored = np.load(STORED)
-    tx, rx, truth = (torch.from_numpy(stored[name]) for name in ("tx", "rx", "total"))
-    cube, vectors = Cube(SOLVED_SIDE), polarised(tx).to(torch.complex128)
-    found = {}
+    case = ring()
+    truth, found = case.truth, {}
     for order, name in enumerate(("optics", "first", "second", "third")):
-        sent, _ = cube.field(tx.expand(len(rx), 3), rx, order)
-        found[name] = float((sent @ vectors - truth).norm() / truth.norm())
-    whole = cube.of_dipole(tx, rx, vectors, 3)
+        found[name] = float((case.field(order) - truth).norm() / truth.norm())
+    vectors = case.dipoles.to(torch.complex128)
+    whole = Cube(case.side).of_dipole(case.tx, case.rx, vectors, 3)
     return found | {"whole": float((whole - truth).norm() / truth.norm())}
 
 
-def solve(step: float) -> None:
-    """The field of a dipole beside the cube by the method of moments, on a ring about it."""
-    from scipy.linalg import lu_factor, lu_solve
+def full_wave_error(order: int = 2, every: int = 1) -> dict[str, float]:
+    """Normalised errors on the plane, of magnitudes, and with phases.
 
-    tx = np.array([10.0, 5.5, 2.5])
-    angle = np.radians(np.arange(360) + 0.5)
-    rx = np.stack([5 * np.cos(angle), 5 * np.sin(angle), 0 * angle + 0.5], 1)
-    points, faces = bodies()["cube"].shape(step)
-    matrix, currents = system(points, faces, WAVE_NUMBER)
-    spots, parts, charge = functions(points, faces, currents, SEVEN_POINTS)
-    vectors = polarised(torch.from_numpy(tx)).numpy().T
-    driven = [
-        sum(p.T @ e for p, e in zip(parts, dipole(v, tx, spots).T, strict=True)) for v in vectors
-    ]
-    factors = lu_factor(matrix, overwrite_a=True, check_finite=False)
-    answer = lu_solve(factors, np.stack(driven, 1).astype(np.complex64), check_finite=False)
-    flow, ends = np.stack([part @ answer for part in parts], 1), charge @ answer
-    total = np.stack([dipole(vector, tx, rx) for vector in vectors], 2)
-    for row, place in enumerate(rx):
-        apart = place - spots
-        distance = np.linalg.norm(apart, axis=1)
-        wave = np.exp(1j * WAVE_NUMBER * distance) / (4 * np.pi * distance)
-        slope = (wave * (1j * WAVE_NUMBER - 1 / distance) / distance)[:, None] * apart
-        total[row] += 1j * WAVE_NUMBER * np.einsum("s,sip->ip", wave, flow)
-        total[row] += 1j / WAVE_NUMBER * np.einsum("si,sp->ip", slope, ends)
-    # The solver's fields turn with exp(−iωt); ours are the conjugates.
-    np.savez_compressed(STORED, tx=tx, rx=rx, total=total.conj(), step=step)
+    Args:
+        order: most edges of a path.
+        every: one of so many places counts.
+    """
+    case = plane()
+    truth, case = case.truth[::every, 2, 0], replace(case, rx=case.rx[::every])
+    found, power = case.field(order)[:, 2, 0], truth.abs().square().sum()
+    return {
+        "full_wave": float((found.abs() - truth.abs()).square().sum() / power),
+        "full_wave_with_phases": float((found - truth).abs().square().sum() / power),
+    }
 
 
 def dipole(vector: np.ndarray, place: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -597,7 +679,8 @@ def measure() -> dict[str, Any]:
         "jump_db_next": largest_jump(3),
         "jump_db_second": largest_jump(2),
         "jump_db_first": largest_jump(1),
-        "full_wave_of": full_wave_error(),
+        **full_wave_error(),
+        "ring_rms_of": ring_error(),
     }
 
 
@@ -620,9 +703,11 @@ def table(metrics: dict[str, Any]) -> Table:
     page.row("jump_db_next", metrics["jump_db_next"], ".2f", "round a cube, up to three edges")
     page.row("jump_db_second", metrics["jump_db_second"], ".2f", "up to two edges")
     page.row("jump_db_first", metrics["jump_db_first"], ".2f", "up to one edge")
-    page.row("full_wave", metrics["full_wave"], ".3f", "field on a ring about a cube")
-    for case, value in metrics["full_wave_of"].items():
-        page.row(f"full_wave_of.{case}", value, ".3f", "the same, up to this order")
+    page.row("full_wave", metrics["full_wave"], ".4f", "magnitudes on a plane about a cube")
+    page.row("full_wave_with_phases", metrics["full_wave_with_phases"], ".4f", "the same, complex")
+    page.row("ring_rms", metrics["ring_rms"], ".3f", "root, complex, on a ring mostly in shadow")
+    for case, value in metrics["ring_rms_of"].items():
+        page.row(f"ring_rms_of.{case}", value, ".3f", "the same, up to this order")
     return page.grid
 
 
@@ -633,10 +718,11 @@ def main() -> None:
     parser.add_argument("--solve", type=float, metavar="STEP", help="store truth anew")
     arguments = parser.parse_args()
     if arguments.solve is not None:
-        solve(arguments.solve)
+        for case in (ring(), plane()):
+            case.solve(arguments.solve)
         return
     metrics = measure()
-    metrics["full_wave"] = metrics["full_wave_of"]["whole"]
+    metrics["ring_rms"] = metrics["ring_rms_of"]["whole"]
     write(metrics, table(metrics), arguments.out)
 
 
