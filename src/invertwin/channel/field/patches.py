@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.field.beams import Bounce, Facets
+from invertwin.channel.field.beams import Bounce, Facets, in_air
 from invertwin.channel.field.waves import dot
 
 _LARGE = 8.0  # times the smallest piece: larger triangles are split before they are looked at
@@ -72,7 +72,7 @@ def _lit(
     aspect, number, d = aspect[row], number[row], d[row]
     normal = _towards(facets.normal[number], d)
     before = torch.full_like(aspect, -1)
-    return Bounce(aspect, number, normal, d, torch.zeros_like(d[:, 0]), corners, before)
+    return in_air(aspect, number, normal, d, torch.zeros_like(d[:, 0]), corners, before)
 
 
 def divided(

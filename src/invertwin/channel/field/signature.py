@@ -19,9 +19,11 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
 from invertwin.channel.field.meshed import SolvedMeshes
+from invertwin.channel.field.passages import at_surface
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
 from invertwin.channel.field.solved import SolvedBodies
+from invertwin.channel.field.solids import Solids, interiors
 from invertwin.channel.field.tubes import tubes
 from invertwin.channel.field.waves import (
     Skins,
@@ -69,6 +71,7 @@ class _Body:
         skins: of the triangles, for each frequency.
         wave_numbers: k of the frequencies [1/m].
         up: direction of V.
+        interiors: groups of frequencies, and what waves enter there.
     """
 
     facets: Facets
@@ -78,6 +81,7 @@ class _Body:
     skins: Sequence[Skins]
     wave_numbers: Sequence[float]
     up: Float64[Tensor, "3"]
+    interiors: Sequence[tuple[Solids | None, Sequence[int]]]
 
     @property
     def wavelength(self) -> float:
@@ -188,44 +192,73 @@ class _View:
     def _bounces(self, depth: int, spacing: float | None, boundary: bool) -> dict[str, Tensor]:
         """Physical optics of every order: of beams, or of tubes where a spacing is given."""
         body, orders = self.body, [list(self._none()) for _ in range(depth)]
-        chains: Iterable[Sequence[Bounce]]
-        if spacing is None:
-            chains = [list(beams(body.facets, -self.transmitters, depth, boundary=boundary))]
-        else:
-            chains = self._sampled(depth, spacing)
-        for chain in chains:
-            currents: list[Tensor] = []
-            integrals = [bounce.integral(self.receivers[bounce.aspect]) for bounce in chain]
-            for f, k in enumerate(body.wave_numbers):
-                if not (body.plain and currents):
-                    currents = self._currents(chain, body.skins[f], 1.0 if body.plain else k)
-                rows = zip(orders, chain, integrals, currents, strict=False)
-                for order, bounce, integral, current in rows:
-                    strength = integral(k) * (k if body.plain else 1.0)
-                    sent = current * strength[:, None, None]
-                    order[f] = order[f].index_add(0, bounce.aspect, sent)
+        for solids, members in body.interiors:
+            chains: Iterable[Sequence[Bounce]]
+            if spacing is None:
+                way = {"boundary": boundary, "solids": solids}
+                chains = [list(beams(body.facets, -self.transmitters, depth, **way))]
+            else:
+                chains = self._sampled(depth, spacing, solids)
+            for chain in chains:
+                self._add(orders, chain, solids, members)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
-    def _sampled(self, depth: int, spacing: float) -> Iterator[Sequence[Bounce]]:
-        """Many facets: tubes that begin as lit triangles."""
-        facets = self.body.facets
-        for lit in lit_triangles(facets, self.body.clear, -self.transmitters, spacing):
-            yield [lit, *tubes(facets, self.body.occluders, lit, spacing, depth)]
+    def _add(
+        self,
+        orders: list[list[Tensor]],
+        chain: Sequence[Bounce],
+        solids: Solids | None,
+        members: Sequence[int],
+    ) -> None:
+        """Add what all patches send to the fields of their orders, at some frequencies."""
+        body = self.body
+        currents: list[Tensor] = []
+        integrals = [bounce.integral(self.receivers[bounce.aspect]) for bounce in chain]
+        for f in members:
+            k = body.wave_numbers[f]
+            if not (body.plain and currents):
+                currents = self._currents(chain, solids, body.skins[f], 1.0 if body.plain else k)
+            rows = zip(orders, chain, integrals, currents, strict=False)
+            for order, bounce, integral, current in rows:
+                strength = integral(k) * (k if body.plain else 1.0)
+                sent = current * strength[:, None, None]
+                order[f] = order[f].index_add(0, bounce.aspect, sent)
 
-    def _currents(self, chain: Sequence[Bounce], skins: Skins, k: float) -> list[Tensor]:
+    def _sampled(
+        self, depth: int, spacing: float, solids: Solids | None
+    ) -> Iterator[Sequence[Bounce]]:
+        """Many facets: tubes that begin as lit triangles."""
+        body, facets = self.body, self.body.facets
+        for lit in lit_triangles(facets, body.clear, -self.transmitters, spacing):
+            outside = [lit, *tubes(facets, body.occluders, lit, spacing, depth)]
+            if solids is None:
+                yield outside
+            else:
+                yield with_inner(facets, body.occluders, solids, outside, spacing, depth)
+
+    def _currents(
+        self, chain: Sequence[Bounce], solids: Solids | None, skins: Skins, k: float
+    ) -> list[Tensor]:
         """S per m² of all patches, order by order: [row, receive, transmit] each."""
         found: list[Tensor] = []
-        again = torch.zeros(0)
+        again = passed = torch.zeros(0)
         for bounce in chain:
-            first = not found
-            field = (
-                self._sent.to(torch.complex128)[bounce.aspect] if first else again[bounce.before]
-            )
-            surface = (skins.rows(bounce.facet), k, bounce.normal, bounce.direction, field)
-            sent = radiated(*surface, self.receivers[bounce.aspect])
+            if not found:
+                field = self._sent.to(torch.complex128)[bounce.aspect]
+            elif solids is None:
+                field = again[bounce.before]
+            else:
+                through = bounce.passed[:, None, None]
+                field = torch.where(through, passed[bounce.before], again[bounce.before])
+                field = field * bounce.spread[:, None, None]
+            towards, own = self.receivers[bounce.aspect], skins.rows(bounce.facet)
+            if solids is None:
+                surface = (own, k, bounce.normal, bounce.direction, field)
+                sent, again = radiated(*surface, towards), reflected(*surface)
+            else:
+                sent, again, passed = at_surface(solids, own, k, bounce, field, towards)
             seen = polarisations(self.receivers, self.body.up)[bounce.aspect]
             found.append(dot(seen[:, :, None], sent[:, None]))
-            again = reflected(*surface)
         return found
 
     def _diffracted(self, most: int) -> dict[str, Tensor]:
@@ -339,7 +372,9 @@ def _body(scene: Scene, frequencies: Tensor, up: Tensor) -> _Body:
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
     skins = [_skins(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
-    return _Body(facets, topology, vertices, occluders, skins, wave_numbers, up)
+    owner, names = topology.face_object, list(objects)
+    entered = interiors(skins, wave_numbers, facets.corners, facets.solid, owner, names)
+    return _Body(facets, topology, vertices, occluders, skins, wave_numbers, up, entered)
 
 
 def _skins(scene: Scene, topology: Topology, frequency: float) -> Skins:
