@@ -7,7 +7,7 @@ whose corners keep their derivatives: what a moving edge changes comes by itself
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -211,7 +211,7 @@ def _next(facets: Facets, incident: Tensor, last: Bounce | None, solids: Solids 
     bounce = replace(bounce, before=begun.before[bounce.before])
     if solids is None:
         return bounce
-    bounce = _rows(bounce, left(bounce, solids.wave_number))
+    bounce = rows_of(bounce, left(bounce, solids.wave_number))
     solids.check(bounce.facet, bounce.medium)
     return bounce
 
@@ -309,14 +309,14 @@ def _without(facets: Facets, bounce: Bounce, shadow: Tensor) -> Bounce:
     hidden &= dot(area_vector(shadow), bounce.direction).detach().abs() > _EMPTY * facets.size**2
     if not bool(hidden.any()):
         return bounce
-    part = _rows(bounce, hidden)
-    pieces, rest = [_rows(bounce, ~hidden)], part.polygon
+    part = rows_of(bounce, hidden)
+    pieces, rest = [rows_of(bounce, ~hidden)], part.polygon
     for plane, at, proper in sides:
         plane, at, proper = plane[hidden], at[hidden], proper[hidden]
         outside = clip(rest, -plane, torch.where(proper, -dot(plane, at), 1.0))
         pieces.append(_proper(facets, part, outside))
         rest = clip(rest, plane, torch.where(proper, dot(plane, at), -1.0))
-    return _joined(pieces)
+    return joined(pieces)
 
 
 def _sides(polygon: Tensor, direction: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
@@ -380,15 +380,26 @@ def clip(
 def _proper(facets: Facets, bounce: Bounce, polygon: Tensor) -> Bounce:
     """Patches with these polygons, without those of no area."""
     keep = area_vector(polygon).detach().norm(dim=1) > _EMPTY * facets.size**2
-    rows = _rows(bounce, keep)
+    rows = rows_of(bounce, keep)
     return Bounce(**{**vars(rows), "polygon": polygon[keep]})
 
 
-def _rows(bounce: Bounce, keep: Tensor) -> Bounce:
+def rows_of(bounce: Bounce, keep: Tensor) -> Bounce:
+    """Some rows.
+
+    Args:
+        bounce: patches.
+        keep: which.
+    """
     return Bounce(**{name: column[keep] for name, column in vars(bounce).items()})
 
 
-def _joined(parts: list[Bounce]) -> Bounce:
+def joined(parts: Sequence[Bounce]) -> Bounce:
+    """All rows of several; polygons of few corners repeat their last.
+
+    Args:
+        parts: one or more.
+    """
     width = max(part.polygon.shape[1] for part in parts)
 
     def wide(polygon: Tensor) -> Tensor:

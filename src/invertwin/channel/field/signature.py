@@ -18,12 +18,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
+from invertwin.channel.field.inner import curved, with_inner
 from invertwin.channel.field.meshed import SolvedMeshes
 from invertwin.channel.field.passages import at_surface
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
-from invertwin.channel.field.solved import SolvedBodies
 from invertwin.channel.field.solids import Solids, interiors
+from invertwin.channel.field.solved import SolvedBodies
 from invertwin.channel.field.tubes import tubes
 from invertwin.channel.field.waves import (
     Skins,
@@ -229,12 +230,13 @@ class _View:
     ) -> Iterator[Sequence[Bounce]]:
         """Many facets: tubes that begin as lit triangles."""
         body, facets = self.body, self.body.facets
+        surface = None if solids is None else curved(facets, body.topology.beside)
         for lit in lit_triangles(facets, body.clear, -self.transmitters, spacing):
             outside = [lit, *tubes(facets, body.occluders, lit, spacing, depth)]
-            if solids is None:
+            if solids is None or surface is None:
                 yield outside
             else:
-                yield with_inner(facets, body.occluders, solids, outside, spacing, depth)
+                yield with_inner(surface, body.occluders, solids, outside, spacing, depth)
 
     def _currents(
         self, chain: Sequence[Bounce], solids: Solids | None, skins: Skins, k: float

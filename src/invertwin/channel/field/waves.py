@@ -409,10 +409,21 @@ def points_at(
         corners: Of the triangles [m].
         points: In them [m].
     """
+    return (shares(corners, points)[..., None] * values).sum(-2)
+
+
+def shares(
+    corners: Float64[Tensor, "*row 3 3"], points: Float64[Tensor, "*row 3"]
+) -> Float64[Tensor, "*row 3"]:
+    """Barycentric coordinates of points in triangles.
+
+    Args:
+        corners: Of the triangles [m].
+        points: In them [m].
+    """
     a, b, c = corners.unbind(-2)
     area = cross(b - a, c - a)
     square = dot(area, area)
     v = dot(cross(b - a, points - a), area) / square
     u = dot(cross(points - a, c - a), area) / square
-    share = torch.stack([1 - u - v, u, v], -1)
-    return (share[..., None] * values).sum(-2)
+    return torch.stack([1 - u - v, u, v], -1)
