@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -23,12 +24,14 @@ from invertwin.channel.field.patches import above, divided, inner_points
 from invertwin.channel.field.solids import Solids
 from invertwin.channel.field.waves import cross, dot, mirrored, points_at, shares
 from invertwin.channel.rays.scene import Occluders, next_surface
+from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import refractive_index
 
 SMOOTH = 0.35
 """Angle between normals of neighbours [rad], above which the edge between them is sharp."""
 _THIN = 1e-14  # of the scene's size squared: a tube of less area is none
 _FLAT = 1e-6  # cosine of rays that are too near grazing
+_TOUCHING = 1e-6  # of the scene's size, and of a normal: two planes that differ less are one
 _RETRIES = 2  # how often a ray goes on from a surface that it has already left
 
 
@@ -175,7 +178,7 @@ def _entering(surface: Curved, solids: Solids, bounce: Bounce) -> _Tubes:
 
 
 class _Leaving(NamedTuple):
-    """Tubes that set out from surfaces; ``index`` is √ε where they go."""
+    """Tubes that set out from surfaces; ``slowness`` is √ε where they go."""
 
     before: Tensor
     corners: Tensor
@@ -184,7 +187,7 @@ class _Leaving(NamedTuple):
     side: Tensor
     medium: Tensor
     passed: Tensor
-    index: Tensor
+    slowness: Tensor
 
 
 def _leaving(solids: Solids, last: Bounce, tubes: _Tubes) -> _Leaving:
@@ -301,7 +304,7 @@ def _ended(
     facets, start = surface.facets, begun.corners[row]
     share = shares(start[:, None], corners)
     ways = normalize((share[..., None] * begun.ways[row][:, None]).sum(2), dim=2)
-    index = begun.index[row]
+    index = begun.slowness[row]
     # The phase is quadratic between corners at which its slope is known.
     slopes = dot(begun.ways[row][:, None], corners[:, :, None] - start[:, None])
     phases = (share * (begun.phases[row][:, None] + index[:, None, None] * slopes / 2)).sum(2)
@@ -383,3 +386,37 @@ def _wide(facets: Facets, corners: Float64[Tensor, "row 3 3"]) -> Bool[Tensor, "
     """Whether triangles have an area."""
     a, b, c = corners.unbind(1)
     return cross(b - a, c - a).norm(dim=1) > _THIN * facets.size**2
+
+
+def require_apart(facets: Facets, solids: Solids) -> None:
+    """Refuse conductors in the very face of a solid: rays find the one or the other.
+
+    Args:
+        facets: the triangles.
+        solids: what waves enter.
+
+    Raises:
+        InputError: names both.
+    """
+    corners, normal = facets.corners.detach(), facets.normal.detach()
+    own, metal = (torch.nonzero(some)[:, 0] for some in (solids.clear, solids.conducting))
+    planes = torch.cat([normal, dot(normal, corners[:, 0])[:, None] / facets.size], 1)
+    if not len(metal):
+        return
+    tree = KDTree(torch.cat([planes[metal], -planes[metal]]))
+    near = tree.query_ball_point(planes[own], _TOUCHING)
+    low, high = corners.amin(1), corners.amax(1)
+    for facet, others in zip(own.tolist(), near, strict=True):
+        other = metal[torch.tensor(others, dtype=torch.int64) % len(metal)]
+        gap = torch.maximum(low[other] - high[facet], low[facet] - high[other])
+        # Neighbours that share a side in one plane do not cover each other.
+        over = (gap < _TOUCHING * facets.size).all(1) & (
+            (gap < -_TOUCHING * facets.size).sum(1) > 1
+        )
+        if bool(over.any()):
+            names = [solids.names[int(solids.owner[n])] for n in (facet, other[over][0])]
+            raise InputError(
+                f"expected conductors that do not touch {names[0]} in a scene of more than 24 "
+                f"triangles, got {names[1]} in the plane of one of its faces; sink it into "
+                f"{names[0]} by a thousandth of a wavelength, or use at most 24 triangles"
+            )

@@ -109,16 +109,17 @@ def interiors(
     groups: dict[tuple[object, ...], list[int]] = {}
     for f, (skin, k) in enumerate(zip(skins, wave_numbers, strict=True)):
         # Equal values of two frequencies may have derivatives that differ.
-        key: list[object] = [f if differentiated(skin.permittivity) else AIR]
+        key: list[object] = [f if differentiated(skin.permittivity) else None]
         for own, chord in zip(bodies, chords, strict=True):
-            entered = bool(solid[own].all()) and body_like(skin.rows(own))
+            rows = skin.rows(own)
+            entered = bool(solid[own].all()) and homogeneous(rows) and not _opaque(rows)
             epsilon = complex(skin.permittivity[own[0]].detach())
             left = math.exp(k * chord * cmath.sqrt(epsilon).imag)
             key.append(epsilon if entered and left > OPAQUE else None)
         groups.setdefault(tuple(key), []).append(f)
     found: list[tuple[Solids | None, list[int]]] = []
-    for key, members in groups.items():
-        entered = torch.tensor([value is not None for value in key[1:]])
+    for alike, members in groups.items():
+        entered = torch.tensor([value is not None for value in alike[1:]])
         if not bool(entered.any()):
             found.append((None, members))
             continue
@@ -131,15 +132,19 @@ def interiors(
     return found
 
 
-def body_like(skins: Skins) -> bool:
-    """Whether surfaces are those of one homogeneous dielectric.
+def homogeneous(skins: Skins) -> bool:
+    """Whether the permittivity of a surface is one; conductors and sheets count as such.
 
     Args:
-        skins: one row each.
+        skins: of its facets.
     """
     epsilon = skins.permittivity.detach()
-    body = ~skins.conducting & torch.isinf(skins.thickness)
-    return bool(body.all() & (epsilon == epsilon[0]).all())
+    return _opaque(skins) or bool((epsilon == epsilon[0]).all())
+
+
+def _opaque(skins: Skins) -> bool:
+    """Whether there is no dielectric body behind a surface."""
+    return bool((skins.conducting | torch.isfinite(skins.thickness)).any())
 
 
 def _mean_chord(corners: Tensor) -> float:

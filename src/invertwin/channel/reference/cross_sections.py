@@ -1,7 +1,7 @@
 """Radar cross-sections that are known otherwise: closed forms, a series, a method of moments.
 
-Each is of the built-in shape of its name as it stands, unturned, and serves as an oracle. All are of
-conductors but the sphere, which may be of a dielectric.
+Each is of the built-in shape of its name as it stands, unturned, and serves as an oracle. All but
+the sphere, which may be of a dielectric, are of conductors.
 """
 
 import math
