@@ -280,8 +280,8 @@ def _met(
         row = torch.nonzero(wrong)[:, 0]
         if not len(row):
             break
-        moved = along[row] * far + 2 * above(facets, torch.ones(1, dtype=torch.float64))
-        starts = starts.index_copy(0, row, starts[row] + moved[:, None] * ways[row])
+        beyond = (along[row] * far)[:, None] * ways[row] + 2 * above(facets, ways[row])
+        starts = starts.index_copy(0, row, starts[row] + beyond)
         again, along_again = next_surface(occluders, starts[row], starts[row] + far * ways[row])
         found = found.index_copy(0, row, again)
         along = along.index_copy(0, row, along_again)

@@ -398,9 +398,9 @@ def area_vector(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "ro
 
 
 def points_at(
-    values: Float64[Tensor, "*row 3 3"],
-    corners: Float64[Tensor, "*row 3 3"],
-    points: Float64[Tensor, "*row 3"],
+    values: Float64[Tensor, "*#row 3 3"],
+    corners: Float64[Tensor, "*#row 3 3"],
+    points: Float64[Tensor, "*#row 3"],
 ) -> Float64[Tensor, "*row 3"]:
     """Vectors at the corners of triangles, interpolated at points in these.
 
@@ -413,7 +413,7 @@ def points_at(
 
 
 def shares(
-    corners: Float64[Tensor, "*row 3 3"], points: Float64[Tensor, "*row 3"]
+    corners: Float64[Tensor, "*#row 3 3"], points: Float64[Tensor, "*#row 3"]
 ) -> Float64[Tensor, "*row 3"]:
     """Barycentric coordinates of points in triangles.
 
