@@ -379,7 +379,8 @@ def _spread(
     ) / before
     turned = before * after < 0
     turns = torch.where(turned, 1, torch.where(trace < 0, 2, 0))
-    return (before / after).abs().sqrt() * 1j**turns
+    quarter = torch.tensor([1.0, 1j, -1.0], dtype=torch.complex128)[turns]
+    return (before / after).abs().sqrt() * quarter
 
 
 def _wide(facets: Facets, corners: Float64[Tensor, "row 3 3"]) -> Bool[Tensor, " row"]:
