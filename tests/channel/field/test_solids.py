@@ -259,14 +259,7 @@ def power(theta: Tensor) -> Tensor:
     )
     floor = Object(plate(0.05, 0.05), METAL, rigid(translation=float64([0.0, 0.0, -0.02])))
     scene = Scene({"block": body, "floor": floor})
-    found = iw.rcs(
-        scene,
-        [[0.25, 0.1, 1.0]],
-        [30e9, 31e9],
-        receivers=[[-0.2, 0.1, 1.0]],
-        depth=3,
-        edges=0,
-    )
+    found = iw.rcs(scene, [[0.25, 0.1, 1.0]], 31e9, depth=3, edges=0)
     return found.matrix.abs().square().sum()
 
 
