@@ -30,6 +30,10 @@ def float64(values: object) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
+def complex128(values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.complex128)
+
+
 def thing(
     mesh: Mesh,
     at: Sequence[float] = (0.0, 0.0, 0.0),

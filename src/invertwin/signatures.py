@@ -34,8 +34,9 @@ class Signature:
 
     Attributes:
         parts: S [m] of each part of the field: ``order 1``, ``order 2`` … are physical optics after
-            as many bounces, ``edges 1`` fringe currents, ``edges 2`` … waves that several edges of
-            a plate diffract, ``rest`` what these leave out of the solved field of small bodies.
+            as many meetings with surfaces, faces of solids from within included, ``edges 1`` fringe
+            currents, ``edges 2`` … waves that several edges of a plate diffract, ``rest`` what
+            these leave out of the solved field of small bodies.
         frequencies: [Hz].
         directions: unit vectors from the target to the transmitter.
         receivers: unit vectors to the receiver.
@@ -133,8 +134,9 @@ def rcs(
     """Compute the radar cross-section of smooth conductors and dielectrics, far away.
 
     Scenes of at most 24 triangles are exact physical optics of every bounce; others are shot with
-    ray tubes. Of small conductors, currents are solved, and ``rest`` is what rays leave out. Scenes
-    of at most 24 triangles are differentiable with respect to vertices, ``rest`` included.
+    ray tubes. Waves go through closed bodies of dielectric, with bounces inside. Of small
+    conductors, currents are solved, and ``rest`` is what rays leave out. Scenes of at most 24
+    triangles are differentiable with respect to vertices, ``rest`` included.
     Monostatic and bistatic results are reciprocal.
 
     Args:
@@ -144,7 +146,7 @@ def rcs(
         receivers: the same to the receiver, one for each direction; None = the transmitter.
         polarisation: of the first row and column of the matrices: "V", "H", "circular" (right-hand)
             or a Jones vector (V, H). V and H are the unit vectors of θ and φ about ``up``.
-        depth: most bounces.
+        depth: most meetings with surfaces; the echo of a solid's back face leaves by the third.
         edges: most diffractions of a wave by sharp edges of conductors: 0 is physical optics alone,
             1 adds fringe currents, 2 the waves between the edges of a flat plate. From 1 on small
             conductors are solved.
@@ -155,7 +157,8 @@ def rcs(
 
     Raises:
         InputError: no direction or frequency, a rough surface, a cloud, derivatives of a scene of
-            more than 24 triangles or with respect to directions or frequencies.
+            more than 24 triangles or with respect to directions or frequencies, dielectrics that
+            touch or lie in each other.
 
     Source: derivations §4, §13, §14.
     """

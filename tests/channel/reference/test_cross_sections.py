@@ -52,6 +52,35 @@ def test_small_and_large_spheres():
     assert float(found[1]) == pytest.approx(area, rel=2e-3)
 
 
+def wave_number(x: float) -> float:
+    """The frequency [Hz] at which a sphere of 0.1 m has the size ka = x."""
+    return x / 0.1 * SPEED_OF_LIGHT / (2 * math.pi)
+
+
+def test_a_small_dielectric_sphere_is_that_of_rayleigh():
+    """σ = 4πa²(ka)⁴ |(ε − 1)/(ε + 2)|²."""
+    found = SphereSection(0.1, 2.5).section(float64([wave_number(0.05)]), AHEAD)
+    expected = 4 * math.pi * 0.1**2 * 0.05**4 * (1.5 / 4.5) ** 2
+    assert float(found) == pytest.approx(expected, rel=2e-3)
+
+
+def test_large_lossy_and_metal_spheres_return_what_their_fronts_reflect():
+    """S = (a/2) r exp(2jka), in phase and polarisation that of physical optics."""
+    front = 0.05 * np.exp(200j)
+    m = np.sqrt(4 * (1 - 0.5j))
+    for sphere, r in ((SphereSection(0.1, 4.0, 0.5), (1 - m) / (1 + m)), (SphereSection(0.1), -1)):
+        found = complex(sphere.amplitude(float64([wave_number(100.0)]))[0])
+        assert abs(found / (r * front) - 1) < 6e-3
+
+
+def test_a_sphere_of_high_loss_is_one_of_metal():
+    metal, lossy = (
+        complex(s.amplitude(float64([wave_number(10.0)]))[0])
+        for s in (SphereSection(0.1), SphereSection(0.1, 1e10, 1.0))
+    )
+    assert abs(lossy / metal - 1) < 1e-4
+
+
 @pytest.mark.parametrize(("name", "radius"), [("s2", 0.3), ("s7", 9.6)])
 def test_spheres_are_those_of_the_published_table(data_folder, name, radius):
     for band in ("f1", "f6"):

@@ -6,14 +6,17 @@ in the beam and no other facet stands before it. All parts are convex polygons, 
 whose corners keep their derivatives: what a moving edge changes comes by itself.
 """
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.field.solids import AIR, Solids, refracted
 from invertwin.channel.field.waves import area_vector, cross, dot, mirrored, polygon_integral
 from invertwin.channel.rays.topology import Topology
 
@@ -21,6 +24,7 @@ FEW = 24
 """Triangles of a scene up to which beams are clipped exactly."""
 _EMPTY = 1e-12  # of the scene's size squared: a polygon of less area is none
 _FLAT = 1e-12  # of a polygon's size: a side between less different heights lies in the plane
+_LOST = 1e-6  # amplitude that losses leave of a wave, below which it is dropped
 _BEFORE = 1e-9  # of the scene's size: what rises less above a facet hides nothing of it
 
 
@@ -68,29 +72,65 @@ class Bounce:
         facet: what is lit.
         normal: of the facet, towards the beam's source.
         direction: d of the beam.
-        offset: c, so that the wave has the phase −k(d·x + c) [m].
+        offset: c [m].
         polygon: the lit part [m].
         before: the row of the previous order that the beam comes from; −1 at the first.
+        wave: K, so that the wave has the phase −k(K·x + c): d in air, complex where it decays.
+        medium: number of the solid that the beam is in; −1 = air.
+        passed: whether it has crossed the face where it comes from, and was not mirrored there.
+        spread: its field over that of a plane wave, by how the ways of neighbours spread.
     """
 
     aspect: Int64[Tensor, " row"]
     facet: Int64[Tensor, " row"]
     normal: Float64[Tensor, "row 3"]
     direction: Float64[Tensor, "row 3"]
-    offset: Float64[Tensor, " row"]
+    offset: Tensor
     polygon: Float64[Tensor, "row corner 3"]
     before: Int64[Tensor, " row"]
+    wave: Tensor
+    medium: Int64[Tensor, " row"]
+    passed: Bool[Tensor, " row"]
+    spread: Tensor
 
     def integral(
         self, towards: Float64[Tensor, "row 3"]
     ) -> Callable[[float], Complex128[Tensor, " row"]]:
-        """∫ exp(−jk(d·x + c − s·x)) dA over each patch, by wave number k [1/m].
+        """∫ exp(−jk(K·x + c − s·x)) dA over each patch, by wave number k [1/m].
 
         Args:
             towards: s, to the receiver.
         """
-        patches = polygon_integral(self.polygon, towards - self.direction)
-        return lambda k: patches(k) * torch.exp(-1j * k * self.offset)
+        way = towards - self.wave
+        if not way.is_complex():
+            patches = polygon_integral(self.polygon, way)
+            return lambda k: patches(k) * torch.exp(-1j * k * self.offset)
+        # About a corner: far from the origin, decaying waves are out of range.
+        start = self.polygon[:, 0]
+        patches = polygon_integral(self.polygon - start[:, None], way)
+        phase = dot(way, start) - self.offset
+        return lambda k: patches(k) * torch.exp(1j * k * phase)
+
+
+def in_air(
+    aspect: Int64[Tensor, " row"],
+    facet: Int64[Tensor, " row"],
+    normal: Float64[Tensor, "row 3"],
+    direction: Float64[Tensor, "row 3"],
+    offset: Float64[Tensor, " row"],
+    polygon: Float64[Tensor, "row corner 3"],
+    before: Int64[Tensor, " row"],
+) -> Bounce:
+    """Lit patches of waves that no solid has let in.
+
+    Args:
+        aspect, facet, normal, direction, offset, polygon, before: as in `Bounce`.
+    """
+    air, plain = torch.full_like(aspect, AIR), torch.ones_like(offset)
+    none = torch.zeros_like(aspect, dtype=torch.bool)
+    return Bounce(
+        aspect, facet, normal, direction, offset, polygon, before, direction, air, none, plain
+    )
 
 
 def beams(
@@ -99,6 +139,7 @@ def beams(
     depth: int,
     *,
     boundary: bool = True,
+    solids: Solids | None = None,
 ) -> Iterator[Bounce]:
     """Lit patches of the first order, of the second, and so on, of plane waves.
 
@@ -107,10 +148,14 @@ def beams(
         incident: d of each wave.
         depth: most bounces.
         boundary: False leaves out of derivatives what moving edges of beams change.
+        solids: what waves enter; None = nothing.
+
+    Raises:
+        InputError: a dielectric within another one, or in touch with it.
     """
     last = None
     for _ in range(depth):
-        last = _next(facets, incident, last)
+        last = _next(facets, incident, last, solids)
         if not boundary:
             last = _fixed(facets, last)
         if not len(last.aspect):
@@ -118,33 +163,102 @@ def beams(
         yield last
 
 
-def _next(facets: Facets, incident: Tensor, last: Bounce | None) -> Bounce:
+class _Source(NamedTuple):
+    """Beams that set out, one row each; ``side`` is normal to where from, on their side of it."""
+
+    aspect: Tensor
+    own: Tensor
+    before: Tensor
+    side: Tensor
+    at: Tensor
+    direction: Tensor
+    offset: Tensor
+    wave: Tensor
+    medium: Tensor
+    passed: Tensor
+
+
+def _next(facets: Facets, incident: Tensor, last: Bounce | None, solids: Solids | None) -> Bounce:
     """All facets in all beams of one order."""
     count = len(facets.normal)
-    if last is None:
-        row = torch.arange(len(incident)).repeat_interleave(count)
-        aspect, before = row, torch.full_like(row, -1)
-        direction, offset = incident[row], torch.zeros(len(row), dtype=torch.float64)
-        own = before
-    else:
-        before = torch.arange(len(last.aspect)).repeat_interleave(count)
-        aspect, own = last.aspect[before], last.facet[before]
-        normal, d = last.normal[before], last.direction[before]
-        direction = mirrored(d, normal)
-        # Equal phases on the mirror itself.
-        on_mirror = last.polygon[before, 0]
-        offset = last.offset[before] + dot(d - direction, on_mirror)
-    facet = torch.arange(count).repeat(len(before) // count)
-    normal = facets.normal[facet]
-    facing = dot(normal, direction).detach()
-    keep = (facet != own) & (facing.abs() > 1e-9) & ~(facets.solid[facet] & (facing > 0))
-    aspect, facet, before = aspect[keep], facet[keep], before[keep]
-    direction, offset = direction[keep], offset[keep]
-    normal = -facing[keep].sign()[:, None] * normal[keep]
-    bounce = Bounce(aspect, facet, normal, direction, offset, facets.corners[facet], before)
+    begun = _first(incident, solids) if last is None else _onwards(last, solids)
+    source = torch.arange(len(begun.aspect)).repeat_interleave(count)
+    facet = torch.arange(count).repeat(len(begun.aspect))
+    facing = dot(facets.normal[facet], begun.direction[source]).detach()
+    lit = ~(facets.solid[facet] & (facing > 0))
+    if solids is not None:
+        within = begun.medium[source] == solids.owner[facet]
+        lit = torch.where(within, facing > 0, lit)
+    keep = (facet != begun.own[source]) & (facing.abs() > 1e-9) & lit
+    source, facet = source[keep], facet[keep]
+    normal = -facing[keep].sign()[:, None] * facets.normal[facet]
+    bounce = Bounce(
+        begun.aspect[source],
+        facet,
+        normal,
+        begun.direction[source],
+        begun.offset[source],
+        facets.corners[facet],
+        source,
+        begun.wave[source],
+        begun.medium[source],
+        begun.passed[source],
+        torch.ones(len(source), dtype=torch.float64),
+    )
     if last is not None:
-        bounce = _within(facets, bounce, last)
-    return _unhidden(facets, bounce, last)
+        bounce = _within(facets, bounce, last, begun)
+    bounce = _unhidden(facets, bounce, None if last is None else begun, solids)
+    bounce = replace(bounce, before=begun.before[bounce.before])
+    if solids is None:
+        return bounce
+    bounce = rows_of(bounce, left(bounce, solids.wave_number))
+    solids.check(bounce.facet, bounce.medium)
+    return bounce
+
+
+def _first(incident: Tensor, solids: Solids | None) -> _Source:
+    """Plane waves from far away."""
+    none = torch.full((len(incident),), -1)
+    wave = incident if solids is None else incident.to(torch.complex128)
+    zeros = torch.zeros(len(incident), dtype=wave.dtype)
+    aspect = torch.arange(len(incident))
+    at, passed = torch.zeros_like(incident), none >= 0
+    return _Source(aspect, none, none, at, at, incident, zeros, wave, none, passed)
+
+
+def _onwards(last: Bounce, solids: Solids | None) -> _Source:
+    """What a mirror sends on, and after that what faces of solids let through."""
+    direction, wave = mirrored(last.direction, last.normal), mirrored(last.wave, last.normal)
+    row, at = torch.arange(len(last.aspect)), last.polygon[:, 0]
+    passed = torch.zeros_like(row, dtype=torch.bool)
+    medium, side = last.medium, last.normal
+    if solids is not None:
+        behind = solids.behind(last.facet, last.medium)
+        through, going = refracted(solids.inside(behind), last.wave, last.normal)
+        some = torch.nonzero(going & solids.clear[last.facet])[:, 0]
+        row = torch.cat([row, some])
+        at = at[row]
+        passed = torch.cat([passed, torch.ones_like(some, dtype=torch.bool)])
+        wave = torch.cat([wave, through[some]])
+        direction = torch.cat([direction, normalize(through[some].real, dim=1)])
+        medium = torch.cat([medium, behind[some]])
+        side = torch.cat([side, -last.normal[some]])
+    # Equal phases on the face itself.
+    offset = last.offset[row] + dot(last.wave[row] - wave, at.to(wave.dtype))
+    aspect, own = last.aspect[row], last.facet[row]
+    return _Source(aspect, own, row, side, at, direction, offset, wave, medium, passed)
+
+
+def left(bounce: Bounce, wave_number: float) -> Bool[Tensor, " row"]:
+    """Whether losses leave anything of waves.
+
+    Args:
+        bounce: where they end.
+        wave_number: k [1/m].
+    """
+    way = (dot(bounce.wave[:, None], bounce.polygon.to(bounce.wave.dtype)).detach()).imag
+    way = way + bounce.offset.detach().imag[:, None]
+    return wave_number * way.amax(1) > math.log(_LOST)
 
 
 def _fixed(facets: Facets, bounce: Bounce) -> Bounce:
@@ -155,24 +269,30 @@ def _fixed(facets: Facets, bounce: Bounce) -> Bounce:
     return replace(bounce, polygon=corners[:, :1] + places @ sides)
 
 
-def _within(facets: Facets, bounce: Bounce, last: Bounce) -> Bounce:
-    """The parts of facets that lie in the beams that a mirror has sent."""
-    mirror = last.polygon[bounce.before]
-    polygon = _in_front(bounce.polygon, last.normal[bounce.before], mirror[:, 0], 0.0)
+def _within(facets: Facets, bounce: Bounce, last: Bounce, begun: _Source) -> Bounce:
+    """The parts of facets that lie in the beams that a mirror, or a face, has sent."""
+    mirror = last.polygon[begun.before[bounce.before]]
+    polygon = _in_front(bounce.polygon, begun.side[bounce.before], mirror[:, 0], 0.0)
     for plane, at, proper in _sides(mirror, bounce.direction):
         polygon = clip(polygon, plane, torch.where(proper, dot(plane, at), -1.0))
     return _proper(facets, bounce, polygon)
 
 
-def _unhidden(facets: Facets, bounce: Bounce, last: Bounce | None) -> Bounce:
+def _unhidden(
+    facets: Facets, bounce: Bounce, begun: _Source | None, solids: Solids | None
+) -> Bounce:
     """What no other facet hides from the source, as convex pieces."""
     for other in range(len(facets.normal)):
         if not len(bounce.aspect):
             break
+        above: Tensor | float = _BEFORE * facets.size
+        if solids is not None and bool(solids.conducting[other]):
+            # A conductor that touches a dielectric is what waves meet there, from either side.
+            above = torch.where(solids.conducting[bounce.facet], above, -above)
         shadow = facets.corners[other].expand(len(bounce.aspect), 3, 3)
-        shadow = _in_front(shadow, bounce.normal, bounce.polygon[:, 0], _BEFORE * facets.size)
-        if last is not None:
-            plane, at = last.normal[bounce.before], last.polygon[bounce.before, 0]
+        shadow = _in_front(shadow, bounce.normal, bounce.polygon[:, 0], above)
+        if begun is not None:
+            plane, at = begun.side[bounce.before], begun.at[bounce.before]
             shadow = _in_front(shadow, plane, at, _BEFORE * facets.size)
         bounce = _without(facets, bounce, shadow)
     return bounce
@@ -189,14 +309,14 @@ def _without(facets: Facets, bounce: Bounce, shadow: Tensor) -> Bounce:
     hidden &= dot(area_vector(shadow), bounce.direction).detach().abs() > _EMPTY * facets.size**2
     if not bool(hidden.any()):
         return bounce
-    part = _rows(bounce, hidden)
-    pieces, rest = [_rows(bounce, ~hidden)], part.polygon
+    part = rows_of(bounce, hidden)
+    pieces, rest = [rows_of(bounce, ~hidden)], part.polygon
     for plane, at, proper in sides:
         plane, at, proper = plane[hidden], at[hidden], proper[hidden]
         outside = clip(rest, -plane, torch.where(proper, -dot(plane, at), 1.0))
         pieces.append(_proper(facets, part, outside))
         rest = clip(rest, plane, torch.where(proper, dot(plane, at), -1.0))
-    return _joined(pieces)
+    return joined(pieces)
 
 
 def _sides(polygon: Tensor, direction: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
@@ -216,7 +336,7 @@ def _sides(polygon: Tensor, direction: Tensor) -> list[tuple[Tensor, Tensor, Ten
     return found
 
 
-def _in_front(polygon: Tensor, normal: Tensor, point: Tensor, margin: float) -> Tensor:
+def _in_front(polygon: Tensor, normal: Tensor, point: Tensor, margin: Tensor | float) -> Tensor:
     return clip(polygon, normal, dot(normal, point) + margin)
 
 
@@ -260,15 +380,26 @@ def clip(
 def _proper(facets: Facets, bounce: Bounce, polygon: Tensor) -> Bounce:
     """Patches with these polygons, without those of no area."""
     keep = area_vector(polygon).detach().norm(dim=1) > _EMPTY * facets.size**2
-    rows = _rows(bounce, keep)
+    rows = rows_of(bounce, keep)
     return Bounce(**{**vars(rows), "polygon": polygon[keep]})
 
 
-def _rows(bounce: Bounce, keep: Tensor) -> Bounce:
+def rows_of(bounce: Bounce, keep: Tensor) -> Bounce:
+    """Some rows.
+
+    Args:
+        bounce: patches.
+        keep: which.
+    """
     return Bounce(**{name: column[keep] for name, column in vars(bounce).items()})
 
 
-def _joined(parts: list[Bounce]) -> Bounce:
+def joined(parts: Sequence[Bounce]) -> Bounce:
+    """All rows of several; polygons of few corners repeat their last.
+
+    Args:
+        parts: one or more.
+    """
     width = max(part.polygon.shape[1] for part in parts)
 
     def wide(polygon: Tensor) -> Tensor:

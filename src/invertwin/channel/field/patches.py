@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.field.beams import Bounce, Facets
+from invertwin.channel.field.beams import Bounce, Facets, in_air
 from invertwin.channel.field.waves import dot
 
 _LARGE = 8.0  # times the smallest piece: larger triangles are split before they are looked at
@@ -72,7 +72,7 @@ def _lit(
     aspect, number, d = aspect[row], number[row], d[row]
     normal = _towards(facets.normal[number], d)
     before = torch.full_like(aspect, -1)
-    return Bounce(aspect, number, normal, d, torch.zeros_like(d[:, 0]), corners, before)
+    return in_air(aspect, number, normal, d, torch.zeros_like(d[:, 0]), corners, before)
 
 
 def divided(
@@ -93,7 +93,7 @@ def divided(
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     row = torch.arange(len(corners))
     while True:
-        seen = look(row, _inner_points(corners))
+        seen = look(row, inner_points(corners))
         whole = (seen == seen[:, :1]).all(1)
         found.append((row[whole], corners[whole], seen[whole, 0]))
         row, corners, seen = row[~whole], corners[~whole], seen[~whole]
@@ -118,7 +118,7 @@ def _cut(
     order = (odd[:, None] + torch.arange(3)) % 3
     row, seen = row[~single], seen[~single, 1:].gather(1, order)
     corners = corners[~single].gather(1, order[..., None].expand(-1, -1, 3))
-    inner = _inner_points(corners)[:, 1:]
+    inner = inner_points(corners)[:, 1:]
     # How far the sides that begin at the odd corner look as it does.
     low = torch.zeros(len(row), 2, dtype=torch.float64)
     for step in range(1, _HALVINGS + 1):
@@ -143,8 +143,12 @@ def above(facets: Facets, normal: Float64[Tensor, "row 3"]) -> Float64[Tensor, "
     return _ASIDE * facets.size * normal
 
 
-def _inner_points(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "row 4 3"]:
-    """The middle of each triangle, and a point near each corner."""
+def inner_points(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "row 4 3"]:
+    """The middle of each triangle, and a point near each corner.
+
+    Args:
+        corners: Of the triangles [m].
+    """
     middle = corners.mean(1, keepdim=True)
     return torch.cat([middle, corners + _INSET * (middle - corners)], 1)
 

@@ -18,9 +18,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
+from invertwin.channel.field.inner import SMOOTH, curved, require_apart, with_inner
 from invertwin.channel.field.meshed import SolvedMeshes
+from invertwin.channel.field.passages import at_surface
 from invertwin.channel.field.patches import lit_triangles
 from invertwin.channel.field.plates import plates_of, several_diffractions
+from invertwin.channel.field.solids import Solids, homogeneous, interiors
 from invertwin.channel.field.solved import SolvedBodies
 from invertwin.channel.field.tubes import tubes
 from invertwin.channel.field.waves import (
@@ -47,10 +50,11 @@ from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.progress import told
+from invertwin.scene.material.fresnel import refractive_index
 from invertwin.scene.scene import Scene
 
 _SAGITTA = 1 / 50  # wavelengths that a facet may be off the curved surface
-_SMOOTH = (1e-6, 0.35)  # rad that normals turn from facet to facet where a surface is curved
+_FLAT = 1e-6  # rad that normals turn from facet to facet where a surface is curved
 _SEGMENTS = 2.0  # of an edge per wavelength; each is seen or not
 _LEAST_LINE = 2.0  # wavelengths that an edge which ends in a smooth surface runs on at least
 _OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
@@ -69,6 +73,7 @@ class _Body:
         skins: of the triangles, for each frequency.
         wave_numbers: k of the frequencies [1/m].
         up: direction of V.
+        interiors: groups of frequencies, and what waves enter there.
     """
 
     facets: Facets
@@ -78,11 +83,17 @@ class _Body:
     skins: Sequence[Skins]
     wave_numbers: Sequence[float]
     up: Float64[Tensor, "3"]
+    interiors: Sequence[tuple[Solids | None, Sequence[int]]]
 
     @property
     def wavelength(self) -> float:
         """The shortest [m]."""
         return 2 * math.pi / max(self.wave_numbers)
+
+    def index(self, number: int) -> float:
+        """The largest refractive index of waves inside an object; 1 where none enter."""
+        inside = [solids.permittivity[number] for solids, _ in self.interiors if solids is not None]
+        return max([1.0, *(float(refractive_index(e.detach())) for e in inside)])
 
     @property
     def plain(self) -> bool:
@@ -133,7 +144,8 @@ def trace_signature(
 
     Raises:
         InputError: a cloud, a rough surface, derivatives of a scene of many triangles, or of a
-            small one of which vertices lie at one place.
+            small one of which vertices lie at one place, a dielectric inside or in touch with
+            another one that waves enter, a conductor in touch with one of many triangles.
     """
     with tracing():
         body = _body(scene, frequencies, up)
@@ -143,6 +155,8 @@ def trace_signature(
                 f"expected at most {FEW} triangles for derivatives of a signature, got {count}: "
                 "ray tubes jump at edges; detach the scene, or fit with power paths"
             )
+        if count > FEW:
+            _check_inner(body)
         spacing = None if count <= FEW else body.wavelength / tubes_per_wavelength
         ways = [(transmitters, transmitters if receivers is None else receivers)]
         if receivers is not None:
@@ -188,44 +202,75 @@ class _View:
     def _bounces(self, depth: int, spacing: float | None, boundary: bool) -> dict[str, Tensor]:
         """Physical optics of every order: of beams, or of tubes where a spacing is given."""
         body, orders = self.body, [list(self._none()) for _ in range(depth)]
-        chains: Iterable[Sequence[Bounce]]
-        if spacing is None:
-            chains = [list(beams(body.facets, -self.transmitters, depth, boundary=boundary))]
-        else:
-            chains = self._sampled(depth, spacing)
-        for chain in chains:
-            currents: list[Tensor] = []
-            integrals = [bounce.integral(self.receivers[bounce.aspect]) for bounce in chain]
-            for f, k in enumerate(body.wave_numbers):
-                if not (body.plain and currents):
-                    currents = self._currents(chain, body.skins[f], 1.0 if body.plain else k)
-                rows = zip(orders, chain, integrals, currents, strict=False)
-                for order, bounce, integral, current in rows:
-                    strength = integral(k) * (k if body.plain else 1.0)
-                    sent = current * strength[:, None, None]
-                    order[f] = order[f].index_add(0, bounce.aspect, sent)
+        for solids, members in body.interiors:
+            chains: Iterable[Sequence[Bounce]]
+            if spacing is None:
+                incident = -self.transmitters
+                found = beams(body.facets, incident, depth, boundary=boundary, solids=solids)
+                chains = [list(found)]
+            else:
+                chains = self._sampled(depth, spacing, solids)
+            for chain in chains:
+                self._add(orders, chain, solids, members)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
-    def _sampled(self, depth: int, spacing: float) -> Iterator[Sequence[Bounce]]:
-        """Many facets: tubes that begin as lit triangles."""
-        facets = self.body.facets
-        for lit in lit_triangles(facets, self.body.clear, -self.transmitters, spacing):
-            yield [lit, *tubes(facets, self.body.occluders, lit, spacing, depth)]
+    def _add(
+        self,
+        orders: list[list[Tensor]],
+        chain: Sequence[Bounce],
+        solids: Solids | None,
+        members: Sequence[int],
+    ) -> None:
+        """Add what all patches send to the fields of their orders, at some frequencies."""
+        body = self.body
+        currents: list[Tensor] = []
+        integrals = [bounce.integral(self.receivers[bounce.aspect]) for bounce in chain]
+        for f in members:
+            k = body.wave_numbers[f]
+            if not (body.plain and currents):
+                currents = self._currents(chain, solids, body.skins[f], 1.0 if body.plain else k)
+            rows = zip(orders, chain, integrals, currents, strict=False)
+            for order, bounce, integral, current in rows:
+                strength = integral(k) * (k if body.plain else 1.0)
+                sent = current * strength[:, None, None]
+                order[f] = order[f].index_add(0, bounce.aspect, sent)
 
-    def _currents(self, chain: Sequence[Bounce], skins: Skins, k: float) -> list[Tensor]:
+    def _sampled(
+        self, depth: int, spacing: float, solids: Solids | None
+    ) -> Iterator[Sequence[Bounce]]:
+        """Many facets: tubes that begin as lit triangles."""
+        body, facets = self.body, self.body.facets
+        surface = None if solids is None else curved(facets, body.topology.beside)
+        for lit in lit_triangles(facets, body.clear, -self.transmitters, spacing):
+            outside = [lit, *tubes(facets, body.occluders, lit, spacing, depth)]
+            if solids is None or surface is None:
+                yield outside
+            else:
+                yield with_inner(surface, body.occluders, solids, outside, spacing, depth)
+
+    def _currents(
+        self, chain: Sequence[Bounce], solids: Solids | None, skins: Skins, k: float
+    ) -> list[Tensor]:
         """S per m² of all patches, order by order: [row, receive, transmit] each."""
         found: list[Tensor] = []
-        again = torch.zeros(0)
+        again = passed = torch.zeros(0)
         for bounce in chain:
-            first = not found
-            field = (
-                self._sent.to(torch.complex128)[bounce.aspect] if first else again[bounce.before]
-            )
-            surface = (skins.rows(bounce.facet), k, bounce.normal, bounce.direction, field)
-            sent = radiated(*surface, self.receivers[bounce.aspect])
+            if not found:
+                field = self._sent.to(torch.complex128)[bounce.aspect]
+            elif solids is None:
+                field = again[bounce.before]
+            else:
+                through = bounce.passed[:, None, None]
+                field = torch.where(through, passed[bounce.before], again[bounce.before])
+                field = field * bounce.spread[:, None, None]
+            towards, own = self.receivers[bounce.aspect], skins.rows(bounce.facet)
+            if solids is None:
+                surface = (own, k, bounce.normal, bounce.direction, field)
+                sent, again = radiated(*surface, towards), reflected(*surface)
+            else:
+                sent, again, passed = at_surface(solids, own, k, bounce, field, towards)
             seen = polarisations(self.receivers, self.body.up)[bounce.aspect]
             found.append(dot(seen[:, :, None], sent[:, None]))
-            again = reflected(*surface)
         return found
 
     def _diffracted(self, most: int) -> dict[str, Tensor]:
@@ -294,6 +339,22 @@ class _View:
         return torch.stack(total)
 
 
+def _check_inner(body: _Body) -> None:
+    """Refuse what tubes inside of solids cannot do."""
+    for solids, _ in body.interiors:
+        if solids is None:
+            continue
+        if differentiated(solids.permittivity):
+            names = [solids.names[int(n)] for n in solids.owner[solids.clear].unique()]
+            raise InputError(
+                f"expected permittivities of {', '.join(names)} without derivatives in a scene of "
+                f"more than {FEW} triangles, got some that require grad: ray tubes inside jump at "
+                "edges; detach them, use fewer triangles, or an open mesh, which shows its front "
+                "alone"
+            )
+        require_apart(body.facets, solids)
+
+
 def _rest(body: _Body, ways: Sequence[tuple[Tensor, Tensor]], known: Tensor) -> Tensor | None:
     """What bounces and edges leave out of the fields of small targets; of larger ones zero."""
     meshes = SolvedMeshes(body.vertices, body.topology.faces, body.facets.solid, body.up)
@@ -339,7 +400,9 @@ def _body(scene: Scene, frequencies: Tensor, up: Tensor) -> _Body:
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
     skins = [_skins(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
-    return _Body(facets, topology, vertices, occluders, skins, wave_numbers, up)
+    owner, names = topology.face_object, list(objects)
+    entered = interiors(skins, wave_numbers, facets.corners, facets.solid, owner, names)
+    return _Body(facets, topology, vertices, occluders, skins, wave_numbers, up, entered)
 
 
 def _skins(scene: Scene, topology: Topology, frequency: float) -> Skins:
@@ -376,7 +439,7 @@ def _warn(scene: Scene, body: _Body, density: float, spacing: float | None, solv
     ends = body.vertices.detach()[body.topology.edges]
     # A triangle of side ℓ whose neighbours turn by α is ℓα/√12 off the curved surface.
     off = (ends[:, 1] - ends[:, 0]).norm(dim=1) * turn / math.sqrt(12)
-    curved = (turn > _SMOOTH[0]) & (turn < _SMOOTH[1])
+    smooth = (turn > _FLAT) & (turn < SMOOTH)
     for number, name in enumerate(scene.objects):
         own = faces == number
         points = body.facets.corners.detach()[own].reshape(-1, 3)
@@ -386,12 +449,20 @@ def _warn(scene: Scene, body: _Body, density: float, spacing: float | None, solv
                 f"{name} is {size / body.wavelength:.2g} wavelengths large: physical optics is for "
                 "objects of several"
             )
-        mine = curved & own[both[:, 0]]
+        mine = smooth & own[both[:, 0]]
+        # Inside, waves are shorter.
+        shorter = body.index(number)
         sagitta = float(off[mine].median()) / body.wavelength if bool(mine.any()) else 0.0
-        if sagitta > _SAGITTA:
+        if sagitta * shorter > _SAGITTA:
             found.append(
-                f"the facets of {name} are {sagitta:.2g} wavelengths off the curved surface, more "
-                "than 1/50: use a finer mesh"
+                f"the facets of {name} are {sagitta * shorter:.2g} wavelengths off the curved "
+                "surface, more than 1/50: use a finer mesh"
+            )
+        mixed = body.facets.solid[own].all() and not homogeneous(body.skins[0].rows(own))
+        if bool(mixed):
+            found.append(
+                f"{name} is closed and its permittivity differs between triangles: it shows its "
+                "front alone"
             )
     for text in found:
         warnings.warn(text, PhysicsWarning, stacklevel=3)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
-from invertwin.channel.field.beams import Bounce, Facets
+from invertwin.channel.field.beams import Bounce, Facets, in_air
 from invertwin.channel.field.patches import above, divided
 from invertwin.channel.field.waves import dot, mirrored
 from invertwin.channel.rays.scene import Occluders, next_surface
@@ -69,4 +69,4 @@ def _next(facets: Facets, occluders: Occluders, last: Bounce, narrowest: float) 
     # Equal phases on the mirror.
     offset = last.offset[before] + dot(last.direction[before] - d, corners[:, 0])
     normal = -facing.sign()[:, None] * normal
-    return Bounce(last.aspect[before], facet, normal, d, offset, polygon, before)
+    return in_air(last.aspect[before], facet, normal, d, offset, polygon, before)

@@ -114,7 +114,7 @@ def reflected(
         field: E.
     """
     cosine = -dot(normal, direction)
-    kept = skins.coherent * _kept(skins, wave_number, 2 * cosine)
+    kept = skins.coherent * kept_by_heights(skins, wave_number, 2 * cosine)
     return _mirrored_field(skins, wave_number, normal, direction, field) * kept[:, None, None]
 
 
@@ -140,25 +140,70 @@ def radiated(
 
     Source: derivations §13 and §14; Balanis, Advanced Engineering Electromagnetics, §6.8.
     """
-    n, d, s = normal[:, None], direction[:, None], towards[:, None]
     again = _mirrored_field(skins, wave_number, normal, direction, field)
-    onwards = mirrored(direction, normal)[:, None]
-    electric = cross(n, cross(d, field) + cross(onwards, again))
-    magnetic = cross(s, cross(n, field + again))
-    sent = -1j * wave_number / (4 * math.pi) * (electric + magnetic)
+    sent = sent_by_currents(wave_number, normal, direction, field, again, towards)
     thin = torch.isfinite(skins.thickness) & ~skins.conducting
     if bool(thin.any()):
         sheet = _sheet_radiated(skins, wave_number, normal, direction, field, towards)
         sent = torch.where(thin[:, None, None], sheet, sent)
     leaving = dot(normal, towards)
-    kept = _kept(skins, wave_number, leaving - dot(normal, direction))
+    kept = kept_by_heights(skins, wave_number, leaving - dot(normal, direction))
     kept = kept * torch.where(leaving > 0, skins.coherent, 1.0)
-    sent = sent * kept[:, None, None]
-    return sent - dot(sent, s.to(sent.dtype))[..., None] * s
+    return transverse(sent * kept[:, None, None], towards)
 
 
-def _kept(skins: Skins, wave_number: float, cosines: Tensor) -> Tensor:
-    """Share of the field that roughness leaves: phases spread by kσ(cosθ + cosθ')."""
+def transverse(
+    field: Complex128[Tensor, "row 2 3"], towards: Vectors
+) -> Complex128[Tensor, "row 2 3"]:
+    """Fields without their part along a direction.
+
+    Args:
+        field: F.
+        towards: s.
+    """
+    s = towards[:, None]
+    return field - dot(field, s.to(field.dtype))[..., None] * s
+
+
+def sent_by_currents(
+    wave_number: float,
+    outwards: Vectors,
+    wave: Tensor,
+    field: Complex128[Tensor, "row 2 3"],
+    again: Complex128[Tensor, "row 2 3"],
+    towards: Vectors,
+) -> Complex128[Tensor, "row 2 3"]:
+    """−(jk/4π) [ηJ − s × M] per m² of the tangential fields of a wave and of its mirrored one.
+
+    A wave along K, of which ηH = K × E, and its mirrored one have ηJ = n × (K×E + K_r×E_r) and
+    M = −n × (E + E_r). What lies along s is still in it.
+
+    Args:
+        wave_number: k [1/m].
+        outwards: n, on the side of the surface that sends.
+        wave: K over k: a unit vector in air.
+        field, again: E and E_r.
+        towards: s, to the receiver.
+
+    Source: derivations §13.
+    """
+    n, s = outwards[:, None], towards[:, None]
+    onwards = mirrored(wave, outwards)[:, None]
+    electric = cross(n, cross(wave[:, None], field) + cross(onwards, again))
+    magnetic = cross(s, cross(n, field + again))
+    return -1j * wave_number / (4 * math.pi) * (electric + magnetic)
+
+
+def kept_by_heights(
+    skins: Skins, wave_number: float, cosines: Float64[Tensor, " row"]
+) -> Float64[Tensor, " row"]:
+    """Share of the field that roughness leaves: phases spread by kσ(cosθ + cosθ').
+
+    Args:
+        skins: one row each.
+        wave_number: k [1/m].
+        cosines: cosθ + cosθ', what a height changes of the way.
+    """
     return torch.exp(-0.5 * (wave_number * skins.rms_height * cosines) ** 2)
 
 
@@ -283,13 +328,13 @@ def parallelogram_integral(
 
 
 def polygon_integral(
-    polygon: Float64[Tensor, "row corner 3"], way: Vectors
+    polygon: Float64[Tensor, "row corner 3"], way: Tensor
 ) -> Callable[[float], Complex128[Tensor, " row"]]:
     """∫ exp(jk w·x) dA over flat polygons, exactly: a sum over their sides, by wave number k.
 
     Args:
         polygon: corners in order, about any point; some may coincide.
-        way: w; what does not depend on k is computed once.
+        way: w, real, or complex where a wave decays; what does not depend on k is computed once.
 
     Source: Gordon, "Far-field approximations to the Kirchhoff-Helmholtz representations of
     scattered fields", IEEE TAP 23, 1975. Near w ⊥ polygon the sum is 0/0; there two terms of the
@@ -302,7 +347,8 @@ def polygon_integral(
     flat = way - dot(way, normal)[:, None] * normal
     square = dot(flat, flat)
     corners = polygon - middle[:, None]
-    largest = square.detach() * corners.detach().norm(dim=-1).amax(1) ** 2
+    length = flat.detach().abs().square().sum(-1)
+    largest = length * corners.detach().norm(dim=-1).amax(1) ** 2
     ends = corners.roll(-1, 1)
     sides = ends - corners
     phase = dot(flat[:, None], corners + ends) / 2
@@ -334,8 +380,10 @@ def turned(phase: Tensor) -> Tensor:
     """exp(j phase).
 
     Args:
-        phase: [rad].
+        phase: [rad], real or complex.
     """
+    if phase.is_complex():
+        return torch.exp(1j * phase)
     return torch.complex(phase.cos(), phase.sin())
 
 
@@ -350,9 +398,9 @@ def area_vector(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "ro
 
 
 def points_at(
-    values: Float64[Tensor, "*row 3 3"],
-    corners: Float64[Tensor, "*row 3 3"],
-    points: Float64[Tensor, "*row 3"],
+    values: Float64[Tensor, "*#row 3 3"],
+    corners: Float64[Tensor, "*#row 3 3"],
+    points: Float64[Tensor, "*#row 3"],
 ) -> Float64[Tensor, "*row 3"]:
     """Vectors at the corners of triangles, interpolated at points in these.
 
@@ -361,10 +409,21 @@ def points_at(
         corners: Of the triangles [m].
         points: In them [m].
     """
+    return (shares(corners, points)[..., None] * values).sum(-2)
+
+
+def shares(
+    corners: Float64[Tensor, "*#row 3 3"], points: Float64[Tensor, "*#row 3"]
+) -> Float64[Tensor, "*row 3"]:
+    """Barycentric coordinates of points in triangles.
+
+    Args:
+        corners: Of the triangles [m].
+        points: In them [m].
+    """
     a, b, c = corners.unbind(-2)
     area = cross(b - a, c - a)
     square = dot(area, area)
     v = dot(cross(b - a, points - a), area) / square
     u = dot(cross(points - a, c - a), area) / square
-    share = torch.stack([1 - u - v, u, v], -1)
-    return (share[..., None] * values).sum(-2)
+    return torch.stack([1 - u - v, u, v], -1)

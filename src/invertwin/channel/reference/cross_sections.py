@@ -1,22 +1,24 @@
 """Radar cross-sections that are known otherwise: closed forms, a series, a method of moments.
 
-Each is of a conductor as the built-in shape of its name stands, unturned, and serves as an oracle.
+Each is of the built-in shape of its name as it stands, unturned, and serves as an oracle. All but
+the sphere, which may be of a dielectric, are of conductors.
 """
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from annotated_types import Ge
+from jaxtyping import Complex128, Float64
 from numpy.typing import NDArray
 from scipy.special import hankel2, roots_legendre, spherical_jn, spherical_yn
 from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.limits import Positive
+from invertwin.limits import NonNegative, Positive
 from invertwin.scene.shapes import trihedral
 
 _PER_WAVELENGTH = 24  # segments of the method of moments
@@ -125,29 +127,64 @@ class TrihedralSection(CrossSection):
 
 @dataclass(frozen=True)
 class SphereSection(CrossSection):
-    """The Mie series of a conducting sphere.
+    """The Mie series of a sphere, of a perfect conductor or of a dielectric.
 
-    ``S = (1/k) Σ (−1)ⁿ (n + ½) (b_n − a_n)``, a_n = j_n/h_n and b_n = (x j_n)′/(x h_n)′ at x = ka.
+    ``S = (j/k) Σ (−1)ⁿ (n + ½) (b_n − a_n)`` at x = ka. With j, h = h⁽²⁾ and their (x j)′, (x h)′,
+    ``a_n = (u j − (x j)′)/(u h − (x h)′)`` and ``b_n = (u j − ε (x j)′)/(u h − ε (x h)′)``, where
+    u = (z j(z))′/j(z) at z = √ε x. A conductor has a_n = j/h and b_n = (x j)′/(x h)′.
 
     Attributes:
         radius: [m].
+        permittivity: ε' of a dielectric ≥ 1; None = a perfect conductor.
+        loss_tangent: tanδ, ε = ε' (1 − j tanδ).
+
+    Source: Bohren, Huffman, Absorption and Scattering of Light by Small Particles, §4.3.
     """
 
     radius: Positive
+    permittivity: Annotated[float, Ge(1)] | None = None
+    loss_tangent: NonNegative = 0.0
 
     def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
         """σ [m²], the same in all directions."""
-        found = [self._of(2 * math.pi * f / SPEED_OF_LIGHT) for f in frequencies.tolist()]
-        return torch.tensor(found, dtype=torch.float64)[:, None].expand(-1, len(directions))
+        found = 4 * math.pi * self.amplitude(frequencies).abs() ** 2
+        return found[:, None].expand(-1, len(directions))
 
-    def _of(self, k: float) -> float:
+    def amplitude(
+        self, frequencies: Float64[Tensor, " frequency"]
+    ) -> Complex128[Tensor, " frequency"]:
+        """S [m] back to the radar, with the sphere's middle at the origin.
+
+        Args:
+            frequencies: [Hz].
+        """
+        found = [self._of(2 * math.pi * f / SPEED_OF_LIGHT) for f in frequencies.tolist()]
+        return torch.tensor(found, dtype=torch.complex128)
+
+    def _of(self, k: float) -> complex:
         x = k * self.radius
         n = np.arange(1, int(x + 4 * x ** (1 / 3) + 12))
         j, h = spherical_jn(n, x), spherical_jn(n, x) - 1j * spherical_yn(n, x)
         dj = spherical_jn(n, x, derivative=True)
         dh = dj - 1j * spherical_yn(n, x, derivative=True)
-        terms = (-1.0) ** n * (n + 0.5) * ((j + x * dj) / (h + x * dh) - j / h)
-        return float(4 * math.pi * abs(terms.sum() / k) ** 2)
+        xj, xh = j + x * dj, h + x * dh
+        if self.permittivity is None:
+            a, b = j / h, xj / xh
+        else:
+            epsilon = self.permittivity * (1 - 1j * self.loss_tangent)
+            u = _logarithmic(np.sqrt(epsilon) * x, len(n))
+            a = (u * j - xj) / (u * h - xh)
+            b = (u * j - epsilon * xj) / (u * h - epsilon * xh)
+        return complex(1j * ((-1.0) ** n * (n + 0.5) * (b - a)).sum() / k)
+
+
+def _logarithmic(z: complex, count: int) -> NDArray[np.complex128]:
+    """(z j_n(z))′/j_n(z) for n = 1 … count: downwards, which is stable and never overflows."""
+    last = max(count, math.ceil(abs(z))) + 16
+    found = np.zeros(last + 1, dtype=np.complex128)
+    for n in range(last, 0, -1):
+        found[n - 1] = n / z - 1 / (found[n] + n / z)
+    return z * found[1 : count + 1]
 
 
 @dataclass(frozen=True)

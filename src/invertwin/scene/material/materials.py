@@ -218,6 +218,8 @@ class RoughDielectric(Medium, Material):
 class Dielectric(Medium, EffectiveRoughness, Material):
     """A half space with effective roughness: what enters it does not come back.
 
+    In `invertwin.rcs` a closed mesh of it is a solid, which waves go through where losses let them.
+
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
             `EffectiveRoughness`; it scatters by default.

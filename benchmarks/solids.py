@@ -1,0 +1,164 @@
+"""Signatures of dielectric solids: blocks against layers, tubes against beams, balls against Mie.
+
+    python benchmarks/solids.py [-o DIR]
+
+A block of 10 × 10 × 3 wavelengths is held against the closed form of a layer. A turned block above
+a metal plate is shot with tubes and held against clipped beams. Range profiles of balls of three
+permittivities, ka = 30 to 50, are held against those of the Mie series at the echoes of front and
+back.
+
+Prints a table and writes `metrics.json` into DIR (default `out/solids`). `block_error` is the
+largest |ΔS|/|S|. `tubes_error.<order>_<tubes>` is ‖ΔS‖/‖S‖ over aspects with so many tubes per
+wavelength. `front_db.<ε>` and `back_db.<ε>` are the differences of the peaks.
+"""
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from report import MetricTable, Required, write
+from rich.table import Table
+from torch import Tensor
+
+from invertwin import Object, Scene, rcs
+from invertwin.channel import SphereSection
+from invertwin.channel.field import signature
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.scene import (
+    PerfectConductor,
+    RefractingBody,
+    box,
+    plate,
+    rigid,
+    rotation_from_vector,
+    slab_coefficients,
+    sphere,
+)
+from invertwin.scene.material.materials import Layer
+from invertwin.signatures import Signature
+
+SIDE, THICKNESS, RADIUS = 0.1, 0.03, 0.1
+LOSS = 0.002  # tanδ of the balls
+BALLS = (1.2, 1.5, 2.5)
+NEAR = 0.006  # from the place of an echo, where its peak is looked for [m]
+REQUIRED: Required = {
+    "block_error": ("<=", 1e-9),
+    "order 1_16": ("<=", 0.01),
+    "back_db.1.2": ("<=", 1.0),
+    "back_db.1.5": ("<=", 1.0),
+}
+
+
+def block_error(epsilon: float = 2.5, loss: float = 0.01) -> float:
+    """The largest relative error of S of a block at broadside over fringes."""
+    band = torch.linspace(27e9, 33e9, 13, dtype=torch.float64)
+    body = Object(box((SIDE, SIDE, THICKNESS)), RefractingBody(epsilon, loss_tangent=loss))
+    found = rcs(Scene({"block": body}), [[0.0, 0.0, 1.0]], band, depth=31, edges=0)
+    layer = Layer(epsilon, loss_tangent=loss, thickness=THICKNESS)
+    errors = []
+    for value, frequency in zip(found.matrix[:, 0, 0, 0].tolist(), band.tolist(), strict=True):
+        law = slab_coefficients([layer.sheet(frequency)], torch.ones(1).double(), frequency)
+        k = 2 * math.pi * frequency / SPEED_OF_LIGHT
+        # The sheet's front lies in the plane of the phase; the block's, half its depth before.
+        turn = complex(math.cos(k * THICKNESS), math.sin(k * THICKNESS))
+        exact = 1j * SIDE**2 * k / (2 * math.pi) * complex(law.reflection_s[0]) * turn
+        errors.append(abs(value - exact) / abs(exact))
+    return max(errors)
+
+
+def tubes_error(densities: tuple[float, ...]) -> dict[str, float]:
+    """‖ΔS‖/‖S‖ of each order of a block above metal, tubes against beams."""
+    pose = rigid(rotation_from_vector(torch.tensor([0.3, 0.2, 0.1]).double()))
+    floor = rigid(translation=torch.tensor([0.0, 0.0, -0.03]).double())
+    scene = Scene(
+        {
+            "block": Object(box((0.03, 0.03, 0.02)), RefractingBody(2.5, loss_tangent=0.02), pose),
+            "floor": Object(plate(0.05, 0.05), PerfectConductor(), floor),
+        }
+    )
+    generator = torch.Generator().manual_seed(1)
+    directions = torch.randn(8, 3, dtype=torch.float64, generator=generator)
+    exact = rcs(scene, directions, 30e9, edges=0).parts
+    errors = {}
+    for density in densities:
+        with patch.object(signature, "FEW", 0):
+            found = rcs(scene, directions, 30e9, edges=0, tubes_per_wavelength=density).parts
+        for name, part in exact.items():
+            errors[f"{name}_{density:g}"] = float((found[name] - part).norm() / part.norm())
+    return errors
+
+
+def ball_errors(
+    epsilon: float, subdivisions: int, count: int
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Differences of the peaks of front and back from Mie [dB], and Mie's peaks [m]."""
+    frequencies = torch.linspace(30.0, 50.0, count, dtype=torch.float64)
+    frequencies = frequencies / RADIUS * SPEED_OF_LIGHT / (2 * math.pi)
+    body = RefractingBody(epsilon, loss_tangent=LOSS)
+    scene = Scene({"ball": Object(sphere(RADIUS, subdivisions), body)})
+    found = rcs(scene, [[0.3, 0.2, 1.0]], frequencies, depth=3, edges=0, tubes_per_wavelength=2.0)
+    exact = SphereSection(RADIUS, epsilon, LOSS).amplitude(frequencies)[:, None, None, None]
+    truth = Signature(
+        {"mie": exact.expand(-1, 1, 2, 2)}, frequencies, found.directions, found.receivers
+    )
+    ranges, level = _profile(found)
+    _, expected = _profile(truth)
+    errors, peaks = {}, {}
+    back = RADIUS * (2 * math.sqrt(epsilon) - 1)
+    for name, place in (("front", -RADIUS), ("back", back)):
+        near = (ranges - place).abs() < NEAR
+        peaks[name] = float(expected[near].max())
+        errors[name] = 20 * math.log10(float(level[near].max()) / peaks[name])
+    return errors, peaks
+
+
+def _profile(found: Signature) -> tuple[Tensor, Tensor]:
+    ranges, profile = found.range_profile(padding=8)
+    return ranges, profile[:, 0, 0, 0].abs()
+
+
+def measure(
+    densities: tuple[float, ...] = (4.0, 8.0, 16.0), subdivisions: int = 5, count: int = 61
+) -> dict[str, Any]:
+    """All metrics.
+
+    Args:
+        densities: tubes per wavelength.
+        subdivisions: of the balls.
+        count: frequencies of the range profiles.
+    """
+    balls = {f"{e:g}": ball_errors(e, subdivisions, count) for e in BALLS}
+    return {
+        "block_error": block_error(),
+        "tubes_error": tubes_error(densities),
+        "front_db": {name: errors["front"] for name, (errors, _) in balls.items()},
+        "back_db": {name: errors["back"] for name, (errors, _) in balls.items()},
+    }
+
+
+def table(metrics: dict[str, Any]) -> Table:
+    """What was counted, and what must hold."""
+    page = MetricTable("Dielectric solids", REQUIRED)
+    page.row("block_error", metrics["block_error"], ".1e", "depth 31 against the layer's series")
+    for name, value in metrics["tubes_error"].items():
+        page.row(f"tubes_error.{name}", value, ".3f", "against clipped beams")
+    for kind in ("front_db", "back_db"):
+        for name, value in metrics[kind].items():
+            page.row(f"{kind}.{name}", value, ".2f", "peak of the range profile against Mie")
+    return page.grid
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/solids"))
+    arguments = parser.parse_args()
+    metrics = measure()
+    write(metrics, table(metrics), arguments.out)
+
+
+if __name__ == "__main__":
+    main()
