@@ -26,7 +26,7 @@ Coherence = Callable[[Tensor, Tensor, Tensor], Tensor]
 """How much two echoes interfere whose ranges [m], u and v differ so much; 1 where they do not."""
 
 _BLACK = RoughDielectric(1.0)
-_CELLS = 6  # along each side of what is tried for shadows
+_CELLS = 12  # along each side of what is tried for shadows
 
 
 def without_echoes(scene: Scene, names: Collection[str]) -> Scene:
