@@ -11,6 +11,7 @@ from torch import Tensor
 
 from invertwin.channel import Sampling, trace_chains, trace_field, without_echoes
 from invertwin.errors import InputError
+from invertwin.inversion.gradcheck import Check, gradcheck
 from invertwin.models import ChainMap, SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum
 from invertwin.scene import (
@@ -26,6 +27,7 @@ from invertwin.scene import (
     rotation_from_vector,
     trihedral,
 )
+from invertwin.scene.parameters import Pose
 from scenes import float64, radar, relative, thing
 
 METAL = PerfectConductor()
@@ -192,6 +194,24 @@ def test_the_map_has_derivatives_with_the_edges_of_beams():
         assert error < 0.01
         if name == "turn":
             assert relative(found[1], truth) > max(3 * error, 0.1)
+
+
+def test_gradient_checks_hold_before_a_rough_wall():
+    """The echo of a target and its shadow on the wall, by a turn; fixed edges fail."""
+    grid = DEVICE.grid(2.4, 3.6, 0.3, oversample=1)
+    wide = Surrogate("gaussian", range_width=2.0, angle_width=1.0)
+    drawn = Sampling(3, samples=20_000, boundary_samples=8_000)
+    report = gradcheck(
+        SurrogateMap(grid, wide, drawn, coherent=["target"]),
+        Pose("target"),
+        {"rotation": float64([0.6, 0.7, 0.2])},
+        scene=walled(alone(trihedral(0.05), (0.1, 0.12, 0.0))),
+        sensor=DEVICE,
+        check=Check(repeats=1, difference_samples=30_000, noise=0.01, max_pairs=4),
+    )
+    error = relative(report.gradient, report.difference)
+    assert error < 0.02
+    assert relative(report.interior_gradient, report.difference) > max(3 * error, 0.1)
 
 
 def test_batches_and_references_have_the_targets_of_single_maps():
