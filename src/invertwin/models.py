@@ -177,7 +177,7 @@ class SurrogateMap(ForwardModel):
         sampling: How paths are sampled.
         coherent: Names of coherent targets: smooth conductors of at most 24 triangles each, such as
             corner reflectors, whose bounces add in field. A smooth conductor that is not named
-            is a narrow lobe, whose bounces add in power: a corner is then up to 8 dB too weak.
+            is a narrow lobe, whose bounces add in power: a corner is then some 10 dB too weak.
         stretch: Wavelength of the targets' phases at the start of a fit, in wavelengths of the
             radar. Lobes of plates and dihedrals are wider by it, with the same peaks.
 
@@ -363,10 +363,11 @@ def _noisy(
 class ChainMap(ForwardModel):
     """The power spectrum of a few flat conductors that mirror one another: |sum of fields|².
 
-    Chains of a corner reflector add in phase, where a ``SurrogateMap`` adds their powers and is
-    up to 8 dB too low. There are no samples and no speckle: the map is smooth in the pose, corners
-    and beams' edges included, as long as one chain or one corner dominates each cell; echoes of
-    several targets in one cell interfere, with a minimum every half wavelength.
+    Chains of a corner reflector add in phase, as in a ``SurrogateMap`` that names it ``coherent``,
+    which serves scenes with rough things, too. There are no samples and no speckle: the map is
+    smooth in the pose, corners and beams' edges included, as long as one chain or one corner
+    dominates each cell; echoes of several targets in one cell interfere, with a minimum every half
+    wavelength.
 
     Attributes:
         grid: Bins, see ``Radar.grid``.
