@@ -9,9 +9,10 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
@@ -27,6 +28,8 @@ from invertwin.channel import (
     trace_chains,
     trace_field,
     trace_power,
+    trace_target,
+    without_echoes,
 )
 from invertwin.errors import InputError
 from invertwin.limits import Positive
@@ -172,14 +175,22 @@ class SurrogateMap(ForwardModel):
         grid: Bins, see ``Radar.grid``.
         surrogate: Kernels and extra widths, or a name among ``SURROGATES``.
         sampling: How paths are sampled.
+        coherent: Names of coherent targets: smooth conductors of at most 24 triangles each, such as
+            corner reflectors, whose bounces add in field. A smooth conductor that is not named
+            is a narrow lobe, whose bounces add in power: a corner is then some 10 dB too weak.
+        stretch: Wavelength of the targets' phases at the start of a fit, in wavelengths of the
+            radar. Lobes of plates and dihedrals are wider by it, with the same peaks.
 
     Raises:
-        InputError: An unknown name, or "exact", which is ``ExactMap``.
+        InputError: An unknown name, or "exact", which is ``ExactMap``; a stretch below 1, or one
+            without targets.
     """
 
     grid: Grid
     surrogate: Surrogate | str = "response"
     sampling: Sampling = Sampling()
+    coherent: Sequence[str] = ()
+    stretch: Annotated[float, Ge(1)] = 1.0
     _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(
         default=None, repr=False
     )
@@ -191,6 +202,17 @@ class SurrogateMap(ForwardModel):
                 'expected a surrogate for a SurrogateMap, got "exact"; use ExactMap(grid)'
             )
         object.__setattr__(self, "surrogate", chosen)
+        if isinstance(self.coherent, str):
+            raise InputError(
+                f"expected a list of names of coherent targets, got {self.coherent!r}; give "
+                f"coherent=[{self.coherent!r}]"
+            )
+        object.__setattr__(self, "coherent", tuple(self.coherent))
+        if not 1 <= self.stretch < math.inf or (self.stretch > 1 and not self.coherent):
+            raise InputError(
+                f"expected a stretch >= 1 of coherent targets, got {self.stretch} and "
+                f"{len(self.coherent)} targets; give coherent=[...], or stretch=1"
+            )
 
     @property
     def kernels(self) -> Surrogate:
@@ -214,6 +236,8 @@ class SurrogateMap(ForwardModel):
             seed=seed,
             scheme=scheme,
             reference=reference,
+            coherent=self.coherent,
+            stretch=self.stretch,
         )
 
     def predict_batch(
@@ -238,7 +262,14 @@ class SurrogateMap(ForwardModel):
                 "scene; use predict, or the model that for_differences was called of"
             )
         return surrogate_spectra(
-            scenes, sensor, self.grid, self.kernels, sampling=self.sampling, seed=seed
+            scenes,
+            sensor,
+            self.grid,
+            self.kernels,
+            sampling=self.sampling,
+            seed=seed,
+            coherent=self.coherent,
+            stretch=self.stretch,
         )
 
     def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
@@ -255,16 +286,34 @@ class SurrogateMap(ForwardModel):
     def looks(
         self, scene: Scene, sensor: Radar, seed: int
     ) -> Callable[[int, float], Tensor] | None:
-        """Spectra of one scene with other speckle; None for smooth conductors and clouds."""
-        items = scene.objects.values()
+        """Spectra of one scene with other speckle, and another phase of every coherent target.
+
+        None for clouds and for smooth conductors that are no targets.
+        """
+        rest = without_echoes(scene, self.coherent)
         if not isinstance(sensor.waveform, SampledWaveform) or any(
-            item.cloud is not None or item.material.coherent for item in items
+            item.cloud is not None or item.material.coherent for item in rest.objects.values()
         ):
             return None
-        fields = replace(self.sampling, boundary=False)
-        looks = Looks(trace_field(scene, sensor.link(), sampling=fields, seed=seed), sensor)
+        fields, link = replace(self.sampling, boundary=False), sensor.link()
+        looks = Looks(trace_field(rest, link, sampling=fields, seed=seed), sensor)
+        targets = [
+            beat_signal(trace_target(scene, name, link, sampling=fields), sensor)
+            for name in self.coherent
+        ]
+
+        def beat(number: int) -> Tensor:
+            generator = torch.Generator().manual_seed(derived_seed(number, 2))
+            turns = 2 * math.pi * torch.rand(len(targets), generator=generator)
+            total = looks.beat(derived_seed(number, 0))
+            for turn, target in zip(
+                torch.polar(torch.ones_like(turns), turns), targets, strict=True
+            ):
+                total = total + turn * target.to(total)
+            return total
+
         return _noisy(
-            lambda number: looks.beat(derived_seed(number, 0)),
+            beat,
             lambda beat: exact_spectrum(beat, sensor, self.grid).to(torch.float32),
             sensor,
             seed,
@@ -272,12 +321,13 @@ class SurrogateMap(ForwardModel):
 
     @property
     def widened(self) -> bool:
-        """Whether the surrogate has extra widths."""
-        return self.kernels.widened
+        """Whether the surrogate has extra widths, or targets a longer wavelength."""
+        return self.kernels.widened or self.stretch > 1
 
     def narrowed(self, share: float) -> "SurrogateMap":
-        """The surrogate with this share of its extra widths."""
-        return replace(self, surrogate=self.kernels.narrowed(share))
+        """The surrogate with this share of its extra widths and of its stretch beyond 1."""
+        stretch = 1 + (self.stretch - 1) * share
+        return replace(self, surrogate=self.kernels.narrowed(share), stretch=stretch)
 
     def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
         """A measured spectrum with the extra widths."""
@@ -313,10 +363,11 @@ def _noisy(
 class ChainMap(ForwardModel):
     """The power spectrum of a few flat conductors that mirror one another: |sum of fields|².
 
-    Chains of a corner reflector add in phase, where a ``SurrogateMap`` adds their powers and is
-    up to 8 dB too low. There are no samples and no speckle: the map is smooth in the pose, corners
-    and beams' edges included, as long as one chain or one corner dominates each cell; echoes of
-    several targets in one cell interfere, with a minimum every half wavelength.
+    Chains of a corner reflector add in phase, as in a ``SurrogateMap`` that names it ``coherent``,
+    which serves scenes with rough things, too. There are no samples and no speckle: the map is
+    smooth in the pose, corners and beams' edges included, as long as one chain or one corner
+    dominates each cell; echoes of several targets in one cell interfere, with a minimum every half
+    wavelength.
 
     Attributes:
         grid: Bins, see ``Radar.grid``.

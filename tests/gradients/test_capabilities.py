@@ -21,11 +21,14 @@ from invertwin.channel import (
     Paths,
     RayPaths,
     Sampling,
+    deposit_paths,
     deposit_power,
+    interference,
     trace_chains,
     trace_field,
     trace_paths,
     trace_scattered,
+    trace_target,
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -74,6 +77,7 @@ MECHANISMS = {
     "coverage maps": "coverage",
     "mirrored scattering": "mirrored",
     "chains": "chains",
+    "coherent targets": "targets",
     "metasurfaces": "panels",
     "images": "images",
 }
@@ -479,6 +483,31 @@ def chain_case(parameter: str) -> Found:
     return Found(found, found, (up - down) / 2e-6, 0.0)
 
 
+def target_map(scene: Scene, radar: Radar) -> Tensor:
+    """What a target sends back past the occluder, deposited: no random numbers."""
+    link, grid = radar.link(), radar.grid(1.2, 2.8, oversample=4)
+
+    def overlap(*gaps: Tensor) -> Tensor:
+        return Surrogate().spread(radar, grid, *(0.5 * gap for gap in gaps))
+
+    fields = trace_target(scene, "wall", link, sampling=Sampling(depth=1))
+    return deposit_paths(interference(fields, link, overlap), link, grid).double()
+
+
+def target_case(parameter: str) -> Found:
+    """A target past which a straight edge of the occluder's shadow goes."""
+    target = thing(plate(0.3, 0.15), (0.19, 0.1, 1.9), (0.05, 0.1, 0.0), METAL)
+    scene = Scene({**occluder(occluder=ROUGH).objects, "wall": target})
+    radar, moves = field_radar(0.3), MOVES[parameter]
+
+    def value(theta: Tensor) -> Tensor:
+        return target_map(*moves(scene, radar, theta))
+
+    up, down = (value(torch.tensor(sign * 1e-3).double()) for sign in (1, -1))
+    found = pushed(value)
+    return Found(found, found, (up - down) / 2e-3, 0.0)
+
+
 # A mirror of elements at the wall; a corner of the occluder's shadow lies on it.
 PANEL = Metasurface(
     float64([0.69, 0.37, 1.85]),
@@ -566,6 +595,8 @@ def case(parameter: str, mechanism: str) -> Found:
         return antenna_case(parameter)
     if mechanism == "chains":
         return chain_case(parameter)
+    if mechanism == "targets":
+        return target_case(parameter)
     if mechanism == "coverage":
         return coverage_case(parameter)
     if mechanism == "mirrored":
@@ -642,6 +673,9 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     if mechanism == "images":
         seen(scene, radar, ImageSampling(1), 0)
         return
+    if mechanism == "targets":
+        target_map(scene, radar)
+        return
     if mechanism == "chains":
         exact_spectrum(
             beat_signal(trace_chains(scene, radar.link(), 2), radar), radar, radar.grid(0.4, 2.8)
@@ -710,7 +744,7 @@ REFUSED = [cell for cell, said in CELLS.items() if said == "refused"]
 
 @pytest.mark.parametrize(("parameter", "mechanism"), REFUSED)
 def test_refused(parameter, mechanism):
-    surface = METAL if mechanism in ("coherent", "chains") else ROUGH
+    surface = METAL if mechanism in ("coherent", "chains", "targets") else ROUGH
     scene, radar = occluder(wall=surface, occluder=surface), power_radar()
     message = NAMES.get(parameter, "expected no geometry derivative of rough field paths")
     theta = torch.zeros((), dtype=torch.float64, requires_grad=True)

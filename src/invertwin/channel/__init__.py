@@ -12,6 +12,9 @@ from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle
 from invertwin.channel.field.speckle import draw_speckle as draw_speckle
 from invertwin.channel.field.specular import trace_paths as trace_paths
+from invertwin.channel.field.targets import interference as interference
+from invertwin.channel.field.targets import trace_target as trace_target
+from invertwin.channel.field.targets import without_echoes as without_echoes
 from invertwin.channel.field.waves import polarisations as polarisations
 from invertwin.channel.paths import Grid as Grid
 from invertwin.channel.paths import Link as Link
@@ -20,6 +23,7 @@ from invertwin.channel.paths import Pattern as Pattern
 from invertwin.channel.power.clouds import deposit_density as deposit_density
 from invertwin.channel.power.deposit import deposit_batch as deposit_batch
 from invertwin.channel.power.deposit import deposit_power as deposit_power
+from invertwin.channel.power.explicit import deposit_paths as deposit_paths
 from invertwin.channel.ray_paths import KINDS as KINDS
 from invertwin.channel.ray_paths import METASURFACE as METASURFACE
 from invertwin.channel.ray_paths import RayPaths as RayPaths

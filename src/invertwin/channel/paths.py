@@ -172,6 +172,16 @@ class Paths:
         """Half the path length [m]."""
         return 0.5 * SPEED_OF_LIGHT * self.delay
 
+    def cosines(self, link: "Link") -> Float64[Tensor, "path 2"]:
+        """Direction cosines u and v in which the receiver sees the last points.
+
+        Args:
+            link: The antennas that the paths belong to.
+        """
+        way = self.last - link.rx[self.frame]
+        local = torch.einsum("nij,ni->nj", link.rotations[self.frame], way)
+        return local[:, :2] / way.norm(dim=1, keepdim=True)
+
     def chosen(self, mask: Bool[Tensor, " path"] | Int64[Tensor, " chosen"]) -> "Paths":
         """Only the paths of a mask, or of indices."""
         rows = {n: value[mask] for n, value in vars(self).items() if isinstance(value, Tensor)}

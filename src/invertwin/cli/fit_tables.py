@@ -11,7 +11,7 @@ from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.minima import pose_grid
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.starts import nearby, posed
-from invertwin.models import ChainField, ChainMap
+from invertwin.models import ChainField, ChainMap, SurrogateMap
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate
 from invertwin.registry.kinds import Group, Registry, Table
 from invertwin.registry.section import fail, key
@@ -55,6 +55,7 @@ def register(registry: Registry) -> None:
     registry.add("loss", "mse", SpectrumLoss, without=("floor", "degrees"))
     registry.add("loss", "likelihood", SpectrumLoss, without=("degrees",))
     registry.add("loss", "heavy_tailed", SpectrumLoss)
+    registry.add("model", "surrogate", SurrogateMap, without=("_reference",), checked=False)
     registry.add("model", "chains", ChainMap, checked=False)
     registry.add("model", "chain_field", ChainField, checked=False)
     for name, make in (("random", nearby), ("grid", pose_grid), ("given", posed)):

@@ -33,9 +33,7 @@ class Looks:
         mixed = places @ torch.sqrt(torch.tensor([2.0, 3, 5, 7, 11, 13], dtype=torch.float64))
         points, self._point = torch.unique((mixed / _SAME).round(), return_inverse=True)
         self._count = len(points)
-        way = paths.last - link.rx[paths.frame]
-        way = way / way.norm(dim=1)[:, None]
-        u, v, _ = torch.einsum("ni,nij->jn", way, link.rotations[paths.frame])
+        u, v = paths.cosines(link).unbind(1)
         bias = torch.as_tensor(radar.range_bias).detach()
         ranges = paths.range - radar.origins[paths.frame] + bias
         steps = (waveform.range_resolution, *radar.beamwidth)

@@ -1,7 +1,6 @@
 """The smooth surrogate of range-Doppler-angle processing."""
 
 import math
-from collections.abc import Callable
 from itertools import combinations
 
 import torch
@@ -11,12 +10,11 @@ from torch import Tensor
 from invertwin.channel import Grid, Paths
 from invertwin.radar.doppler import velocity_span
 from invertwin.radar.motion import Chirps
+from invertwin.radar.point_spread import interpolated
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import aperture
 from invertwin.radar.waveform import FMCW, SteppedFrequency, Waveform, unit_window
 from invertwin.scene.checks import check_shape
-
-_TABLE = 32  # entries per cell of a tabulated response
 
 
 def moving_power(
@@ -103,7 +101,7 @@ def _range_spread(
     ranges: Float64[Tensor, " path"], radar: Radar, grid: Grid
 ) -> Float64[Tensor, "range path"]:
     off = grid.ranges[:, None] - ranges
-    return _interpolated(
+    return interpolated(
         off,
         radar.waveform.range_resolution,
         lambda places: radar.waveform.range_response(places, radar.window),
@@ -118,27 +116,7 @@ def _doppler_response(cycles: Tensor, chirps: Chirps, window: str) -> Tensor:
         turns = 2j * math.pi * places[:, None] * torch.arange(chirps.count)
         return (turns.exp() @ weight).abs().square()
 
-    return _interpolated(cycles, 1 / chirps.count, response)
-
-
-def _interpolated(places: Tensor, cell: float, response: Callable[[Tensor], Tensor]) -> Tensor:
-    """A response of this cell at many places, from a table: cubic, so with a smooth derivative.
-
-    A third of a path's bins lie in the main lobe; each asked for by itself would cost its whole
-    sum over samples. The error is below 1e-5 of the peak.
-    """
-    step = cell / _TABLE
-    distance = places.abs() / step
-    last = int(distance.detach().max()) + 3 if distance.numel() else 3
-    table = response(torch.arange(-1, last + 1, dtype=torch.float64) * step)
-    index = distance.detach().floor().to(torch.int64)
-    before, here, after, beyond = (table[index + k] for k in range(4))
-    t = distance - index
-    slope, next_slope = 0.5 * (after - before), 0.5 * (beyond - here)
-    rise = after - here
-    return here + t * (
-        slope + t * (3 * rise - 2 * slope - next_slope + t * (slope + next_slope - 2 * rise))
-    )
+    return interpolated(cycles, 1 / chirps.count, response)
 
 
 def _steered(

@@ -9,13 +9,31 @@ from types import MappingProxyType
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, Sampling, deposit_batch, deposit_power
+from invertwin.channel import (
+    Grid,
+    Link,
+    Sampling,
+    deposit_batch,
+    deposit_paths,
+    deposit_power,
+    interference,
+    trace_target,
+    use_backend,
+    without_echoes,
+)
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
-from invertwin.radar.point_spread import airy, airy_radii, array_point_spread, range_point_spread
+from invertwin.radar.point_spread import (
+    airy,
+    airy_radii,
+    array_point_spread,
+    array_spread_at,
+    interpolated,
+    range_point_spread,
+)
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import Aperture, aperture
 from invertwin.radar.waveform import PhysicsWarning, Waveform
@@ -126,6 +144,39 @@ class Surrogate:
                 power = _flat(dim, count).apply(power, [sigma])
         return power
 
+    def spread(
+        self,
+        radar: Radar,
+        grid: Grid,
+        ranges: Float64[Tensor, " point"],
+        u: Float64[Tensor, " point"],
+        v: Float64[Tensor, " point"],
+    ) -> Float64[Tensor, " point"]:
+        """The point spread at offsets from its peak of 1, without extra widths.
+
+        Args:
+            radar: Its window, arrays and waveform.
+            grid: Axes of one bin have no spread.
+            ranges: Offsets in range [m].
+            u, v: Offsets in direction.
+        """
+
+        def along(places: Tensor) -> Tensor:
+            return range_point_spread(radar.waveform, places, radar.window, self.range_kernel)
+
+        power = interpolated(ranges, radar.waveform.range_resolution, along)
+        u, v = u * (grid.u_count > 1), v * (grid.v_count > 1)
+        if grid.u_count == grid.v_count == 1:
+            return power
+        array = aperture(radar)
+        if self.angle_kernel == "airy":
+            across, up = airy_radii(radar, self.aperture_radius)
+            away = (across * u).square() + (up * v).square()
+            near = away == 0  # a root of zero has no derivative
+            away = torch.where(near, 0.0, torch.where(near, 1.0, away).sqrt())
+            return power * airy(2 * math.pi / array.wavelength * away)
+        return power * array_spread_at(array, u, v)
+
     def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_Kernel, ...]":
         resolved = grid.u_count > 1 or grid.v_count > 1
         return _kernels(
@@ -186,10 +237,14 @@ def surrogate_spectrum(
     seed: int,
     scheme: Literal["rays", "area"] = "rays",
     reference: tuple[Scene, Link] | None = None,
+    coherent: Sequence[str] = (),
+    stretch: float = 1.0,
 ) -> Float[Tensor, "frame range u v"]:
     """Power spectrum of a scene, differentiable with respect to it: deposit, then shape.
 
-    Power is never negative: what shaping leaves below zero counts as zero.
+    Power is never negative: what shaping leaves below zero counts as zero. Coherent targets are
+    deposited beside the rough power: all bounces of one target add in field, as far as they share
+    a cell, and targets add in power. In the rest of the scene they only cast shadows.
 
     Args:
         scene: What is seen.
@@ -199,14 +254,47 @@ def surrogate_spectrum(
         sampling: How many paths are drawn.
         seed: Same seed, same spectrum.
         scheme, reference: See ``deposit_power``.
+        coherent: Names of coherent targets, see ``trace_target``.
+        stretch: Wavelength of their phases in wavelengths of the radar.
 
     Raises:
-        InputError: See ``deposit_power``.
+        InputError: See ``deposit_power`` and ``trace_target``.
     """
-    deposit = deposit_power(
-        scene, radar.link(), grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
-    )
-    return surrogate.shape(deposit, radar, grid).clamp_min(0.0)
+    link = radar.link()
+    parts = _targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
+    if set(scene.objects) - set(coherent):
+        if reference is not None:
+            reference = without_echoes(reference[0], coherent), reference[1]
+        rest = without_echoes(scene, coherent)
+        parts.append(
+            deposit_power(
+                rest, link, grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
+            )
+        )
+    return surrogate.shape(torch.stack(parts).sum(0), radar, grid).clamp_min(0.0)
+
+
+def _targets(
+    scene: Scene,
+    radar: Radar,
+    grid: Grid,
+    surrogate: Surrogate,
+    sampling: Sampling,
+    names: Sequence[str],
+    stretch: float,
+) -> list[Float32[Tensor, "frame range u v"]]:
+    """Deposits of coherent targets."""
+    link, deposits = radar.link(), []
+
+    def overlap(*gaps: Tensor) -> Tensor:
+        return surrogate.spread(radar, grid, *(0.5 * gap for gap in gaps))
+
+    with use_backend(sampling.backend):
+        for name in names:
+            fields = trace_target(scene, name, link, sampling=sampling, stretch=stretch)
+            powers = interference(fields, link, overlap, stretch=stretch)
+            deposits.append(deposit_paths(powers, link, grid))
+    return deposits
 
 
 def surrogate_spectra(
@@ -217,6 +305,8 @@ def surrogate_spectra(
     *,
     sampling: Sampling,
     seed: int,
+    coherent: Sequence[str] = (),
+    stretch: float = 1.0,
 ) -> Float[Tensor, "scene frame range u v"]:
     """``surrogate_spectrum`` of many scenes at once, see ``deposit_batch``.
 
@@ -227,11 +317,19 @@ def surrogate_spectra(
         surrogate: Kernels and their extra widths.
         sampling: How many paths are drawn of each scene.
         seed: Same seed and scenes, same spectra.
+        coherent, stretch: As of ``surrogate_spectrum``, in every scene.
 
     Raises:
-        InputError: See ``deposit_batch``.
+        InputError: See ``deposit_batch`` and ``trace_target``.
     """
-    deposit = deposit_batch(scenes, radar.link(), grid, sampling=sampling, seed=seed)
+    rest = [without_echoes(scene, coherent) for scene in scenes]
+    deposit = deposit_batch(rest, radar.link(), grid, sampling=sampling, seed=seed)
+    if coherent:
+        targets = [
+            torch.stack(_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)).sum(0)
+            for scene in scenes
+        ]
+        deposit = deposit + torch.stack(targets)
     shaped = surrogate.shape(deposit.flatten(0, 1), radar, grid)
     return shaped.clamp_min(0.0).reshape(deposit.shape)
 

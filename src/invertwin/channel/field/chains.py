@@ -28,7 +28,9 @@ from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 
-def trace_chains(scene: Scene, link: Link, depth: int) -> Paths:
+def trace_chains(
+    scene: Scene, link: Link, depth: int, *, stretch: float = 1.0, boundary: bool = True
+) -> Paths:
     """Field paths between few flat conductors, one for every beam; differentiable.
 
     ``a = −(j/4π) √(G_t G_r)/(R r) p_r · [n × (d × E)] ∫ exp(−jk(d − s)·x) dA`` after m bounces,
@@ -42,6 +44,9 @@ def trace_chains(scene: Scene, link: Link, depth: int) -> Paths:
         scene: Smooth conductors of at most 24 triangles together.
         link: Antennas, per frame.
         depth: Most bounces.
+        stretch: The wavelength of phases over a polygon in wavelengths of the antennas. A longer
+            one widens the lobes of polygons and keeps their peaks.
+        boundary: False leaves out of derivatives what moving edges of beams change.
 
     Source: derivations §13.
 
@@ -53,9 +58,10 @@ def trace_chains(scene: Scene, link: Link, depth: int) -> Paths:
     parts: list[Paths] = []
     last: Bounce | None = None
     unfolding: _Unfolding | None = None
-    for order, bounce in enumerate(beams(facets, normalize(middle - link.tx, dim=1), depth), 1):
+    lit = beams(facets, normalize(middle - link.tx, dim=1), depth, boundary=boundary)
+    for order, bounce in enumerate(lit, 1):
         unfolding = _unfolded(bounce, last, unfolding)
-        parts.append(_paths(bounce, unfolding, link, order))
+        parts.append(_paths(bounce, unfolding, link, order, stretch))
         last = bounce
     if not parts:
         raise InputError("expected facets that the radar lights, got none; check poses")
@@ -101,7 +107,7 @@ def _unfolded(bounce: Bounce, last: Bounce | None, before: _Unfolding | None) ->
     )
 
 
-def _paths(bounce: Bounce, unfolding: _Unfolding, link: Link, order: int) -> Paths:
+def _paths(bounce: Bounce, unfolding: _Unfolding, link: Link, order: int, stretch: float) -> Paths:
     frame, place = bounce.aspect, _centroid(bounce.polygon)
     tx, rx, rotation = link.tx[frame], link.rx[frame], link.rotations[frame]
     image = torch.einsum("nij,nj->ni", unfolding.turn, place) + unfolding.shift
@@ -119,7 +125,7 @@ def _paths(bounce: Bounce, unfolding: _Unfolding, link: Link, order: int) -> Pat
     kernel = current_kernel(bounce.normal, arriving, sent, -onwards, received)
     spread, leaving = gain / (length * distance) ** 2, dot(bounce.normal, onwards)
     fields = conductor_field(spread, kernel, leaving)
-    integral = area(2 * torch.pi / link.wavelength)
+    integral = area(2 * torch.pi / (stretch * link.wavelength))
     coefficient, matrix = combined(link, fields * integral[:, None, None])
     return Paths(
         frame=frame,

@@ -19,8 +19,8 @@ from torch.nn.functional import grid_sample
 from invertwin.channel.coupling import power_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins
-from invertwin.channel.rays.arrays import to_float, to_index, to_torch
-from invertwin.channel.rays.backend import backend, mi, tracing, use_backend
+from invertwin.channel.power.explicit import Splat
+from invertwin.channel.rays.backend import use_backend
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.cloud import Cloud
@@ -69,7 +69,7 @@ def deposit_density(
     layout = bins.Layout.of(grid, link)
     with use_backend(sampling.backend):
         rays = _Rays.of(item, link, sampling.samples, seed)
-        parts = [_Splat.apply(layout, *part) for part in rays.contributions()]
+        parts = [Splat.apply(layout, *part) for part in rays.contributions()]
     return torch.stack(parts).sum(0)
 
 
@@ -241,34 +241,3 @@ class _Trilinear(torch.autograd.Function):
                 (slope,) = torch.autograd.grad(_trilinear(known, at).sum(), at)
             total = total + (slope * place).sum(1)
         return total
-
-
-class _Splat(torch.autograd.Function):
-    """Points into the bins of a map, with the derivatives of ``bins`` in both modes."""
-
-    @staticmethod
-    def forward(ctx: Any, layout: bins.Layout, frame: Tensor, *columns: Tensor) -> Tensor:
-        ctx.layout, ctx.backend = layout, backend()
-        with tracing():
-            places = [to_float(column) for column in columns]
-            ctx.found = bins.Contribution(mi.Int32(to_index(frame)), *places)
-            out = bins.Bins(layout)
-            out.add(ctx.found, True)
-            return out.map()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        with tracing(ctx.backend):
-            bars = bins.gather(to_float(grad), ctx.layout, ctx.found, True)
-            return None, None, *(to_torch(bar).double() for bar in bars)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
-        with tracing(ctx.backend):
-            dots = tuple(
-                mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[2:]
-            )
-            out = bins.Bins(ctx.layout)
-            out.add_derivative(ctx.found, dots, True)
-            return out.map()

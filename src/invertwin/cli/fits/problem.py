@@ -292,7 +292,10 @@ def annealed_until(run: RunFile) -> float | None:
     """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
     (_, own), *others = stages_of(run)
     kernels, settings = own.surrogate, settings_of(own)
-    if others or kernels.exact or not (kernels.range_width > 0 or kernels.angle_width > 0):
+    widened = kernels.range_width > 0 or kernels.angle_width > 0
+    if own.model is not None and own.model.kind == "surrogate":
+        widened |= own.model.stretch > 1
+    if others or kernels.exact or not widened:
         return None
     return settings.annealing * settings.steps
 
@@ -337,12 +340,13 @@ def shown_models(problem: Problem) -> list[ForwardModel]:
 
 def sharp_models(problem: Problem) -> list[SurrogateMap]:
     """The smooth model of every sensor without extra widths, mean over phases."""
-    sharp = {"range_width": 0.0, "angle_width": 0.0}
-    sampling = sampling_of(problem.run)
-    return [
-        SurrogateMap(sight.grid, replace(build.made(run, "surrogate"), **sharp), sampling)
-        for run, sight in problem.sensors
-    ]
+    sampling, found = sampling_of(problem.run), []
+    for model, (run, sight) in zip(models_of(problem), problem.sensors, strict=True):
+        smooth = model
+        if not isinstance(smooth, SurrogateMap):
+            smooth = SurrogateMap(sight.grid, build.made(run, "surrogate"), sampling)
+        found.append(smooth.narrowed(0.0))
+    return found
 
 
 def observations_of(problem: Problem) -> list[Observation]:

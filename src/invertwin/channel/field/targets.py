@@ -1,0 +1,177 @@
+"""Coherent targets: few flat conductors whose bounces add in field, among things that are rough.
+
+A target is one object, such as a corner reflector. Its chains of mirrors add in field, and their
+power is what a map shows. Two targets, or a target and a rough surface, add in power: their phases
+change with every half wavelength, and no map of powers should.
+"""
+
+import math
+from collections.abc import Callable, Collection
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.channel.field.chains import trace_chains
+from invertwin.channel.field.lit import PanelCells, lit_fractions
+from invertwin.channel.field.waves import cross
+from invertwin.channel.paths import Link, Paths, joined
+from invertwin.channel.sampling import Sampling
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.scene.material.materials import RoughDielectric
+from invertwin.scene.scene import Scene
+
+Coherence = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""How much two echoes interfere whose ranges [m], u and v differ so much; 1 where they do not."""
+
+_BLACK = RoughDielectric(1.0)
+_CELLS = 12  # along each side of what is tried for shadows
+
+
+def without_echoes(scene: Scene, names: Collection[str]) -> Scene:
+    """The scene with some objects that hide what is behind them and send nothing back.
+
+    Args:
+        scene: Its objects.
+        names: Of those without an echo.
+    """
+    for name in names:
+        scene = scene.replace(name, material=_BLACK)
+    return scene
+
+
+def trace_target(
+    scene: Scene, name: str, link: Link, *, sampling: Sampling, stretch: float = 1.0
+) -> Paths:
+    """Field paths of one target alone, as far as the rest of the scene lets antennas see it.
+
+    Where something else stands before a target, its fields are weighted by the share of its
+    outline's rectangle that is lit, the geometric mean of both ways. Clouds hide nothing. There
+    are no chains between a target and other objects.
+
+    Args:
+        scene: The target, and what may hide it.
+        name: Of the target, of at most 24 triangles of a smooth conductor.
+        link: Antennas, per frame.
+        sampling: Its ``depth`` and ``boundary`` count.
+        stretch: See ``trace_chains``.
+
+    Raises:
+        InputError: A target that ``trace_chains`` refuses, or sheets and refracting bodies
+            elsewhere in the scene, since these hide a target in part only.
+    """
+    boundary = sampling.boundary
+    paths = trace_chains(
+        Scene({name: scene[name]}), link, sampling.depth, stretch=stretch, boundary=boundary
+    )
+    others = {n: o for n, o in scene.objects.items() if n != name and o.cloud is None}
+    if not others:
+        return paths
+    rest = Scene(others)
+    _require_opaque(rest, name, link)
+    points = scene[name].vertices
+    lit = _lit_shares(rest, points, link.tx, boundary=boundary)
+    if not link.shared_visibility:
+        both = lit * _lit_shares(rest, points, link.rx, boundary=boundary)
+        # A root of zero has no derivative.
+        seen = both > 0
+        lit = torch.where(seen, torch.where(seen, both, 1.0).sqrt(), 0.0)
+    return paths.weighted(lit[paths.frame])
+
+
+def _require_opaque(rest: Scene, target: str, link: Link) -> None:
+    for name, item in rest.objects.items():
+        surface = item.material.surface(SPEED_OF_LIGHT / link.wavelength)
+        if bool(surface.transmittance.any()) or bool(surface.refraction.any()):
+            raise InputError(
+                f"expected opaque objects beside the coherent target {target!r}, got {name!r}, "
+                "which lets waves through; leave it out, or fit the target without it"
+            )
+
+
+def _lit_shares(
+    rest: Scene,
+    points: Float64[Tensor, "v 3"],
+    places: Float64[Tensor, "place 3"],
+    *,
+    boundary: bool,
+) -> Float64[Tensor, " place"]:
+    """The share of a target's outline that each place sees past other objects."""
+    return torch.stack(
+        [
+            lit_fractions(rest, place[None], _outline(points, place), boundary=boundary).mean()
+            for place in places
+        ]
+    )
+
+
+def _outline(points: Float64[Tensor, "v 3"], place: Float64[Tensor, "3"]) -> PanelCells:
+    """Cells of the rectangle about points as a place sees them, where the foremost of them is."""
+    middle = points.mean(0)
+    normal = torch.nn.functional.normalize(place - middle, dim=0)
+    # Any direction across will do, as long as it turns with the sight.
+    axis = torch.eye(3, dtype=torch.float64)[int(normal.detach().abs().argmin())]
+    right = torch.nn.functional.normalize(cross(axis, normal), dim=0)
+    axes = torch.stack([right, cross(normal, right), normal], 1)
+    local = (points - middle) @ axes
+    low, high = local.amin(0), local.amax(0)
+    center = middle + axes @ torch.cat([0.5 * (low + high)[:2], high[2:]])
+    size = (high - low).detach()[:2] / _CELLS
+    steps = torch.arange(_CELLS, dtype=torch.float64) - 0.5 * (_CELLS - 1)
+    offsets = torch.cartesian_prod(steps, steps) * size
+    return PanelCells(center, axes, offsets, (float(size[0]), float(size[1])))
+
+
+def interference(paths: Paths, link: Link, coherence: Coherence, *, stretch: float = 1.0) -> Paths:
+    """The power of paths that add in field: of each, and of the interference of each two.
+
+    ``|Σ aᵢ exp(−jkLᵢ)|² = Σᵢ |aᵢ|² + Σ_{i<j} 2 Re(aᵢ aⱼ* exp(−jk(Lᵢ − Lⱼ)))``. Interference lies
+    midway between the two echoes. Two echoes h(R − Rᵢ) and h(R − Rⱼ) with a point spread h² overlap
+    there by h²((Rᵢ − Rⱼ)/2), likewise over u and v: exactly for Gaussians, at the middle for any.
+    So echoes in one cell add in field, and those of different cells in power.
+
+    Args:
+        paths: Of one target.
+        link: The antennas that they belong to.
+        coherence: The overlap, of differences in range [m], u and v.
+        stretch: The wavelength of phases in wavelengths of the antennas, see ``trace_chains``.
+
+    Source: derivations §13.
+    Differs from the source: phases between chains are kept, so that orders add in phase only where
+    they are in phase.
+    """
+    field = paths.coefficient * torch.exp(
+        -2j * math.pi * SPEED_OF_LIGHT / (stretch * link.wavelength) * paths.delay
+    )
+    cosines = paths.cosines(link)
+    parts = []
+    for frame in range(link.frame_count):
+        own = torch.nonzero(paths.frame == frame)[:, 0]
+        one, other = own[torch.triu_indices(len(own), len(own), 1)]
+        gap = torch.cat([paths.range[:, None], cosines], 1)
+        overlap = coherence(*(gap[one] - gap[other]).unbind(1))
+        cross_power = 2 * (field[one] * field[other].conj()).real * overlap
+        parts += [
+            _powers(paths, own, own, field[own].abs().square()),
+            _powers(paths, one, other, cross_power),
+        ]
+    return joined(parts)
+
+
+def _powers(paths: Paths, one: Tensor, other: Tensor, power: Tensor) -> Paths:
+    """Power paths midway between others."""
+
+    def midway(places: Tensor) -> Tensor:
+        return 0.5 * (places[one] + places[other])
+
+    return Paths(
+        frame=paths.frame[one],
+        delay=midway(paths.delay),
+        coefficient=torch.zeros_like(paths.coefficient[one]),
+        power=power,
+        first=midway(paths.first),
+        last=midway(paths.last),
+        kind="power",
+        boundary=torch.zeros(len(one), dtype=torch.bool),
+    )
