@@ -1,5 +1,7 @@
 """The deposit of explicit paths: that of ``deposit_power``, and its derivatives."""
 
+from dataclasses import replace
+
 import torch
 
 from invertwin.channel import Grid, Sampling, deposit_paths, deposit_power, trace_power
@@ -25,7 +27,7 @@ def test_derivatives_by_power_and_place_are_differences():
     weight = torch.linspace(0, 1, 40 * 13).sin().reshape(1, 40, 13, 1)
 
     def value(power: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
-        moved = type(paths)(**{**vars(paths), "power": power, "last": last})
+        moved = replace(paths, power=power, last=last)
         found = deposit_paths(moved, antennas, grid).double()
         return (found * weight).sum() / paths.power.sum()
 
