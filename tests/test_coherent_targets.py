@@ -168,6 +168,24 @@ def test_the_loss_of_a_place_falls_steadily_where_fields_fringe():
         assert bool((torch.tensor(losses).diff() > 0).all()) == steady
 
 
+def test_a_stretched_wavelength_widens_the_basin_of_a_turn():
+    """Of a plate, 8° to 1.6° off: sidelobes are minima of the loss, but not at four wavelengths."""
+    model = SurrogateMap(GRID, sampling=Sampling(1), coherent=["target"])
+    turns = torch.linspace(math.radians(1.6), math.radians(8), 33)
+    truth = model.predict(alone(plate(0.05, 0.05), (0.0, TOWARDS, 0.0)), DEVICE, 0)
+    minima = {}
+    for stretch in (1.0, 4.0):
+        own = replace(model, stretch=stretch)
+        losses = []
+        for turn in turns.tolist():
+            found = own.predict(alone(plate(0.05, 0.05), (0.0, TOWARDS + turn, 0.0)), DEVICE, 0)
+            losses.append(float((found - truth).square().mean()))
+        slopes = torch.tensor(losses).diff()
+        minima[stretch] = int(((slopes[:-1] < 0) & (slopes[1:] > 0)).sum())
+    assert minima[1.0] >= 2
+    assert minima[4.0] == 0
+
+
 def test_the_map_has_derivatives_with_the_edges_of_beams():
     """By place and turn; with beams' edges fixed the derivative by turns is wrong."""
     model = SurrogateMap(GRID, sampling=Sampling(3, boundary_samples=0), coherent=["target"])
