@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.planes import Planes, planes_of
-from invertwin.channel.field.waves import cross, dot, mirrored
+from invertwin.channel.field.waves import cross, dot, mirrored, unit_across
 from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, Occluders
@@ -396,7 +396,7 @@ def _tried(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
     """The triangle at the end of each segment, and whether the segment exists."""
     way = pieces.end - pieces.start
     unit = normalize(way, dim=1)
-    first = normalize(cross(unit, torch.eye(3, dtype=unit.dtype)[unit.abs().argmin(1)]), dim=1)
+    first = unit_across(unit)
     second = cross(unit, first)
     votes = torch.zeros(len(unit), dtype=torch.int64)
     met = torch.full_like(votes, -1)

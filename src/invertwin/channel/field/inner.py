@@ -22,7 +22,7 @@ from torch.nn.functional import normalize
 from invertwin.channel.field.beams import Bounce, Facets, joined, left, rows_of
 from invertwin.channel.field.patches import above, divided, inner_points
 from invertwin.channel.field.solids import Solids
-from invertwin.channel.field.waves import cross, dot, mirrored, points_at, shares
+from invertwin.channel.field.waves import cross, dot, mirrored, points_at, shares, unit_across
 from invertwin.channel.rays.scene import Occluders, next_surface
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import refractive_index
@@ -272,12 +272,15 @@ def _met(
     """First facets that rays in a medium can meet (−1: none)."""
     far = 3 * facets.size
     found, along = next_surface(occluders, starts, starts + far * ways)
+
+    def wrong() -> Tensor:
+        """The chord of a curved face lies on the wrong side of it, or of its facets."""
+        facet = found.clamp_min(0)
+        within, facing = medium == solids.owner[facet], dot(facets.normal[facet], ways)
+        return (found >= 0) & facets.solid[facet] & (within != (facing > 0))
+
     for _ in range(_RETRIES):
-        facing = dot(facets.normal[found.clamp_min(0)], ways)
-        within = medium == solids.owner[found.clamp_min(0)]
-        # The chord of a curved face lies on the wrong side of it, or of its facets.
-        wrong = (found >= 0) & facets.solid[found.clamp_min(0)] & (within != (facing > 0))
-        row = torch.nonzero(wrong)[:, 0]
+        row = torch.nonzero(wrong())[:, 0]
         if not len(row):
             break
         beyond = (along[row] * far)[:, None] * ways[row] + 2 * above(facets, ways[row])
@@ -285,10 +288,7 @@ def _met(
         again, along_again = next_surface(occluders, starts[row], starts[row] + far * ways[row])
         found = found.index_copy(0, row, again)
         along = along.index_copy(0, row, along_again)
-    facing = dot(facets.normal[found.clamp_min(0)], ways)
-    within = medium == solids.owner[found.clamp_min(0)]
-    wrong = facets.solid[found.clamp_min(0)] & (within != (facing > 0))
-    return torch.where(wrong, -1, found)
+    return torch.where(wrong(), -1, found)
 
 
 def _ended(
@@ -363,9 +363,7 @@ def _spread(
     end: Float64[Tensor, "row 3 3"],
 ) -> Complex128[Tensor, " row"]:
     """√(A/A′) of the areas of tubes across, and j for each line in which rays have crossed."""
-    first = normalize(
-        cross(direction, torch.eye(3, dtype=torch.float64)[direction.abs().argmin(1)]), dim=1
-    )
+    first = unit_across(direction)
     axes = torch.stack([first, cross(direction, first)], 1)
     a, b = ((x[:, 1:] - x[:, :1]) @ axes.mT for x in (start, end))
     a, b = a.mT, b.mT

@@ -9,8 +9,9 @@ mean of both ways, which is. In one place it is the mean of both cross-polar ter
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Complex128, Float64
@@ -18,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
-from invertwin.channel.field.inner import SMOOTH, curved, require_apart, with_inner
+from invertwin.channel.field.inner import SMOOTH, Curved, curved, require_apart, with_inner
 from invertwin.channel.field.meshed import SolvedMeshes
 from invertwin.channel.field.passages import at_surface
 from invertwin.channel.field.patches import lit_triangles
@@ -60,6 +61,9 @@ _LEAST_LINE = 2.0  # wavelengths that an edge which ends in a smooth surface run
 _OFF = 1e-5  # of the scene's size: how far aside of an edge rays to it end
 _ROWS_AT_ONCE = 1 << 18
 
+_Chain = tuple[Sequence[Bounce], Solids | None, Sequence[int]]
+"""Patches of all orders, what waves enter, and numbers of the frequencies of which that holds."""
+
 
 @dataclass(frozen=True)
 class _Body:
@@ -89,6 +93,11 @@ class _Body:
     def wavelength(self) -> float:
         """The shortest [m]."""
         return 2 * math.pi / max(self.wave_numbers)
+
+    @cached_property
+    def curved(self) -> Curved:
+        """The facets as pieces of smooth faces."""
+        return curved(self.facets, self.topology.beside)
 
     def index(self, number: int) -> float:
         """The largest refractive index of waves inside an object; 1 where none enter."""
@@ -201,17 +210,10 @@ class _View:
 
     def _bounces(self, depth: int, spacing: float | None, boundary: bool) -> dict[str, Tensor]:
         """Physical optics of every order: of beams, or of tubes where a spacing is given."""
-        body, orders = self.body, [list(self._none()) for _ in range(depth)]
-        for solids, members in body.interiors:
-            chains: Iterable[Sequence[Bounce]]
-            if spacing is None:
-                incident = -self.transmitters
-                found = beams(body.facets, incident, depth, boundary=boundary, solids=solids)
-                chains = [list(found)]
-            else:
-                chains = self._sampled(depth, spacing, solids)
-            for chain in chains:
-                self._add(orders, chain, solids, members)
+        orders = [list(self._none()) for _ in range(depth)]
+        chains = self._beams(depth, boundary) if spacing is None else self._tubes(depth, spacing)
+        for chain, solids, members in chains:
+            self._add(orders, chain, solids, members)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
     def _add(
@@ -235,18 +237,23 @@ class _View:
                 sent = current * strength[:, None, None]
                 order[f] = order[f].index_add(0, bounce.aspect, sent)
 
-    def _sampled(
-        self, depth: int, spacing: float, solids: Solids | None
-    ) -> Iterator[Sequence[Bounce]]:
+    def _beams(self, depth: int, boundary: bool) -> Iterator[_Chain]:
+        """Few facets: clipped beams."""
+        facets, incident = self.body.facets, -self.transmitters
+        for solids, members in self.body.interiors:
+            found = beams(facets, incident, depth, boundary=boundary, solids=solids)
+            yield list(found), solids, members
+
+    def _tubes(self, depth: int, spacing: float) -> Iterator[_Chain]:
         """Many facets: tubes that begin as lit triangles."""
-        body, facets = self.body, self.body.facets
-        surface = None if solids is None else curved(facets, body.topology.beside)
-        for lit in lit_triangles(facets, body.clear, -self.transmitters, spacing):
-            outside = [lit, *tubes(facets, body.occluders, lit, spacing, depth)]
-            if solids is None or surface is None:
-                yield outside
-            else:
-                yield with_inner(surface, body.occluders, solids, outside, spacing, depth)
+        body = self.body
+        for lit in lit_triangles(body.facets, body.clear, -self.transmitters, spacing):
+            outside = [lit, *tubes(body.facets, body.occluders, lit, spacing, depth)]
+            for solids, members in body.interiors:
+                chain = outside
+                if solids is not None:
+                    chain = with_inner(body.curved, body.occluders, solids, outside, spacing, depth)
+                yield chain, solids, members
 
     def _currents(
         self, chain: Sequence[Bounce], solids: Solids | None, skins: Skins, k: float

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from invertwin.channel.field.chains import trace_chains
 from invertwin.channel.field.lit import PanelCells, lit_fractions
-from invertwin.channel.field.waves import cross
+from invertwin.channel.field.waves import cross, unit_across
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
@@ -110,9 +110,7 @@ def _outline(points: Float64[Tensor, "v 3"], place: Float64[Tensor, "3"]) -> Pan
     """Cells of the rectangle about points as a place sees them, where the foremost of them is."""
     middle = points.mean(0)
     normal = torch.nn.functional.normalize(place - middle, dim=0)
-    # Any direction across will do, as long as it turns with the sight.
-    axis = torch.eye(3, dtype=torch.float64)[int(normal.detach().abs().argmin())]
-    right = torch.nn.functional.normalize(cross(axis, normal), dim=0)
+    right = unit_across(normal)
     axes = torch.stack([right, cross(normal, right), normal], 1)
     local = (points - middle) @ axes
     low, high = local.amin(0), local.amax(0)
@@ -144,19 +142,15 @@ def interference(paths: Paths, link: Link, coherence: Coherence, *, stretch: flo
     field = paths.coefficient * torch.exp(
         -2j * math.pi * SPEED_OF_LIGHT / (stretch * link.wavelength) * paths.delay
     )
-    cosines = paths.cosines(link)
-    parts = []
-    for frame in range(link.frame_count):
-        own = torch.nonzero(paths.frame == frame)[:, 0]
-        one, other = own[torch.triu_indices(len(own), len(own), 1)]
-        gap = torch.cat([paths.range[:, None], cosines], 1)
-        overlap = coherence(*(gap[one] - gap[other]).unbind(1))
-        cross_power = 2 * (field[one] * field[other].conj()).real * overlap
-        parts += [
-            _powers(paths, own, own, field[own].abs().square()),
-            _powers(paths, one, other, cross_power),
-        ]
-    return joined(parts)
+    frames = [torch.nonzero(paths.frame == frame)[:, 0] for frame in range(link.frame_count)]
+    pairs = [own[torch.triu_indices(len(own), len(own), 1)] for own in frames]
+    one, other = torch.cat(pairs, 1)
+    places = torch.cat([paths.range[:, None], paths.cosines(link)], 1)
+    overlap = coherence(*(places[one] - places[other]).unbind(1))
+    cross_power = 2 * (field[one] * field[other].conj()).real * overlap
+    own = torch.arange(len(field))
+    alone = _powers(paths, own, own, field.abs().square())
+    return joined([alone, _powers(paths, one, other, cross_power)])
 
 
 def _powers(paths: Paths, one: Tensor, other: Tensor, power: Tensor) -> Paths:

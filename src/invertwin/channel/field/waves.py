@@ -222,6 +222,16 @@ def _mirrored_field(
     return torch.where(skins.conducting[:, None, None], whole, part)
 
 
+def unit_across(direction: Float64[Tensor, "*row 3"]) -> Float64[Tensor, "*row 3"]:
+    """A unit vector at a right angle to each direction, any that turns with it.
+
+    Args:
+        direction: not zero.
+    """
+    spare = torch.eye(3, dtype=direction.dtype)[direction.detach().abs().argmin(-1)]
+    return normalize(cross(direction, spare), dim=-1)
+
+
 def plane_of_incidence(normal: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Unit vectors of E across the plane of incidence (s), and in it (p) before and after a mirror.
 
@@ -231,9 +241,8 @@ def plane_of_incidence(normal: Tensor, direction: Tensor) -> tuple[Tensor, Tenso
     """
     across = cross(direction, normal)
     # At normal incidence any axis serves.
-    spare = cross(normal, torch.eye(3, dtype=normal.dtype)[normal.detach().abs().argmin(-1)])
     steep = across.detach().norm(dim=-1, keepdim=True) < 1e-9
-    across = normalize(torch.where(steep, spare, across), dim=-1)
+    across = normalize(torch.where(steep, unit_across(normal), across), dim=-1)
     onwards = mirrored(direction, normal)
     # A conductor has r_p = +1 between these two, r_s = −1.
     return (across[:, None], cross(direction, across)[:, None], cross(onwards, across)[:, None])
