@@ -27,7 +27,9 @@ def gradients(
     dr.enable_grad(list(tables.values()))
     inputs, out = trace.inputs(tables), mi.Float(0)
     for records in trace.records():
-        vertex = replay._vertex(trace.rays, inputs, records, mi.UInt32(0), records.depth)
+        number, antennas = mi.UInt32(0), replay._Antennas.of(inputs, records.frame)
+        near = replay._Near.of(inputs, records, number, records.depth)
+        vertex = replay._vertex(trace.rays, inputs, records, antennas, number, near)
         path, arriving = vertex.path(), vertex.arriving
         power = dr.select(vertex.seen, path.power * (arriving / dr.detach(arriving)), 0)
         length = 0.5 * (vertex.segment + vertex.connection.distance)

@@ -155,7 +155,7 @@ def test_a_plate_of_gentle_slopes_is_a_mirror(slope, bounces):
         scene,
         antennas,
         BINS,
-        sampling=Sampling(depth=bounces, samples=1_000_000, boundary_samples=0),
+        sampling=Sampling(depth=bounces, samples=4_000_000, boundary_samples=0),
         seed=1,
     )
     mirrored = share * (WAVELENGTH / (4 * math.pi * length)) ** 2

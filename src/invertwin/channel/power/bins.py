@@ -8,14 +8,22 @@ has continuous derivatives in range and direction.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
+import torch
 from jaxtyping import Float32
 from torch import Tensor
 
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.rays.arrays import to_float, to_torch
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import backend, dr, mi
+
+# Bytes that copies of a map, one a thread, may take; beyond, additions are atomic.
+_COPIES = 2**28
+# Numbers up to which a map has further copies, and the most of them: sums of many amounts are
+# rounded less where each copy takes some. They fit a core's cache.
+_ROUNDED_LESS, _MOST_COPIES = 2**16, 64
 
 
 @dataclass(frozen=True)
@@ -77,6 +85,37 @@ class Layout:
         """Frames, and bins along range, u and v."""
         return self.frames, *self.grid.shape
 
+    @property
+    def fine(self) -> int:
+        """The axis of strips: the last one of range, u and v that has bins to choose from."""
+        return max((axis for axis, count in enumerate(self.grid.shape) if count > 1), default=2)
+
+    @property
+    def strips(self) -> tuple[int, ...]:
+        """The shape of an array of strips: the fine axis comes last, with one strip at each end."""
+        rest = list(self.shape)
+        count = rest.pop(self.fine + 1)
+        return *rest, count + 2, 4
+
+    def summed(self, strips: Any) -> Float32[Tensor, "frame range u v"]:
+        """The map whose strips hold these amounts.
+
+        Args:
+            strips: A flat Dr.Jit array, one or more of the shape ``strips``.
+        """
+        parts = to_torch(strips).reshape(-1, *self.strips).sum(0)
+        total = parts[..., 2:, 0] + parts[..., 1:-1, 1] + parts[..., :-2, 2]
+        return total.movedim(-1, self.fine + 1)
+
+    def spread(self, bins: Float32[Tensor, "frame range u v"]) -> Any:
+        """The adjoint of ``summed``: every strip gets the values of its three bins.
+
+        Args:
+            bins: A value for every bin.
+        """
+        rows = torch.nn.functional.pad(bins.movedim(self.fine + 1, -1), (2, 3))
+        return to_float(rows.unfold(-1, 4, 1))
+
     def shown(self, found: Contribution) -> Any:
         """Ranges of paths from the origin of their frame (detached).
 
@@ -89,32 +128,66 @@ class Layout:
         return length - dr.gather(mi.Float, to_float(self.origin), mi.UInt32(found.frame))
 
 
-def _taps(
-    layout: Layout, found: Contribution
-) -> Iterator[tuple[Any, Any, Any, tuple[Any, Any, Any]]]:
-    """The bins that paths fall on (detached).
+@dataclass(frozen=True)
+class _Strip:
+    """Three bins side by side along the fine axis, and how paths fall on them (detached)."""
 
-    Yields a bin's index, whether it is on the grid, the weight with which paths fall on it, and
-    the derivatives of the weight in range, u and v.
-    """
-    grid = layout.grid
-    ranges = _axis(layout.shown(found), grid.range_start, grid.range_step, grid.range_count)
-    across = _axis(found.u, grid.u_start, grid.u_step, grid.u_count)
-    upwards = _axis(found.v, grid.v_start, grid.v_step, grid.v_count)
-    for i, on_range, wr, sr in ranges:
-        for j, on_u, wu, su in across:
-            row = (mi.Int32(found.frame) * grid.range_count + i) * grid.u_count + j
-            for k, on_v, wv, sv in upwards:
-                index, inside = mi.UInt32(row * grid.v_count + k), on_range & on_u & on_v
-                yield index, inside, wr * wu * wv, (sr * wu * wv, wr * su * wv, wr * wu * sv)
+    place: Any  # number of the strip
+    inside: Any  # whether its row is on the grid, and its middle at most one bin off it
+    across: Any  # weight of the row
+    slopes: list[Any]  # its derivatives in range, u and v; along the fine axis the weight itself
+    weights: list[Any]  # of the three bins
+    steep: list[Any]  # their derivatives along the fine axis
+
+    def slope(self, axis: int, fine: int) -> list[Any]:
+        """Derivatives of the three weights along an axis.
+
+        Args:
+            axis: 0 range, 1 u, 2 v.
+            fine: That of the strips.
+        """
+        return [self.slopes[axis] * w for w in (self.steep if axis == fine else self.weights)]
+
+
+def _strips(layout: Layout, found: Contribution) -> Iterator[_Strip]:
+    """The strips that paths fall on: three for every other axis with bins to choose from."""
+    grid, fine = layout.grid, layout.fine
+    counts = list(grid.shape)
+    axes = [
+        _axis(layout.shown(found), grid.range_start, grid.range_step, grid.range_count),
+        _axis(found.u, grid.u_start, grid.u_step, grid.u_count),
+        _axis(found.v, grid.v_start, grid.v_step, grid.v_count),
+    ]
+    none, one = mi.Float(0.0), mi.Float(1.0)
+    along = axes[fine]
+    if len(along) == 1:
+        along = [(mi.Int32(0), mi.Bool(True), weight, none) for weight in (none, one, none)]
+    middle, length = along[1][0], counts[fine] + 2
+    near = (middle >= -1) & (middle <= counts[fine])
+    axes[fine], counts[fine] = [(mi.Int32(0), mi.Bool(True), one, one)], 1
+    for taps in product(*axes):
+        row, inside = mi.Int32(found.frame), near
+        for (place, on_axis, _, _), count in zip(taps, counts, strict=True):
+            row, inside = row * count + place, inside & on_axis
+        yield _Strip(
+            place=mi.UInt32(row * length + middle + 1),
+            inside=inside,
+            across=math.prod(tap[2] for tap in taps),
+            slopes=[
+                math.prod(tap[3 if k == axis else 2] for k, tap in enumerate(taps))
+                for axis in range(3)
+            ],
+            weights=[tap[2] for tap in along],
+            steep=[tap[3] for tap in along],
+        )
 
 
 class Bins:
     """A map that paths are added to.
 
-    Taps are added one by one: for small maps Dr.Jit then keeps a copy for every thread and lane,
-    so that the many sums of one bin are rounded little. Additions of whole vectors are faster and
-    have no copies: differences of maps were ten times as noisy with them.
+    The three bins that lie side by side are added to at once, as one vector, to strips that
+    overlap; they are summed at the end. For maps that are not too large, Dr.Jit keeps a copy for
+    every thread, so that no addition need be atomic.
 
     Args:
         layout: Its bins.
@@ -122,7 +195,12 @@ class Bins:
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        self.values = dr.zeros(mi.Float, math.prod(layout.shape))
+        self._strips = math.prod(layout.strips[:-1])
+        self._copies = min(_MOST_COPIES, max(1, _ROUNDED_LESS // (4 * self._strips)))
+        size = 4 * self._strips * self._copies
+        self.values = dr.zeros(mi.Float, size)
+        copied = backend() == "cpu" and 4 * size * dr.thread_count() <= _COPIES
+        self._mode = dr.ReduceMode.Expand if copied else dr.ReduceMode.Auto
 
     def add(self, found: Contribution, active: Any) -> None:
         """Add paths.
@@ -131,8 +209,9 @@ class Bins:
             found: The paths.
             active: Which paths exist.
         """
-        for index, inside, weight, _ in _taps(self.layout, found):
-            dr.scatter_add(self.values, found.power * weight, index, inside & active)
+        for strip in _strips(self.layout, found):
+            power = found.power * strip.across
+            self._add([power * weight for weight in strip.weights], strip, active)
 
     def add_derivative(self, found: Contribution, dots: tuple, active: Any) -> None:
         """Add the derivative of paths' deposit, given those of power, range, u and v.
@@ -144,13 +223,23 @@ class Bins:
         """
         power = dr.detach(found.power)
         dot_power, *moves = dots
-        for index, inside, weight, slopes in _taps(self.layout, found):
-            moved = sum(dot * slope for dot, slope in zip(moves, slopes, strict=True))
-            dr.scatter_add(self.values, dot_power * weight + power * moved, index, inside & active)
+        fine = self.layout.fine
+        for strip in _strips(self.layout, found):
+            values = [dot_power * strip.across * weight for weight in strip.weights]
+            for axis, dot in enumerate(moves):
+                slopes = strip.slope(axis, fine)
+                values = [v + power * dot * s for v, s in zip(values, slopes, strict=True)]
+            self._add(values, strip, active)
+
+    def _add(self, values: list[Any], strip: _Strip, active: Any) -> None:
+        amounts = mi.Vector4f(*values, 0.0)
+        lane = dr.arange(mi.UInt32, dr.width(amounts, strip.place))
+        place = strip.place + lane % self._copies * self._strips
+        dr.scatter_add(self.values, amounts, place, strip.inside & active, mode=self._mode)
 
     def map(self) -> Float32[Tensor, "frame range u v"]:
         """What all bins hold."""
-        return to_torch(self.values).reshape(self.layout.shape)
+        return self.layout.summed(self.values)
 
 
 def gather(
@@ -159,15 +248,17 @@ def gather(
     """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path.
 
     Args:
-        seed: ∂loss/∂map, flat.
+        seed: ∂loss/∂map, as ``Layout.spread`` has it.
         layout: The bins.
         found: The paths.
         active: Which paths exist.
     """
     bars = [mi.Float(0.0) for _ in range(4)]
-    for index, inside, weight, slopes in _taps(layout, found):
-        value = dr.gather(mi.Float, seed, index, inside & active)
-        for number, factor in enumerate((weight, *slopes)):
-            bars[number] += value * factor
+    for strip in _strips(layout, found):
+        values = dr.gather(mi.Vector4f, seed, strip.place, strip.inside & active)
+        factors = [[strip.across * weight for weight in strip.weights]]
+        factors += [strip.slope(axis, layout.fine) for axis in range(3)]
+        for number, three in enumerate(factors):
+            bars[number] += sum(f * values[k] for k, f in enumerate(three))
     power = dr.detach(found.power)
     return bars[0], bars[1] * power, bars[2] * power, bars[3] * power

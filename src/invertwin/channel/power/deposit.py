@@ -20,7 +20,6 @@ from invertwin.channel.power.clouds import deposit_density
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
 from invertwin.channel.power.trace import Trace, tables_of, without_derivatives
 from invertwin.channel.rays.apart import stand_apart
-from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, tracing
 from invertwin.channel.rays.geometry import Geometry, differentiated, flatten, require_edges
 from invertwin.channel.sampling import Sampling
@@ -267,7 +266,7 @@ def _pulled(ctx: Any, wanted: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ..
     with tracing(ctx.backend), torch_threads(1):
         tables = _attached(trace, wanted)
         inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
-        seed = to_float(grad)
+        seed = ctx.layout.spread(grad)
 
         def gather(*path: Any) -> tuple[Any, Any, Any, Any]:
             return bins.gather(seed, ctx.layout, *path)

@@ -57,12 +57,12 @@ class Directions:
         self.width = shares.shape[1]
 
     def draw(self, point: Place, back: Any, numbers: list[Any], scene: Any) -> Direction:
-        """A direction from five uniform numbers.
+        """A direction from uniform numbers.
 
         Args:
             point: The vertex.
             back: Unit direction from where the path comes.
-            numbers: Five uniform numbers.
+            numbers: Six uniform numbers; the second is left to others.
             scene: Whose objects are aimed at.
         """
         facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, back)))
@@ -70,9 +70,9 @@ class Directions:
         group, aimed = mi.UInt32(_ANY), mi.UInt32(_ANY)
         spheres = self.spheres
         if spheres.most > 1:
-            towards, rest = numbers[0] < _TOWARDS, numbers[4]
+            towards, rest = numbers[4] < _TOWARDS, numbers[5]
             first, groups = spheres.groups_of(scene)
-            drawn = first + dr.minimum(mi.UInt32(numbers[0] / _TOWARDS * groups), groups - 1)
+            drawn = first + dr.minimum(mi.UInt32(numbers[4] / _TOWARDS * groups), groups - 1)
             members = spheres.members(drawn)
             axis, height = mi.Vector3f(0, 0, 1), mi.Float(2.0)
             # One of the group that the point is outside of, if a few tries find one.
@@ -85,7 +85,7 @@ class Directions:
                 taken = towards & outside & (aimed == _ANY)
                 axis, height = dr.select(taken, direction, axis), dr.select(taken, cap, height)
                 aimed = dr.select(taken, place, aimed)
-            omega = dr.select(aimed != _ANY, _in_cap(axis, height, numbers[2:]), omega)
+            omega = dr.select(aimed != _ANY, _in_cap(axis, height, numbers[2:4]), omega)
             group = dr.select(towards, drawn, _ANY)
         density = self._density(point, back, facing, omega)
         if self.surfaces.bodies:
@@ -137,11 +137,11 @@ class Directions:
             height = 2 * dr.select(fall > -0.01, series, 1 - dr.exp(fall))
             lobe = _in_cap(axis, height, [mi.Float(1.0), numbers[3]])
             share = self._share(point, number + 1)
-            chosen = (numbers[1] >= limit) & (numbers[1] < limit + share)
+            chosen = (numbers[0] >= limit) & (numbers[0] < limit + share)
             omega = dr.select(chosen, lobe, omega)
             limit += share
         if self.surfaces.bodies:
-            omega = dr.select(numbers[1] >= limit, self._refracted(point, back, numbers), omega)
+            omega = dr.select(numbers[0] >= limit, self._refracted(point, back, numbers), omega)
         return mi.Vector3f(omega)
 
     def _sides(self, point: Place, back: Any) -> tuple[Any, Any, Any]:
@@ -175,7 +175,9 @@ class Directions:
         density = self._share(point, 0) * dr.maximum(cosine, 0.0) * dr.inv_pi
         for number, present in enumerate(self.surfaces.lobed):
             if present:
-                lobe, exponent = self.surfaces.lobe(number, point.surface, facing, back, omega)
+                lobe, exponent = self.surfaces.lobe(
+                    number, point.surface, point.normal, back, omega
+                )
                 lobe = (exponent + 1) / (4 * dr.pi) * lobe
                 density += self._share(point, number + 1) * lobe
         if self.surfaces.bodies:

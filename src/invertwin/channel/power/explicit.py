@@ -48,7 +48,7 @@ class Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         with tracing(ctx.backend):
-            bars = bins.gather(to_float(grad), ctx.layout, ctx.found, True)
+            bars = bins.gather(ctx.layout.spread(grad), ctx.layout, ctx.found, True)
             return None, None, *(to_torch(bar).double() for bar in bars)
 
     @staticmethod

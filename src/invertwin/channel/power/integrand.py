@@ -63,6 +63,7 @@ class Inputs:
     surfaces: Surfaces
     faces: Any  # vertices of every triangle
     face_surface: Any  # row of every triangle's surface
+    triangles: Any  # ``RayScene.triangles``: what is read where vertices carry no derivatives
     monostatic: bool  # both antennas are one
     tx_pattern: "PatternTable"
     rx_pattern: "PatternTable"
@@ -85,8 +86,9 @@ class Inputs:
             rx=rays.rx,
             rotations=to_float(link.rotations),
             surfaces=Surfaces.of(rays.geometry),
-            faces=rays.topology.device_faces,
+            faces=rays.topology.device_corners,
             face_surface=to_index(rays.geometry.face_surface),
+            triangles=rays.triangles,
             monostatic=monostatic,
             tx_pattern=PatternTable.of(link.tx_pattern),
             rx_pattern=PatternTable.of(link.rx_pattern),
@@ -209,6 +211,24 @@ class Place:
     jacobian: Any  # area of its triangle over that area detached: one in value
     surface: Any  # row of its surface
 
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What a loop carries of it, detached."""
+        return {
+            "position": mi.Point3f(dr.detach(self.position)),
+            "normal": mi.Vector3f(dr.detach(self.normal)),
+            "surface": self.surface,
+        }
+
+    @staticmethod
+    def of(parts: dict[str, Any]) -> "Place":
+        """What a loop has carried.
+
+        Args:
+            parts: As ``parts`` has them, among others.
+        """
+        return Place(parts["position"], parts["normal"], mi.Float(1.0), parts["surface"])
+
 
 def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Place:
     """Where a pair of barycentric coordinates lies now.
@@ -219,6 +239,14 @@ def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Pl
         b1, b2: Barycentric coordinates.
         active: Lanes.
     """
+    surface = dr.gather(mi.UInt32, inputs.face_surface, face, active)
+    if not dr.grad_enabled(inputs.vertices):
+        p0, first, second = (
+            dr.gather(mi.Vector4f, inputs.triangles, face * 3 + k, active) for k in range(3)
+        )
+        position = mi.Point3f(p0.xyz + b1 * first.xyz + b2 * second.xyz)
+        normal = mi.Vector3f(p0.w, first.w, second.w)
+        return Place(position, normal, mi.Float(1.0), surface)
     triangle = p0, p1, p2 = corners(inputs, face, active)
     normal = dr.cross(p1 - p0, p2 - p0)
     double_area = dr.norm(normal)
@@ -226,7 +254,7 @@ def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Pl
         position=between(triangle, b1, b2),
         normal=normal / double_area,
         jacobian=double_area / dr.detach(double_area),
-        surface=dr.gather(mi.UInt32, inputs.face_surface, face, active),
+        surface=surface,
     )
 
 
@@ -250,7 +278,27 @@ def to_radar(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> 
         direction: Unit direction in the world.
         active: Lanes.
     """
-    rows = [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k, active) for k in range(3)]
+    return along_axes(radar_axes(inputs, frame, active), direction)
+
+
+def radar_axes(inputs: Inputs, frame: Any, active: Any = True) -> list[Any]:
+    """Rows of the radar's rotation.
+
+    Args:
+        inputs: Tables of the kernel.
+        frame: Radar pose.
+        active: Lanes.
+    """
+    return [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k, active) for k in range(3)]
+
+
+def along_axes(rows: list[Any], direction: Any) -> Any:
+    """World direction in the radar frame.
+
+    Args:
+        rows: Of the radar's rotation.
+        direction: Unit direction in the world.
+    """
     return mi.Vector3f(*(sum(rows[k][axis] * direction[k] for k in range(3)) for axis in range(3)))
 
 
@@ -286,6 +334,26 @@ def medium(inputs: Inputs, start: Place, end: Place | None, towards: Any, active
 
 
 @dataclass(frozen=True)
+class End:
+    """An antenna that a path ends at. To look it up before a loop spares the loop doing so."""
+
+    position: Any  # about the local origin [m]
+    axes: list[Any]  # rows of the radar's rotation
+
+    @staticmethod
+    def of(inputs: Inputs, frame: Any, receiver: Any, active: Any = True) -> "End":
+        """Look it up.
+
+        Args:
+            inputs: Tables of the kernel.
+            frame: Radar pose.
+            receiver: Whether it is the receiver (a bool, or one per lane).
+            active: Lanes.
+        """
+        return End(inputs.antenna(frame, receiver, active), radar_axes(inputs, frame, active))
+
+
+@dataclass(frozen=True)
 class Connection:
     """The last segment of a path, from a surface point to an antenna."""
 
@@ -303,6 +371,7 @@ def connection(
     active: Any = True,
     *,
     same: bool = False,
+    end: End | None = None,
 ) -> Connection:
     """Scatter what comes from ``back`` towards an antenna; ``same`` if it lies there.
 
@@ -314,10 +383,11 @@ def connection(
         receiver: Whether the antenna is the receiver (a bool, or one per lane).
         active: Lanes.
         same: Whether the path comes from that very antenna.
+        end: The antenna, where it has been looked up.
     """
-    antenna = inputs.antenna(frame, receiver, active)
-    to_antenna, distance = segment(point.position, antenna)
-    seen = to_radar(inputs, frame, -to_antenna, active)
+    end = end or End.of(inputs, frame, receiver, active)
+    to_antenna, distance = segment(point.position, end.position)
+    seen = along_axes(end.axes, -to_antenna)
     on = None if same else to_antenna
     value = inputs.surfaces.scattered(point.surface, point.normal, back, on, active)
     gain = inputs.gain(frame, receiver, seen)

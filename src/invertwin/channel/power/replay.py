@@ -7,14 +7,14 @@ but the records is stored, whatever the depth; the tangent is one sweep from the
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power.bins import Contribution
-from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.power.integrand import Inputs, Place
 from invertwin.channel.power.passage import Passage, crossed, passage
-from invertwin.channel.power.walk import Records
+from invertwin.channel.power.walk import Recorded, Records
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import RayScene
@@ -47,56 +47,104 @@ class _Vertex:
         return Contribution(self.frame, power, length, found.seen.x, found.seen.y)
 
 
-def _vertex(rays: RayScene, inputs: Inputs, records: Records, number: Any, depth: Any) -> _Vertex:
-    """Evaluate vertex ``number`` (from 0 to ``depth`` − 1) of every path."""
-    lanes, single = records.lanes, records.depth == 1
-    lane = dr.arange(mi.UInt32, lanes)
+@dataclass(frozen=True)
+class _Near:
+    """A vertex and its neighbours on the path, as far as there are any."""
 
-    def read(name: str, at: Any, active: Any = True) -> Any:
-        column = getattr(records, name)
-        return column if single else dr.gather(type(column), column, at * lanes + lane, active)
+    own: Recorded
+    earlier: Recorded | None  # the vertex before; None on paths of one vertex
+    goes_on: Any  # whether there is a next one
+    here: Place
+    before: Place | None
+    onward: Any  # position of the next vertex
 
-    throughput, frame = read("throughput", number), records.frame
-    active = throughput != 0
+    @staticmethod
+    def of(inputs: Inputs, records: Records, number: Any, depth: Any) -> "_Near":
+        """Vertex ``number`` (from 0 to ``depth`` − 1) of every path, as attached as the inputs."""
+        own = records.at(number)
+        here = own.place(inputs, own.exists)
+        if records.depth == 1:
+            return _Near(own, None, mi.Bool(False), here, None, None)
+        inner, follows = own.exists & (number > 0), own.exists & (number + 1 < depth)
+        earlier, later = records.at(number - 1, inner), records.at(number + 1, follows)
+        goes_on = follows & later.exists
+        before, onward = earlier.place(inputs, inner), later.place(inputs, goes_on)
+        return _Near(own, earlier, goes_on, here, before, onward.position)
 
-    def located(at: Any, exists: Any) -> integrand.Place:
-        face, b1, b2 = (read(name, at, exists) for name in ("face", "b1", "b2"))
-        return integrand.place(inputs, face, b1, b2, exists)
+    def leaves(self) -> "_Near":
+        """The same, but places with derivatives of their own."""
+        assert self.before is not None
+        here = Place(
+            mi.Point3f(self.here.position),
+            mi.Vector3f(self.here.normal),
+            dr.ones(mi.Float, dr.width(self.own.face)),
+            self.here.surface,
+        )
+        before = replace(self.before, position=mi.Point3f(self.before.position))
+        onward = mi.Point3f(self.onward)
+        dr.enable_grad(here.position, here.normal, here.jacobian, before.position, onward)
+        return replace(self, here=here, before=before, onward=onward)
 
+
+@dataclass(frozen=True)
+class _Antennas:
+    """Where paths start and end; looked up once where that carries no derivatives."""
+
+    inputs: Inputs
+    frame: Any
+    ends: tuple[integrand.End, integrand.End] | None  # transmitter and receiver
+
+    @staticmethod
+    def of(inputs: Inputs, frame: Any) -> "_Antennas":
+        if any(dr.grad_enabled(inputs.table(name)) for name in ("tx", "rx", "rotations")):
+            return _Antennas(inputs, frame, None)
+        first, second = (integrand.End.of(inputs, frame, receiver) for receiver in (False, True))
+        return _Antennas(inputs, frame, (first, second))
+
+    def end(self, receiver: bool, active: Any) -> integrand.End:
+        if self.ends is not None:
+            return self.ends[receiver]
+        return integrand.End.of(self.inputs, self.frame, receiver, active)
+
+
+def _vertex(
+    rays: RayScene, inputs: Inputs, records: Records, antennas: _Antennas, number: Any, near: _Near
+) -> _Vertex:
+    """Evaluate vertex ``number`` of every path."""
+    single, frame = near.before is None, records.frame
+    own, here, goes_on = near.own, near.here, near.goes_on
+    active = own.exists
     inner = mi.Bool(False) if single else active & (number > 0)
 
-    def previous() -> Any:
-        transmitter = inputs.antenna(frame, False, active)
-        if single:
-            return transmitter
-        return dr.select(inner, located(number - 1, inner).position, transmitter)
+    def previous(place: Callable[[], Place | None]) -> Any:
+        start = antennas.end(False, active).position
+        earlier = place()
+        return start if earlier is None else dr.select(inner, earlier.position, start)
 
-    here, before = located(number, active), previous()
+    before = previous(lambda: near.before)
     back, distance = integrand.segment(here.position, before)
     optical, lost = distance, mi.Float(1.0)
-    if inputs.surfaces.bodies and not single:
-        inside = integrand.medium(inputs, here, located(number - 1, inner), back, inner)
+    if inputs.surfaces.bodies and near.before is not None:
+        inside = integrand.medium(inputs, here, near.before, back, inner)
         optical, lost = distance * inside.index, dr.exp(-inside.attenuation * distance)
     first = active if single else active & (number == 0)
-    seen_from_tx = integrand.to_radar(inputs, frame, -back, first)
+    seen_from_tx = integrand.along_axes(antennas.end(False, first).axes, -back)
     gain = dr.select(first, inputs.gain(frame, False, seen_from_tx), 1.0)
     arriving = gain * here.jacobian * lost / dr.square(distance)
+    receiver = antennas.end(True, active)
     connection = integrand.connection(
-        inputs, frame, here, back, True, active, same=single and inputs.monostatic
+        inputs, frame, here, back, True, active, same=single and inputs.monostatic, end=receiver
     )
-    goes_on, scattered = mi.Bool(False), mi.Float(1.0)
+    scattered = mi.Float(1.0)
     if not single:
-        goes_on = active & (number + 1 < depth)
-        goes_on &= read("throughput", number + 1, goes_on) != 0
-        transmitter = inputs.antenna(frame, False, active)
-        onward = dr.select(goes_on, located(number + 1, goes_on).position, transmitter)
-        direction, _ = integrand.segment(here.position, onward)
+        start = antennas.end(False, active).position
+        direction, _ = integrand.segment(here.position, dr.select(goes_on, near.onward, start))
         scattered = inputs.surfaces.scattered(here.surface, here.normal, back, direction, goes_on)
-    seen = active & read("seen", number)
+    seen = active & own.seen
     twice, passed = mi.Bool(False), Passage(mi.Float(1.0), mi.Float(0.0))
     if inputs.surfaces.sheets:
         twice = first if rays.link.shared_visibility else twice
-        end = dr.select(twice, before, inputs.antenna(frame, True, active))
+        end = dr.select(twice, before, receiver.position)
         fixed = (dr.detach(here.position), dr.detach(end))
         with dr.suspend_grad():
             passed = passage(rays, inputs.detached(), *fixed, seen)
@@ -104,15 +152,15 @@ def _vertex(rays: RayScene, inputs: Inputs, records: Records, number: Any, depth
         passed=passed,
         twice=twice,
         ends=(
-            previous,
-            lambda: located(number, active).position,
-            lambda: inputs.antenna(frame, True, active),
+            lambda: previous(lambda: near.earlier and near.earlier.place(inputs, inner)),
+            lambda: own.place(inputs, active).position,
+            lambda: antennas.end(True, active).position,
         ),
         active=active,
         goes_on=goes_on,
         seen=seen,
-        throughput=throughput,
-        length=read("length", number),
+        throughput=own.throughput,
+        length=records.length_at(number),
         frame=frame,
         arriving=arriving,
         segment=optical,
@@ -142,10 +190,18 @@ def pull(
         gather: Adjoints of paths: ∂loss/∂power, and power · ∂loss/∂(range, u, v).
     """
     depth = opaque(records.depth)
+    antennas = _Antennas.of(inputs, records.frame)
+    # With neighbours, all that moves a vertex is summed before its triangle is asked.
+    carried = records.depth > 1 and dr.grad_enabled(inputs.vertices)
+    fixed = inputs.detached()
 
-    def sweep(number: Any, power_sum: Any, range_sum: Any) -> tuple[Any, Any]:
+    def sweep(number: Any, sums: Any, pending: Any) -> tuple[Any, Any]:
+        power_sum, range_sum = sums
+        if carried:
+            near = waited(number, pending)
         with dr.resume_grad():
-            vertex = _vertex(rays, inputs, records, number, depth)
+            near = near.leaves() if carried else _Near.of(inputs, records, number, depth)
+            vertex = _vertex(rays, inputs, records, antennas, number, near)
             path = vertex.path()
             power, length, u, v = (
                 dr.select(vertex.seen, bar, 0.0) for bar in gather(path, vertex.seen)
@@ -160,9 +216,70 @@ def pull(
             objective = dr.select(vertex.active, so_far, 0.0) + dr.select(vertex.seen, ending, 0.0)
             objective += dr.select(vertex.goes_on, later, 0.0)
             dr.backward_from(objective)
+            if carried:
+                pending = moved_on(near, pending)
         if inputs.surfaces.sheets:
             pull_sheets(vertex, power * dr.detach(path.power), length, power_sum, range_sum)
-        return power_sum, range_sum
+        return (power_sum, range_sum), pending
+
+    def waited(number: Any, pending: Any) -> _Near:
+        """A vertex and its neighbours; only the one before has not been read yet."""
+        own, later = (Recorded(**pending[name], seen=pending["seen"]) for name in ("own", "later"))
+        earlier = records.at(number - 1, number > 0)
+        before = earlier.place(fixed, number > 0)
+        here, goes_on = Place.of(pending["here"]), own.exists & later.exists
+        return _Near(own, earlier, goes_on, here, before, pending["onward"])
+
+    def moved_on(near: _Near, pending: Any) -> Any:
+        """Ask the triangle of the next vertex, of which all is known now; this one waits."""
+        here, before, earlier = near.here, near.before, near.earlier
+        assert before is not None
+        assert earlier is not None
+
+        def moved(value: Any, active: Any = near.own.exists) -> Any:
+            return dr.select(active, dr.grad(value), 0.0)
+
+        position = pending["position"] + moved(near.onward, near.goes_on)
+        told(
+            Recorded(**pending["later"], seen=None), pending | {"position": position}, near.goes_on
+        )
+        return {
+            "own": _identity(earlier),
+            "later": _identity(near.own),
+            "seen": earlier.seen,
+            "here": before.parts,
+            "onward": dr.detach(here.position),
+            "position": pending["earlier"] + moved(here.position),
+            "normal": moved(here.normal),
+            "jacobian": moved(here.jacobian),
+            "earlier": moved(before.position),
+        }
+
+    def told(vertex: Recorded, pending: Any, active: Any) -> None:
+        place = vertex.place(inputs, active)
+        total = dr.dot(place.position, pending["position"])
+        total += dr.dot(place.normal, pending["normal"]) + place.jacobian * pending["jacobian"]
+        dr.backward_from(dr.select(active, total, 0.0))
+
+    def waiting() -> Any:
+        """Nothing is known but which vertex is the last."""
+        if not carried:
+            return ()
+        lanes, last = records.lanes, records.at(depth - 1)
+        with dr.suspend_grad():
+            here = last.place(fixed)
+        none = Recorded(last.face, last.b1, last.b2, dr.zeros(mi.Float, lanes), None)
+        return {
+            "own": _identity(last),
+            "later": _identity(none),
+            "seen": last.seen,
+            "here": here.parts,
+            "onward": dr.zeros(mi.Point3f, lanes),
+            "position": dr.zeros(mi.Point3f, lanes),
+            "normal": dr.zeros(mi.Vector3f, lanes),
+            "jacobian": dr.zeros(mi.Float, lanes),
+            "earlier": dr.zeros(mi.Point3f, lanes),
+        }
 
     def pull_sheets(
         vertex: _Vertex, power: Any, length: Any, power_sum: Any, range_sum: Any
@@ -184,7 +301,16 @@ def pull(
 
             crossed(rays, inputs, start, vertex.ends[1], active, {}, act)
 
-    _swept(rays, records, sweep, backwards=True)
+    pending = _swept(rays, records, sweep, waiting(), backwards=True)
+    if carried:
+        with dr.resume_grad():
+            first = Recorded(**pending["later"], seen=None)
+            told(first, pending, first.exists)
+
+
+def _identity(vertex: Recorded) -> dict[str, Any]:
+    """What a loop carries of a vertex besides whether it is seen."""
+    return {name: getattr(vertex, name) for name in ("face", "b1", "b2", "throughput")}
 
 
 def push(
@@ -202,10 +328,13 @@ def push(
         scatter: Takes paths, the derivatives of their power, range, u and v, and which exist.
     """
     depth = opaque(records.depth)
+    antennas = _Antennas.of(inputs, records.frame)
 
-    def sweep(number: Any, growth: Any, longer: Any) -> tuple[Any, Any]:
+    def sweep(number: Any, sums: Any, pending: Any) -> tuple[Any, Any]:
+        growth, longer = sums
         with dr.resume_grad():
-            vertex = _vertex(rays, inputs, records, number, depth)
+            near = _Near.of(inputs, records, number, depth)
+            vertex = _vertex(rays, inputs, records, antennas, number, near)
             path = vertex.path()
             values = (
                 vertex.arriving, vertex.segment, path.power, vertex.connection.distance,
@@ -230,7 +359,7 @@ def push(
             vertex.seen,
         )
         growth = growth + _per(vertex.goes_on, scattered, vertex.scattered)
-        return growth, longer
+        return (growth, longer), pending
 
     def push_sheets(start: Any, end: Any, active: Any) -> tuple[Any, Any]:
         def act(carry: dict[str, Any], transmittance: Any, extra: Any) -> None:
@@ -245,25 +374,29 @@ def push(
         done = crossed(rays, inputs, start, end, active, carry, act)
         return done["growth"], done["longer"]
 
-    _swept(rays, records, sweep)
+    _swept(rays, records, sweep, ())
 
 
 def _swept(
     rays: RayScene,
     records: Records,
     sweep: Callable[[Any, Any, Any], tuple[Any, Any]],
+    pending: Any,
     *,
     backwards: bool = False,
-) -> None:
-    """Carry two sums along all paths, vertex by vertex, from the near end or from the far one."""
+) -> Any:
+    """Carry two sums along all paths, vertex by vertex, from the near end or from the far one.
+
+    What else is to be carried is given, and returned as it is at the end.
+    """
     last = opaque(records.depth - 1)
-    first, second = (dr.zeros(mi.Float, records.lanes) for _ in range(2))
+    sums = tuple(dr.zeros(mi.Float, records.lanes) for _ in range(2))
     with dr.suspend_grad():
         if records.depth == 1:
-            sweep(mi.UInt32(0), first, second)
-            return
-        rays.loop(
-            (dr.zeros(mi.UInt32, records.lanes), first, second),
+            return sweep(mi.UInt32(0), sums, pending)[1]
+        state = rays.loop(
+            (dr.zeros(mi.UInt32, records.lanes), sums, pending),
             lambda done, *_: done <= last,
-            lambda done, *sums: (done + 1, *sweep(last - done if backwards else done, *sums)),
+            lambda done, *carried: (done + 1, *sweep(last - done if backwards else done, *carried)),
         )
+        return state[2]

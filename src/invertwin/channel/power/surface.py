@@ -48,7 +48,12 @@ class Surfaces:
             row: Row of the surface.
             active: Lanes.
         """
-        return dr.gather(mi.Float, self.tables[name], row, active)
+        return self._read(name, row, active)
+
+    def _read(self, name: str, at: Any, active: Any) -> Any:
+        """Entries of a table; by all lanes where it has no derivatives, so that it is read once."""
+        table = self.tables[name]
+        return dr.gather(mi.Float, table, at, active if dr.grad_enabled(table) else True)
 
     def tabulated(self, name: str, row: Any, cosine: Any, active: Any = True) -> Any:
         """A table over cosθ, linear between its entries.
@@ -59,11 +64,10 @@ class Surfaces:
             cosine: Of the angle of incidence, at least 0.
             active: Lanes.
         """
-        table = self.tables[name]
         t = dr.minimum(cosine, 1.0) * (self.cosines - 1)
         low = dr.minimum(mi.UInt32(dr.detach(t)), self.cosines - 2)
-        first = dr.gather(mi.Float, table, row * self.cosines + low, active)
-        second = dr.gather(mi.Float, table, row * self.cosines + low + 1, active)
+        first = self._read(name, row * self.cosines + low, active)
+        second = self._read(name, row * self.cosines + low + 1, active)
         return first + (second - first) * (t - mi.Float(low))
 
     def through(self, row: Any, cosine: Any, active: Any = True) -> tuple[Any, Any]:
@@ -98,7 +102,7 @@ class Surfaces:
         else:
             both, across = on + back, dr.dot(normal, on) - dr.dot(normal, back)
             apart = dr.squared_norm(both - normal * dr.dot(normal, both)) + dr.square(across)
-        exponent = dr.gather(mi.Float, self.tables["exponents"], row * 3 + number, active)
+        exponent = self._read("exponents", row * 3 + number, active)
         return dr.exp(exponent * log_less(0.25 * apart)), exponent
 
     def scattered(self, row: Any, normal: Any, back: Any, on: Any, active: Any = True) -> Any:
@@ -130,7 +134,7 @@ class Surfaces:
                     for direction in (back, on):
                         cosine = dr.abs(dr.dot(normal, direction))
                         lobe *= self.tabulated("spread", row, cosine, active)
-                shape += dr.gather(mi.Float, self.tables["lobes"], row * 3 + number, active) * lobe
+                shape += self._read("lobes", row * 3 + number, active) * lobe
         value = dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
         if self.bodies and on is not back:
             through = self.refracted(row, normal, back, on, active)
@@ -188,7 +192,7 @@ class Surfaces:
             row: Row of the surface.
             active: Lanes.
         """
-        exponent = dr.gather(mi.Float, self.tables["exponents"], row * 3, active)
+        exponent = self._read("exponents", row * 3, active)
         return 2 / dr.maximum(exponent, 1.0)
 
     def is_skin(self, row: Any) -> Any:

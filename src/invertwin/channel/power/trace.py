@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 from torch import Tensor
@@ -25,7 +25,7 @@ from invertwin.channel.rays.scene import RayScene
 from invertwin.channel.sampling import Sampling
 from invertwin.scene.checks import plain
 
-_BYTES_PER_VERTEX = 21  # one record: triangle, two barycentrics, throughput, length, seen
+_BYTES_PER_VERTEX = 20  # one record: triangle, two barycentrics, throughput, length
 
 
 def tables_of(geometry: Geometry, link: Link) -> list[Tensor]:
@@ -134,13 +134,15 @@ class Trace:
         state = self._started(index)
         state["lane"] = dr.arange(mi.UInt32, dr.width(index))
         looped = record and depth > 1
-        records = Records.empty(state, depth if looped else 0, self.rays.sound_face)
+        records = Records.empty(state, depth if looped else 0)
+        receiver = integrand.End.of(self.fixed, state["frame"], True)
 
         def visit(state: State, point: Place) -> None:
             nonlocal records
             found, exists = walk.connect(
-                self.rays, self.fixed, state, point, True, shared=shared, one_place=one_place
-            )
+                self.rays, self.fixed, state, point, True,
+                shared=shared, one_place=one_place, end=receiver,
+            )  # fmt: skip
             if out is not None:
                 out.add(found, exists)
             if looped:
@@ -175,9 +177,10 @@ class Trace:
         sampling = self.sampling
         if not (sampling.boundary and sampling.boundary_samples):
             return None
+        # Nothing that refers to this object: records would stay until garbage is collected.
         return BoundaryPoints(
             self.rays, self.fixed, sampling, self.seed, self.contacts,
-            chunks=lambda size: chunks(size, self.chunk),
+            chunks=partial(chunks, chunk=self.chunk),
         )  # fmt: skip
 
     def boundary(self, inputs: Inputs) -> Iterator[BoundaryPaths]:

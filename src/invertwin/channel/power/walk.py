@@ -104,10 +104,12 @@ class Walk:
         last = opaque(depth) if isinstance(depth, int) else depth
         lanes = dr.width(state["index"])
         state = {**state, "last": mi.UInt32(last) + dr.zeros(mi.UInt32, lanes)}
+        # Carried, since a vertex is located where it is found.
+        state |= self._place(state).parts
 
         def body(state: State) -> tuple[State]:
             state = dict(state)
-            point = self._place(state)
+            point = Place.of(state)
             visit(state, point)
             self._extend(state, point, directions)
             return (state,)
@@ -160,10 +162,11 @@ class Walk:
         active = state["active"] & (state["number"] < state["last"])
         back = state["back"]
         scene = self.rays.frame_scene(state["frame"])
-        drawn = directions.draw(point, back, self._numbers(state, 0, 1, 2), scene)
+        numbers = self._numbers(state)
+        drawn = directions.draw(point, back, numbers, scene)
         omega = drawn.omega
         scattered = self.inputs.surfaces.scattered(
-            point.surface, point.normal, back, mi.Vector3f(omega), active
+            point.surface, point.normal, back, mi.Vector3f(omega)
         )
         ratio: Any = scattered / (drawn.scattered * dr.abs(dr.dot(point.normal, back)))
         survival = dr.select(
@@ -171,7 +174,7 @@ class Walk:
             dr.minimum(dr.maximum(ratio, _LEAST_SURVIVAL), 1.0),
             1.0,
         )
-        active &= (scattered > 0) & (self._numbers(state, 3)[0] < survival)
+        active &= (scattered > 0) & (numbers[1] < survival)
         side = dr.mulsign(point.normal, dr.dot(point.normal, omega))
         origin = point.position + side * (NEAR * dr.norm(point.position))
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
@@ -191,15 +194,16 @@ class Walk:
         if "weight" in state:
             state["weight"] = state["weight"] * dr.square(distance) / odds
         state["face"], state["b1"], state["b2"] = hit.face, hit.b1, hit.b2
+        state |= found.parts
         state["back"] = mi.Vector3f(to_point)
         state["length"] = state["length"] + inside.index * distance + hit.extra
         state["number"] = state["number"] + 1
         state["active"] = active
 
-    def _numbers(self, state: State, *streams: int) -> list[Any]:
-        """Uniform numbers of this vertex, two of each stream."""
+    def _numbers(self, state: State) -> list[Any]:
+        """Six uniform numbers of this vertex; ``land`` has a stream of its own after them."""
         numbers = []
-        for stream in streams:
+        for stream in range(3):
             seed = self.seed + (state["number"] * 5 + stream) * _STREAM
             numbers += uniform_pair(state["index"], seed)
         return numbers
@@ -215,6 +219,7 @@ def connect(
     least: Any = 1,
     shared: bool = False,
     one_place: bool = False,
+    end: integrand.End | None = None,
 ) -> tuple[Contribution, Any]:
     """The path that ends at the latest vertex, and whether it exists.
 
@@ -228,9 +233,11 @@ def connect(
         least: Fewest vertices of a path (a number, or one per lane).
         shared: What the antenna at the start sees, the one at the end sees too.
         one_place: Both are one.
+        end: The antenna at the end, if it has been looked up.
     """
+    end = end or integrand.End.of(inputs, state["frame"], receiver, state["active"])
     found = integrand.connection(
-        inputs, state["frame"], point, state["back"], receiver, state["active"], same=one_place
+        inputs, state["frame"], point, state["back"], receiver, same=one_place, end=end
     )
     u, v = found.seen.x, found.seen.y
     if receiver is not True:
@@ -242,8 +249,7 @@ def connect(
     transmittance, extra = state.get("transmittance", one), state.get("extra", none)
     if not (shared and "last" not in state):
         first = exists & (state["number"] == 1) if shared else mi.Bool(False)
-        antenna = inputs.antenna(state["frame"], receiver, exists)
-        passed = passage(rays, inputs, point.position, antenna, exists & ~first)
+        passed = passage(rays, inputs, point.position, end.position, exists & ~first)
         transmittance = dr.select(first, transmittance, passed.transmittance)
         extra = dr.select(first, extra, passed.extra)
     length = 0.5 * (state["length"] + found.distance + extra)
@@ -253,18 +259,43 @@ def connect(
 
 
 @dataclass(frozen=True)
+class Recorded:
+    """One vertex of every path."""
+
+    face: Any  # triangle
+    b1: Any  # barycentric coordinates
+    b2: Any
+    throughput: Any  # all factors so far; zero where the path has ended before
+    seen: Any  # whether the vertex is connected to the receiver
+
+    @property
+    def exists(self) -> Any:
+        """Which paths come here."""
+        return self.throughput != 0
+
+    def place(self, inputs: Inputs, active: Any = True) -> Place:
+        """Where it lies now.
+
+        Args:
+            inputs: Tables of the kernel.
+            active: Lanes.
+        """
+        return integrand.place(inputs, self.face, self.b1, self.b2, active)
+
+
+@dataclass(frozen=True)
 class Records:
-    """Vertices of paths as flat arrays, vertex after vertex: ``[vertex × lane]``."""
+    """Vertices of paths.
+
+    What tells a vertex is written and read at once, as four numbers: triangle (its bits), two
+    barycentric coordinates, and the throughput, negative where the vertex is not seen.
+    """
 
     lanes: int  # paths
     depth: int  # vertices of a path
     frame: Any  # radar pose of a lane
-    face: Any  # triangle
-    b1: Any  # barycentric coordinates
-    b2: Any
-    throughput: Any  # all factors so far; zero where the path has ended
-    length: Any  # from the transmitter to the vertex [m]
-    seen: Any  # whether the vertex is connected to the receiver
+    rows: Any  # four numbers each: [vertex × lane], or four arrays for paths of one vertex
+    length: Any  # from the transmitter to the vertex [m], [vertex × lane]
 
     @staticmethod
     def single(state: State, seen: Any) -> "Records":
@@ -274,39 +305,48 @@ class Records:
             state: The path so far.
             seen: Whether the vertex is connected to the receiver.
         """
-        names = ("frame", "face", "b1", "b2", "throughput", "length")
-        columns = {name: state[name] for name in names}
-        return Records(lanes=dr.width(state["index"]), depth=1, **columns, seen=seen)
+        lanes = dr.width(state["index"])
+        return Records(lanes, 1, state["frame"], _row(state, seen), state["length"])
 
     @staticmethod
-    def empty(state: State, depth: int, sound_face: Any) -> "Records":
+    def empty(state: State, depth: int) -> "Records":
         """Room for paths that start in this state.
 
         Args:
             state: The path so far.
             depth: Most vertices of a path.
-            sound_face: A triangle that any lane may read.
         """
         lanes = dr.width(state["index"])
-        size = lanes * depth
-        face = dr.zeros(mi.UInt32, size)
-        b1, b2, throughput, length = (dr.zeros(mi.Float, size) for _ in range(4))
-        return Records(
-            lanes=lanes,
-            depth=depth,
-            frame=state["frame"],
-            face=face + sound_face if size else face,
-            b1=b1,
-            b2=b2,
-            throughput=throughput,
-            length=length,
-            seen=dr.zeros(mi.Bool, size),
-        )
+        rows, length = dr.zeros(mi.Float, 4 * lanes * depth), dr.zeros(mi.Float, lanes * depth)
+        return Records(lanes, depth, state["frame"], rows, length)
 
     @property
     def columns(self) -> list[Any]:
         """All arrays."""
-        return [column for column in vars(self).values() if not isinstance(column, int)]
+        return [self.frame, self.rows, self.length]
+
+    def at(self, number: Any, active: Any = True) -> Recorded:
+        """One vertex of every path.
+
+        Args:
+            number: Of the vertex, from 0.
+            active: Lanes.
+        """
+        row = self.rows
+        if self.depth > 1:
+            row = dr.gather(mi.Vector4f, self.rows, self._places(number), active)
+        face = dr.reinterpret_array(mi.UInt32, row.x)
+        return Recorded(face, row.y, row.z, dr.abs(row.w), row.w > 0)
+
+    def length_at(self, number: Any) -> Any:
+        """Length of every path up to one of its vertices [m].
+
+        Args:
+            number: Of the vertex, from 0.
+        """
+        if self.depth == 1:
+            return self.length
+        return dr.gather(mi.Float, self.length, self._places(number))
 
     def write(self, state: State, seen: Any) -> None:
         """Store the latest vertex.
@@ -316,6 +356,14 @@ class Records:
             seen: Whether the vertex is connected to the receiver.
         """
         at = (state["number"] - 1) * self.lanes + state["lane"]
-        values = {**state, "seen": seen}
-        for name in ("face", "b1", "b2", "throughput", "length", "seen"):
-            dr.scatter(getattr(self, name), values[name], at, state["active"])
+        dr.scatter(self.rows, _row(state, seen), at, state["active"])
+        dr.scatter(self.length, state["length"], at, state["active"])
+
+    def _places(self, number: Any) -> Any:
+        return number * self.lanes + dr.arange(mi.UInt32, self.lanes)
+
+
+def _row(state: State, seen: Any) -> Any:
+    throughput = dr.select(seen, state["throughput"], -state["throughput"])
+    face = dr.reinterpret_array(mi.Float, state["face"])
+    return mi.Vector4f(face, state["b1"], state["b2"], throughput)

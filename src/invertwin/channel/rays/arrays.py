@@ -107,12 +107,12 @@ def corners(vertices: Any, faces: Any, face: Any, active: Any = True) -> tuple[A
 
     Args:
         vertices: Table of points.
-        faces: Vertex indices of triangles.
+        faces: Vertex indices of triangles, four numbers each.
         face: Triangles.
         active: Lanes.
     """
-    index = dr.gather(mi.Vector3u, faces, face, active)
-    return tuple(point_at(vertices, i, active) for i in index)  # type: ignore[return-value]
+    index = dr.gather(mi.Vector4u, faces, face, active)
+    return tuple(point_at(vertices, index[k], active) for k in range(3))  # type: ignore[return-value]
 
 
 def between(triangle: tuple[Any, Any, Any], b1: Any, b2: Any) -> Any:

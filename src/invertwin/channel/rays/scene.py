@@ -115,6 +115,17 @@ class RayScene(Occluders):
         return Spheres(self.geometry, self.origin, margin=1.001)
 
     @cached_property
+    def triangles(self) -> Any:
+        """Of every triangle a corner, two sides and the unit normal, as three rows of four numbers.
+
+        Rows are (corner, normal's x), (side, its y), (side, its z): each is read as a whole.
+        """
+        p0, p1, p2 = (self.local_vertices[self.geometry.faces[:, k]] for k in range(3))
+        normal = torch.nn.functional.normalize(torch.linalg.cross(p1 - p0, p2 - p0), dim=1)
+        rows = torch.stack([p0, p1 - p0, p2 - p0], dim=1)
+        return to_float(torch.cat([rows, normal[:, :, None]], dim=2))
+
+    @cached_property
     def exact_vertices(self) -> Any:
         """Vertices in float64, three numbers each."""
         return to_double(self.geometry.vertices.detach() - self.origin)
@@ -188,7 +199,7 @@ class RayScene(Occluders):
             face: Triangle.
             active: Lanes.
         """
-        return arrays.corners(self.vertices, self.topology.device_faces, face, active)
+        return arrays.corners(self.vertices, self.topology.device_corners, face, active)
 
 
 def _sound_face(geometry: Geometry) -> int:

@@ -49,6 +49,8 @@ class Topology:
         alone = (self.opposite >= 0).sum(1) == 1
         self.open_objects = set(face_object[beside[alone, 0]].tolist())
         self.device_faces = to_index(faces)
+        #: The same, four numbers each, the last one zero: each is read as a whole.
+        self.device_corners = to_index(torch.nn.functional.pad(faces, (0, 1)))
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
         self.device_edge_object = to_index(owner[self.edges[:, 0]])

@@ -77,9 +77,10 @@ def _row(geometry: Geometry, link: Link, edge: ShadowEdge, echo: Echo) -> Paths:
 
 def _walked(trace: Trace, records: Records) -> Iterator[Paths]:
     """The paths of one point, of two and so on; the kernel says what arrives at the last point."""
+    vertices = [records.at(number) for number in range(records.depth)]
     face, b1, b2, throughput, seen = (
-        to_torch(column).reshape(records.depth, -1).T
-        for column in (records.face, records.b1, records.b2, records.throughput, records.seen)
+        torch.stack([to_torch(getattr(vertex, name)) for vertex in vertices], dim=1)
+        for name in ("face", "b1", "b2", "throughput", "seen")
     )
     for count in range(1, records.depth + 1):
         lit = seen[:, count - 1].bool()
